@@ -1,0 +1,28 @@
+"""fusion-gym: Gymnasium environments that ask when a measurement is worth transmitting.
+
+Importing the package registers its environments with Gymnasium.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from fusion_gym.envs.registration import make_task, register
+from fusion_gym.validation import ConfigurationError
+
+if TYPE_CHECKING:
+    from fusion_gym.envs.sb3 import FusionSB3VecEnv, make_sb3_vec_env
+
+__version__ = "0.1.0"
+__all__ = ["ConfigurationError", "FusionSB3VecEnv", "make_sb3_vec_env", "make_task", "register"]
+
+register()
+
+
+def __getattr__(name: str) -> Any:
+    """Stable-Baselines3 and torch are imported only where they are used."""
+    if name in ("FusionSB3VecEnv", "make_sb3_vec_env"):
+        from fusion_gym.envs import sb3
+
+        return getattr(sb3, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,180 @@
+"""The batched core: N episodes of one task side by side, with their noise, tokens and rewards."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium.utils import seeding
+from numpy.typing import NDArray
+
+from fusion_gym.envs.task import ObservationLayout, Task
+from fusion_gym.systems import Signals
+from fusion_gym.validation import Array
+
+_LONGEST_BLOCK = 256  # steps of noise that are drawn and kept at a time
+
+
+class Outcome(NamedTuple):
+    """What one step brought, batch axis last.
+
+    ``reward`` (N,) is ``reward_error`` + ``reward_cost``; ``cost`` (N,) the tokens spent;
+    ``requested``, ``granted`` (sensors, N) bool; ``squared_error`` (n, N) of the fused estimate;
+    ``truncated`` (N,) bool.
+    """
+
+    reward: Array
+    reward_error: Array
+    reward_cost: Array
+    cost: Array
+    requested: NDArray[np.bool_]
+    granted: NDArray[np.bool_]
+    squared_error: Array
+    truncated: NDArray[np.bool_]
+
+
+class EpisodeBatch:
+    """N runs of a :class:`~fusion_gym.envs.task.Task`, advanced together.
+
+    Each run draws all its noise from its own generator, in blocks and whatever the actions: a
+    seed fixes an episode's noise (common random numbers), and a run does not depend on what
+    stands beside it (batch invariance).
+    """
+
+    def __init__(self, task: Task, num_envs: int) -> None:
+        self.task = task
+        self.num_envs = num_envs
+        self.layout = ObservationLayout(task)
+        self.generators: list[np.random.Generator | None] = [None] * num_envs
+        self.state: Any = None
+        self.tokens = task.bucket.start(num_envs)
+        self.steps = np.zeros(num_envs, dtype=np.int64)
+        self.finished = np.ones(num_envs, dtype=np.bool_)
+        self._limit = np.full(num_envs, task.horizon, dtype=np.int64)
+        # Row (cursor mod block) of the ring holds the noise of the next sensing; a run's block
+        # starts wherever the cursor stood at its reset, so that a row is one contiguous read.
+        self._block = min(task.horizon + 1, _LONGEST_BLOCK)
+        self._ring = np.zeros((self._block, task.system.noise_channels, num_envs))
+        self._cursor = 0
+        self._block_start = np.zeros(num_envs, dtype=np.int64)
+
+    def seed(self, runs: NDArray[np.int64], seeds: Sequence[int | None]) -> None:
+        """Give these runs new generators; ``None`` keeps a run's generator if it has one."""
+        for run, seed in zip(runs.tolist(), seeds, strict=True):
+            if seed is not None or self.generators[run] is None:
+                self.generators[run], _ = seeding.np_random(seed)
+
+    def reset(self, runs: NDArray[np.int64] | None = None, *, stagger: bool = False) -> None:
+        """Begin new episodes in the given runs (all by default) and sense for the first time.
+
+        ``stagger`` spreads the lengths of these first episodes evenly from 1 to the horizon, so
+        that later ones do not all end in the same step.
+        """
+        everyone = runs is None
+        runs = np.arange(self.num_envs) if runs is None else runs
+        system = self.task.system
+        noise = np.empty((len(runs), system.start_channels))
+        for place, run in enumerate(runs.tolist()):
+            self._generator(run).standard_normal(out=noise[place])
+        self._draw(runs)
+        fresh = system.start(np.ascontiguousarray(noise.T))
+        row = self._ring[self._cursor % self._block]
+        fresh = system.sense(fresh, row if everyone else row[:, runs])
+        self.state = fresh if everyone else _merge(self.state, fresh, runs)
+        self.tokens = _merge(self.tokens, self.task.bucket.start(len(runs)), runs)
+        self.steps[runs] = 0
+        self.finished[runs] = False
+        horizon = self.task.horizon
+        self._limit[runs] = horizon
+        if stagger:
+            self._limit[runs] = horizon - (np.arange(len(runs)) * horizon) // len(runs)
+
+    def step(self, requests: NDArray[np.bool_]) -> Outcome:
+        """Answer the requests (sensors, N), update, fuse, reward; then move and sense.
+
+        Runs that are ``finished`` are carried along without meaning until they are reset.
+        """
+        task, system = self.task, self.task.system
+        granted, spent, tokens = task.bucket.grant(self.tokens, requests, self.steps)
+        state = system.deliver(self.state, granted)
+        mean, covariance = system.fused(state)
+        error = system.truth(state) - mean
+        squared_error = error * error
+        reward_error, reward_cost = task.reward.terms(squared_error, covariance, spent)
+        self.tokens = tokens
+        self.steps = self.steps + 1
+        truncated = self.steps >= self._limit
+        self._cursor += 1
+        used_up = ~self.finished & (self._cursor - self._block_start >= self._block)
+        if used_up.any():
+            self._draw(np.flatnonzero(used_up))
+        self.delivered = state
+        self.state = system.sense(state, self._ring[self._cursor % self._block])
+        self.finished = truncated
+        return Outcome(
+            reward=reward_error + reward_cost,
+            reward_error=reward_error,
+            reward_cost=reward_cost,
+            cost=spent,
+            requested=requests,
+            granted=granted,
+            squared_error=squared_error,
+            truncated=truncated,
+        )
+
+    def observe(self) -> NDArray[np.float32]:
+        """Observations (N, entries) of all runs, a fresh array."""
+        return self.layout.encode(self.state, self.tokens)
+
+    def signals(self) -> Signals:
+        """The signals of all runs, without what the information mode withholds.
+
+        To the system's own it adds ``tokens`` (N,), ``token_cost`` (sensors, 1), ``step`` (N,),
+        the steps taken in the episode, ``start`` (N,) bool, and ``observation`` (N, entries).
+        """
+        values = dict(self.task.system.read(self.state))
+        values |= {
+            "tokens": self.tokens,
+            "token_cost": self.task.bucket.cost,
+            "step": self.steps,
+            "start": self.steps == 0,
+            "observation": self.observe,
+        }
+        return Signals(values, self.task.hidden_signals)
+
+    def _generator(self, run: int) -> np.random.Generator:
+        generator = self.generators[run]
+        if generator is None:
+            generator, _ = seeding.np_random(None)
+            self.generators[run] = generator
+        return generator
+
+    def _draw(self, runs: NDArray[np.int64]) -> None:
+        """Draw the next block of noise for these runs, to begin at the cursor."""
+        channels = self.task.system.noise_channels
+        noise = np.empty((len(runs), self._block, channels))
+        for place, run in enumerate(runs.tolist()):
+            self._generator(run).standard_normal(out=noise[place])
+        rows = (self._cursor + np.arange(self._block)) % self._block
+        self._ring[rows[:, None], :, runs[None, :]] = noise.transpose(1, 0, 2)
+        self._block_start[runs] = self._cursor
+
+
+def _merge(old: Any, new: Any, runs: NDArray[np.int64]) -> Any:
+    """``old`` with the given runs replaced by ``new``, through dataclasses and named tuples."""
+    if isinstance(old, np.ndarray):
+        result = old.copy()
+        result[..., runs] = new
+        return result
+    if old is None:
+        return None
+    if isinstance(old, tuple):
+        return type(old)(*(_merge(a, b, runs) for a, b in zip(old, new, strict=True)))
+    return type(old)(
+        *(
+            _merge(getattr(old, field.name), getattr(new, field.name), runs)
+            for field in dataclasses.fields(old)
+        )
+    )

@@ -1,0 +1,50 @@
+"""Registration of the environments with Gymnasium, and the way to a task by its id."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+from gymnasium.envs.registration import load_env_creator
+
+from fusion_gym.envs.task import Task
+from fusion_gym.envs.vector import FusionVectorEnv
+from fusion_gym.validation import ConfigurationError
+
+ENVIRONMENTS = {
+    "fusion_gym/TobitOscillator-v0": "fusion_gym.envs.tobit_oscillator:TobitOscillator",
+}
+
+
+def register() -> None:
+    """Register every environment with Gymnasium (again: no effect)."""
+    for name, prefix in ENVIRONMENTS.items():
+        if name not in gymnasium.registry:
+            gymnasium.register(
+                name, entry_point=f"{prefix}Env", vector_entry_point=f"{prefix}VectorEnv"
+            )
+
+
+def make_task(env_id: str, **options: Any) -> Task:
+    """The task of a registered environment with these options.
+
+    Raises:
+        ConfigurationError: an id that is not one of this suite's, an unknown option, or a value
+            that is not allowed.
+    """
+    known = {
+        name
+        for name, spec in gymnasium.registry.items()
+        if spec.vector_entry_point is not None and name.startswith("fusion_gym/")
+    }
+    if env_id not in known:
+        raise ConfigurationError(
+            f"unknown environment {env_id!r}: known are {', '.join(sorted(known))}"
+        )
+    spec = gymnasium.spec(env_id)
+    entry = spec.vector_entry_point
+    creator = load_env_creator(entry) if isinstance(entry, str) else entry
+    assert creator is not None
+    env = creator(num_envs=1, **(spec.kwargs | options))
+    assert isinstance(env, FusionVectorEnv)
+    return env.task

@@ -1,0 +1,175 @@
+"""Stable-Baselines3's vector environment over the batched core."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+
+from fusion_gym import validation
+from fusion_gym.envs import spaces
+from fusion_gym.envs.batch import EpisodeBatch
+from fusion_gym.envs.registration import make_task
+from fusion_gym.envs.task import Task
+
+
+class FusionSB3VecEnv(VecEnv):
+    """N runs of a task behind Stable-Baselines3's interface, without a wrapper in between.
+
+    A run that ends is reset in the same step; its info then holds ``terminal_observation``,
+    ``TimeLimit.truncated`` and ``episode`` (return ``r``, length ``l``, seconds ``t``, tokens
+    ``cost``), which is also what SB3's monitor would write. The infos of all others are empty:
+    a dictionary a run and step would cost more than the step.
+
+    ``stagger`` spreads the lengths of the first episodes from 1 to the horizon. PPO asks for one
+    value of each truncated run, so episodes that all end together would stall it.
+
+    Attributes:
+        task: the task.
+        observation_names: a name for each entry of an observation.
+        seconds: wall time spent in :meth:`step_wait` and :meth:`reset` so far.
+    """
+
+    def __init__(self, task: Task, num_envs: int, *, stagger: bool = False) -> None:
+        validation.integer("num_envs", num_envs, at_least=1)
+        self.task = task
+        self.batch = EpisodeBatch(task, num_envs)
+        self.observation_names = self.batch.layout.names
+        self.stagger = validation.boolean("stagger", stagger)
+        self.seconds = 0.0
+        self.render_mode = None
+        super().__init__(
+            num_envs, spaces.observation_space(self.batch.layout), spaces.action_space(task)
+        )
+        self._actions: Any = None
+        self._returns = np.zeros(num_envs)
+        self._spent = np.zeros(num_envs)
+        self._began = time.perf_counter()
+        self._empty: list[dict[str, Any]] = [{} for _ in range(num_envs)]
+
+    def reset(self) -> NDArray[np.float32]:
+        """New episodes in all runs, with the seeds and options set before (used once).
+
+        Raises:
+            ConfigurationError: an option was set; there are none.
+        """
+        began = time.perf_counter()
+        for option in self._options:
+            validation.keys("reset option", option, [])
+        self.batch.seed(np.arange(self.num_envs), self._seeds)
+        self.batch.reset(stagger=self.stagger)
+        self._reset_seeds()
+        self._reset_options()
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._returns[:] = 0.0
+        self._spent[:] = 0.0
+        observation = self.batch.observe()
+        self.seconds += time.perf_counter() - began
+        return observation
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Keep the actions for :meth:`step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """One step of every run.
+
+        Raises:
+            ValueError: an action that is not in the action space.
+        """
+        began = time.perf_counter()
+        requests = spaces.requests(self.task, self._actions, self.num_envs)
+        lengths = self.batch.steps
+        outcome = self.batch.step(requests)
+        self._returns += outcome.reward
+        self._spent += outcome.cost
+        done = outcome.truncated
+        infos = self._empty
+        if done.any():
+            runs = np.flatnonzero(done)
+            final = self.batch.observe()[runs]
+            infos = list(self._empty)
+            elapsed = round(time.perf_counter() - self._began, 6)
+            for place, run in enumerate(runs.tolist()):
+                infos[run] = {
+                    "terminal_observation": final[place],
+                    "TimeLimit.truncated": True,
+                    "episode": {
+                        "r": float(self._returns[run]),
+                        "l": int(lengths[run]) + 1,
+                        "t": elapsed,
+                        "cost": float(self._spent[run]),
+                    },
+                }
+                self.reset_infos[run] = {}
+            self._returns[runs] = 0.0
+            self._spent[runs] = 0.0
+            self.batch.reset(runs)
+        else:
+            infos = list(infos)
+        result = (self.batch.observe(), outcome.reward.astype(np.float32), done.copy(), infos)
+        self.seconds += time.perf_counter() - began
+        return result
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """The attribute of this environment, once for each index."""
+        value = getattr(self, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Refused: the runs share one task, build another environment instead.
+
+        Raises:
+            AttributeError: always.
+        """
+        raise AttributeError(
+            f"cannot set {attr_name!r} of some runs: they share one task; make a new environment"
+        )
+
+    def env_method(
+        self,
+        method_name: str,
+        *method_args: Any,
+        indices: VecEnvIndices = None,
+        **method_kwargs: Any,
+    ) -> list[Any]:
+        """Refused: the runs are not separate objects.
+
+        Raises:
+            AttributeError: always.
+        """
+        raise AttributeError(f"the runs share one batch and have no method {method_name!r}")
+
+    def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
+        """Whether a run is wrapped: ``Monitor`` counts as built in, anything else is absent."""
+        from stable_baselines3.common.monitor import Monitor
+
+        return [wrapper_class is Monitor for _ in self._get_indices(indices)]
+
+
+def make_sb3_vec_env(
+    env_id: str, num_envs: int, *, seed: int | None = None, stagger: bool = False, **options: Any
+) -> FusionSB3VecEnv:
+    """A native SB3 ``VecEnv`` of a registered environment.
+
+    ``options`` are those of ``gym.make``; ``seed`` (run i gets ``seed + i``) is used by the next
+    reset.
+
+    Raises:
+        ConfigurationError: an unknown id or option, or a value that is not allowed.
+    """
+    env = FusionSB3VecEnv(make_task(env_id, **options), num_envs, stagger=stagger)
+    if seed is not None:
+        env.seed(seed)
+    return env
+
+
+__all__: Sequence[str] = ["FusionSB3VecEnv", "make_sb3_vec_env"]

@@ -1,0 +1,73 @@
+"""Gymnasium's single environment: the batched core with one run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import validation
+from fusion_gym.envs import spaces
+from fusion_gym.envs.batch import EpisodeBatch
+from fusion_gym.envs.task import Task
+from fusion_gym.envs.vector import Infos, refuse_rendering, reset_infos, step_infos
+
+
+class FusionEnv(gymnasium.Env[Any, Any]):
+    """One run of a task behind Gymnasium's interface.
+
+    An episode ends by truncation at the task's horizon, never by termination.
+
+    Attributes:
+        observation_names: a name for each entry of the observation.
+    """
+
+    def __init__(self, task: Task, render_mode: str | None = None) -> None:
+        refuse_rendering(render_mode)
+        self.metadata = {"render_modes": []}
+        self.render_mode = None
+        self.task = task
+        self.batch = EpisodeBatch(task, 1)
+        self.observation_names = self.batch.layout.names
+        self.observation_space = spaces.observation_space(self.batch.layout)
+        self.action_space = spaces.action_space(task)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], Infos]:
+        """A new episode. There are no options.
+
+        Raises:
+            ConfigurationError: an unknown option.
+        """
+        validation.keys("reset option", options or {}, [])
+        super().reset(seed=seed)
+        self.batch.generators[0] = self.np_random
+        self.batch.reset()
+        return self.batch.observe()[0], _first(reset_infos(self.task, 1))
+
+    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, Infos]:
+        """One step; see the environment's documentation for the info.
+
+        Raises:
+            ValueError: an action that is not in the action space.
+            ResetNeeded: before the first reset, or after the end of the episode.
+        """
+        if self.batch.finished[0]:
+            raise gymnasium.error.ResetNeeded("the episode is over or never began: call reset")
+        outcome = self.batch.step(spaces.requests(self.task, np.asarray(action)[None], 1))
+        observation = self.batch.observe()[0]
+        infos = _first(step_infos(outcome))
+        return observation, float(outcome.reward[0]), False, bool(outcome.truncated[0]), infos
+
+
+def _first(infos: Infos) -> Infos:
+    """The info of the only run: numbers and arrays without the batch axis."""
+    return {
+        key: _first(value)
+        if isinstance(value, dict)
+        else (float(value[0]) if value.ndim == 1 else value[0].copy())
+        for key, value in infos.items()
+    }

@@ -1,0 +1,52 @@
+"""Spaces of a task, and the way from an action to requests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from fusion_gym.envs.task import ObservationLayout, Task
+
+
+def observation_space(layout: ObservationLayout) -> spaces.Box:
+    """Box of shape (entries,), float32, with the layout's bounds."""
+    return spaces.Box(layout.low, layout.high, dtype=np.float32)
+
+
+def action_space(task: Task) -> spaces.MultiBinary | spaces.Discrete[Any]:
+    """``MultiBinary(sensors)``, or ``Discrete(2**sensors)`` for ``action="discrete"``."""
+    if task.action == "discrete":
+        return spaces.Discrete(2**task.sensors)
+    return spaces.MultiBinary(task.sensors)
+
+
+def requests(task: Task, actions: Any, num_envs: int) -> NDArray[np.bool_]:
+    """Requests (sensors, N) from actions (N, sensors) of 0 and 1, or (N,) of whole numbers.
+
+    Raises:
+        ValueError: an action of another shape, not finite, or outside the action space.
+    """
+    given = np.asarray(actions)
+    discrete = task.action == "discrete"
+    wanted = (num_envs,) if discrete else (num_envs, task.sensors)
+    if given.shape != wanted or given.dtype == object:
+        raise ValueError(f"action of shape {given.shape} is not allowed: it must be {wanted}")
+    if discrete:
+        high = 2**task.sensors - 1
+        valid = (given >= 0) & (given <= high) & (given == np.floor(given))
+        if not valid.all():
+            raise ValueError(f"action {_first(given, valid)} is not allowed: it must be 0..{high}")
+        return (given.astype(np.int64) >> np.arange(task.sensors)[:, None] & 1).astype(np.bool_)
+    result = given == 1
+    valid = result | (given == 0)
+    if not valid.all():
+        raise ValueError(f"action {_first(given, valid)} is not allowed: it must be 0 or 1")
+    return np.ascontiguousarray(result.T)
+
+
+def _first(given: NDArray[Any], valid: NDArray[np.bool_]) -> str:
+    place = tuple(int(i) for i in np.argwhere(~valid)[0])
+    return f"{list(place)} = {given[place]}"

@@ -1,0 +1,150 @@
+"""A task: a system, its network, what a policy may know, and what the answer is worth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_gym import linalg, validation
+from fusion_gym.network import TokenBucket
+from fusion_gym.systems import Feature, System
+from fusion_gym.validation import Array
+
+INFORMATION_MODES = ("sensors", "centre")
+ACTION_KINDS = ("binary", "discrete")
+ERROR_KINDS = ("squared", "trace")
+
+
+@dataclass(frozen=True)
+class Reward:
+    """reward = -(error_weight · Σᵢ wᵢ error_i + cost_weight · tokens spent).
+
+    ``error="squared"`` takes the squared error of the fused estimate, ``"trace"`` the diagonal of
+    its covariance as the filter claims it (which a policy can game, see the documentation).
+    ``state_weights`` w has shape (n, 1).
+    """
+
+    error: str
+    error_weight: float
+    cost_weight: float
+    state_weights: Array
+
+    @classmethod
+    def create(
+        cls,
+        error: str,
+        error_weight: float,
+        cost_weight: float,
+        state_weights: ArrayLike | None,
+        open_loop: Array,
+    ) -> Reward:
+        """Check the weights; ``None`` weighs all states alike so that open loop costs 1.
+
+        ``open_loop`` (n,) is the mean error variance of each state without any transmission.
+
+        Raises:
+            ConfigurationError: an unknown kind, a negative weight, or a wrong shape.
+        """
+        weights = (
+            np.full(open_loop.shape, 1.0 / open_loop.sum())
+            if state_weights is None
+            else validation.not_negative("state_weights", state_weights, open_loop.shape)
+        )
+        return cls(
+            error=validation.choice("error", error, ERROR_KINDS),
+            error_weight=validation.number("error_weight", error_weight, at_least=0.0),
+            cost_weight=validation.number("cost_weight", cost_weight, at_least=0.0),
+            state_weights=weights[:, None],
+        )
+
+    def terms(self, squared_error: Array, covariance: Array, spent: Array) -> tuple[Array, Array]:
+        """The two terms of the reward (N,), both <= 0: error and cost.
+
+        From squared errors (n, N), the fused covariance (n, n, N) and tokens spent (N,).
+        """
+        error = squared_error if self.error == "squared" else linalg.diagonal(covariance)
+        return -self.error_weight * (self.state_weights * error).sum(0), -self.cost_weight * spent
+
+
+@dataclass(frozen=True)
+class Task:
+    """Everything that an environment needs to know, independent of the number of runs.
+
+    ``information`` is ``"sensors"`` (a coordinator that sees every sensor's new measurement) or
+    ``"centre"`` (only what the fusion centre knows before anything is sent). ``action`` is
+    ``"binary"`` (one bit a sensor) or ``"discrete"`` (the bits as one number, sensor 0 the lowest).
+    ``settings`` is what a user chose, for reports; ``policy_defaults`` the scenario's own
+    parameters of named policies.
+
+    Raises:
+        ConfigurationError: an unknown mode, a horizon below 1, or parts that do not fit together.
+    """
+
+    system: System[Any]
+    bucket: TokenBucket
+    reward: Reward
+    horizon: int
+    information: str = "sensors"
+    action: str = "binary"
+    settings: dict[str, Any] = field(default_factory=dict)
+    policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        validation.integer("horizon", self.horizon, at_least=1)
+        validation.choice("information", self.information, INFORMATION_MODES)
+        validation.choice("action", self.action, ACTION_KINDS)
+        if len(self.bucket.cost) != self.system.sensor_count:
+            raise validation.ConfigurationError(
+                f"token_cost for {len(self.bucket.cost)} sensors is not allowed: the system has "
+                f"{self.system.sensor_count}"
+            )
+        states = len(self.system.state_names)
+        if self.reward.state_weights.shape != (states, 1):
+            raise validation.ConfigurationError(
+                f"state_weights of shape {self.reward.state_weights.shape} are not allowed: the "
+                f"system has {states} states, so it must be ({states}, 1)"
+            )
+
+    @property
+    def sensors(self) -> int:
+        """Number of sensors."""
+        return self.system.sensor_count
+
+    @property
+    def hidden_signals(self) -> tuple[str, ...]:
+        """Names of the system's signals that the information mode withholds."""
+        if self.information == "sensors":
+            return ()
+        return tuple(s.name for s in self.system.signals if s.knowledge == "sensor")
+
+
+class ObservationLayout:
+    """Which entries an agent's observation has, by name, and how it is filled.
+
+    ``names`` has one name an entry, ``low`` and ``high`` (entries,) float32 its bounds.
+    """
+
+    def __init__(self, task: Task) -> None:
+        blocks = (*task.system.features, (Feature("tokens", "centre", 0.0, 1.0),))
+        self._kept = [
+            number
+            for number, block in enumerate(blocks)
+            if task.information == "sensors" or block[0].knowledge == "centre"
+        ]
+        entries = [entry for number in self._kept for entry in blocks[number]]
+        self.names = tuple(entry.name for entry in entries)
+        self.low = np.array([entry.low for entry in entries], dtype=np.float32)
+        self.high = np.array([entry.high for entry in entries], dtype=np.float32)
+        self._capacity = task.bucket.capacity
+        self._system = task.system
+
+    def encode(self, state: Any, tokens: Array) -> np.ndarray[Any, np.dtype[np.float32]]:
+        """Observations (N, entries) float32, clipped to their bounds."""
+        blocks = (*self._system.observe(state), tokens[None] / self._capacity)
+        rows = np.concatenate([blocks[number] for number in self._kept])
+        result = np.ascontiguousarray(rows.T, dtype=np.float32)
+        np.maximum(result, self.low, out=result)
+        return np.minimum(result, self.high, out=result)

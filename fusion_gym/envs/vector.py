@@ -1,0 +1,211 @@
+"""Gymnasium's vector environment over the batched core."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from fusion_gym import validation
+from fusion_gym.envs import spaces
+from fusion_gym.envs.batch import EpisodeBatch, Outcome
+from fusion_gym.envs.task import Task
+
+Infos = dict[str, Any]
+
+
+class FusionVectorEnv(VectorEnv[Any, Any, Any]):
+    """N runs of a task behind Gymnasium's vector interface.
+
+    Episodes end by truncation at the task's horizon, never by termination. ``autoreset_mode`` is
+    any of Gymnasium's: ``NEXT_STEP`` (the default), ``SAME_STEP`` (with ``final_obs`` and
+    ``final_info``) or ``DISABLED`` (reset with ``options={"reset_mask": mask}``).
+
+    Attributes:
+        observation_names: a name for each entry of an observation.
+
+    Raises:
+        ConfigurationError: ``num_envs`` is not a whole number >= 1, or an unknown mode.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        num_envs: int = 1,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+    ) -> None:
+        refuse_rendering(render_mode)
+        self.num_envs = validation.integer("num_envs", num_envs, at_least=1)
+        modes = [mode.value for mode in AutoresetMode]
+        given = getattr(autoreset_mode, "value", autoreset_mode)
+        self.autoreset_mode = AutoresetMode(validation.choice("autoreset_mode", given, modes))
+        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
+        self.task = task
+        self.batch = EpisodeBatch(task, self.num_envs)
+        self.observation_names = self.batch.layout.names
+        self.single_observation_space = spaces.observation_space(self.batch.layout)
+        self.single_action_space = spaces.action_space(task)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._everyone = np.ones(self.num_envs, dtype=np.bool_)
+        self._started = np.zeros(self.num_envs, dtype=np.bool_)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[NDArray[np.float32], Infos]:
+        """New episodes in all runs, or in those of ``options["reset_mask"]``.
+
+        Run i gets the seed ``seed + i`` (or the i-th of a sequence); without a seed its noise
+        goes on where it stood.
+
+        Raises:
+            ValueError: seeds or a mask of the wrong length or kind, or an unknown option.
+        """
+        seeds: Sequence[int | None]
+        if seed is None:
+            seeds = [None] * self.num_envs
+        elif isinstance(seed, (int, np.integer)):
+            super().reset(seed=int(seed))
+            seeds = [int(seed) + run for run in range(self.num_envs)]
+        else:
+            seeds = list(seed)
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed has {len(seeds)} entries: it must have {self.num_envs}")
+        mask = self._reset_mask(options or {})
+        runs = np.flatnonzero(mask)
+        self.batch.seed(runs, [seeds[run] for run in runs])
+        self.batch.reset(None if mask.all() else runs)
+        self._started |= mask
+        return self.batch.observe(), _with_mask(reset_infos(self.task, self.num_envs), mask)
+
+    def _reset_mask(self, options: dict[str, Any]) -> NDArray[np.bool_]:
+        validation.keys("reset option", options, ["reset_mask"])
+        if "reset_mask" not in options:
+            return self._everyone
+        mask = options["reset_mask"]
+        if (
+            not isinstance(mask, np.ndarray)
+            or mask.dtype != np.bool_
+            or mask.shape != (self.num_envs,)
+            or not mask.any()
+        ):
+            raise ValueError(
+                f"reset_mask = {mask!r} is not allowed: it must be a NumPy array of bool, of shape "
+                f"({self.num_envs},), with at least one True"
+            )
+        if not (self._started | mask).all():
+            raise ValueError("reset_mask must cover every run that was never reset before")
+        return mask
+
+    def step(
+        self, actions: Any
+    ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], Infos]:
+        """One step of every run; see the environment's documentation for the info.
+
+        Raises:
+            ValueError: an action that is not in the action space.
+            ResetNeeded: before the first reset, or (``DISABLED``) in a finished run.
+        """
+        if not self._started.all():
+            raise gymnasium.error.ResetNeeded("call reset before the first step")
+        batch = self.batch
+        requests = spaces.requests(self.task, actions, self.num_envs)
+        finished = batch.finished
+        if self.autoreset_mode == AutoresetMode.DISABLED and finished.any():
+            raise gymnasium.error.ResetNeeded(
+                f"runs {np.flatnonzero(finished).tolist()} are finished: reset them with "
+                "options={'reset_mask': mask} before the next step"
+            )
+        outcome = batch.step(requests)
+        terminated = np.zeros(self.num_envs, dtype=np.bool_)
+        reward, truncated = outcome.reward, outcome.truncated
+        infos = step_infos(outcome)
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP and finished.any():
+            batch.reset(np.flatnonzero(finished))
+            reward = np.where(finished, 0.0, reward)
+            truncated = truncated & ~finished
+            infos = _cleared(infos, finished)
+        elif self.autoreset_mode == AutoresetMode.SAME_STEP and truncated.any():
+            final = _final_infos(infos, truncated, batch.observe())
+            batch.reset(np.flatnonzero(truncated))
+            cleared = _with_mask(_cleared(infos, truncated), self._everyone)
+            return batch.observe(), reward, terminated, truncated, cleared | final
+        observation = batch.observe()
+        return observation, reward, terminated, truncated, _with_mask(infos, self._everyone)
+
+
+def refuse_rendering(render_mode: str | None) -> None:
+    """Nothing is drawn step by step; ``fusion_gym.evaluation`` draws whole episodes.
+
+    Raises:
+        ConfigurationError: a render mode.
+    """
+    if render_mode is not None:
+        raise validation.ConfigurationError(
+            f"render_mode = {render_mode!r} is not allowed: it must be None"
+        )
+
+
+def step_infos(outcome: Outcome) -> Infos:
+    """The info of a step as arrays with the batch axis first, without masks."""
+    return {
+        "cost": outcome.cost,
+        "cost_tokens": outcome.cost,
+        "rewards": {"error": outcome.reward_error, "cost": outcome.reward_cost},
+        "granted": outcome.granted.T,
+        "denied": (outcome.requested & ~outcome.granted).T,
+        "squared_error": outcome.squared_error.T,
+    }
+
+
+def reset_infos(task: Task, num_envs: int) -> Infos:
+    """The info of a reset: nothing was spent, granted or denied, and no error was made."""
+    sensors, states = task.sensors, len(task.system.state_names)
+    return {
+        "cost": np.zeros(num_envs),
+        "cost_tokens": np.zeros(num_envs),
+        "rewards": {"error": np.zeros(num_envs), "cost": np.zeros(num_envs)},
+        "granted": np.zeros((num_envs, sensors), dtype=np.bool_),
+        "denied": np.zeros((num_envs, sensors), dtype=np.bool_),
+        "squared_error": np.zeros((num_envs, states)),
+    }
+
+
+def _cleared(infos: Infos, runs: NDArray[np.bool_]) -> Infos:
+    """The infos with zeros in the given runs, as after a reset."""
+    return {
+        key: _cleared(value, runs)
+        if isinstance(value, dict)
+        else np.where(runs.reshape(-1, *[1] * (value.ndim - 1)), np.zeros((), value.dtype), value)
+        for key, value in infos.items()
+    }
+
+
+def _with_mask(infos: Infos, mask: NDArray[np.bool_]) -> Infos:
+    """Gymnasium's vector form: beside every key the mask of the runs for which it holds."""
+    result: Infos = {}
+    for key, value in infos.items():
+        result[key] = _with_mask(value, mask) if isinstance(value, dict) else value.copy()
+        result[f"_{key}"] = mask.copy()
+    return result
+
+
+def _final_infos(infos: Infos, ended: NDArray[np.bool_], observation: NDArray[np.float32]) -> Infos:
+    final_obs = np.full(len(ended), None, dtype=object)
+    for run in np.flatnonzero(ended):
+        final_obs[run] = observation[run]
+    return {
+        "final_obs": final_obs,
+        "_final_obs": ended.copy(),
+        "final_info": _with_mask(_cleared(infos, ~ended), ended),
+        "_final_info": ended.copy(),
+    }

@@ -1,0 +1,22 @@
+"""Evaluation: paired episodes, metrics with confidence intervals, the lower envelope."""
+
+from fusion_gym.evaluation.envelope import EnvelopePoint, compare_with_envelope, lower_envelope
+from fusion_gym.evaluation.episodes import EpisodeResults, Trajectory, record_episode, run_episodes
+from fusion_gym.evaluation.intervals import Interval, mean_interval
+from fusion_gym.evaluation.metrics import paired_difference, summarise
+from fusion_gym.evaluation.policies import make_policy
+
+__all__ = [
+    "EnvelopePoint",
+    "EpisodeResults",
+    "Interval",
+    "Trajectory",
+    "compare_with_envelope",
+    "lower_envelope",
+    "make_policy",
+    "mean_interval",
+    "paired_difference",
+    "record_episode",
+    "run_episodes",
+    "summarise",
+]

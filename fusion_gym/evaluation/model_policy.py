@@ -1,0 +1,127 @@
+"""A saved Stable-Baselines3 agent as a policy.
+
+Loading a model unpickles parts of the file: load only files that you trust.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
+
+from fusion_gym import validation
+from fusion_gym.envs import EpisodeBatch, Task, spaces
+from fusion_gym.systems import Signals
+from fusion_gym.triggers import Requests
+from fusion_gym.validation import ConfigurationError
+
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"a2c": A2C, "dqn": DQN, "ppo": PPO}
+_TAG = "fusion_gym_model"
+
+
+def tag_model(model: BaseAlgorithm, task: Task) -> None:
+    """Write algorithm and observation layout into the model, to be saved with it."""
+    names = EpisodeBatch(task, 1).layout.names
+    tag = {"algorithm": type(model).__name__.lower(), "observation_names": list(names)}
+    setattr(model, _TAG, tag)
+
+
+class ModelPolicy:
+    """Asks a Stable-Baselines3 model, which sees the task's observation and nothing else."""
+
+    def __init__(self, model: BaseAlgorithm, task: Task, deterministic: bool = True) -> None:
+        self.model = model
+        self.deterministic = deterministic
+        self._sensors = task.sensors
+        self._discrete = isinstance(model.action_space, gymnasium.spaces.Discrete)
+
+    def reset(self, num_envs: int, seed: int = 0) -> None:
+        """Nothing to forget; a stochastic policy draws from the stream of ``seed``."""
+        if not self.deterministic:
+            self.model.set_random_seed(seed)
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Requests (sensors, N)."""
+        action, _ = self.model.predict(signals["observation"], deterministic=self.deterministic)
+        if self._discrete:
+            bits = np.asarray(action)[None] >> np.arange(self._sensors)[:, None] & 1
+            return bits.astype(np.bool_)
+        return np.ascontiguousarray(np.asarray(action).T == 1)
+
+
+def load_model_policy(path: str, task: Task, deterministic: bool = True) -> ModelPolicy:
+    """The agent saved at ``path`` (with or without ``.zip``), checked against the task.
+
+    Raises:
+        ConfigurationError: no such file, no Stable-Baselines3 model of a known algorithm, or a
+            model of another observation layout or action space.
+    """
+    validation.boolean("deterministic", deterministic)
+    file = next((p for p in (Path(path), Path(f"{path}.zip")) if p.is_file()), None)
+    if file is None:
+        raise ConfigurationError(f"model {path!r} is not allowed: there is no such file")
+    try:
+        data, _, _ = load_from_zip_file(file, device="cpu", load_data=True)
+    except Exception as error:
+        raise ConfigurationError(
+            f"model {path!r} is not allowed: it is no Stable-Baselines3 model ({error})"
+        ) from None
+    if not data or "observation_space" not in data:
+        raise ConfigurationError(f"model {path!r} is not allowed: it has no observation space")
+    _check_layout(path, data, task)
+    return ModelPolicy(_load(path, file, data), task, deterministic)
+
+
+def _check_layout(path: str, data: dict[str, Any], task: Task) -> None:
+    layout = EpisodeBatch(task, 1).layout
+    names = data.get(_TAG, {}).get("observation_names")
+    if names is not None and list(names) != list(layout.names):
+        missing = [name for name in names if name not in layout.names]
+        extra = [name for name in layout.names if name not in names]
+        raise ConfigurationError(
+            f"model {path!r} was trained for another observation layout: it expects {len(names)} "
+            f"entries, the task (information={task.information!r}) has {len(layout.names)}; "
+            f"missing are {missing[:4] or 'none'}, unknown to the model {extra[:4] or 'none'}"
+            + ("" if missing or extra else " (the order differs)")
+        )
+    wanted = spaces.observation_space(layout)
+    have = data["observation_space"]
+    if have.shape != wanted.shape:
+        raise ConfigurationError(
+            f"model {path!r} was trained for another observation layout: it expects shape "
+            f"{have.shape}, the task (information={task.information!r}) has {wanted.shape}"
+        )
+    action = data["action_space"]
+    fits = action == gymnasium.spaces.MultiBinary(task.sensors) or (
+        isinstance(action, gymnasium.spaces.Discrete) and action.n == 2**task.sensors
+    )
+    if not fits:
+        raise ConfigurationError(
+            f"model {path!r} has the action space {action}: the task has {task.sensors} sensors, "
+            f"so it must be MultiBinary({task.sensors}) or Discrete({2**task.sensors})"
+        )
+
+
+def _load(path: str, file: Path, data: dict[str, Any]) -> BaseAlgorithm:
+    """Load with the algorithm that the file names, or the one that its policy class fits."""
+    tagged = data.get(_TAG, {}).get("algorithm")
+    if tagged in ALGORITHMS:
+        candidates = [tagged]
+    elif "q_net" in str(data) or "exploration_schedule" in data:
+        candidates = ["dqn"]
+    else:
+        candidates = ["ppo", "a2c"]
+    problems = []
+    for name in candidates:
+        try:
+            return ALGORITHMS[name].load(file, device="cpu")
+        except Exception as error:
+            problems.append(f"{name}: {error}")
+    raise ConfigurationError(
+        f"model {path!r} cannot be loaded as {' or '.join(candidates)} ({'; '.join(problems)})"
+    )

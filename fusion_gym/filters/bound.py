@@ -1,0 +1,242 @@
+"""The paper's Tobit Kalman filter: it minimises a bound of its error covariance.
+
+Source: tobit_token_bucket, Theorems 1 and 2. Four readings, each checked by simulation and
+described in docs/tobit_oscillator.md: (29) starts from the previous posterior; K_{t+1} in (30) is
+K_t; C{Υ∘Ω}Cᵀ is Υ∘(C Ω Cᵀ); without a delivery the filter really updates with the held value.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_gym import linalg, validation
+from fusion_gym.filters.base import Expectation, Plan, linear_update
+from fusion_gym.filters.tobit import expect_censored
+from fusion_gym.sensors import CensoredSensors
+from fusion_gym.validation import Array, ConfigurationError
+
+# Below this probability of an uncensored value, q counts as this: q enters only in ratios whose
+# limits are reached long before, and 1/q must stay finite.
+_SMALLEST_PROBABILITY = 1e-290
+# A held value beyond this multiple of q pins its direction completely (relative effect 1e-24).
+_LARGEST_RATIO = 1e12
+
+
+@dataclass(frozen=True)
+class BoundConstants:
+    """The constants κ₁..κ₈ of the bound and (1 + ε₁₄, 1 + 1/ε₁₄), from ε₁..ε₁₄ > 0.
+
+    Source: tobit_token_bucket, below equation (30).
+    """
+
+    kappa: tuple[float, ...]
+    second_moment: tuple[float, float]
+
+    @classmethod
+    def create(cls, epsilon: ArrayLike) -> BoundConstants:
+        """From the 14 scalars.
+
+        Raises:
+            ConfigurationError: not 14 numbers > 0.
+        """
+        e = validation.positive(
+            "bound_epsilon", validation.array("bound_epsilon", epsilon, (14,)), (14,)
+        )
+        kappa = (
+            1 + e[0] + e[1] + e[2] + e[3] + e[4],
+            1 + 1 / e[0] + 1 / e[6] + 1 / e[9] + 1 / e[11] + 1 / e[12],
+            1 + e[5],
+            1 + e[6] + e[7] + e[8] + 1 / e[1],
+            1 + 1 / e[2] + 1 / e[7] + e[9] + e[10],
+            1 + 1 / e[3] + e[11],
+            1 + 1 / e[4] + 1 / e[8] + 1 / e[10] + e[12],
+            1 + 1 / e[5],
+        )
+        return cls(tuple(float(k) for k in kappa), (float(1 + e[13]), float(1 + 1 / e[13])))
+
+
+@dataclass(frozen=True)
+class EventError:
+    """The bound Ξ of the event error that the paper adds to a delivered measurement.
+
+    Ξ(G) = ``growth`` G + ``offset``, G' = Ξ(G), G₀ = ``initial``; each of shape (sensors, 1), in
+    squared units of the measurement. It belongs to the dynamic event trigger: a delivered
+    measurement is the current one and has no event error, whatever the policy.
+    Source: tobit_token_bucket, equations (33), (34) and below (30).
+    """
+
+    growth: Array
+    offset: Array
+    initial: Array
+
+    def at(self, time: Array) -> Array:
+        """Ξ(G_t) at the steps ``time`` (N,) counted from 1, shape (sensors, N)."""
+        power = self.growth ** (time + 1.0)
+        fixed = np.where(self.growth == 1.0, 0.0, self.offset / (1.0 - self.growth))
+        ramp = np.where(self.growth == 1.0, self.offset * (time + 1.0), 0.0)
+        return fixed + power * (self.initial - fixed) + ramp
+
+    @classmethod
+    def create(
+        cls,
+        threshold: ArrayLike,
+        decay: ArrayLike,
+        divisor: ArrayLike,
+        initial: ArrayLike,
+        young: tuple[float, float],
+        sensors: int,
+    ) -> EventError:
+        """From σ_m, λ_m, χ_m, η_{m,0} of the trigger and (d, e) of the bound.
+
+        Raises:
+            ConfigurationError: a wrong shape, a negative number, or χ, d, e not > 0.
+        """
+        shape = (sensors,)
+        sigma = validation.not_negative("trigger_threshold", threshold, shape)
+        lam = validation.not_negative("trigger_decay", decay, shape)
+        chi = validation.positive("trigger_divisor", divisor, shape)
+        eta = validation.not_negative("trigger_initial", initial, shape)
+        d, e = validation.positive("bound_young", young, (2,))
+        growth = (1 + d) * (1 + e) * lam**2 + (1 + chi) * (1 + 1 / d) / chi**2
+        offset = ((1 + d) * (1 + 1 / e) + (1 + 1 / d) * (1 + 1 / chi)) * sigma**2
+        return cls(growth[:, None], offset[:, None], (eta**2)[:, None])
+
+
+@dataclass(frozen=True)
+class BoundTobitFilter:
+    """Tobit Kalman filter whose gain minimises the trace of the paper's bound.
+
+    ``event_error`` (or None) is the κ₆ Ξ term of a delivery; ``hold`` says what happens without
+    one: True updates with the held value as the paper does, False predicts.
+    """
+
+    sensors: CensoredSensors
+    constants: BoundConstants
+    event_error: EventError | None
+    hold: bool
+
+    def __post_init__(self) -> None:
+        matrices = self.sensors.measurement_matrix[..., 0]
+        ranks = np.linalg.matrix_rank(matrices)
+        if self.hold and np.any(ranks < self.sensors.size):
+            raise ConfigurationError(
+                f"measurement_matrices with row ranks {ranks.tolist()} are not allowed with "
+                f"filter='paper', silent='hold': each must have its {self.sensors.size} rows "
+                "independent, since (37) has no noise term in the held update"
+            )
+
+    def expect(self, mean: Array) -> Expectation:
+        """See :class:`fusion_gym.filters.NodeFilter`."""
+        return expect_censored(self.sensors, mean)
+
+    def plan(
+        self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
+    ) -> Plan:
+        """See :class:`fusion_gym.filters.NodeFilter`.
+
+        Source: tobit_token_bucket, equations (30) and (37). At the optimal gain (30) is
+        κ₁ P - κ₁ P C̃ᵀ Φ⁻¹ C̃ P κ₁, with Φ = κ₁ C̃ P C̃ᵀ + S and C̃ = q C.
+        """
+        matrix = self.sensors.measurement_matrix
+        cross = linalg.matmul(matrix, covariance)
+        spread = linalg.matmul(cross, linalg.transpose(matrix))
+        latent = expectation.latent
+        grow, shift = self.constants.second_moment
+        moment = grow * spread + shift * linalg.outer(latent, latent)
+        correction, delivered = self._delivered(covariance, spread, moment, expectation, time)
+        if not self.hold:
+            return Plan(correction, delivered, mean, covariance)
+        silent = self._held(mean, covariance, cross, spread, moment, expectation, held)
+        return Plan(correction, delivered, *silent)
+
+    def _delivered(
+        self, covariance: Array, spread: Array, moment: Array, expectation: Expectation, time: Array
+    ) -> tuple[Array, Array]:
+        """θ = 0: correction and bound."""
+        k1, k2, k3, _, _, k6, _, k8 = self.constants.kappa
+        variance, threshold = self.sensors.variance, self.sensors.finite_threshold
+        q = np.maximum(expectation.uncensored_probability, _SMALLEST_PROBABILITY)
+        a = q * expectation.hazard * self.sensors.deviation
+        noise = q * variance + q * (1.0 - q) * (k3 * linalg.diagonal(moment) + k8 * threshold**2)
+        if self.event_error is not None:
+            noise = noise + k6 * self.event_error.at(time)[:, None]
+        total = linalg.outer(q, q) * (k1 * spread) + k2 * linalg.outer(a, a)
+        total = linalg.add_diagonal(total, noise)
+        weighted = q[:, :, None] * self.sensors.measurement_matrix
+        return linear_update(k1 * covariance, weighted, total)
+
+    def _held(
+        self,
+        mean: Array,
+        covariance: Array,
+        cross: Array,
+        spread: Array,
+        moment: Array,
+        expectation: Expectation,
+        held: Array,
+    ) -> tuple[Array, Array]:
+        """θ = 1: mean and bound after the update with the held value ȳ.
+
+        Every term of Φ but two is scaled by q on both sides, so the update is written in units of
+        q: Φ = q (N + F Fᵀ) q with F = [√κ₅ ȳ, √κ₇ (1 - q) τ]/q, which may be huge. The inverse of
+        N + F Fᵀ and its product with F are taken by the Woodbury identity, so that q as small as
+        1e-290 loses no digits and the gain itself is never formed.
+        """
+        k1, k2, _, k4, k5, _, k7, _ = self.constants.kappa
+        threshold = self.sensors.finite_threshold
+        q = np.maximum(expectation.uncensored_probability, _SMALLEST_PROBABILITY)
+        bias = expectation.hazard * self.sensors.deviation
+        core = k1 * spread + k4 * moment + k2 * linalg.outer(bias, bias)
+        columns = [(np.sqrt(k5) * held / q, 1.0 / np.sqrt(k5))]
+        if np.any(threshold):
+            columns.append((np.sqrt(k7) * (1.0 - q) * threshold / q, -1.0 / np.sqrt(k7)))
+        uncensored = expectation.latent + bias
+        whitened, shift = _pinned_solve(core, columns, cross)
+        step = linalg.matvec(linalg.transpose(cross), shift) - linalg.matvec(
+            linalg.transpose(whitened), uncensored
+        )
+        bound = k1 * covariance - k1**2 * linalg.matmul(linalg.transpose(cross), whitened)
+        return mean + k1 * step, linalg.symmetrise(bound)
+
+
+def _pinned_solve(
+    core: Array, columns: list[tuple[Array, float]], right: Array
+) -> tuple[Array, Array]:
+    """(N + F Fᵀ)⁻¹ B and (N + F Fᵀ)⁻¹ F c for one or two columns F (…, m, N) with factors c.
+
+    ``core`` N (…, m, m, N) is positive definite, ``right`` B (…, m, n, N).
+    """
+    solved = linalg.solve(core, right)
+    f, c = _capped(columns[0][0]), columns[0][1]
+    nf = linalg.solve_vector(core, f)
+    norm = linalg.dot(f, nf)
+    if len(columns) == 1:
+        weight = nf / (1.0 + norm)[..., None, :]
+        projected = linalg.matvec(linalg.transpose(right), weight)
+        return solved - linalg.outer(nf, projected), weight * c
+    g, e = _capped(columns[1][0]), columns[1][1]
+    ng = linalg.solve_vector(core, g)
+    mixed, other = linalg.dot(f, ng), linalg.dot(g, ng)
+    # The Gram determinant norm·other - mixed² from the residual of g on f: no cancellation.
+    safe = np.where(norm > 0.0, norm, 1.0)
+    residual = g - f * (mixed / safe)[..., None, :]
+    gram = norm * linalg.dot(residual, linalg.solve_vector(core, residual))
+    scale = (1.0 / (1.0 + norm + other + gram))[..., None, :]
+    norm, mixed, other = norm[..., None, :], mixed[..., None, :], other[..., None, :]
+    weight_f = (nf * (1.0 + other) - ng * mixed) * scale
+    weight_g = (ng * (1.0 + norm) - nf * mixed) * scale
+    back = linalg.transpose(right)
+    solved = (
+        solved
+        - linalg.outer(weight_f, linalg.matvec(back, nf))
+        - linalg.outer(weight_g, linalg.matvec(back, ng))
+    )
+    return solved, weight_f * c + weight_g * e
+
+
+def _capped(column: Array) -> Array:
+    largest = np.abs(column).max(-2, keepdims=True)
+    return column * np.minimum(1.0, _LARGEST_RATIO / np.maximum(largest, 1e-290))

@@ -1,0 +1,62 @@
+"""The standard Tobit Kalman filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fusion_gym import gaussian, linalg
+from fusion_gym.filters.base import Expectation, Plan, linear_update
+from fusion_gym.sensors import CensoredSensors
+from fusion_gym.validation import Array
+
+
+def expect_censored(sensors: CensoredSensors, mean: Array) -> Expectation:
+    """Moments of a measurement censored from below, given the predicted state (sensors, n, N).
+
+    With ζ = (τ - C x̂)/√R: q = 1 - Φ(ζ), λ = φ(ζ)/q, ŷ = q (C x̂ + λ √R) + (1 - q) τ.
+    Source: tobit_token_bucket, equations (5)-(7) and (23).
+    """
+    latent = linalg.matvec(sensors.measurement_matrix, mean)
+    deviation = sensors.deviation
+    moments = gaussian.tobit_moments((sensors.threshold - latent) / deviation)
+    q = moments.uncensored_probability
+    excess = np.where(sensors.uncensored, 0.0, moments.excess)
+    variance = q * moments.truncated_variance + q * (1.0 - q) * excess * excess
+    value = q * (latent + deviation * moments.hazard) + (1.0 - q) * sensors.finite_threshold
+    return Expectation(
+        latent=latent,
+        value=value,
+        noise_variance=sensors.variance * variance,
+        uncensored_probability=q,
+        hazard=moments.hazard,
+        truncated_variance=moments.truncated_variance,
+    )
+
+
+@dataclass(frozen=True)
+class TobitKalmanFilter:
+    """Tobit Kalman filter; when nothing arrives the prior is the posterior.
+
+    S = q C P Cᵀ q + R v, K = P Cᵀ q S⁻¹ with q, v of :func:`expect_censored`.
+    Source: Allik et al., "The Tobit Kalman filter" (IEEE Trans. Control Syst. Technol. 24, 2016);
+    tobit_token_bucket, equations (21)-(23) with κ₁ = 1 and S = diag(R v).
+    """
+
+    sensors: CensoredSensors
+
+    def expect(self, mean: Array) -> Expectation:
+        """See :class:`fusion_gym.filters.NodeFilter`."""
+        return expect_censored(self.sensors, mean)
+
+    def plan(
+        self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
+    ) -> Plan:
+        """See :class:`fusion_gym.filters.NodeFilter`; ``held`` and ``time`` do not matter here."""
+        weighted = expectation.uncensored_probability[:, :, None] * self.sensors.measurement_matrix
+        innovation = linalg.congruence(weighted, covariance)
+        noise = self.sensors.variance * expectation.truncated_variance
+        innovation = linalg.add_diagonal(innovation, noise)
+        correction, posterior = linear_update(covariance, weighted, innovation)
+        return Plan(correction, posterior, mean, covariance)

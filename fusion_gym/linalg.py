@@ -1,0 +1,341 @@
+"""Small dense linear algebra for many parallel runs, batch axis last.
+
+A quantity of shape S for N runs is an array of shape ``(*S, N)``: a matrix is
+``(..., n, m, N)`` and a vector ``(..., n, N)``. Leading axes (for example sensors) and a
+batch axis of length 1 broadcast as in NumPy, so a constant matrix is kept as ``(n, m, 1)``.
+
+Every routine is a short sequence of element-wise NumPy operations written out along the two
+small axes. Each lane therefore sees exactly the same floating-point operations whatever the
+number of lanes, and a lane's result is bitwise the same alone and in a batch.
+
+The routines for symmetric positive definite matrices (`cholesky`, `solve`, `solve_vector`,
+`inverse`, `is_positive_definite`) read only the diagonal and the lower triangle. They first
+scale rows and columns by ``1 / sqrt(diagonal)``, which gives a unit diagonal: the accuracy then
+depends on the conditioning of the correlation matrix and not on the units of the components,
+and diagonal entries from 1e-200 to 1e200 neither overflow nor underflow. A lane whose matrix is
+not positive definite comes back filled with NaN; the other lanes are unaffected, nothing is
+raised and no NumPy warning is issued.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+def identity(size: int) -> FloatArray:
+    """Identity matrix of shape ``(size, size, 1)``, broadcasting over the batch."""
+    return np.eye(size)[:, :, None]
+
+
+def transpose(a: FloatArray) -> FloatArray:
+    """Matrix transpose: ``(..., n, m, N)`` to ``(..., m, n, N)``, a view of `a`."""
+    return a.swapaxes(-3, -2)
+
+
+def diagonal(a: FloatArray) -> FloatArray:
+    """Diagonal of square matrices: ``(..., n, n, N)`` to ``(..., n, N)``, a read-only view."""
+    return a.diagonal(0, -3, -2).swapaxes(-1, -2)
+
+
+def trace(a: FloatArray) -> FloatArray:
+    """Sum of the diagonal: ``(..., n, n, N)`` to ``(..., N)``."""
+    total = a[..., 0, 0, :].copy()
+    for k in range(1, a.shape[-2]):
+        total += a[..., k, k, :]
+    return total
+
+
+def add_diagonal(a: FloatArray, d: FloatArray) -> FloatArray:
+    """``a + diag(d)``: ``(..., n, n, N)`` and d broadcastable to ``(..., n, N)``, a new array."""
+    result = a.copy()
+    for k in range(a.shape[-2]):
+        result[..., k, k, :] += d[..., k, :]
+    return result
+
+
+def symmetrise(a: FloatArray) -> FloatArray:
+    """Symmetric part ``(a + a^T) / 2`` of ``(..., n, n, N)``, exactly symmetric, a new array."""
+    result = a + a.swapaxes(-3, -2)
+    result *= 0.5
+    return result
+
+
+def _require_equal_lengths(operation: str, left: int, right: int) -> None:
+    if left != right:
+        raise ValueError(
+            f"{operation}: the summed axes must be equally long, not {left} and {right}"
+        )
+
+
+def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Matrix product: ``(..., n, k, N)`` times ``(..., k, m, N)`` to ``(..., n, m, N)``.
+
+    Accumulated over k in ascending order, in ``2 k - 1`` array operations.
+
+    Raises:
+        ValueError: the two axes of length k differ.
+    """
+    length = a.shape[-2]
+    _require_equal_lengths("matmul", length, b.shape[-3])
+    result: FloatArray = a[..., 0:1, :] * b[..., 0:1, :, :]
+    for k in range(1, length):
+        result += a[..., k : k + 1, :] * b[..., k : k + 1, :, :]
+    return result
+
+
+def matvec(a: FloatArray, v: FloatArray) -> FloatArray:
+    """Matrix times vector: ``(..., n, k, N)`` times ``(..., k, N)`` to ``(..., n, N)``.
+
+    Raises:
+        ValueError: the two axes of length k differ.
+    """
+    length = a.shape[-2]
+    _require_equal_lengths("matvec", length, v.shape[-2])
+    result: FloatArray = a[..., 0, :] * v[..., 0:1, :]
+    for k in range(1, length):
+        result += a[..., k, :] * v[..., k : k + 1, :]
+    return result
+
+
+def outer(u: FloatArray, v: FloatArray) -> FloatArray:
+    """Outer product ``u v^T``: ``(..., n, N)`` and ``(..., m, N)`` to ``(..., n, m, N)``."""
+    return u[..., :, None, :] * v[..., None, :, :]
+
+
+def dot(u: FloatArray, v: FloatArray) -> FloatArray:
+    """Inner product ``u^T v``: ``(..., n, N)`` and ``(..., n, N)`` to ``(..., N)``.
+
+    Raises:
+        ValueError: the two axes of length n differ.
+    """
+    length = u.shape[-2]
+    _require_equal_lengths("dot", length, v.shape[-2])
+    result: FloatArray = u[..., 0, :] * v[..., 0, :]
+    for k in range(1, length):
+        result += u[..., k, :] * v[..., k, :]
+    return result
+
+
+def quadratic(v: FloatArray, a: FloatArray) -> FloatArray:
+    """Quadratic form ``v^T a v``: ``(..., n, N)`` and ``(..., n, n, N)`` to ``(..., N)``.
+
+    Raises:
+        ValueError: the sizes of `v` and `a` differ.
+    """
+    return dot(v, matvec(a, v))
+
+
+def congruence(a: FloatArray, p: FloatArray) -> FloatArray:
+    """Congruence ``a p a^T`` for symmetric `p`, made exactly symmetric.
+
+    Args:
+        a: ``(..., m, n, N)``.
+        p: ``(..., n, n, N)``, symmetric (not checked).
+
+    Returns:
+        ``(..., m, m, N)``. The symmetric part of the computed product is returned, which costs
+        two array operations and keeps repeated covariance updates from drifting.
+
+    Raises:
+        ValueError: the sizes of `a` and `p` differ.
+    """
+    product = matmul(matmul(a, p), a.swapaxes(-3, -2))
+    return product if product.shape[-2] == 1 else symmetrise(product)
+
+
+def _inverse_root(x: FloatArray) -> FloatArray:
+    """``1 / sqrt(x)`` for positive x and NaN for zero, negative or infinite x."""
+    root: FloatArray = np.sqrt(x)
+    root /= x
+    return root
+
+
+def _pair_scales(a: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Closed form for 2x2: the correlation ``(..., N)`` and scales ``(..., 2, N)``.
+
+    With r the correlation and w_i = 1 / sqrt(a_ii (1 - r^2)), the inverse of `a` is
+    [[w_0^2, -r w_0 w_1], [-r w_0 w_1, w_1^2]]; the determinant itself is never formed.
+    """
+    scale = _inverse_root(diagonal(a))
+    correlation: FloatArray = a[..., 1, 0, :] * scale[..., 0, :]
+    correlation *= scale[..., 1, :]
+    complement: FloatArray = 1.0 - correlation
+    complement *= 1.0 + correlation
+    return correlation, scale * _inverse_root(complement)[..., None, :]
+
+
+def _equilibrate(a: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Correlation matrix ``(..., n, n, N)`` and the scales 1 / sqrt(a_ii) ``(..., n, N)``."""
+    scale = _inverse_root(diagonal(a))
+    correlation: FloatArray = a * scale[..., :, None, :]
+    correlation *= scale[..., None, :, :]
+    return correlation, scale
+
+
+def _eliminate(work: FloatArray, right: FloatArray | None) -> FloatArray:
+    """Cholesky factorisation in place by columns, with an optional forward substitution.
+
+    On return the lower triangle of `work` ``(..., n, n, N)`` holds the factor L, except that its
+    diagonal holds 1 / L_kk, and `right` ``(..., n, m, N)`` holds L^-1 times what it held before.
+    A pivot which is not positive makes its own column and every later one NaN.
+
+    Returns:
+        The last inverse pivot, ``(..., N)``, which is NaN exactly where factorisation failed.
+    """
+    size = work.shape[-2]
+    for k in range(size):
+        inverse_pivot = _inverse_root(work[..., k, k, :])
+        work[..., k, k, :] = inverse_pivot
+        if right is not None:
+            right[..., k, :, :] *= inverse_pivot[..., None, :]
+        if k + 1 == size:
+            break
+        column = work[..., k + 1 :, k, :]
+        column *= inverse_pivot[..., None, :]
+        work[..., k + 1 :, k + 1 :, :] -= column[..., :, None, :] * column[..., None, :, :]
+        if right is not None:
+            right[..., k + 1 :, :, :] -= column[..., :, None, :] * right[..., k : k + 1, :, :]
+    return inverse_pivot
+
+
+@np.errstate(all="ignore")
+def cholesky(a: FloatArray) -> FloatArray:
+    """Lower Cholesky factor: ``(..., n, n, N)`` to lower triangular L with ``L L^T = a``.
+
+    Args:
+        a: symmetric positive definite; only the lower triangle is read.
+
+    Returns:
+        ``(..., n, n, N)`` with a positive diagonal and zeros above it. Every entry of a lane
+        that is not positive definite is NaN.
+    """
+    work, scale = _equilibrate(a)
+    last = _eliminate(work, None)
+    poison = last * 0.0
+    factor = np.empty_like(work)
+    for i in range(work.shape[-2]):
+        factor[..., i, i + 1 :, :] = poison[..., None, :]
+        factor[..., i, :i, :] = work[..., i, :i, :] / scale[..., i : i + 1, :]
+        factor[..., i, :i, :] += poison[..., None, :]
+        factor[..., i, i, :] = 1.0 / (work[..., i, i, :] * scale[..., i, :]) + poison
+    return factor
+
+
+@np.errstate(all="ignore")
+def solve(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Solve ``a x = b`` for symmetric positive definite `a`.
+
+    Sizes 1 and 2 use closed forms, larger ones a Cholesky factorisation of the equilibrated
+    matrix.
+
+    Args:
+        a: ``(..., n, n, N)``; only the lower triangle is read.
+        b: ``(..., n, m, N)``.
+
+    Returns:
+        x ``(..., n, m, N)``, all NaN in a lane where `a` is not positive definite.
+
+    Raises:
+        ValueError: the sizes of `a` and `b` differ.
+    """
+    size = a.shape[-2]
+    _require_equal_lengths("solve", size, b.shape[-3])
+    x: FloatArray
+    if size == 1:
+        return b / np.where(a > 0.0, a, np.nan)
+    if size == 2:
+        correlation, weight = _pair_scales(a)
+        scaled = b * weight[..., :, None, :]
+        x = correlation[..., None, None, :] * scaled[..., ::-1, :, :]
+        np.subtract(scaled, x, out=x)
+        x *= weight[..., :, None, :]
+        return x
+    work, scale = _equilibrate(a)
+    x = b * scale[..., :, None, :]
+    _eliminate(work, x)
+    for k in range(size - 1, -1, -1):
+        x[..., k, :, :] *= work[..., k, k, None, :]
+        if k:
+            x[..., :k, :, :] -= work[..., k, :k, None, :] * x[..., k : k + 1, :, :]
+    x *= scale[..., :, None, :]
+    return x
+
+
+def solve_vector(a: FloatArray, v: FloatArray) -> FloatArray:
+    """Solve ``a x = v`` for symmetric positive definite `a` and one right-hand side.
+
+    Args:
+        a: ``(..., n, n, N)``; only the lower triangle is read.
+        v: ``(..., n, N)``.
+
+    Returns:
+        x ``(..., n, N)``, all NaN in a lane where `a` is not positive definite.
+
+    Raises:
+        ValueError: the sizes of `a` and `v` differ.
+    """
+    return solve(a, v[..., None, :])[..., 0, :]
+
+
+@np.errstate(all="ignore")
+def inverse(a: FloatArray) -> FloatArray:
+    """Inverse of symmetric positive definite matrices, ``(..., n, n, N)`` to the same shape.
+
+    Size 2 uses its closed form and larger ones ``L^-T L^-1`` with L the Cholesky factor; both
+    give an exactly symmetric result.
+
+    Args:
+        a: symmetric positive definite; only the lower triangle is read.
+
+    Returns:
+        The inverse, all NaN in a lane where `a` is not positive definite.
+    """
+    size = a.shape[-2]
+    if size == 1:
+        return 1.0 / np.where(a > 0.0, a, np.nan)
+    if size == 2:
+        correlation, weight = _pair_scales(a)
+        result = outer(weight, weight)
+        off_diagonal = result[..., 0, 1, :]
+        off_diagonal *= -correlation
+        result[..., 1, 0, :] = off_diagonal
+        return result
+    work, scale = _equilibrate(a)
+    # Rows n and up turn from the scales into diag(scale) L^-T, which is upper triangular.
+    stack = np.zeros((*a.shape[:-3], 2 * size, size, a.shape[-1]))
+    stack[..., :size, :, :] = work
+    for k in range(size):
+        stack[..., size + k, k, :] = scale[..., k, :]
+        column = stack[..., k + 1 : size + k + 1, k, :]
+        column *= _inverse_root(stack[..., k, k, :])[..., None, :]
+        if k + 1 < size:
+            multiplier = column[..., None, : size - k - 1, :]
+            stack[..., k + 1 : size + k + 1, k + 1 :, :] -= column[..., :, None, :] * multiplier
+    column = stack[..., size:, size - 1, :]
+    result = outer(column, column)
+    for k in range(size - 1):
+        column = stack[..., size : size + k + 1, k, :]
+        result[..., : k + 1, : k + 1, :] += outer(column, column)
+    return result
+
+
+@np.errstate(all="ignore")
+def is_positive_definite(a: FloatArray) -> NDArray[np.bool_]:
+    """Whether each matrix is positive definite beyond rounding: ``(..., n, n, N)`` to ``(..., N)``.
+
+    True where the diagonal is positive and finite and every pivot of the equilibrated matrix
+    exceeds ``4 n`` times the float64 epsilon, below which it cannot be told from zero (behind an
+    ill-conditioned leading block rounding can be larger than that). Only the lower triangle is
+    read, so symmetry is for the caller to check.
+    """
+    size = a.shape[-2]
+    work, _ = _equilibrate(a)
+    last = _eliminate(work, None)
+    largest = 0.5 / np.sqrt(size * np.finfo(np.float64).eps)
+    mask: NDArray[np.bool_] = last < largest
+    for k in range(size - 1):
+        mask &= work[..., k, k, :] < largest
+    return mask

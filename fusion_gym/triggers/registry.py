@@ -1,0 +1,89 @@
+"""Policies by name: ``NAME`` or ``NAME:key=value,key=value``."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+from typing import Any
+
+from fusion_gym import validation
+from fusion_gym.triggers.base import Policy, Trigger
+from fusion_gym.triggers.constant import Always, Never
+from fusion_gym.triggers.dynamic_event import DynamicEvent
+from fusion_gym.triggers.information_gain import InformationGain
+from fusion_gym.triggers.innovation_threshold import InnovationThreshold
+from fusion_gym.triggers.periodic import Periodic, RoundRobin
+from fusion_gym.triggers.random import Random
+from fusion_gym.triggers.send_on_delta import SendOnDelta
+from fusion_gym.triggers.variance_threshold import VarianceThreshold
+from fusion_gym.validation import ConfigurationError
+
+TRIGGERS: dict[str, type[Trigger]] = {
+    "always": Always,
+    "dynamic_event": DynamicEvent,
+    "information_gain": InformationGain,
+    "innovation_threshold": InnovationThreshold,
+    "never": Never,
+    "periodic": Periodic,
+    "random": Random,
+    "round_robin": RoundRobin,
+    "send_on_delta": SendOnDelta,
+    "variance_threshold": VarianceThreshold,
+}
+
+
+def parse_value(text: str) -> Any:
+    """A number, true, false, none, or a list as Python writes it; anything else stays text.
+
+    Values for several sensors may also be written with slashes: ``0.1/0.2/0.3``.
+    """
+    plain = {"true": True, "false": False, "none": None, "null": None}
+    if text.strip().lower() in plain:
+        return plain[text.strip().lower()]
+    if "/" in text:
+        parts = tuple(parse_value(part) for part in text.split("/"))
+        if all(isinstance(part, (int, float)) for part in parts):
+            return parts
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        return text
+
+
+def parse_settings(kind: str, entries: list[str]) -> dict[str, Any]:
+    """``["key=value", …]`` as a dictionary, with :func:`parse_value`.
+
+    Raises:
+        ConfigurationError: an entry without ``=``, or a key given twice.
+    """
+    result: dict[str, Any] = {}
+    for entry in entries:
+        key, equals, value = entry.partition("=")
+        key = key.strip()
+        if not equals or not key:
+            raise ConfigurationError(f"{kind} {entry!r} is not allowed: write key=value")
+        if key in result:
+            raise ConfigurationError(f"{kind} {key!r} is given twice")
+        result[key] = parse_value(value)
+    return result
+
+
+def make_trigger(spec: str, defaults: dict[str, dict[str, Any]] | None = None) -> Policy:
+    """The analytic policy that ``NAME`` or ``NAME:key=value,key=value`` stands for.
+
+    ``defaults`` are a scenario's own parameters by policy name
+    (:attr:`fusion_gym.envs.Task.policy_defaults`); what the text says goes before them.
+
+    Raises:
+        ConfigurationError: an unknown policy or parameter, or a value that is not allowed.
+    """
+    name, _, text = spec.partition(":")
+    validation.keys("policy", [name], [*TRIGGERS, "model"])
+    kind = TRIGGERS[name]
+    parameters = parse_settings(f"parameter of policy {name!r}", text.split(",") if text else [])
+    known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    validation.keys(f"parameter of policy {name!r}", parameters, known)
+    try:
+        return kind(**((defaults or {}).get(name, {}) | parameters))
+    except ConfigurationError as error:
+        raise ConfigurationError(f"policy {spec!r}: {error}") from None
