@@ -1,0 +1,1 @@
+"""Scripts: training, evaluation, the demo. Run them with ``python -m agents.NAME``."""

@@ -1,0 +1,64 @@
+"""Tables for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from fusion_gym.evaluation import Interval
+
+
+def console() -> Console:
+    """A console that keeps tables whole where the output is no terminal."""
+    found = Console()
+    return found if found.is_terminal else Console(width=150)
+
+
+def number(interval: Mapping[str, float]) -> str:
+    """Mean with the half width of its interval."""
+    half = (interval["high"] - interval["low"]) / 2
+    return f"{interval['mean']:.4g} ± {half:.2g}"
+
+
+def difference(interval: Interval) -> str:
+    """Mean and ends of an interval, with signs."""
+    return f"{interval.mean:+.4f} [{interval.low:+.4f}, {interval.high:+.4f}]"
+
+
+def evaluation_table(
+    title: str, policies: Mapping[str, Mapping[str, Any]], differences: Mapping[str, Interval]
+) -> Table:
+    """One row a policy; ``differences`` to a reference may be empty."""
+    table = Table(title=title, box=box.SIMPLE_HEAD, caption=_CAPTION)
+    table.add_column("policy", overflow="fold")
+    columns = ["MSE", "rate", "requests", "tokens", "denied", "trace P", "NEES", "return"]
+    for column in columns:
+        table.add_column(column, justify="right", no_wrap=True)
+    if differences:
+        table.add_column("MSE - reference", justify="right", no_wrap=True)
+    for name, found in policies.items():
+        row = [
+            name,
+            number(found["mse"]),
+            f"{sum(found['rate']) / len(found['rate']):.3f}",
+            f"{sum(found['requests']) / len(found['requests']):.3f}",
+            f"{found['tokens']['mean']:.3f}",
+            f"{found['denied']['mean']:.3f}",
+            f"{found['bound_trace']['mean']:.4g}",
+            f"{found['nees']['mean']:.3f}",
+            number(found["return"]),
+        ]
+        if differences:
+            row.append(difference(differences[name]) if name in differences else "reference")
+        table.add_row(*row)
+    return table
+
+
+_CAPTION = (
+    "mean ± half width of the 95 % bootstrap interval over episodes; rate and requests per sensor "
+    "and step, tokens and denied per step; NEES is 1 for a consistent filter"
+)

@@ -1,0 +1,334 @@
+"""Train a Stable-Baselines3 agent on the native vector environment.
+
+    python -m agents.train --config configs/tobit_oscillator_ppo.yaml [--resume]
+
+Into the config's ``output`` folder go, as they are made: ``config.yaml``, ``latest.zip`` (the
+checkpoint), ``best_model.zip`` (best return on the validation seeds), ``validation.jsonl``,
+``tensorboard/`` and at the end ``final_model.zip`` and ``summary.json``. Ctrl-C and SIGTERM end
+the training after the current step with a checkpoint; ``--resume`` goes on from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import time
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.utils import LinearSchedule
+from tqdm import tqdm
+
+from agents.config import Experiment, load_experiment, parse
+from fusion_gym.envs import Task
+from fusion_gym.envs.registration import make_task
+from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.evaluation import run_episodes
+from fusion_gym.evaluation.model_policy import ALGORITHMS, ModelPolicy, tag_model
+from fusion_gym.validation import ConfigurationError
+
+# Training seeds lie far from the validation's and from the small numbers that tests use.
+TRAINING_SEEDS = 1_000_000_000
+
+
+class Interrupt:
+    """Turns Ctrl-C and SIGTERM into a flag while it is entered; a second Ctrl-C gets through."""
+
+    def __init__(self) -> None:
+        self.raised = False
+
+    def __enter__(self) -> Interrupt:
+        self._before = {
+            number: signal.signal(number, self._raise) for number in (signal.SIGINT, signal.SIGTERM)
+        }
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _raise(self, number: int, _: FrameType | None) -> None:
+        self.raised = True
+        signal.signal(number, self._before[signal.Signals(number)])
+
+
+class Progress(BaseCallback):
+    """Validation, best model, checkpoints, the progress bar and the split of the wall time."""
+
+    def __init__(
+        self, experiment: Experiment, folder: Path, task: Task, interrupt: Interrupt, bar: tqdm[Any]
+    ) -> None:
+        super().__init__()
+        self.experiment, self.folder, self.task = experiment, folder, task
+        self.interrupt, self.bar = interrupt, bar
+        self.records = read_records(folder)
+        self.best = max((r["return"] for r in self.records), default=-np.inf)
+        self.seconds = {"environment": 0.0, "policy": 0.0, "update": 0.0, "validation": 0.0}
+        self._mark = 0.0
+        self._env_mark = 0.0
+        self._next = 0
+
+    def _on_training_start(self) -> None:
+        self._next = self.num_timesteps + self.experiment.validation.every
+        self._mark = time.perf_counter()
+
+    def _on_rollout_start(self) -> None:
+        now = time.perf_counter()
+        self.seconds["update"] += now - self._mark
+        self._mark, self._env_mark = now, self._environment().seconds
+
+    def _on_step(self) -> bool:
+        return not self.interrupt.raised
+
+    def _on_rollout_end(self) -> None:
+        environment = self._environment().seconds - self._env_mark
+        now = time.perf_counter()
+        self.seconds["environment"] += environment
+        self.seconds["policy"] += now - self._mark - environment
+        self._mark = now
+        self.bar.update(self.num_timesteps - self.bar.n)
+        if self.num_timesteps >= self._next:
+            self._next += self.experiment.validation.every
+            self.validate()
+            self.save()
+            now = time.perf_counter()
+            self.seconds["validation"] += now - self._mark
+            self._mark = now
+
+    def validate(self) -> None:
+        """Run the validation episodes, log them, and keep the model if it is the best so far."""
+        settings = self.experiment.validation
+        found = run_episodes(
+            self.task, ModelPolicy(self.model, self.task), settings.episodes, settings.seed
+        )
+        record = {
+            "timesteps": self.num_timesteps,
+            "return": float(found.returns.mean()),
+            "mse": float(found.mse.mean()),
+            "rate": float(found.rate.mean()),
+        }
+        self.records.append(record)
+        with (self.folder / "validation.jsonl").open("a") as file:
+            file.write(json.dumps(record) + "\n")
+        for key in ("return", "mse", "rate"):
+            self.logger.record(f"validation/{key}", record[key])
+        self.logger.dump(self.num_timesteps)
+        self.bar.set_postfix(mse=f"{record['mse']:.4f}", rate=f"{record['rate']:.3f}")
+        if record["return"] > self.best:
+            self.best = record["return"]
+            save(self.model, self.folder / "best_model.zip")
+
+    def save(self) -> None:
+        """Write the checkpoint, with the replay buffer where there is one."""
+        if getattr(self.model, "replay_buffer", None) is not None:
+            partial = self.folder / "latest_buffer.part"
+            self.model.save_replay_buffer(partial)  # type: ignore[attr-defined]
+            partial.with_suffix(".part.pkl").replace(self.folder / "latest_buffer.pkl")
+        save(self.model, self.folder / "latest.zip")
+
+    def _environment(self) -> FusionSB3VecEnv:
+        env = self.training_env.unwrapped
+        assert isinstance(env, FusionSB3VecEnv)
+        return env
+
+
+def save(model: BaseAlgorithm, path: Path) -> None:
+    """Save in one move, so that an interrupt never leaves half a file."""
+    partial = path.with_name(path.stem + ".part.zip")
+    model.save(partial)
+    partial.replace(path)
+
+
+def read_records(folder: Path) -> list[dict[str, float]]:
+    """The validations written so far."""
+    file = folder / "validation.jsonl"
+    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
+    """A new model of the config's algorithm."""
+    settings = experiment.algorithm.model_dump()
+    name, network = settings.pop("name"), settings.pop("network")
+    end = settings.pop("learning_rate_end")
+    if end is not None:
+        settings["learning_rate"] = LinearSchedule(settings["learning_rate"], end, 1.0)
+    activation = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[network["activation"]]
+    model = ALGORITHMS[name](
+        "MlpPolicy",  # type: ignore[arg-type]
+        env,
+        seed=experiment.training.seed,
+        device="cpu",
+        policy_kwargs={"net_arch": list(network["hidden"]), "activation_fn": activation},
+        **settings,
+    )
+    tag_model(model, env.task)
+    return model
+
+
+def prepare(experiment: Experiment, folder: Path, resume: bool) -> None:
+    """Make the folder, or check that it holds the same experiment.
+
+    Raises:
+        ConfigurationError: the folder holds a training and ``resume`` is false, there is nothing
+            to resume, or the training there had another config.
+    """
+    plain = experiment.model_dump(mode="json")
+    file = folder / "config.yaml"
+    if not resume:
+        if file.exists():
+            raise ConfigurationError(
+                f"output = {str(folder)!r} holds a training already: go on with --resume, or give "
+                "another --output"
+            )
+        folder.mkdir(parents=True, exist_ok=True)
+        file.write_text(yaml.safe_dump(plain, sort_keys=False))
+        return
+    if not file.exists():
+        raise ConfigurationError(f"output = {str(folder)!r} holds no training: nothing to resume")
+    earlier = load_experiment(file).model_dump(mode="json")
+    for key in ("environment", "algorithm", "validation"):
+        if earlier[key] != plain[key]:
+            raise ConfigurationError(
+                f"{key} = {plain[key]} differs from the training in {str(folder)!r}: {earlier[key]}"
+            )
+    file.write_text(yaml.safe_dump(plain, sort_keys=False))
+
+
+def train(experiment: Experiment, *, resume: bool = False) -> dict[str, Any]:
+    """Run the training and return its summary.
+
+    The summary has ``timesteps``, ``finished``, ``steps_per_second``, ``seconds`` by activity,
+    and the best validation.
+
+    Raises:
+        ConfigurationError: a config, environment or folder that does not fit.
+    """
+    task = make_task(experiment.environment.id, **experiment.environment.options)
+    if experiment.algorithm.name == "dqn" and task.action != "discrete":
+        raise ConfigurationError(
+            f"action = {task.action!r} is not allowed with algorithm 'dqn': set the environment's "
+            "option action: discrete"
+        )
+    folder = Path(experiment.output)
+    prepare(experiment, folder, resume)
+    torch.set_num_threads(experiment.training.threads)
+    env = FusionSB3VecEnv(task, experiment.training.num_envs, stagger=True)
+    checkpoint = folder / "latest.zip"
+    if resume and checkpoint.exists():
+        model = ALGORITHMS[experiment.algorithm.name].load(checkpoint, env=env, device="cpu")
+        if (folder / "latest_buffer.pkl").exists():
+            model.load_replay_buffer(folder / "latest_buffer.pkl")  # type: ignore[attr-defined]
+    else:
+        model = make_model(experiment, env)
+    begun = model.num_timesteps
+    remaining = experiment.training.timesteps - begun
+    # Every stretch of a training gets noise of its own, also after an interrupt.
+    env.seed(TRAINING_SEEDS + 10_000_019 * experiment.training.seed + begun)
+    model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
+    began = time.perf_counter()
+    with (
+        Interrupt() as interrupt,
+        tqdm(
+            total=experiment.training.timesteps, initial=begun, unit="step", unit_scale=True,
+            desc=f"training {experiment.algorithm.name}",
+        ) as bar,
+    ):  # fmt: skip
+        progress = Progress(experiment, folder, task, interrupt, bar)
+        if remaining > 0:
+            model.learn(remaining, callback=progress, reset_num_timesteps=False)
+            progress.num_timesteps = model.num_timesteps
+            bar.update(model.num_timesteps - bar.n)
+            if not interrupt.raised:
+                progress.validate()
+            progress.save()
+    elapsed = time.perf_counter() - began
+    finished = model.num_timesteps >= experiment.training.timesteps
+    if finished:
+        save(model, folder / "final_model.zip")
+    best = max(progress.records, key=lambda record: record["return"], default=None)
+    summary = {
+        "timesteps": model.num_timesteps,
+        "finished": finished,
+        "steps_per_second": round((model.num_timesteps - begun) / elapsed) if remaining > 0 else 0,
+        "seconds": {key: round(value, 2) for key, value in progress.seconds.items()},
+        "best_validation": best,
+    }
+    (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
+    print(describe(summary, folder, elapsed))
+    return summary
+
+
+def describe(summary: dict[str, Any], folder: Path, elapsed: float) -> str:
+    """What a reader wants to know of a training, in a few lines."""
+    lines = [
+        f"{'finished' if summary['finished'] else 'interrupted'} after {summary['timesteps']:,} "
+        f"steps; this stretch: {elapsed:.0f} s, {summary['steps_per_second']:,} steps/s"
+    ]
+    total = sum(summary["seconds"].values())
+    if total > 0.0:
+        parts = (f"{key} {value / total:.0%}" for key, value in summary["seconds"].items())
+        lines.append("wall time: " + ", ".join(parts))
+    best = summary["best_validation"]
+    if best:
+        lines.append(
+            f"best validation at {best['timesteps']:,} steps: return {best['return']:.3f}, "
+            f"MSE {best['mse']:.4f}, rate {best['rate']:.4f}"
+        )
+    if not summary["finished"]:
+        lines.append("go on with --resume")
+    return "\n".join([*lines, f"results in {folder}"])
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    result = argparse.ArgumentParser(
+        prog="python -m agents.train",
+        description="Train a Stable-Baselines3 agent on the native vector environment.",
+    )
+    result.add_argument("--config", required=True, help="the experiment, see configs/")
+    result.add_argument("--timesteps", type=int, help="instead of the config's")
+    result.add_argument("--seed", type=int, help="instead of the config's")
+    result.add_argument("--output", help="folder, instead of the config's")
+    result.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
+    return result
+
+
+def with_overrides(experiment: Experiment, arguments: argparse.Namespace) -> Experiment:
+    """The config with what the command line says instead, checked again.
+
+    Raises:
+        ConfigurationError: a value that is not allowed.
+    """
+    plain = experiment.model_dump()
+    for key in ("timesteps", "seed"):
+        value = getattr(arguments, key)
+        if value is not None:
+            plain["training"][key] = value
+    if arguments.output is not None:
+        plain["output"] = arguments.output
+    return parse(Experiment, plain, "command line")
+
+
+def main() -> None:
+    """Entry point; exit status 130 after an interrupt."""
+    arguments = parser().parse_args()
+    try:
+        experiment = with_overrides(load_experiment(arguments.config), arguments)
+        summary = train(experiment, resume=arguments.resume)
+    except ConfigurationError as error:
+        sys.exit(f"error: {error}")
+    if not summary["finished"]:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()
