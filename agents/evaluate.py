@@ -120,7 +120,9 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
             "differences": {name: found._asdict() for name, found in differences.items()},
         }
     write(arguments.json, report)
-    title = f"{env_id}: {arguments.episodes} episodes of {task.horizon} steps, seed {arguments.seed}"
+    title = (
+        f"{env_id}: {arguments.episodes} episodes of {task.horizon} steps, seed {arguments.seed}"
+    )
     tables.console().print(tables.evaluation_table(title, report["policies"], differences))
     return report
 

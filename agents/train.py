@@ -163,7 +163,7 @@ def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
         settings["learning_rate"] = LinearSchedule(settings["learning_rate"], end, 1.0)
     activation = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[network["activation"]]
     model = ALGORITHMS[name](
-        "MlpPolicy",  # type: ignore[arg-type]
+        "MlpPolicy",
         env,
         seed=experiment.training.seed,
         device="cpu",

@@ -1,0 +1,156 @@
+"""Figures: the Pareto front, and one episode in the manner of the token-bucket paper."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from fusion_gym.evaluation import (
+    EnvelopePoint,
+    EpisodeResults,
+    Trajectory,
+    mean_interval,
+)
+
+_INK = "#30343b"
+_AGENT = "#c8102e"
+plt.rcParams.update(
+    {
+        "figure.dpi": 130,
+        "font.size": 9,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.edgecolor": _INK,
+        "axes.grid": True,
+        "grid.alpha": 0.25,
+        "legend.frameon": False,
+        "svg.hashsalt": "fusion-gym",
+    }
+)
+
+
+@dataclass(frozen=True)
+class Line:
+    """One curve of the Pareto figure: its label and its policies' results, in sweep order."""
+
+    label: str
+    results: Sequence[EpisodeResults]
+
+
+def pareto(
+    path: Path,
+    title: str,
+    lines: Sequence[Line],
+    points: Mapping[str, EpisodeResults],
+    agents: Mapping[str, EpisodeResults],
+    envelope: Sequence[EnvelopePoint],
+) -> None:
+    """MSE against transmission rate, with 95 % intervals over episodes.
+
+    ``lines`` are the swept baselines, ``points`` single policies, ``agents`` the learned ones,
+    ``envelope`` the lower convex hull of the baselines.
+    """
+    figure, axes = plt.subplots(figsize=(8.6, 5.6))
+    colours = plt.get_cmap("tab20")
+    for place, line in enumerate(lines):
+        _draw(axes, line.label, line.results, colours(place % 20), marker="o")
+    for name, found in points.items():
+        _draw(axes, None, [found], _INK, marker="s")
+        axes.annotate(
+            name, (found.rate.mean(), found.mse.mean()), (5, 4), textcoords="offset points"
+        )
+    hull = [*envelope]
+    right = axes.get_xlim()[1]
+    rates = [p.rate for p in hull] + [max(right, hull[-1].rate)]
+    errors = [p.mse for p in hull] + [hull[-1].mse]
+    axes.plot(rates, errors, "--", color=_INK, lw=1, label="lower envelope of the baselines")
+    for name, found in agents.items():
+        _draw(axes, name, [found], _AGENT, marker="*", size=15)
+    axes.set_xlabel("transmissions per sensor and step")
+    axes.set_ylabel("mean squared error of the fused estimate")
+    every = [r for line in lines for r in line.results] + [*points.values(), *agents.values()]
+    means = np.array([r.mse.mean() for r in every])
+    if means.max() > 6 * means.min():
+        axes.set_yscale("log")
+    axes.set_xlim(left=-0.005)
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.legend(fontsize=7.5, ncols=2)
+    _save(figure, path)
+
+
+def _draw(
+    axes: plt.Axes,
+    label: str | None,
+    results: Sequence[EpisodeResults],
+    colour: object,
+    marker: str,
+    size: float = 3.5,
+) -> None:
+    rate = np.array([r.rate.mean() for r in results])
+    order = np.argsort(rate, kind="stable")
+    intervals = [mean_interval(results[i].mse) for i in order]
+    mean = np.array([i.mean for i in intervals])
+    spread = np.abs(np.array([[i.mean - i.low, i.high - i.mean] for i in intervals]).T)
+    axes.errorbar(
+        rate[order], mean, yerr=spread, label=label, color=colour, marker=marker,
+        ms=size, lw=1.1, elinewidth=0.8, capsize=1.5, zorder=3 if size > 5 else 2,
+    )  # fmt: skip
+
+
+def episode(path: Path, title: str, trajectory: Trajectory, capacity: float) -> None:
+    """One episode: tokens with requests and grants above, states and estimates below."""
+    steps = np.arange(1, len(trajectory.truth) + 1)
+    sensors, states = trajectory.granted.shape[1], trajectory.truth.shape[1]
+    figure, axes = plt.subplots(
+        1 + states, 1, figsize=(9, 2.2 * (1 + states)), sharex=True, constrained_layout=True
+    )
+    top = axes[0]
+    top.plot(steps, trajectory.tokens, color="#2a8c4a", lw=1.3, label="tokens")
+    for sensor in range(sensors):
+        height = capacity * (1.08 + 0.1 * sensor)
+        for kind, mask in (
+            ("denied", trajectory.requested[:, sensor] & ~trajectory.granted[:, sensor]),
+            ("granted", trajectory.granted[:, sensor]),
+        ):
+            style = {"marker": "o", "color": f"C{sensor}"} if kind == "granted" else {
+                "marker": "x", "color": "0.6"}  # fmt: skip
+            top.plot(
+                steps[mask], np.full(mask.sum(), height), linestyle="", ms=3.5,
+                label=f"sensor {sensor + 1}" if kind == "granted" else None, **style,
+            )  # fmt: skip
+    top.set_ylabel("tokens")
+    top.set_title(f"{title} (× = denied request)", loc="left", fontsize=10)
+    top.legend(ncols=1 + sensors, fontsize=7.5, loc="lower right")
+    for state, panel in enumerate(axes[1:]):
+        deviation = np.sqrt(trajectory.variance[:, state])
+        mean = trajectory.mean[:, state]
+        panel.fill_between(
+            steps, mean - 2 * deviation, mean + 2 * deviation, color=_AGENT, alpha=0.12, lw=0,
+            label="fused ± 2 claimed deviations",
+        )  # fmt: skip
+        for sensor in range(sensors):
+            panel.plot(
+                steps, trajectory.local_mean[:, sensor, state], color=f"C{sensor}", lw=0.7,
+                alpha=0.7, label=f"node {sensor + 1}",
+            )  # fmt: skip
+        panel.plot(steps, trajectory.truth[:, state], color=_INK, lw=1.4, label="state")
+        panel.plot(steps, mean, color=_AGENT, lw=1.2, label="fused estimate")
+        reach = np.abs(trajectory.truth[:, state]).max() * 2
+        panel.set_ylim(*np.clip(panel.get_ylim(), -reach, reach))
+        panel.set_ylabel(f"x{state + 1}")
+    axes[1].legend(ncols=6, fontsize=7, loc="upper right")
+    axes[-1].set_xlabel("step")
+    _save(figure, path)
+
+
+def _save(figure: plt.Figure, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, bbox_inches="tight")
+    plt.close(figure)

@@ -1,0 +1,1 @@
+"""Benchmarks: performance as ratios within one run."""

@@ -1,0 +1,166 @@
+"""Environment steps per second, everything included, beside the alternatives.
+
+    python -m benchmarks.throughput [--seconds 3]
+
+One thread (``make bench`` sets it), float64. All rows are measured in one run, in turns, and each figure is the median of
+its turns; ratios are to the single environment behind ``gym.make`` or, for the filter, to the
+plain loop. The absolute figures belong to the machine, the ratios to the code.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import filterpy.kalman
+import gymnasium
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+import fusion_gym
+from fusion_gym.envs.tobit_oscillator import TobitOscillatorOptions
+
+ENV = "fusion_gym/TobitOscillator-v0"
+TURNS = 5
+# A workload takes seconds and returns environment steps per second.
+Workload = Callable[[float], float]
+
+
+def _timed(step: Callable[[], object], steps_per_call: int) -> Workload:
+    def run(seconds: float) -> float:
+        calls, began = 0, time.perf_counter()
+        while True:
+            for _ in range(8):
+                step()
+            calls += 8
+            elapsed = time.perf_counter() - began
+            if elapsed >= seconds:
+                return calls * steps_per_call / elapsed
+
+    return run
+
+
+def single(options: dict[str, Any]) -> Workload:
+    """``gym.make``, with the reset at the end of each episode."""
+    env = gymnasium.make(ENV, **options)
+    env.reset(seed=0)
+    actions = [np.array(bits, dtype=np.int8) for bits in ((1, 0, 1), (0, 1, 0), (0, 0, 0))]
+    count = iter(range(10**12))
+
+    def step() -> None:
+        truncated = env.step(actions[next(count) % 3])[3]
+        if truncated:
+            env.reset()
+
+    return _timed(step, 1)
+
+
+def vector(options: dict[str, Any], num_envs: int) -> Workload:
+    """``gym.make_vec`` with autoreset."""
+    env = gymnasium.make_vec(ENV, num_envs, vectorization_mode="vector_entry_point", **options)
+    env.reset(seed=0)
+    actions = np.random.default_rng(0).integers(0, 2, (16, num_envs, 3), dtype=np.int8)
+    count = iter(range(10**12))
+    return _timed(lambda: env.step(actions[next(count) % 16]), num_envs)
+
+
+def native_sb3(options: dict[str, Any], num_envs: int) -> Workload:
+    """The native SB3 environment, its first episodes staggered as in training."""
+    env = fusion_gym.make_sb3_vec_env(ENV, num_envs, seed=0, stagger=True, **options)
+    env.reset()
+    actions = np.random.default_rng(0).integers(0, 2, (16, num_envs, 3), dtype=np.int8)
+    count = iter(range(10**12))
+    return _timed(lambda: env.step(actions[next(count) % 16]), num_envs)
+
+
+def dummy_sb3(options: dict[str, Any], num_envs: int) -> Workload:
+    """SB3's DummyVecEnv over single environments."""
+    env = DummyVecEnv([lambda: gymnasium.make(ENV, **options)] * num_envs)
+    env.seed(0)
+    env.reset()
+    actions = np.random.default_rng(0).integers(0, 2, (16, num_envs, 3), dtype=np.int8)
+    count = iter(range(10**12))
+    return _timed(lambda: env.step(actions[next(count) % 16]), num_envs)
+
+
+def filterpy_loop() -> Workload:
+    """Plant, three sensors and three FilterPy updates in a loop: no network, no observation.
+
+    The filter takes censored values at face value, which is less work than the Tobit filter.
+    """
+    numbers = TobitOscillatorOptions()
+    transition, gain = np.array(numbers.transition), np.array(numbers.process_gain)
+    generator = np.random.default_rng(0)
+    node = filterpy.kalman.KalmanFilter(dim_x=2, dim_z=2)
+    node.F, node.H, node.R = transition, np.eye(2), 0.5 * np.eye(2)
+    node.Q, node.P = 0.05 * np.outer(gain, gain), 0.1 * np.eye(2)
+    state = np.array([5.0, 0.0])
+    node.x = state.copy()
+
+    def step() -> None:
+        nonlocal state
+        state = transition @ state + gain * (0.05**0.5 * generator.standard_normal())
+        node.predict()
+        for _ in range(3):
+            noise = 0.5**0.5 * generator.standard_normal(2)
+            node.update(np.maximum(state + noise, 0.0))
+
+    return _timed(step, 1)
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description="Environment steps per second, as ratios.")
+    parser.add_argument("--seconds", type=float, default=0.6, help="of each row and turn")
+    seconds = parser.parse_args().seconds
+    paper: dict[str, Any] = {}
+    tobit: dict[str, Any] = {"filter": "tobit"}
+    rows: dict[str, Workload] = {
+        "plain loop with FilterPy's Kalman filter": filterpy_loop(),
+        "gym.make, paper's filter": single(paper),
+        "gym.make, Tobit filter": single(tobit),
+        "SB3 DummyVecEnv, 64 × gym.make, paper's filter": dummy_sb3(paper, 64),
+        "native SB3 VecEnv, 256, paper's filter": native_sb3(paper, 256),
+        "native SB3 VecEnv, 1,024, paper's filter": native_sb3(paper, 1024),
+        "native SB3 VecEnv, 1,024, Tobit filter": native_sb3(tobit, 1024),
+        "gym.make_vec, 64, paper's filter": vector(paper, 64),
+        "gym.make_vec, 1,024, paper's filter": vector(paper, 1024),
+        "gym.make_vec, 1,024, Tobit filter": vector(tobit, 1024),
+        "gym.make_vec, 4,096, Tobit filter": vector(tobit, 4096),
+    }
+    figures: dict[str, list[float]] = {name: [] for name in rows}
+    for workload in rows.values():
+        workload(seconds / 4)
+    for _ in range(TURNS):
+        for name, workload in rows.items():
+            figures[name].append(workload(seconds))
+    medians = {name: statistics.median(found) for name, found in figures.items()}
+    names = list(rows)
+    table = Table(
+        title=f"{ENV}: steps per second, one thread, median of {TURNS} turns",
+        box=box.SIMPLE_HEAD,
+    )
+    table.add_column("what")
+    for column in ("steps/s", "least", "most", "to the FilterPy loop", "to DummyVecEnv"):
+        table.add_column(column, justify="right")
+    for name, median in medians.items():
+        found = figures[name]
+        table.add_row(
+            name,
+            f"{median:,.0f}",
+            f"{min(found):,.0f}",
+            f"{max(found):,.0f}",
+            f"{median / medians[names[0]]:.2f}",
+            f"{median / medians[names[3]]:.2f}",
+        )
+    Console(width=130).print(table)
+
+
+if __name__ == "__main__":
+    main()
