@@ -91,7 +91,7 @@ class TrainingConfig(_Strict):
     timesteps: Positive
     num_envs: Positive = 256
     seed: int = pydantic.Field(default=0, ge=0)
-    threads: Positive = 2
+    threads: Positive = 1
 
 
 class ValidationConfig(_Strict):
@@ -145,6 +145,21 @@ class Sweep(_Strict):
         return list(dict.fromkeys([*self.points, *texts]))
 
 
+class ComparisonRow(_Strict):
+    """One policy in one setting of the environment."""
+
+    label: str
+    policy: str
+    options: dict[str, Any] = {}
+
+
+class Comparison(_Strict):
+    """Settings and policies of one environment, row by row."""
+
+    environment: str
+    rows: tuple[ComparisonRow, ...] = pydantic.Field(min_length=1)
+
+
 def read_yaml(path: str | Path) -> Any:
     """The parsed file.
 
@@ -174,6 +189,11 @@ def load_experiment(path: str | Path) -> Experiment:
 def load_sweep(path: str | Path) -> Sweep:
     """A sweep's config; raises like :func:`load_experiment`."""
     return parse(Sweep, read_yaml(path), str(path))
+
+
+def load_comparison(path: str | Path) -> Comparison:
+    """A comparison's config; raises like :func:`load_experiment`."""
+    return parse(Comparison, read_yaml(path), str(path))
 
 
 def parse(kind: type[Model], content: Any, source: str) -> Model:

@@ -113,13 +113,13 @@ def demonstrate(
         "training": summary,
     }
     (folder / "comparison.json").write_text(json.dumps(verdict, indent=1) + "\n")
-    shown = [*sweep.points, *(point.name for point in envelope), "dynamic_event:scale=1", agent]
+    shown = [*sweep.points, *(point.name for point in envelope), agent]
     chosen = {name: report["policies"][name] for name in dict.fromkeys(shown)}
     console = tables.console()
     console.print(
         tables.evaluation_table(
             f"{setting.title}: single policies, the lower envelope of all {len(baselines)} "
-            "baselines, the paper's trigger, and the agent",
+            "baselines, and the agent",
             chosen,
             {},
         )

@@ -61,11 +61,10 @@ def pareto(
     colours = plt.get_cmap("tab20")
     for place, line in enumerate(lines):
         _draw(axes, line.label, line.results, colours(place % 20), marker="o")
-    for name, found in points.items():
+    for place, (name, found) in enumerate(points.items()):
         _draw(axes, None, [found], _INK, marker="s")
-        axes.annotate(
-            name, (found.rate.mean(), found.mse.mean()), (5, 4), textcoords="offset points"
-        )
+        at, offset = (found.rate.mean(), found.mse.mean()), (6, 12 * (place % 2) - 8)
+        axes.annotate(name, at, offset, textcoords="offset points", fontsize=7.5)
     hull = [*envelope]
     right = axes.get_xlim()[1]
     rates = [p.rate for p in hull] + [max(right, hull[-1].rate)]
@@ -127,7 +126,7 @@ def episode(path: Path, title: str, trajectory: Trajectory, capacity: float) -> 
             )  # fmt: skip
     top.set_ylabel("tokens")
     top.set_title(f"{title} (× = denied request)", loc="left", fontsize=10)
-    top.legend(ncols=1 + sensors, fontsize=7.5, loc="lower right")
+    top.legend(ncols=1 + sensors, fontsize=7.5, loc="lower right", bbox_to_anchor=(1, 1))
     for state, panel in enumerate(axes[1:]):
         deviation = np.sqrt(trajectory.variance[:, state])
         mean = trajectory.mean[:, state]

@@ -104,6 +104,9 @@ class Progress(BaseCallback):
             self.seconds["validation"] += now - self._mark
             self._mark = now
 
+    def _on_training_end(self) -> None:
+        self.seconds["update"] += time.perf_counter() - self._mark
+
     def validate(self) -> None:
         """Run the validation episodes, log them, and keep the model if it is the best so far."""
         settings = self.experiment.validation
@@ -130,9 +133,9 @@ class Progress(BaseCallback):
     def save(self) -> None:
         """Write the checkpoint, with the replay buffer where there is one."""
         if getattr(self.model, "replay_buffer", None) is not None:
-            partial = self.folder / "latest_buffer.part"
+            partial = self.folder / "latest_buffer.part.pkl"
             self.model.save_replay_buffer(partial)  # type: ignore[attr-defined]
-            partial.with_suffix(".part.pkl").replace(self.folder / "latest_buffer.pkl")
+            partial.replace(self.folder / "latest_buffer.pkl")
         save(self.model, self.folder / "latest.zip")
 
     def _environment(self) -> FusionSB3VecEnv:

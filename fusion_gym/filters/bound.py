@@ -7,6 +7,7 @@ K_t; C{Υ∘Ω}Cᵀ is Υ∘(C Ω Cᵀ); without a delivery the filter really up
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +22,8 @@ from fusion_gym.validation import Array, ConfigurationError
 # Below this probability of an uncensored value, q counts as this: q enters only in ratios whose
 # limits are reached long before, and 1/q must stay finite.
 _SMALLEST_PROBABILITY = 1e-290
-# A held value beyond this multiple of q pins its direction completely (relative effect 1e-24).
-_LARGEST_RATIO = 1e12
+# The same where a held value is divided by q, and the ratio is squared.
+_SMALLEST_DIVISOR = 1e-140
 
 
 @dataclass(frozen=True)
@@ -74,10 +75,16 @@ class EventError:
 
     def at(self, time: Array) -> Array:
         """Ξ(G_t) at the steps ``time`` (N,) counted from 1, shape (sensors, N)."""
-        power = self.growth ** (time + 1.0)
-        fixed = np.where(self.growth == 1.0, 0.0, self.offset / (1.0 - self.growth))
-        ramp = np.where(self.growth == 1.0, self.offset * (time + 1.0), 0.0)
-        return fixed + power * (self.initial - fixed) + ramp
+        fixed, slope, gap = self._closed_form
+        steps = time + 1.0
+        return fixed + slope * steps + gap * self.growth**steps
+
+    @functools.cached_property
+    def _closed_form(self) -> tuple[Array, Array, Array]:
+        """Fixed point, slope and first distance: G_t = fixed + slope t + gap growth^t."""
+        steady = self.growth != 1.0
+        fixed = np.divide(self.offset, 1.0 - self.growth, where=steady, out=0.0 * self.offset)
+        return fixed, np.where(steady, 0.0, self.offset), self.initial - fixed
 
     @classmethod
     def create(
@@ -181,20 +188,18 @@ class BoundTobitFilter:
         """θ = 1: mean and bound after the update with the held value ȳ.
 
         Every term of Φ but two is scaled by q on both sides, so the update is written in units of
-        q: Φ = q (N + F Fᵀ) q with F = [√κ₅ ȳ, √κ₇ (1 - q) τ]/q, which may be huge. The inverse of
-        N + F Fᵀ and its product with F are taken by the Woodbury identity, so that q as small as
-        1e-290 loses no digits and the gain itself is never formed.
+        q: Φ = q (N + F Fᵀ) q with F = [√κ₅ ȳ, √κ₇ (1 - q) τ]/q, whose rows may be huge and of very
+        different size. :func:`_pinned_solve` takes them in without loss of digits, and the gain
+        itself, which grows as 1/q, is never formed.
         """
         k1, k2, _, k4, k5, _, k7, _ = self.constants.kappa
         threshold = self.sensors.finite_threshold
         q = np.maximum(expectation.uncensored_probability, _SMALLEST_PROBABILITY)
         bias = expectation.hazard * self.sensors.deviation
         core = k1 * spread + k4 * moment + k2 * linalg.outer(bias, bias)
-        columns = [(np.sqrt(k5) * held / q, 1.0 / np.sqrt(k5))]
-        if np.any(threshold):
-            columns.append((np.sqrt(k7) * (1.0 - q) * threshold / q, -1.0 / np.sqrt(k7)))
+        columns = _pinned_columns(held, threshold, q, np.sqrt(k5), np.sqrt(k7))
+        whitened, shift = _pinned_solve(core, cross, columns)
         uncensored = expectation.latent + bias
-        whitened, shift = _pinned_solve(core, columns, cross)
         step = linalg.matvec(linalg.transpose(cross), shift) - linalg.matvec(
             linalg.transpose(whitened), uncensored
         )
@@ -202,41 +207,62 @@ class BoundTobitFilter:
         return mean + k1 * step, linalg.symmetrise(bound)
 
 
-def _pinned_solve(
-    core: Array, columns: list[tuple[Array, float]], right: Array
-) -> tuple[Array, Array]:
-    """(N + F Fᵀ)⁻¹ B and (N + F Fᵀ)⁻¹ F c for one or two columns F (…, m, N) with factors c.
+def _pinned_columns(
+    held: Array, threshold: Array, q: Array, a: float, b: float
+) -> list[tuple[Array, Array]]:
+    """Columns of F and factors c with F c = (ȳ - u)/q and F Fᵀ = (a² ȳ ȳᵀ + b² u uᵀ)/q².
 
-    ``core`` N (…, m, m, N) is positive definite, ``right`` B (…, m, n, N).
+    ``held`` ȳ and ``q`` are (…, m, N), ``threshold`` τ broadcasts to them, u = (1 - q) τ; a factor
+    is (…, 1, N). The columns a ȳ and b u are rotated into each other so that the second is zero
+    in the row p where the first is largest. Its other rows are a b/r times
+    ȳ_p u - u_p ȳ = (e_p τ - τ_p e) - q ȳ_p τ + q_p τ_p ȳ with e = ȳ - τ, which loses no digits
+    where ȳ lies at the threshold and q is tiny.
     """
-    solved = linalg.solve(core, right)
-    f, c = _capped(columns[0][0]), columns[0][1]
-    nf = linalg.solve_vector(core, f)
-    norm = linalg.dot(f, nf)
-    if len(columns) == 1:
-        weight = nf / (1.0 + norm)[..., None, :]
-        projected = linalg.matvec(linalg.transpose(right), weight)
-        return solved - linalg.outer(nf, projected), weight * c
-    g, e = _capped(columns[1][0]), columns[1][1]
-    ng = linalg.solve_vector(core, g)
-    mixed, other = linalg.dot(f, ng), linalg.dot(g, ng)
-    # The Gram determinant norm·other - mixed² from the residual of g on f: no cancellation.
-    safe = np.where(norm > 0.0, norm, 1.0)
-    residual = g - f * (mixed / safe)[..., None, :]
-    gram = norm * linalg.dot(residual, linalg.solve_vector(core, residual))
-    scale = (1.0 / (1.0 + norm + other + gram))[..., None, :]
-    norm, mixed, other = norm[..., None, :], mixed[..., None, :], other[..., None, :]
-    weight_f = (nf * (1.0 + other) - ng * mixed) * scale
-    weight_g = (ng * (1.0 + norm) - nf * mixed) * scale
-    back = linalg.transpose(right)
-    solved = (
-        solved
-        - linalg.outer(weight_f, linalg.matvec(back, nf))
-        - linalg.outer(weight_g, linalg.matvec(back, ng))
-    )
-    return solved, weight_f * c + weight_g * e
+    floored = np.maximum(q, _SMALLEST_DIVISOR)
+    if not np.any(threshold):
+        return [(a * held / floored, np.full(held[..., :1, :].shape, 1.0 / a))]
+    u = (1.0 - q) * threshold
+    size = np.hypot(a * held, b * u)
+    row = np.argmax(size / floored, axis=-2)[..., None, :]
+
+    def at_row(values: Array) -> Array:
+        return np.take_along_axis(np.broadcast_to(values, size.shape), row, axis=-2)
+
+    radius = at_row(size)
+    radius = np.where(radius > 0.0, radius, 1.0)
+    held_p, u_p, q_p, threshold_p = at_row(held), at_row(u), at_row(q), at_row(threshold)
+    above = held - threshold
+    above_p = at_row(above)
+    crossed = (above_p * threshold - threshold_p * above) / floored
+    crossed += q_p / q * threshold_p * held - held_p * threshold
+    crossed *= a * b / radius
+    np.put_along_axis(crossed, row, 0.0, axis=-2)
+    first = (a * a * held_p * held + b * b * u_p * u) / (radius * floored)
+    return [
+        (first, (above_p + q_p * threshold_p) / radius),
+        (crossed, -(a / b * held_p + b / a * u_p) / radius),
+    ]
 
 
-def _capped(column: Array) -> Array:
-    largest = np.abs(column).max(-2, keepdims=True)
-    return column * np.minimum(1.0, _LARGEST_RATIO / np.maximum(largest, 1e-290))
+def _pinned_solve(
+    core: Array, right: Array, columns: list[tuple[Array, Array]]
+) -> tuple[Array, Array]:
+    """(N + F Fᵀ)⁻¹ B and (N + F Fᵀ)⁻¹ F c, one column of F after another.
+
+    ``core`` N (…, m, m, N) is positive definite, ``right`` B (…, m, n, N); ``columns`` are those
+    of :func:`_pinned_columns`. Each step is the Sherman-Morrison formula: with h = M⁻¹ f,
+    (M + f fᵀ)⁻¹ = M⁻¹ - h hᵀ/(1 + fᵀ h), and (M + f fᵀ)⁻¹ f = h/(1 + fᵀ h).
+    """
+    n = right.shape[-2]
+    stacked = np.concatenate([right, *(f[..., None, :] for f, _ in columns)], axis=-2)
+    solved = linalg.solve(core, stacked)
+    shift: Array | float = 0.0
+    for place, (f, factor) in enumerate(columns):
+        h = solved[..., n + place, :]
+        weight = h / (1.0 + linalg.dot(f, h))[..., None, :]
+        if np.ndim(shift):
+            shift = shift - weight * linalg.dot(f, shift)[..., None, :]
+        shift = shift + weight * factor
+        projected = linalg.matvec(linalg.transpose(solved), f)
+        solved = solved - linalg.outer(weight, projected)
+    return solved[..., :n, :], np.asarray(shift)

@@ -1,0 +1,260 @@
+"""The scripts, used as a user does: configs, evaluation, training with interrupts, the demo."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import fusion_gym
+from agents import demo, evaluate, reproduce, train
+from agents.config import load_comparison, load_experiment, load_sweep
+from fusion_gym.evaluation import make_policy
+from fusion_gym.evaluation.metrics import summarise
+from fusion_gym.validation import ConfigurationError
+
+ROOT = Path(__file__).parent.parent
+CONFIGS = ROOT / "configs"
+ENV = "fusion_gym/TobitOscillator-v0"
+EXPERIMENTS = [f for f in sorted(CONFIGS.glob("*.yaml")) if "algorithm" in f.read_text()]
+SMALL: dict[str, dict[str, Any]] = {
+    "ppo": {"name": "ppo", "n_steps": 16, "batch_size": 128, "n_epochs": 1},
+    "a2c": {"name": "a2c", "n_steps": 8},
+    "dqn": {
+        "name": "dqn",
+        "buffer_size": 2000,
+        "learning_starts": 100,
+        "batch_size": 32,
+        "learning_rate_end": 1e-4,
+    },
+}
+
+
+def small_config(folder: Path, kind: str = "ppo", **changes: Any) -> Path:
+    content: dict[str, Any] = {
+        "environment": {"id": ENV, "options": {"filter": "tobit", "horizon": 20}},
+        "algorithm": SMALL[kind],
+        "training": {"timesteps": 1024, "num_envs": 8},
+        "validation": {"every": 512, "episodes": 4},
+        "output": str(folder / "run"),
+    }
+    if kind == "dqn":
+        content["environment"]["options"]["action"] = "discrete"
+    path = folder / "config.yaml"
+    path.write_text(yaml.safe_dump(content | changes))
+    return path
+
+
+@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
+def test_committed_experiments_are_valid(path: Path) -> None:
+    experiment = load_experiment(path)
+    task = fusion_gym.make_task(experiment.environment.id, **experiment.environment.options)
+    assert (experiment.algorithm.name == "dqn") == (task.action == "discrete")
+
+
+def test_committed_sweep_and_comparison_name_policies_that_exist() -> None:
+    sweep = load_sweep(CONFIGS / "tobit_oscillator_sweep.yaml")
+    task = fusion_gym.make_task(ENV)
+    assert len(sweep.policies) == len(set(sweep.policies)) > 50
+    for policy in sweep.policies:
+        make_policy(policy, task)
+    comparison = load_comparison(CONFIGS / "tobit_oscillator_reproduce.yaml")
+    for row in comparison.rows:
+        make_policy(row.policy, fusion_gym.make_task(comparison.environment, **row.options))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"trainig": {}}, "trainig"),
+        ({"training": {"timesteps": 0}}, "training.timesteps = 0"),
+        ({"training": {"timesteps": "many"}}, "training.timesteps = 'many'"),
+        ({"algorithm": {"name": "ppo", "learning_rte": 1}}, "learning_rte"),
+        ({"algorithm": {"name": "sac"}}, "sac"),
+        ({"output": None}, "output = None"),
+        ({"environment": {}}, "environment.id"),
+    ],
+)
+def test_a_config_that_is_not_allowed_names_the_field(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigurationError, match="is not allowed") as error:
+        load_experiment(small_config(tmp_path, **changes))
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_config_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"absent\.yaml"):
+        load_experiment(tmp_path / "absent.yaml")
+    (tmp_path / "broken.yaml").write_text("a: [1,")
+    with pytest.raises(ConfigurationError, match="no YAML"):
+        load_experiment(tmp_path / "broken.yaml")
+
+
+@pytest.mark.parametrize("algorithm", list(SMALL))
+def test_training_writes_its_results_and_resumes(tmp_path: Path, algorithm: str) -> None:
+    experiment = load_experiment(small_config(tmp_path, algorithm))
+    summary = train.train(experiment)
+    folder = Path(experiment.output)
+    assert summary["finished"]
+    assert summary["timesteps"] >= 1024
+    assert json.loads((folder / "summary.json").read_text()) == summary
+    assert list((folder / "tensorboard").glob("events*"))
+    records = train.read_records(folder)
+    assert max(r["return"] for r in records) == summary["best_validation"]["return"]
+    with pytest.raises(ConfigurationError, match="--resume"):
+        train.train(experiment)
+    longer = experiment.model_copy(
+        update={"training": experiment.training.model_copy(update={"timesteps": 2048})}
+    )
+    again = train.train(longer, resume=True)
+    assert again["timesteps"] >= 2048
+    assert len(train.read_records(folder)) > len(records)
+    other = longer.model_copy(
+        update={"validation": longer.validation.model_copy(update={"episodes": 5})}
+    )
+    with pytest.raises(ConfigurationError, match="validation"):
+        train.train(other, resume=True)
+    task = fusion_gym.make_task(ENV, **experiment.environment.options)
+    make_policy(f"model:{folder / 'best_model.zip'}", task)
+
+
+def test_dqn_needs_the_discrete_action(tmp_path: Path) -> None:
+    config = small_config(tmp_path, "dqn", environment={"id": ENV, "options": {}})
+    with pytest.raises(ConfigurationError, match="action: discrete"):
+        train.train(load_experiment(config))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_an_interrupted_training_loses_nothing(tmp_path: Path, number: signal.Signals) -> None:
+    config = small_config(tmp_path, training={"timesteps": 10_000_000, "num_envs": 8})
+    command = [sys.executable, "-m", "agents.train", "--config", str(config)]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    folder = tmp_path / "run"
+    deadline = time.monotonic() + 120
+    while not (folder / "latest.zip").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.kill(process.pid, number)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert b"go on with --resume" in output
+    summary = json.loads((folder / "summary.json").read_text())
+    assert not summary["finished"]
+    records = len(train.read_records(folder))
+    resumed = [*command, "--resume", "--timesteps", str(summary["timesteps"] + 1500)]
+    subprocess.run(resumed, cwd=ROOT, check=True, capture_output=True, timeout=120)
+    later = json.loads((folder / "summary.json").read_text())
+    assert later["finished"]
+    assert later["timesteps"] >= summary["timesteps"] + 1500
+    assert len(train.read_records(folder)) > records
+
+
+def run_evaluation(*arguments: str) -> dict[str, Any]:
+    return evaluate.evaluate(evaluate.parser().parse_args(list(arguments)))
+
+
+def test_evaluation_writes_the_promised_json(tmp_path: Path) -> None:
+    file = tmp_path / "deep" / "result.json"
+    report = run_evaluation(
+        *("--env", ENV, "--set", "filter=tobit", "horizon=20", "--set", "tokens=unlimited"),
+        *("--policies", "always", "random:rate=0.5", "--episodes", "30", "--seed", "3"),
+        *("--reference", "always", "--json", str(file)),
+    )
+    written = json.loads(file.read_text())
+    assert written == json.loads(json.dumps(report))
+    assert list(written) == [
+        *("env", "episodes", "seed", "horizon", "settings", "policies", "reference"),
+    ]
+    assert (written["env"], written["episodes"], written["horizon"]) == (ENV, 30, 20)
+    assert written["settings"]["filter"] == "tobit"
+    always = written["policies"]["always"]
+    assert always["rate"] == [1.0, 1.0, 1.0]
+    assert set(always) == {
+        *("mse", "armse", "bound_trace", "nees", "rate", "requests", "tokens", "denied", "return"),
+    }
+    for key in ("mse", "bound_trace", "nees", "tokens", "denied", "return"):
+        assert always[key]["low"] <= always[key]["mean"] <= always[key]["high"]
+    difference = written["reference"]["differences"]["random:rate=0.5"]
+    random = written["policies"]["random:rate=0.5"]
+    assert difference["mean"] == pytest.approx(random["mse"]["mean"] - always["mse"]["mean"])
+
+
+def test_evaluation_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = str(tmp_path / "result.json")
+    common = ["--env", ENV, "--set", "horizon=10", "--episodes", "5", "--json", file]
+    first = run_evaluation(*common, "--policies", "always", "never")
+    ran: list[int] = []
+
+    def counted(results: Any) -> dict[str, Any]:
+        ran.append(results.episodes)
+        return summarise(results)
+
+    monkeypatch.setattr(evaluate, "summarise", counted)
+    second = run_evaluation(*common, "--resume", "--policies", "always", "never", "round_robin")
+    assert len(ran) == 1
+    assert second["policies"]["always"] == first["policies"]["always"]
+    with pytest.raises(ConfigurationError, match="another evaluation"):
+        run_evaluation(*common, "--seed", "1", "--resume", "--policies", "always")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--env", "fusion_gym/Nothing-v0"], "fusion_gym/Nothing-v0"),
+        (["--env", ENV, "--set", "filer=tobit"], "did you mean 'filter'"),
+        (["--env", ENV, "--set", "horizon"], "key=value"),
+        (["--env", ENV, "--reference", "never"], "reference = 'never'"),
+        (["--env", ENV, "--resume"], "without json"),
+        (["--env", ENV, "--episodes", "0"], "episodes = 0"),
+        (["--env", ENV, "--seed", "-1"], "seed = -1"),
+        ([], "--env"),
+    ],
+)
+def test_evaluation_refuses_with_one_line(arguments: list[str], message: str) -> None:
+    command = [sys.executable, "-m", "agents.evaluate", *arguments, "--policies", "always"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 1
+    error = result.stderr.strip().splitlines()[-1]
+    assert error.startswith("error: ")
+    assert message in error
+    assert "Traceback" not in result.stderr
+
+
+def test_demo_from_baselines_to_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sweep = tmp_path / "sweep.yaml"
+    curve = {"label": "innovation", "policy": "innovation_threshold:threshold={value}"}
+    content = {"points": ["never", "always"], "curves": [curve | {"values": [0.5, 1.0, 2.0]}]}
+    sweep.write_text(yaml.safe_dump(content))
+    monkeypatch.chdir(ROOT)
+    output = tmp_path / "demo"
+    arguments = ["demo", "--output", str(output), "--sweep", str(sweep), "--episodes", "20"]
+    monkeypatch.setattr(sys, "argv", [*arguments, "--timesteps", "16384"])
+    demo.main()
+    for setting in ("benchmark", "paper"):
+        folder = output / setting
+        for figure in ("pareto.png", "episode_agent.png", "episode_dynamic_event.png"):
+            assert (folder / figure).stat().st_size > 20_000
+        verdict = json.loads((folder / "comparison.json").read_text())
+        assert verdict["difference"]["mean"] == pytest.approx(verdict["mse"] - verdict["envelope"])
+        assert verdict["training"]["finished"]
+    began = (output / "paper" / "agent" / "final_model.zip").stat().st_mtime
+    demo.main()
+    records = train.read_records(output / "paper" / "agent")
+    assert len(records) == 1, "a finished training is not repeated"
+    assert (output / "paper" / "agent" / "final_model.zip").stat().st_mtime >= began
+
+
+def test_reproduce_prints_every_row() -> None:
+    comparison = load_comparison(CONFIGS / "tobit_oscillator_reproduce.yaml")
+    rows = reproduce.run(comparison, episodes=3, seed=0)
+    assert [row[0] for row in rows] == [row.label for row in comparison.rows]
+    assert all(len(row) == len(reproduce.COLUMNS) for row in rows)

@@ -1,0 +1,306 @@
+"""What cannot be used is refused at once, by an error that names the field and its value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+
+import fusion_gym
+from fusion_gym import ConfigurationError, make_sb3_vec_env, make_task
+from fusion_gym.evaluation import make_policy, run_episodes
+from fusion_gym.triggers import make_trigger
+
+ENV_ID = "fusion_gym/TobitOscillator-v0"
+
+
+def make_vector(num_envs: Any = 3, **options: Any) -> Any:
+    return gymnasium.make_vec(
+        ENV_ID, num_envs, vectorization_mode="vector_entry_point", **options
+    ).unwrapped
+
+
+def refused(call: Callable[[], Any], kind: type[Exception], parts: tuple[str, ...]) -> str:
+    with pytest.raises(kind) as caught:
+        call()
+    message = str(caught.value)
+    assert [part for part in parts if part not in message] == [], message
+    return message
+
+
+# Options of the environment: what is handed in, and what the message must contain.
+BAD_OPTIONS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
+    ({"initial_covariance": ((1, 2), (2, 1))}, ("2.", "positive definite", "-1")),
+    ({"initial_covariance": ((1, 0), (0, 0))}, ("initial_covariance", "positive definite")),
+    ({"initial_covariance": ((1, 0.5), (0.2, 1))}, ("0.5", "0.2", "symmetric")),
+    ({"initial_covariance": np.eye(3)}, ("(2, 2)", "(3, 3)")),
+    ({"initial_covariance": ((np.nan, 0), (0, 1))}, ("nan", "finite")),
+    ({"transition": ((1, 0, 0), (0, 1, 0))}, ("(2, 2)", "(2, 3)")),
+    ({"transition": "rotation"}, ("'rotation'", "numbers")),
+    ({"initial_mean": (1, 2, 3)}, ("(1, 2, 3)", "(3,)")),
+    ({"process_gain": (1, 2, 3)}, ("(1, 2, 3)", "(3,)")),
+    ({"process_variance": -0.1}, ("-0.1", "> 0")),
+    ({"process_noise": "ful"}, ("'ful'", "did you mean 'full'")),
+    ({"measurement_matrices": (((1, 0, 0),),)}, ("(any, any, 2)", "(1, 1, 3)")),
+    ({"measurement_variance": 0.0}, ("0.0", "> 0")),
+    ({"measurement_variance": (1, 2, 3)}, ("(1, 2, 3)", "(3, 2)")),
+    ({"censoring_threshold": np.nan}, ("nan", "finite")),
+    ({"censoring_threshold": np.inf}, ("inf", "finite")),
+    ({"censoring_threshold": (0, 0, 0, 0)}, ("0.", "(3, 2)")),
+    ({"censoring_threshold": "low"}, ("'low'",)),
+    ({"tokens": "many"}, ("'many'", "'limited', 'unlimited'")),
+    ({"token_rate": -1}, ("-1", ">= 0")),
+    ({"token_rate": "fast"}, ("'fast'", "number")),
+    ({"token_cost": -3.0}, ("-3.0", "> 0")),
+    ({"token_cost": (3.0, 0.0, 3.0)}, ("(3.0, 0.0, 3.0)", "> 0")),
+    ({"token_cost": (3.0, 3.0)}, ("(3.0, 3.0)", "(3,)")),
+    ({"token_capacity": 8.9}, ("8.9", "at least 9", "sharing='equal'", "costs up to 3")),
+    (
+        {"token_capacity": 2.5, "initial_tokens": 1.0, "sharing": "fixed"},
+        ("2.5", "at least", "cost of a transmission, 3"),
+    ),
+    ({"initial_tokens": 31.0}, ("31.0", "<= 30")),
+    ({"sharing": "equl"}, ("'equl'", "did you mean 'equal'")),
+    ({"filter": "papr"}, ("'papr'", "did you mean 'paper'")),
+    ({"silent": "hold", "filter": "tobit"}, ("'hold'", "filter='tobit'", "'paper'")),
+    ({"event_error": True, "filter": "tobit"}, ("True", "filter='tobit'", "'paper'")),
+    ({"silent": "hld"}, ("'hld'", "did you mean 'hold'")),
+    ({"event_error": "yes"}, ("'yes'", "True or False")),
+    ({"bound_epsilon": (1, 2)}, ("(1, 2)", "(14)")),
+    ({"information_shares": (0.5, 0.2, 0.2)}, ("[0.5, 0.2, 0.2]", "sum 1", "0.9")),
+    ({"information_shares": (0.0, 0.5, 0.5)}, ("[0.0, 0.5, 0.5]", "> 0")),
+    ({"information_shares": (0.5, 0.5)}, ("(0.5, 0.5)", "(3)")),
+    ({"trigger_threshold": (-1.0, 1.0, 1.0)}, ("(-1.0, 1.0, 1.0)", ">= 0")),
+    ({"trigger_divisor": 0.0}, ("0.0", "> 0")),
+    ({"random_start": 1}, ("1", "True or False")),
+    ({"horizon": 0}, ("0", "whole number >= 1")),
+    ({"horizon": 10.0}, ("10.0", "whole number >= 1")),
+    ({"information": "center"}, ("'center'", "did you mean 'centre'")),
+    ({"action": "continuous"}, ("'continuous'", "'binary', 'discrete'")),
+    ({"error": "square"}, ("'square'", "did you mean 'squared'")),
+    ({"error_weight": -1.0}, ("-1.0", ">= 0")),
+    ({"cost_weight": np.inf}, ("inf", "finite")),
+    ({"state_weights": (1.0, 1.0, 1.0)}, ("(1.0, 1.0, 1.0)", "(2,)")),
+    ({"state_weights": (1.0, -1.0)}, ("(1.0, -1.0)", ">= 0")),
+    ({"horizn": 5}, ("TobitOscillator-v0", "did you mean 'horizon'", "known are action")),
+]
+
+
+@pytest.mark.parametrize(("options", "parts"), BAD_OPTIONS, ids=lambda value: str(value)[:60])
+def test_options(options: dict[str, Any], parts: tuple[str, ...]) -> None:
+    """Every way to an environment says the same; the field that is to blame comes first."""
+    field = next(iter(options))
+    ways: list[Callable[[], Any]] = [
+        lambda: make_task(ENV_ID, **options),
+        lambda: gymnasium.make(ENV_ID, **options),
+        lambda: make_vector(**options),
+        lambda: make_sb3_vec_env(ENV_ID, 2, **options),
+    ]
+    messages = {refused(way, ConfigurationError, (field, *parts)) for way in ways}
+    assert len(messages) == 1
+
+
+@pytest.mark.parametrize("render_mode", ["human", "rgb_array"])
+@pytest.mark.filterwarnings("ignore:.*render_mode")
+def test_render_mode(render_mode: str) -> None:
+    for make in (lambda **o: gymnasium.make(ENV_ID, **o), make_vector):
+        refused(
+            lambda make=make: make(render_mode=render_mode),
+            ConfigurationError,
+            ("render_mode", repr(render_mode), "None"),
+        )
+
+
+@pytest.mark.parametrize("num_envs", [0, -2, 2.0, "2", True, None], ids=repr)
+def test_number_of_environments(num_envs: Any) -> None:
+    for make in (make_vector, lambda count: make_sb3_vec_env(ENV_ID, count)):
+        refused(
+            lambda make=make: make(num_envs),
+            ConfigurationError,
+            (f"num_envs = {num_envs!r}", "whole number >= 1"),
+        )
+
+
+@pytest.mark.parametrize(
+    ("call", "parts"),
+    [
+        (
+            lambda: make_task("fusion_gym/TobitOscilator-v0"),
+            ("'fusion_gym/TobitOscilator-v0'", "did you mean 'fusion_gym/TobitOscillator-v0'"),
+        ),
+        (lambda: make_task("CartPole-v1"), ("'CartPole-v1'", "fusion_gym/TobitOscillator-v0")),
+        (lambda: make_vector(autoreset_mode="same_step"), ("'same_step'", "mean 'SameStep'")),
+        (lambda: make_vector(autoreset_mode=3), ("autoreset_mode = 3", "'Disabled'")),
+        (lambda: make_vector(max_episode_steps=0), ("horizon = 0",)),
+        (lambda: make_sb3_vec_env(ENV_ID, 2, stagger=1), ("stagger = 1", "True or False")),
+        (lambda: gymnasium.make(ENV_ID).reset(options={"phase": 1}), ("'phase'",)),
+        (
+            lambda: make_vector().reset(options={"reset_masks": 1}),
+            ("'reset_masks'", "did you mean 'reset_mask'"),
+        ),
+        (lambda: run_episodes(make_task(ENV_ID), make_trigger("never"), 0, 1), ("episodes = 0",)),
+        (lambda: run_episodes(make_task(ENV_ID), make_trigger("never"), 5, -1), ("seed = -1",)),
+    ],
+    ids=lambda value: value[0] if isinstance(value, tuple) else "call",
+)
+def test_calls(call: Callable[[], Any], parts: tuple[str, ...]) -> None:
+    refused(call, ConfigurationError, parts)
+
+
+@pytest.mark.parametrize(
+    ("spec", "parts"),
+    [
+        ("randm", ("unknown policy 'randm'", "did you mean 'random'")),
+        ("", ("unknown policy ''", "always, dynamic_event")),
+        ("random:rat=0.1", ("'rat'", "did you mean 'rate'")),
+        ("always:rate=1", ("'rate'", "'always'")),
+        ("random:rate", ("'rate'", "key=value")),
+        ("random:rate=0.1,rate=0.2", ("'rate'", "twice")),
+        ("random:rate=1.5", ("rate = 1.5", "<= 1")),
+        ("random:rate=0.1/0.2", ("rate = (0.1, 0.2)", "(3,)")),
+        ("random:rate=often", ("rate = 'often'", "number")),
+        ("send_on_delta:threshold=-1", ("threshold = -1", ">= 0")),
+        ("innovation_threshold:threshold=-1", ("threshold = -1", ">= 0")),
+        ("variance_threshold:threshold=-1", ("threshold = -1", ">= 0")),
+        ("information_gain:threshold=-1", ("threshold = -1", ">= 0")),
+        ("dynamic_event:threshold=0.1/-1/0.3", ("threshold = (0.1, -1, 0.3)", ">= 0")),
+        ("dynamic_event:divisor=0", ("divisor = 0", "> 0")),
+        ("dynamic_event:scale=-1", ("scale = -1", ">= 0")),
+        ("dynamic_event:initial=nan", ("initial = 'nan'", "finite")),
+        ("send_on_delta:threshold=0.1/0.2", ("threshold = (0.1, 0.2)", "(3,)")),
+        ("information_gain:threshold=0.1/0.2/0.3,at_most=none", ("threshold = (0.1, 0.2, 0.3)",)),
+        ("variance_threshold:threshold=0.1/0.2/0.3,at_most=none", ("threshold = (0.1, 0.2",)),
+        ("innovation_threshold:whitened=1", ("whitened = 1", "True or False")),
+        ("innovation_threshold:at_most=0", ("at_most = 0", "whole number >= 1")),
+        ("periodic:period=0", ("period = 0", "whole number >= 1")),
+        ("round_robin:period=2.5", ("period = 2.5", "whole number >= 1")),
+        ("model:", ("model ''", "no such file")),
+        ("model:nowhere/agent.zip", ("'nowhere/agent.zip'", "no such file")),
+        ("model:nowhere,greedy=true", ("'greedy'", "deterministic")),
+    ],
+)
+def test_policies(spec: str, parts: tuple[str, ...]) -> None:
+    refused(lambda: make_policy(spec, make_task(ENV_ID)), ConfigurationError, parts)
+
+
+def test_a_model_is_no_trigger() -> None:
+    refused(lambda: make_trigger("model:agent.zip"), ConfigurationError, ("'model",))
+
+
+BAD_BINARY: list[tuple[Any, tuple[str, ...]]] = [
+    ([1, np.nan, 0], ("nan", "0 or 1")),
+    ([1, 0, np.inf], ("inf", "0 or 1")),
+    ([2, 0, 0], ("= 2", "0 or 1")),
+    ([0, -1, 0], ("= -1", "0 or 1")),
+    ([0, 0, 0.5], ("= 0.5", "0 or 1")),
+    (["up", "0", "1"], ("up",)),
+    ([1, 0], ("shape",)),
+    ([[1, 0, 1]], ("shape",)),
+    (1, ("shape",)),
+    (None, ("action",)),
+    (np.array([1, 0, 1], dtype=object), ("object",)),
+]
+BAD_DISCRETE: list[tuple[Any, tuple[str, ...]]] = [
+    (8, ("= 8", "0..7")),
+    (-1, ("= -1", "0..7")),
+    (2.5, ("= 2.5", "0..7")),
+    (np.nan, ("nan", "0..7")),
+    ([3], ("shape",)),
+    ("left", ("left",)),
+    (np.array(3, dtype=object), ("object",)),
+]
+
+
+@pytest.mark.parametrize(
+    ("kind", "action", "parts"),
+    [("binary", *case) for case in BAD_BINARY] + [("discrete", *case) for case in BAD_DISCRETE],
+    ids=lambda value: repr(value)[:40],
+)
+def test_actions(kind: str, action: Any, parts: tuple[str, ...]) -> None:
+    """Nothing moves when an action is refused: the next good step is that of an untouched twin."""
+    good = 3 if kind == "discrete" else [1, 1, 0]
+    single, twin = (gymnasium.make(ENV_ID, action=kind).unwrapped for _ in range(2))
+    vector, sb3 = make_vector(1, action=kind), make_sb3_vec_env(ENV_ID, 1, action=kind)
+    sb3.seed(0)
+    for env in (single, twin, vector):
+        env.reset(seed=0)
+    sb3.reset()
+    refused(lambda: single.step(action), ValueError, ("action", *parts))
+    batch = np.asarray(action)[None]
+    refused(lambda: vector.step(batch), ValueError, ("action", *parts))
+    refused(lambda: sb3.step(batch), ValueError, ("action", *parts))
+    expected = twin.step(good)[1]
+    assert single.step(good)[1] == pytest.approx(expected, rel=1e-12)
+    assert vector.step(np.array([good]))[1] == pytest.approx(expected, rel=1e-10)
+    assert sb3.step(np.array([good]))[1] == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_first_bad_action_of_a_batch_is_named() -> None:
+    env = make_vector(4)
+    env.reset(seed=0)
+    actions = np.zeros((4, 3))
+    actions[2, 1] = 7.0
+    refused(lambda: env.step(actions), ValueError, ("[2, 1]", "7.0"))
+    refused(lambda: env.step(np.zeros((3, 3))), ValueError, ("(3, 3)", "(4, 3)"))
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [[True, False, True], np.ones(2, bool), np.ones((3, 1), bool), np.ones(3), np.zeros(3, bool)],
+    ids=repr,
+)
+def test_reset_masks(mask: Any) -> None:
+    env = make_vector()
+    env.reset(seed=0)
+    message = refused(
+        lambda: env.reset(options={"reset_mask": mask}), ValueError, ("reset_mask = ", "(3,)")
+    )
+    assert repr(mask) in message
+
+
+@pytest.mark.parametrize(
+    ("seed", "kind", "parts"),
+    [
+        ([1, 2], ValueError, ("2 entries", "3")),
+        ([1, 2, -3], gymnasium.error.Error, ("-3",)),
+        (-1, gymnasium.error.Error, ("-1",)),
+    ],
+    ids=str,
+)
+def test_seeds(seed: Any, kind: type[Exception], parts: tuple[str, ...]) -> None:
+    refused(lambda: make_vector().reset(seed=seed), kind, parts)
+
+
+def test_a_reset_comes_first() -> None:
+    nothing = np.zeros((3, 3), dtype=np.int8)
+    some = {"reset_mask": np.array([True, False, True])}
+    env = make_vector()
+    refused(lambda: env.step(nothing), ResetNeeded, ("reset",))
+    refused(lambda: env.reset(options=some), ValueError, ("reset_mask", "never reset"))
+    single = gymnasium.make(ENV_ID).unwrapped
+    refused(lambda: single.step(nothing[0]), ResetNeeded, ("reset",))
+
+
+def test_sb3_needs_a_reset_too() -> None:
+    env = make_sb3_vec_env(ENV_ID, 3)
+    refused(lambda: env.step(np.zeros((3, 3), dtype=np.int8)), ResetNeeded, ("reset",))
+
+
+def test_finished_runs_must_be_reset_when_autoreset_is_disabled() -> None:
+    env = make_vector(3, autoreset_mode="Disabled", horizon=2)
+    env.reset(seed=0)
+    nothing = np.zeros((3, 3), dtype=np.int8)
+    env.step(nothing)
+    env.reset(options={"reset_mask": np.array([False, True, False])})
+    assert env.step(nothing)[3].tolist() == [True, False, True]
+    refused(lambda: env.step(nothing), ResetNeeded, ("[0, 2]", "reset_mask"))
+    env.reset(options={"reset_mask": np.array([True, False, False])})
+    refused(lambda: env.step(nothing), ResetNeeded, ("[2]",))
+
+
+def test_configuration_errors_are_value_errors() -> None:
+    assert issubclass(fusion_gym.ConfigurationError, ValueError)

@@ -1,0 +1,399 @@
+"""Episodes, metrics, intervals and the envelope, each against the plainest way to compute it."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from fusion_gym import ConfigurationError, make_sb3_vec_env, make_task
+from fusion_gym.envs import EpisodeBatch, Task
+from fusion_gym.evaluation import (
+    EpisodeResults,
+    compare_with_envelope,
+    lower_envelope,
+    make_policy,
+    mean_interval,
+    paired_difference,
+    record_episode,
+    run_episodes,
+    summarise,
+)
+from fusion_gym.evaluation.model_policy import tag_model
+
+ENV_ID = "fusion_gym/TobitOscillator-v0"
+OPTIONS: dict[str, Any] = {"horizon": 12, "token_cost": (3.0, 2.0, 1.0), "token_rate": 2.0}
+
+
+@pytest.fixture(scope="module")
+def task() -> Task:
+    return make_task(ENV_ID, **OPTIONS)
+
+
+def evaluate(task: Task, spec: str, episodes: int, seed: int = 10) -> EpisodeResults:
+    return run_episodes(task, make_policy(spec, task), episodes, seed)
+
+
+def fake(mse: Any, rate: Any) -> EpisodeResults:
+    """Results of which only the error and the rate matter."""
+    errors = np.asarray(mse, dtype=float)
+    values = {field.name: np.zeros(len(errors)) for field in fields(EpisodeResults)}
+    return EpisodeResults(**(values | {"mse": errors, "rate": np.full((len(errors), 3), rate)}))
+
+
+@pytest.mark.parametrize(
+    "spec", ["send_on_delta", "dynamic_event", "information_gain", "round_robin"]
+)
+def test_metrics_against_a_plain_loop(task: Task, spec: str) -> None:
+    """Five episodes at seed 10 are the single environments with the seeds 10 to 14."""
+    results = evaluate(task, spec, 5)
+    squared_error = []
+    for episode in range(5):
+        env = gymnasium.make(ENV_ID, **OPTIONS)
+        batch = env.unwrapped.batch
+        policy = make_policy(spec, task)
+        policy.reset(1)
+        env.reset(seed=10 + episode)
+        rows: dict[str, list[Any]] = {field.name: [] for field in fields(EpisodeResults)}
+        truncated = False
+        while not truncated:
+            requests = policy(batch.signals())[:, 0]
+            _, reward, _, truncated, info = env.step(requests.astype(np.int8))
+            mean, covariance = task.system.fused(batch.delivered)
+            error = (task.system.truth(batch.delivered) - mean)[:, 0]
+            claimed = covariance[..., 0]
+            rows["squared_error"].append(info["squared_error"])
+            rows["mse"].append(info["squared_error"].sum())
+            rows["bound_trace"].append(np.trace(claimed))
+            rows["nees"].append(error @ np.linalg.solve(claimed, error) / 2)
+            rows["rate"].append(info["granted"])
+            rows["requests"].append(info["granted"] | info["denied"])
+            rows["tokens"].append(info["cost"])
+            rows["denied"].append(info["denied"].sum())
+            rows["returns"].append(reward)
+        assert len(rows["mse"]) == 12
+        squared_error.append(rows.pop("squared_error"))
+        for name, row in rows.items():
+            expected = np.sum(row, 0) if name == "returns" else np.mean(row, 0)
+            np.testing.assert_allclose(
+                getattr(results, name)[episode], expected, rtol=1e-9, err_msg=name
+            )
+    np.testing.assert_allclose(results.squared_error, np.mean(squared_error, 0), rtol=1e-9)
+    np.testing.assert_allclose(results.tokens, results.rate @ [3.0, 2.0, 1.0])
+    assert results.episodes == 5
+
+
+def test_results_do_not_depend_on_how_episodes_are_batched(
+    task: Task, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = evaluate(task, "send_on_delta", 11)
+    steps: list[int] = []
+    monkeypatch.setattr("fusion_gym.evaluation.episodes._BATCH", 4)
+    parts = run_episodes(task, make_policy("send_on_delta", task), 11, 10, steps.append)
+    assert sum(steps) == 11 * 12
+    for field in fields(EpisodeResults):
+        np.testing.assert_allclose(
+            getattr(parts, field.name), getattr(whole, field.name), rtol=1e-9, atol=1e-12
+        )
+    assert not np.allclose(evaluate(task, "send_on_delta", 11, seed=500).mse, whole.mse)
+
+
+def test_recorded_episode_is_the_evaluated_one(task: Task) -> None:
+    results = evaluate(task, "send_on_delta", 3)
+    for episode in range(3):
+        path = record_episode(task, make_policy("send_on_delta", task), 10 + episode)
+        assert path.truth.shape == path.mean.shape == path.variance.shape == (12, 2)
+        assert path.local_mean.shape == (12, 3, 2)
+        error = ((path.truth - path.mean) ** 2).sum(1).mean()
+        assert error == pytest.approx(results.mse[episode], rel=1e-9)
+        np.testing.assert_allclose(path.granted.mean(0), results.rate[episode])
+        spent = path.granted @ np.array([3.0, 2.0, 1.0])
+        level = 10.0
+        for tokens, cost in zip(path.tokens, spent, strict=True):
+            level = min(level + 2.0 - cost, 30.0)
+            assert tokens == pytest.approx(level)
+        assert (path.requested | ~path.granted).all()
+
+
+def test_summary(task: Task) -> None:
+    results = evaluate(task, "innovation_threshold", 40)
+    summary = summarise(results)
+    sources = {
+        "mse": results.mse,
+        "bound_trace": results.bound_trace,
+        "nees": results.nees,
+        "tokens": results.tokens,
+        "denied": results.denied,
+        "return": results.returns,
+    }
+    assert summary.keys() == {*sources, "armse", "rate", "requests"}
+    for name, samples in sources.items():
+        assert summary[name].keys() == {"mean", "low", "high"}
+        assert all(type(value) is float for value in summary[name].values())
+        assert summary[name]["mean"] == pytest.approx(np.mean(samples))
+        assert summary[name]["low"] < summary[name]["mean"] < summary[name]["high"]
+    for name in ("rate", "requests"):
+        assert summary[name] == pytest.approx(getattr(results, name).mean(0).tolist())
+    # Σ_t √(mean over episodes of the squared error at t) / H, written out
+    policy = make_policy("innovation_threshold", task)
+    paths = [record_episode(task, policy, 10 + episode) for episode in range(40)]
+    errors = [(path.truth - path.mean) ** 2 for path in paths]
+    for state in range(2):
+        total = 0.0
+        for time in range(12):
+            total += math.sqrt(sum(error[time, state] for error in errors) / 40)
+        assert summary["armse"][state] == pytest.approx(total / 12, rel=1e-9)
+
+
+@pytest.mark.parametrize("law", ["normal", "exponential"])
+def test_interval_covers_the_mean_19_times_in_20(law: str) -> None:
+    """400 samples of 50, each with the true mean 1."""
+    rng = np.random.default_rng(17)
+    hits = 0
+    for _ in range(400):
+        samples = rng.normal(1.0, 2.0, 50) if law == "normal" else rng.exponential(1.0, 50)
+        mean, low, high = mean_interval(samples, seed=int(rng.integers(2**31)))
+        assert mean == np.mean(samples)
+        hits += low <= 1.0 <= high
+    # Percentile intervals of 50 draws of a skew law cover a little less than they claim.
+    assert (0.91 if law == "normal" else 0.88) <= hits / 400 <= 0.98
+
+
+@pytest.mark.parametrize("samples", [[3.5], [2.0, 2.0, 2.0], [0.0] * 50], ids=str)
+def test_interval_of_samples_without_spread(samples: list[float]) -> None:
+    assert mean_interval(np.array(samples)) == (samples[0], samples[0], samples[0])
+
+
+def test_interval_is_reproducible_and_narrows() -> None:
+    samples = np.random.default_rng(0).normal(size=1600)
+    few, many = mean_interval(samples[:100]), mean_interval(samples)
+    assert mean_interval(samples) == many
+    ratio = (few.high - few.low) / (many.high - many.low)
+    assert ratio == pytest.approx(4.0, rel=0.25)
+
+
+def test_pairing_removes_the_noise_that_policies_share(task: Task) -> None:
+    one = evaluate(task, "innovation_threshold:threshold=1", 300)
+    other = evaluate(task, "innovation_threshold:threshold=1.1", 300)
+    elsewhere = evaluate(task, "innovation_threshold:threshold=1.1", 300, seed=5000)
+    paired, unpaired = paired_difference(one, other), paired_difference(one, elsewhere)
+    assert paired.mean == pytest.approx(np.mean(one.mse - other.mse))
+    assert (paired.high - paired.low) < 0.5 * (unpaired.high - unpaired.low)
+    assert paired_difference(one, one) == (0.0, 0.0, 0.0)
+    with pytest.raises(ConfigurationError, match="episodes = 300 and 5"):
+        paired_difference(one, evaluate(task, "never", 5))
+
+
+clouds = st.lists(st.tuples(st.integers(0, 20), st.integers(1, 40)), min_size=1, max_size=12).map(
+    lambda points: {f"p{i}": (rate / 20, mse / 8) for i, (rate, mse) in enumerate(points)}
+)
+
+
+def envelope_at(hull: Any, rate: float) -> float:
+    """The envelope by interpolation; to the right of its last point it stays level."""
+    return float(np.interp(rate, [p.rate for p in hull], [p.mse for p in hull]))
+
+
+@settings(deadline=None, max_examples=200)
+@given(cloud=clouds)
+def test_envelope_lies_below_every_policy_and_every_mixture(
+    cloud: dict[str, tuple[float, float]],
+) -> None:
+    hull = lower_envelope({name: fake([mse], rate) for name, (rate, mse) in cloud.items()})
+    for point in hull:
+        assert (point.rate, point.mse) == pytest.approx(cloud[point.name])
+    for rate, mse in cloud.values():
+        assert envelope_at(hull, rate) <= mse + 1e-12
+        assert rate >= hull[0].rate - 1e-12
+    rates, errors = np.array([p.rate for p in hull]), np.array([p.mse for p in hull])
+    assert (np.diff(rates) > 0).all()
+    assert (np.diff(errors) < 0).all()
+    assert (np.diff(np.diff(errors) / np.diff(rates)) > -1e-12).all()
+    assert hull[-1].mse == pytest.approx(min(mse for _, mse in cloud.values()))
+
+
+@settings(deadline=None, max_examples=60)
+@given(cloud=clouds, rate=st.integers(0, 20), data=st.data())
+def test_comparison_mixes_episode_by_episode(
+    cloud: dict[str, tuple[float, float]], rate: int, data: st.DataObject
+) -> None:
+    noise = np.random.default_rng(data.draw(st.integers(0, 999))).normal(size=(13, 6))
+    noise -= noise.mean(1, keepdims=True)
+    baselines = {name: fake(mse + noise[i], r) for i, (name, (r, mse)) in enumerate(cloud.items())}
+    hull = lower_envelope(baselines)
+    policy = fake(2.0 + noise[12], rate / 20)
+    if rate / 20 < hull[0].rate - 1e-12:
+        with pytest.raises(ConfigurationError, match="below every baseline"):
+            compare_with_envelope(policy, baselines)
+        return
+    result = compare_with_envelope(policy, baselines)
+    expected = envelope_at(hull, rate / 20)
+    assert result.envelope == pytest.approx(expected)
+    assert result.difference.mean == pytest.approx(2.0 - expected)
+    assert 1 <= len(result.between) <= 2
+    assert set(result.between) <= {point.name for point in hull}
+
+
+def test_envelope_by_hand() -> None:
+    baselines = {
+        "never": fake([8.0, 4.0], 0.0),
+        "inside": fake([5.0, 5.5], 0.2),
+        "good": fake([3.0, 1.0], 0.4),
+        "worse": fake([3.0, 3.0], 0.6),
+        "always": fake([1.0, 1.0], 1.0),
+        "wasteful": fake([1.5, 1.5], 1.0),
+    }
+    hull = lower_envelope(baselines)
+    assert [point.name for point in hull] == ["never", "good", "always"]
+    assert [point.rate for point in hull] == pytest.approx([0.0, 0.4, 1.0])
+    assert [point.mse for point in hull] == pytest.approx([6.0, 2.0, 1.0])
+    # At a rate of 0.1 three quarters never and one quarter good: 6.75 and 3.25
+    result = compare_with_envelope(fake([6.0, 3.0], 0.1), baselines)
+    assert result.between == ("never", "good")
+    assert result.envelope == pytest.approx(5.0)
+    assert result.difference.mean == pytest.approx((6.0 - 6.75 + 3.0 - 3.25) / 2)
+    assert result.difference.low >= -0.75 - 1e-12
+    assert result.difference.high <= -0.25 + 1e-12
+    # Exactly at a policy of the envelope, that policy alone
+    result = compare_with_envelope(fake([3.0, 1.0], 0.4), baselines)
+    assert result.between == ("good",)
+    assert result.difference == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
+    with pytest.raises(ConfigurationError, match="add 'never'"):
+        compare_with_envelope(fake([1.0, 1.0], 0.1), {"always": baselines["always"]})
+    with pytest.raises(ConfigurationError, match="paired"):
+        compare_with_envelope(fake([1.0, 1.0, 1.0], 0.4), baselines)
+    with pytest.raises(ConfigurationError, match="at least one"):
+        lower_envelope({})
+
+
+def test_nothing_beats_the_envelope_of_itself(task: Task) -> None:
+    specs = ["never", "always", *(f"send_on_delta:threshold={k}" for k in (0.5, 1, 2, 3))]
+    results = {spec: evaluate(task, spec, 60) for spec in specs}
+    for result in results.values():
+        assert compare_with_envelope(result, results).difference.mean >= -1e-12
+
+
+ALGORITHMS: dict[str, tuple[type[BaseAlgorithm], dict[str, Any], dict[str, Any]]] = {
+    "ppo": (PPO, {}, {"n_steps": 4, "batch_size": 64, "n_epochs": 2}),
+    "a2c": (A2C, {"information": "centre"}, {"n_steps": 4}),
+    "dqn": (DQN, {"action": "discrete"}, {"learning_starts": 64, "buffer_size": 1000}),
+}
+TWO_SENSORS: dict[str, Any] = {"measurement_matrices": (np.eye(2), np.eye(2)), "token_cost": 3.0}
+TWO_SENSORS |= {"trigger_threshold": 0.1, "trigger_decay": 0.1}
+
+
+class Trained(NamedTuple):
+    model: BaseAlgorithm
+    task: Task
+    tagged: str
+    untagged: str
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Trained]:
+    """A small agent of every algorithm, after a few hundred steps, with and without a tag."""
+    result = {}
+    folder = tmp_path_factory.mktemp("models")
+    for name, (algorithm, options, parameters) in ALGORITHMS.items():
+        env = make_sb3_vec_env(ENV_ID, 64, **OPTIONS, **options)
+        model = algorithm(
+            "MlpPolicy", env, seed=0, device="cpu", policy_kwargs={"net_arch": [8]}, **parameters
+        )
+        model.learn(512)
+        paths = str(folder / f"{name}_tagged"), str(folder / f"{name}.zip")
+        model.save(paths[1])
+        tag_model(model, env.task)
+        model.save(paths[0])
+        result[name] = Trained(model, env.task, *paths)
+    return result
+
+
+@pytest.mark.parametrize("tagged", [True, False], ids=["tagged", "untagged"])
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_a_saved_agent_decides_as_it_did(
+    trained: dict[str, Trained], name: str, tagged: bool
+) -> None:
+    agent = trained[name]
+    spec = f"model:path={agent.tagged}" if tagged else f"model:{agent.untagged}"
+    policy: Any = make_policy(spec, agent.task)
+    chance: Any = make_policy(f"{spec},deterministic=false", agent.task)
+    if tagged:
+        assert type(policy.model) is type(agent.model)
+    policy.reset(200)
+    batch = EpisodeBatch(agent.task, 200)
+    batch.seed(np.arange(200), list(range(200)))
+    batch.reset()
+    drawn = []
+    for _ in range(12):
+        signals = batch.signals()
+        action, _ = agent.model.predict(batch.observe(), deterministic=True)
+        expected = [
+            [bool(int(one) >> s & 1) if name == "dqn" else bool(one[s]) for one in action]
+            for s in range(3)
+        ]
+        assert policy(signals).tolist() == expected
+        for seed in (1, 1, 2):
+            chance.reset(200, seed)
+            drawn.append(chance(signals))
+        batch.step(policy(signals))
+    np.testing.assert_array_equal(drawn[0::3], drawn[1::3])
+    if name != "dqn":  # which draws one coin for all, and that with a probability of 5 %
+        assert not np.array_equal(drawn[0::3], drawn[2::3])
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "parts"),
+    [
+        ("a2c", {}, ("layout", "'sensors'", "whitened_innovation[0,0]")),
+        ("ppo", {"information": "centre"}, ("layout", "'centre'", "whitened_innovation[0,0]")),
+        ("ppo", TWO_SENSORS, ("layout", "whitened_innovation[2,0]")),
+    ],
+    ids=["centre's agent", "sensors' agent", "fewer sensors"],
+)
+def test_an_agent_of_another_layout_is_refused(
+    trained: dict[str, Trained], name: str, options: dict[str, Any], parts: tuple[str, ...]
+) -> None:
+    agent, other = trained[name], make_task(ENV_ID, **(OPTIONS | options))
+    shape = str(agent.model.observation_space.shape)
+    for path, texts in ((agent.tagged, parts), (agent.untagged, ("layout", shape))):
+        with pytest.raises(ConfigurationError) as caught:
+            make_policy(f"model:{path}", other)
+        assert [text for text in (path, *texts) if text not in str(caught.value)] == []
+
+
+class Misfit(gymnasium.Env[Any, Any]):
+    """The task's observations with another action space."""
+
+    def __init__(self, task: Task) -> None:
+        self.observation_space = gymnasium.make(ENV_ID, **OPTIONS).observation_space
+        self.action_space = gymnasium.spaces.MultiBinary(task.sensors + 2)
+
+
+def test_files_that_hold_no_fitting_agent(task: Task, tmp_path: Path) -> None:
+    text, empty = tmp_path / "notes.zip", tmp_path / "empty.zip"
+    text.write_text("no model")
+    with zipfile.ZipFile(empty, "w") as archive:
+        archive.writestr("notes.txt", "no model")
+    misfit = tmp_path / "misfit.zip"
+    PPO("MlpPolicy", Misfit(task), n_steps=2, batch_size=2, device="cpu").save(misfit)
+    for path, part in (
+        (tmp_path / "absent", "no such file"),
+        (tmp_path, "no such file"),
+        (text, "no Stable-Baselines3 model"),
+        (empty, "no observation space"),
+        (misfit, "MultiBinary(5)"),
+    ):
+        with pytest.raises(ConfigurationError) as caught:
+            make_policy(f"model:{path}", task)
+        assert str(path) in str(caught.value)
+        assert part in str(caught.value)

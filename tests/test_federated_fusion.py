@@ -1,0 +1,157 @@
+"""Federated fusion against its formula, and against the centralised Kalman filter."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter as FilterPyFilter
+from numpy.typing import NDArray
+
+from fusion_gym import ConfigurationError
+from fusion_gym.filters import KalmanFilter, NodeFilter, TobitKalmanFilter
+from fusion_gym.fusion import FederatedFusion
+from fusion_gym.plants import LinearPlant
+from fusion_gym.sensors import CensoredSensors
+from fusion_gym.systems import FederatedTobitSystem
+
+Array = NDArray[np.float64]
+EQUAL = (1 / 3, 1 / 3, 1 / 3)
+UNEQUAL = (0.5, 0.3, 0.2)
+MATRICES = np.array([[[1.0, 0.0], [0.3, 1.0]], [[0.0, 1.0], [1.0, -1.0]], [[1.0, 2.0], [0.0, 0.5]]])
+VARIANCES = np.array([[0.5, 0.2], [1.0, 0.1], [0.3, 2.0]])
+TRANSITION = np.array([[0.9, 0.4], [-0.4, 0.9]])
+PROCESS = np.outer([0.3, 0.1], [0.3, 0.1])  # rank one
+
+
+def nodes(generator: np.random.Generator, sensors: int, states: int, runs: int) -> Any:
+    mean = generator.normal(size=(sensors, states, runs))
+    factor = generator.normal(size=(sensors, states, states + 1, runs))
+    return mean, np.einsum("sikN,sjkN->sijN", factor, factor)
+
+
+@pytest.mark.parametrize("sensors", [1, 2, 3, 7])
+@pytest.mark.parametrize("states", [1, 2, 3, 5])
+def test_fusion_is_the_information_weighted_sum(sensors: int, states: int) -> None:
+    mean, covariance = nodes(np.random.default_rng(states), sensors, states, runs=9)
+    fused_mean, fused = FederatedFusion.create(None, sensors).fuse(mean, covariance)
+    for run in range(9):
+        information = [np.linalg.inv(covariance[s, :, :, run]) for s in range(sensors)]
+        wanted = np.linalg.inv(np.sum(information, axis=0))
+        weighted = np.sum([i @ mean[s, :, run] for s, i in enumerate(information)], axis=0)
+        np.testing.assert_allclose(fused[..., run], wanted, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(fused_mean[:, run], wanted @ weighted, rtol=1e-9, atol=1e-9)
+
+
+def test_shares_do_not_enter_the_fusion_itself() -> None:
+    mean, covariance = nodes(np.random.default_rng(1), 3, 2, runs=4)
+    equal = FederatedFusion.create(EQUAL, 3).fuse(mean, covariance)
+    unequal = FederatedFusion.create(UNEQUAL, 3).fuse(mean, covariance)
+    assert np.array_equal(equal[0], unequal[0])
+    assert np.array_equal(equal[1], unequal[1])
+
+
+@pytest.mark.parametrize("share", [None, UNEQUAL, (0.98, 0.01, 0.01)])
+def test_what_is_distributed_fuses_to_what_it_was(share: Any) -> None:
+    generator = np.random.default_rng(2)
+    mean, covariance = (value[0] for value in nodes(generator, 1, 3, runs=5))
+    fusion = FederatedFusion.create(share, 3)
+    given_mean, given = fusion.distribute(mean, covariance)
+    weights = EQUAL if share is None else share
+    for sensor, weight in enumerate(weights):
+        np.testing.assert_allclose(given[sensor], covariance / weight, rtol=1e-15)
+        assert np.array_equal(given_mean[sensor], mean)
+    back_mean, back = fusion.fuse(given_mean, given)
+    np.testing.assert_allclose(back, covariance, rtol=1e-9)
+    np.testing.assert_allclose(back_mean, mean, rtol=1e-9)
+
+
+def make_system(kind: Any, share: Any) -> FederatedTobitSystem:
+    """Uncensored sensors that all differ, and a process covariance without an inverse."""
+    plant = LinearPlant.create(TRANSITION, PROCESS, [2.0, -1.0], 0.4 * np.eye(2))
+    sensors = CensoredSensors.create(MATRICES, VARIANCES, -np.inf, 2)
+    node_filter: NodeFilter = kind(sensors)
+    return FederatedTobitSystem(
+        plant=plant,
+        filter=node_filter,
+        fusion=FederatedFusion.create(share, 3),
+        random_start=False,
+        state_names=("x1", "x2"),
+        scale=np.ones(2),
+        reference=np.ones(2),
+    )
+
+
+@pytest.mark.parametrize("kind", [KalmanFilter, TobitKalmanFilter])
+@pytest.mark.parametrize("share", [None, UNEQUAL, (0.01, 0.01, 0.98)])
+@pytest.mark.parametrize("arrival", ["all", "some"])
+def test_uncensored_federation_is_the_centralised_kalman_filter(
+    kind: Any, share: Any, arrival: str
+) -> None:
+    """Whoever delivers, and however the information is shared: the centre loses nothing."""
+    system, runs, steps = make_system(kind, share), 4, 40
+    generator = np.random.default_rng(6)
+    state = system.start(generator.normal(size=(system.start_channels, runs)))
+    central = []
+    for _ in range(runs):
+        other = FilterPyFilter(dim_x=2, dim_z=6)
+        other.x, other.P = np.array([[2.0], [-1.0]]), 0.4 * np.eye(2)
+        other.F, other.Q = TRANSITION, PROCESS
+        central.append(other)
+    for _ in range(steps):
+        state = system.sense(state, generator.normal(size=(system.noise_channels, runs)))
+        granted = np.ones((3, runs), dtype=np.bool_)
+        if arrival == "some":
+            granted = generator.random((3, runs)) < 0.5
+        state = system.deliver(state, granted)
+        mean, covariance = system.fused(state)
+        for run, other in enumerate(central):
+            other.predict()
+            kept = granted[:, run]
+            if kept.any():
+                other.update(
+                    state.measurement[kept, :, run].reshape(-1, 1),
+                    R=np.diag(VARIANCES[kept].ravel()),
+                    H=MATRICES[kept].reshape(-1, 2),
+                )
+            np.testing.assert_allclose(mean[:, run], other.x[:, 0], rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(covariance[..., run], other.P, rtol=1e-9, atol=1e-11)
+
+
+def test_inflating_only_the_fused_covariance_is_not_centralised() -> None:
+    """What the process covariance's own share is good for: without it the filter is too sure."""
+    prior, weight = 0.4 * np.eye(2), 1 / 3
+    predicted = TRANSITION @ prior @ TRANSITION.T + PROCESS
+    careless = TRANSITION @ (prior / weight) @ TRANSITION.T + PROCESS
+    careless_mean, careless_fused = FederatedFusion.create(None, 3).fuse(
+        np.zeros((3, 2, 1)), np.broadcast_to(careless[..., None], (3, 2, 2, 1))
+    )
+    assert np.all(careless_mean == 0.0)
+    assert np.trace(careless_fused[..., 0]) < np.trace(predicted) - 0.05
+
+
+@pytest.mark.parametrize(
+    ("share", "reason"),
+    [
+        ((0.5, 0.3, 0.3), "sum 1"),
+        ((0.3, 0.3, 0.3), "sum 1"),
+        ((1.2, -0.1, -0.1), "> 0"),
+        ((0.5, 0.5, 0.0), "> 0"),
+        ((0.5, 0.5), "shape"),
+        (0.5, "shape"),
+        ((0.5, 0.5, float("nan")), "finite"),
+        ("equal", "numbers"),
+    ],
+)
+def test_bad_shares_are_refused(share: Any, reason: str) -> None:
+    with pytest.raises(ConfigurationError) as refused:
+        FederatedFusion.create(share, 3)
+    message = str(refused.value)
+    assert message.startswith("information_shares = ")
+    assert reason in message
+    assert str(np.ravel(share)[0]) in message
+
+
+def test_equal_shares_are_the_default() -> None:
+    assert FederatedFusion.create(None, 4).share.tolist() == [[0.25]] * 4

@@ -1,0 +1,288 @@
+"""The token bucket against a scalar loop, its properties, and what it refuses."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fusion_gym import ConfigurationError
+from fusion_gym.network import SHARING_RULES, TokenBucket
+
+PAPER = {"rate": 5.0, "capacity": 30.0, "initial": 10.0, "cost": 3.0, "sensors": 3}
+
+
+def scalar_step(
+    tokens: float,
+    requests: list[bool],
+    costs: list[float],
+    rate: float,
+    capacity: float,
+    sharing: str,
+    step: int,
+) -> tuple[list[bool], float, float]:
+    """(16)-(18), and the two rules that serve one sensor after another, in plain Python."""
+    sensors = len(costs)
+    granted = [False] * sensors
+    if sharing == "equal":
+        for m in range(sensors):
+            granted[m] = requests[m] and costs[m] <= tokens / sensors
+    else:
+        order = list(range(sensors))
+        if sharing == "rotating":
+            turn = step % sensors
+            order = order[turn:] + order[:turn]
+        left = tokens
+        for m in order:
+            if requests[m] and costs[m] <= left:
+                granted[m] = True
+                left -= costs[m]
+    spent = math.fsum(cost for cost, grant in zip(costs, granted, strict=True) if grant)
+    return granted, spent, min(tokens + rate - spent, capacity)
+
+
+# Eighths: sums, differences and the comparison with a multiple of a cost are then exact.
+eighths = st.integers(1, 80).map(lambda number: number / 8)
+
+
+@st.composite
+def buckets(draw: st.DrawFn, unlimited: bool = False) -> TokenBucket:
+    sensors = draw(st.integers(1, 5))
+    costs = draw(st.lists(eighths, min_size=sensors, max_size=sensors))
+    capacity = sensors * max(costs) + draw(eighths)
+    return TokenBucket.create(
+        rate=draw(st.one_of(st.just(0.0), eighths)),
+        capacity=capacity,
+        initial=draw(st.integers(0, int(8 * capacity))) / 8,
+        cost=costs,
+        sensors=sensors,
+        sharing=draw(st.sampled_from(SHARING_RULES)),
+        unlimited=unlimited,
+    )
+
+
+def random_requests(bucket: TokenBucket, runs: int, steps: int, seed: int) -> Any:
+    generator = np.random.default_rng(seed)
+    eagerness = generator.random((len(bucket.cost), runs))
+    return generator.random((steps, len(bucket.cost), runs)) < eagerness
+
+
+@pytest.mark.parametrize("sharing", SHARING_RULES)
+@pytest.mark.parametrize("cost", [3.0, (1.0, 2.5, 4.0)], ids=["equal costs", "unequal costs"])
+@pytest.mark.parametrize("rate", [0.0, 1.75, 5.0, 12.0])
+def test_every_rule_agrees_with_the_scalar_loop(sharing: str, cost: Any, rate: float) -> None:
+    bucket = TokenBucket.create(**(PAPER | {"cost": cost, "rate": rate, "sharing": sharing}))
+    costs, runs, steps = bucket.cost[:, 0].tolist(), 7, 60
+    requests = random_requests(bucket, runs, steps, seed=4)
+    tokens, expected = bucket.start(runs), [10.0] * runs
+    first = np.arange(runs)  # the runs stand at different steps of their episodes
+    some_denied = False
+    for number in range(steps):
+        answer = bucket.grant(tokens, requests[number], first + number)
+        for run in range(runs):
+            asked = requests[number][:, run].tolist()
+            granted, spent, expected[run] = scalar_step(
+                expected[run], asked, costs, rate, 30.0, sharing, run + number
+            )
+            assert answer.granted[:, run].tolist() == granted
+            assert answer.spent[run] == spent
+            assert answer.tokens[run] == expected[run]
+            some_denied |= granted != asked
+        tokens = answer.tokens
+    assert some_denied or rate == 12.0
+
+
+@given(bucket=buckets(), seed=st.integers(0, 2**31))
+@settings(max_examples=150, deadline=None)
+def test_random_buckets_agree_with_the_scalar_loop(bucket: TokenBucket, seed: int) -> None:
+    requests = random_requests(bucket, 3, 12, seed)
+    tokens = bucket.start(3)
+    costs = bucket.cost[:, 0].tolist()
+    for number, asked in enumerate(requests):
+        answer = bucket.grant(tokens, asked, np.full(3, number))
+        for run in range(3):
+            granted, spent, left = scalar_step(
+                tokens[run],
+                asked[:, run].tolist(),
+                costs,
+                bucket.rate,
+                bucket.capacity,
+                bucket.sharing,
+                number,
+            )
+            assert answer.granted[:, run].tolist() == granted
+            assert (answer.spent[run], answer.tokens[run]) == (spent, left)
+        tokens = answer.tokens
+
+
+@given(bucket=buckets(), seed=st.integers(0, 2**31))
+@settings(max_examples=150, deadline=None)
+def test_tokens_and_grants_stay_within_their_limits(bucket: TokenBucket, seed: int) -> None:
+    requests = random_requests(bucket, 4, 30, seed)
+    tokens = bucket.start(4)
+    for number, asked in enumerate(requests):
+        answer = bucket.grant(tokens, asked, np.full(4, number))
+        assert not np.any(answer.granted & ~asked)
+        assert np.all(answer.spent <= tokens)
+        assert np.all(answer.tokens >= 0.0)
+        assert np.all(answer.tokens <= bucket.capacity)
+        assert np.array_equal(answer.spent, (answer.granted * bucket.cost).sum(0))
+        tokens = answer.tokens
+
+
+@given(
+    cost=st.floats(0.01, 100.0),
+    sensors=st.integers(1, 9),
+    rate=st.floats(0.0, 50.0),
+    seed=st.integers(0, 2**31),
+)
+@settings(max_examples=100, deadline=None)
+def test_limits_hold_for_any_numbers_up_to_rounding(
+    cost: float, sensors: int, rate: float, seed: int
+) -> None:
+    capacity = 1.5 * sensors * cost
+    bucket = TokenBucket.create(rate, capacity, capacity, cost, sensors)
+    tokens = bucket.start(2)
+    for number, asked in enumerate(random_requests(bucket, 2, 20, seed)):
+        answer = bucket.grant(tokens, asked, np.full(2, number))
+        assert np.all(answer.spent <= tokens * (1 + 1e-14))
+        assert np.all(answer.tokens >= -1e-14 * capacity)
+        assert np.all(answer.tokens <= capacity)
+        tokens = answer.tokens
+
+
+@given(tokens=st.floats(0.0, 30.0), asked=st.lists(st.booleans(), min_size=3, max_size=3))
+@settings(max_examples=200, deadline=None)
+def test_equal_sharing_with_equal_costs_is_all_or_nothing(
+    tokens: float, asked: list[bool]
+) -> None:
+    bucket = TokenBucket.create(**PAPER)
+    requests = np.array(asked)[:, None]
+    granted = bucket.grant(np.array([tokens]), requests, np.array([0])).granted
+    # Three sensors at three tokens each: from nine tokens on, however few of them ask.
+    assert np.array_equal(granted, requests if tokens >= 9.0 else np.zeros_like(requests))
+
+
+def test_equal_sharing_looks_at_the_tokens_before_this_steps_spending() -> None:
+    bucket = TokenBucket.create(**PAPER)
+    everyone = np.ones((3, 4), dtype=np.bool_)
+    before = np.array([8.999, 9.0, 4.0, 30.0])
+    answer = bucket.grant(before, everyone, np.zeros(4, dtype=np.int64))
+    # At nine tokens all three are served although nothing is left for a fourth; at 8.999 and at
+    # 4 none is, although 4 + 5 - 3 tokens would pay for one after the refill.
+    assert answer.granted.all(0).tolist() == [False, True, False, True]
+    assert answer.granted.any(0).tolist() == [False, True, False, True]
+    assert answer.spent.tolist() == [0.0, 9.0, 0.0, 9.0]
+    assert answer.tokens == pytest.approx([13.999, 5.0, 9.0, 26.0], abs=1e-12)
+
+
+def test_rules_in_order_spend_while_tokens_last() -> None:
+    everyone = np.ones((3, 3), dtype=np.bool_)
+    tokens = np.full(3, 7.0)  # pays for two of three
+    steps = np.array([0, 1, 2])
+    fixed = TokenBucket.create(**(PAPER | {"sharing": "fixed"})).grant(tokens, everyone, steps)
+    assert fixed.granted.T.tolist() == [[True, True, False]] * 3
+    turning = TokenBucket.create(**(PAPER | {"sharing": "rotating"})).grant(tokens, everyone, steps)
+    assert turning.granted.T.tolist() == [
+        [True, True, False],
+        [False, True, True],
+        [True, False, True],
+    ]
+    assert turning.tokens.tolist() == [6.0] * 3
+
+
+def test_a_dear_sensor_does_not_block_a_cheap_one_behind_it() -> None:
+    bucket = TokenBucket.create(0.0, 10.0, 2.0, (5.0, 2.0), 2, sharing="fixed")
+    answer = bucket.grant(bucket.start(1), np.ones((2, 1), dtype=np.bool_), np.array([0]))
+    assert answer.granted[:, 0].tolist() == [False, True]
+
+
+@pytest.mark.parametrize("sharing", SHARING_RULES)
+def test_rotation_is_fair_and_fixed_order_is_not(sharing: str) -> None:
+    bucket = TokenBucket.create(**(PAPER | {"rate": 3.0, "initial": 9.0, "sharing": sharing}))
+    tokens, served = bucket.start(1), np.zeros(3)
+    for number in range(300):
+        answer = bucket.grant(tokens, np.ones((3, 1), dtype=np.bool_), np.array([number]))
+        tokens, served = answer.tokens, served + answer.granted[:, 0]
+    if sharing == "fixed":
+        assert served[0] > 250
+        assert served[2] < 50
+    else:
+        assert np.ptp(served) <= 3
+    assert served.sum() == pytest.approx(300, abs=3)  # three tokens a step pay for one each
+
+
+def test_at_most_five_ninths_of_all_requests_are_sustained() -> None:
+    bucket = TokenBucket.create(**PAPER)
+    tokens, granted, steps = bucket.start(1), 0, 9000
+    for number in range(steps):
+        answer = bucket.grant(tokens, np.ones((3, 1), dtype=np.bool_), np.array([number]))
+        tokens, granted = answer.tokens, granted + int(answer.granted.sum())
+    assert granted / (3 * steps) == pytest.approx(5 / 9, abs=2e-4)
+
+
+@given(bucket=buckets(unlimited=True), seed=st.integers(0, 2**31))
+@settings(max_examples=50, deadline=None)
+def test_unlimited_grants_everything_and_counts_it(bucket: TokenBucket, seed: int) -> None:
+    asked = random_requests(bucket, 4, 1, seed)[0]
+    tokens = bucket.start(4)
+    answer = bucket.grant(tokens, asked, np.zeros(4, dtype=np.int64))
+    assert np.array_equal(answer.granted, asked)
+    assert np.array_equal(answer.spent, asked.T.astype(float) @ bucket.cost[:, 0])
+    assert answer.tokens.tolist() == [bucket.capacity] * 4
+    answer.granted[:] = False  # the caller's requests are not shared
+    assert np.array_equal(asked, random_requests(bucket, 4, 1, seed)[0])
+
+
+def test_an_unlimited_bucket_needs_no_capacity_for_a_transmission() -> None:
+    bucket = TokenBucket.create(0.0, 1.0, 1.0, 3.0, 3, unlimited=True)
+    answer = bucket.grant(bucket.start(1), np.ones((3, 1), dtype=np.bool_), np.array([0]))
+    assert answer.granted.all()
+
+
+def test_granting_changes_nothing_in_place() -> None:
+    for sharing in SHARING_RULES:
+        bucket = TokenBucket.create(**(PAPER | {"sharing": sharing}))
+        tokens, asked = np.array([10.0, 4.0]), np.ones((3, 2), dtype=np.bool_)
+        bucket.grant(tokens, asked, np.array([1, 2]))
+        assert tokens.tolist() == [10.0, 4.0]
+        assert asked.all()
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "value"),
+    [
+        ({"capacity": 8.0}, "token_capacity", "8"),
+        ({"capacity": 2.0, "initial": 1.0, "sharing": "fixed"}, "token_capacity", "2"),
+        ({"cost": (1.0, 1.0, 11.0)}, "token_capacity", "30"),
+        ({"capacity": 0.0}, "token_capacity", "0.0"),
+        ({"capacity": math.inf}, "token_capacity", "inf"),
+        ({"cost": -3.0}, "token_cost", "-3.0"),
+        ({"cost": 0.0}, "token_cost", "0.0"),
+        ({"cost": (1.0, 2.0)}, "token_cost", r"\(1.0, 2.0\)"),
+        ({"cost": "dear"}, "token_cost", "dear"),
+        ({"rate": -1.0}, "token_rate", "-1.0"),
+        ({"rate": math.nan}, "token_rate", "nan"),
+        ({"rate": True}, "token_rate", "True"),
+        ({"initial": 31.0}, "initial_tokens", "31.0"),
+        ({"initial": -0.5}, "initial_tokens", "-0.5"),
+        ({"sharing": "even"}, "sharing", "even"),
+        ({"sharing": None}, "sharing", "None"),
+        ({"unlimited": 1}, "unlimited", "1"),
+    ],
+)
+def test_bad_input_is_refused_by_name_and_value(
+    change: dict[str, Any], field: str, value: str
+) -> None:
+    with pytest.raises(ConfigurationError, match=rf"^{field} = '?{value}'? is not allowed: "):
+        TokenBucket.create(**(PAPER | change))
+
+
+def test_the_least_capacity_is_accepted() -> None:
+    assert TokenBucket.create(**(PAPER | {"capacity": 9.0, "initial": 9.0})).capacity == 9.0
+    fixed = TokenBucket.create(**(PAPER | {"capacity": 3.0, "initial": 0.0, "sharing": "fixed"}))
+    assert fixed.capacity == 3.0
