@@ -278,9 +278,7 @@ def simulate(
         for m in sensors:
             size = math.sqrt(float(np.sum((requested[m] - values[m]) ** 2)))
             ask = size >= eta[m] / example.chi[m] + example.sigma[m]
-            eta[m] = max(
-                example.decay[m] * eta[m] + example.sigma[m] - (0.0 if ask else size), 0.0
-            )
+            eta[m] = max(example.decay[m] * eta[m] + example.sigma[m] - (0.0 if ask else size), 0.0)
             if ask:
                 requested[m] = values[m]
             if requests is not None:

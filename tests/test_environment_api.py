@@ -163,6 +163,22 @@ def test_who_can_tell_what_was_measured(information: str) -> None:
     assert unchanged == (information == "centre")
 
 
+def test_extreme_entries_are_clipped_to_their_bounds() -> None:
+    env = make().unwrapped
+    env.reset(seed=4)
+    state, space = env.batch.state, env.observation_space
+    sensed = [n.startswith(("whitened", "held")) for n in env.observation_names]
+    assumed = [n.startswith(("log_variance", "estimate")) for n in env.observation_names]
+    for sign, bound in ((1.0, space.high), (-1.0, space.low)):
+        state.measurement = np.full_like(state.measurement, sign * 1e6)
+        state.prior_mean = np.full_like(state.prior_mean, sign * 1e6)
+        state.prior_covariance = np.eye(2)[..., None] * 10.0 ** (9.0 * sign)
+        observation = env.batch.observe()[0]
+        assert space.contains(observation)
+        for entries in (sensed, assumed):
+            np.testing.assert_array_equal(observation[entries][1:], bound[entries][1:])
+
+
 def test_withheld_signals() -> None:
     env = make(information="centre").unwrapped
     env.reset(seed=0)

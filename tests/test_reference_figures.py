@@ -17,6 +17,7 @@ import mpmath
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from reference_tobit import Example, Run, simulate
 
 import fusion_gym
 from fusion_gym.envs import EpisodeBatch, Task
@@ -25,7 +26,6 @@ from fusion_gym.filters import Expectation, Plan, TobitKalmanFilter
 from fusion_gym.sensors import CensoredSensors
 from fusion_gym.systems import Signals
 from fusion_gym.triggers import Policy
-from reference_tobit import Example, Run, simulate
 
 Array = NDArray[np.float64]
 ENV_ID = "fusion_gym/TobitOscillator-v0"
@@ -187,7 +187,7 @@ def test_initial_states_have_the_examples_distribution() -> None:
     assert np.abs(np.cov(initial) - 0.1 * np.eye(2)).max() <= 5 * 0.1 * math.sqrt(2 / runs)
 
 
-# --- figures ---------------------------------------------------------------------------------------
+# --- figures -----------------------------------------------------------------------------------
 
 
 def assert_figure(name: str, samples: Array, printed: float, digit: float) -> None:
@@ -385,7 +385,7 @@ def test_periodic_requests_meet_their_figures(options: dict[str, Any], mse: floa
     assert_figure("MSE", found.mse, mse, 1e-3)
 
 
-# --- consistency -----------------------------------------------------------------------------------
+# --- consistency -------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
@@ -412,9 +412,7 @@ def misinformed_task(factor: float, **options: Any) -> Task:
         2,
     )
     node_filter = WronglyInformed(sensors, TobitKalmanFilter(believed))
-    return dataclasses.replace(
-        task, system=dataclasses.replace(task.system, filter=node_filter)
-    )
+    return dataclasses.replace(task, system=dataclasses.replace(task.system, filter=node_filter))
 
 
 def consistency(task: Task, policy: str) -> tuple[float, float]:

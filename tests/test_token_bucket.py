@@ -157,9 +157,7 @@ def test_limits_hold_for_any_numbers_up_to_rounding(
 
 @given(tokens=st.floats(0.0, 30.0), asked=st.lists(st.booleans(), min_size=3, max_size=3))
 @settings(max_examples=200, deadline=None)
-def test_equal_sharing_with_equal_costs_is_all_or_nothing(
-    tokens: float, asked: list[bool]
-) -> None:
+def test_equal_sharing_with_equal_costs_is_all_or_nothing(tokens: float, asked: list[bool]) -> None:
     bucket = TokenBucket.create(**PAPER)
     requests = np.array(asked)[:, None]
     granted = bucket.grant(np.array([tokens]), requests, np.array([0])).granted

@@ -1,0 +1,67 @@
+"""What the README and the pages show must run, and their tables must name what exists."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import fusion_gym
+from fusion_gym.envs import EpisodeBatch
+from fusion_gym.envs.tobit_oscillator import TobitOscillatorOptions
+from fusion_gym.triggers import TRIGGERS
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+PAGE = (ROOT / "docs" / "tobit_oscillator.md").read_text()
+BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", README + PAGE, re.DOTALL | re.MULTILINE)
+EXAMPLES = [text for language, text in BLOCKS if language == "python"]
+
+
+@pytest.mark.parametrize("code", EXAMPLES, ids=range(len(EXAMPLES)))
+def test_python_examples_run(code: str) -> None:
+    exec(compile(code, "example", "exec"), {})
+
+
+def test_the_evaluation_command_runs(tmp_path: Path) -> None:
+    block = next(text for language, text in BLOCKS if not language and "evaluate" in text)
+    words = shlex.split(block.replace("\\\n", " "))
+    assert words[0] == "python"
+    words[words.index("--json") + 1] = str(tmp_path / "evaluation.json")
+    subprocess.run([sys.executable, *words[1:]], cwd=ROOT, check=True, capture_output=True)
+    assert (tmp_path / "evaluation.json").exists()
+
+
+def test_files_and_configs_that_the_readme_names_exist() -> None:
+    linked = re.findall(r"\]\(([\w/.]+)\)", README)
+    configs = re.findall(r"--config (\S+)", README)
+    assert linked
+    assert configs
+    for name in (*linked, *configs):
+        assert (ROOT / name).exists(), name
+
+
+def test_every_policy_is_in_the_readme() -> None:
+    missing = [name for name in TRIGGERS if f"`{name}`" not in README]
+    assert not missing
+
+
+def test_every_option_and_observation_is_on_the_page() -> None:
+    options = [field.name for field in dataclasses.fields(TobitOscillatorOptions)]
+    assert not [name for name in options if f"`{name}`" not in PAGE]
+    names = EpisodeBatch(fusion_gym.make_task("fusion_gym/TobitOscillator-v0"), 1).layout.names
+    kinds = {name.split("[")[0] for name in names}
+    assert not [kind for kind in kinds if f"`{kind}" not in PAGE]
+
+
+def test_registered_environments_are_in_the_readme() -> None:
+    import gymnasium
+
+    registered = [name for name in gymnasium.registry if name.startswith("fusion_gym/")]
+    assert registered
+    assert not [name for name in registered if name not in README]
