@@ -2,9 +2,9 @@
 
     python -m benchmarks.throughput [--seconds 3]
 
-One thread (``make bench`` sets it), float64. All rows are measured in one run, in turns, and each figure is the median of
-its turns; ratios are to the single environment behind ``gym.make`` or, for the filter, to the
-plain loop. The absolute figures belong to the machine, the ratios to the code.
+One thread (``make bench`` sets it), float64. All rows are measured in one run, in turns, and each
+figure is the median of its turns; the ratios are to a plain loop with FilterPy and to SB3's
+DummyVecEnv. The absolute figures belong to the machine, the ratios to the code.
 """
 
 from __future__ import annotations

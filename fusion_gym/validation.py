@@ -25,16 +25,24 @@ def _refuse(field: str, value: Any, allowed: str) -> ConfigurationError:
     return ConfigurationError(f"{field} = {text} is not allowed: it must be {allowed}")
 
 
+def _numbers(field: str, value: ArrayLike, allowed: str) -> Array:
+    """The value as a float64 array; text, booleans, complex numbers and ragged lists are none."""
+    try:
+        given = np.asarray(value)
+    except ValueError:
+        raise _refuse(field, value, allowed) from None
+    if given.dtype.kind not in "iuf":
+        raise _refuse(field, value, allowed)
+    return np.array(given, dtype=np.float64)
+
+
 def array(field: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
     """A finite float64 array of the given shape; ``None`` in the shape stands for any length >= 1.
 
     Raises:
         ConfigurationError: not numeric, not finite, or of another shape.
     """
-    try:
-        result = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise _refuse(field, value, "an array of numbers") from error
+    result = _numbers(field, value, "an array of numbers")
     wanted = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
     matches = len(shape) == result.ndim and all(
         have >= 1 if size is None else have == size
@@ -47,19 +55,25 @@ def array(field: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
     return result
 
 
-def spread(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+def spread(
+    field: str, value: ArrayLike, shape: tuple[int, ...], *, minus_infinity: bool = False
+) -> Array:
     """Like :func:`array`, but a value that broadcasts to ``shape`` (one number for all) will do.
+
+    ``minus_infinity`` allows that value as well.
 
     Raises:
         ConfigurationError: not numeric, not finite, or not broadcastable to ``shape``.
     """
+    allowed = f"a number or an array of shape {shape}"
+    given = _numbers(field, value, allowed)
     try:
-        given = np.array(value, dtype=np.float64)
         result = np.broadcast_to(given, shape).copy()
-    except (TypeError, ValueError) as error:
-        raise _refuse(field, value, f"a number or an array of shape {shape}") from error
-    if not np.all(np.isfinite(result)):
-        raise _refuse(field, value, "finite")
+    except ValueError:
+        raise _refuse(field, value, allowed) from None
+    valid = np.isfinite(result) | (np.isneginf(result) & minus_infinity)
+    if not valid.all():
+        raise _refuse(field, value, "finite" + (" or minus infinity" if minus_infinity else ""))
     return result
 
 
@@ -86,9 +100,9 @@ def number(
         if limit is not None
     ]
     allowed = "a finite number" + (" " + " and ".join(limits) if limits else "")
-    if isinstance(value, (bool, str)) or not np.isscalar(value):
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise _refuse(field, value, allowed)
-    result = float(value)  # type: ignore[arg-type]
+    result = float(value)
     outside = (
         not np.isfinite(result)
         or (above is not None and result <= above)
@@ -148,9 +162,10 @@ def keys(kind: str, given: Iterable[str], known: Iterable[str]) -> None:
     names = sorted(known)
     for key in given:
         if key not in names:
-            near = difflib.get_close_matches(key, names, n=1)
+            near = difflib.get_close_matches(str(key), names, n=1)
             hint = f"did you mean {near[0]!r}? " if near else ""
-            raise ConfigurationError(f"unknown {kind} {key!r}: {hint}known are {', '.join(names)}")
+            listed = ", ".join(names) or "none"
+            raise ConfigurationError(f"unknown {kind} {key!r}: {hint}known are {listed}")
 
 
 def covariance(field: str, value: ArrayLike, size: int, *, definite: bool = False) -> Array:

@@ -88,11 +88,11 @@ def kappas(epsilon: Sequence[float]) -> list[float]:
 
 
 def event_error(example: Example, sensor: int, time: int) -> float:
-    """Ξ(G_t) of a sensor, by the recursion below (30) from G₀ = η₀²."""
+    """Ξ(G_{t-1}) of a sensor, by the recursion below (30) from G₀ = η₀²."""
     d, e = example.young
     lam, chi, sigma = example.decay[sensor], example.chi[sensor], example.sigma[sensor]
     bound = example.eta[sensor] ** 2
-    for _ in range(time + 1):
+    for _ in range(time):
         bound = ((1 + d) * (1 + e) * lam**2 + (1 + chi) * (1 + 1 / d) / chi**2) * bound + (
             (1 + d) * (1 + 1 / e) + (1 + 1 / d) * (1 + 1 / chi)
         ) * sigma**2

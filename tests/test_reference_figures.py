@@ -49,6 +49,13 @@ OTHER_SENSORS: dict[str, Any] = {
     "information_shares": (0.5, 0.3, 0.2),
     "token_cost": (3.0, 2.0, 4.0),
 }
+# Long silences at first, in which the dynamic variable would fall far below zero.
+PATIENT: dict[str, Any] = {
+    "trigger_initial": (30.0, 20.0, 10.0),
+    "trigger_divisor": (2.0, 3.0, 2.5),
+    "trigger_decay": (0.1, 0.3, 0.2),
+    "trigger_threshold": (0.4, 0.5, 0.6),
+}
 CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "paper": ({}, {}),
     "paper, predicting": ({"silent": "predict", "event_error": False}, {}),
@@ -58,6 +65,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "tobit, full noise": ({"filter": "tobit", "process_noise": "full"}, {}),
     "tobit, other sensors": (OTHER_SENSORS | {"filter": "tobit"}, {}),
     "tobit, unlimited": ({"filter": "tobit", "tokens": "unlimited"}, {"random": 0.5}),
+    "tobit, patient trigger": (PATIENT | {"filter": "tobit"}, {}),
     "kalman": ({"filter": "kalman"}, {}),
 }
 
@@ -79,6 +87,10 @@ def example_of(options: dict[str, Any]) -> Example:
         ("token_cost", "token_cost"),
         ("token_rate", "token_rate"),
         ("initial_tokens", "initial_tokens"),
+        ("trigger_initial", "eta"),
+        ("trigger_divisor", "chi"),
+        ("trigger_decay", "decay"),
+        ("trigger_threshold", "sigma"),
     ):
         if name in options:
             change[field] = options[name]

@@ -354,7 +354,7 @@ def test_random_rate_and_stream() -> None:
         ("[1, 2]", [1, 2]),
         ("'text'", "text"),
         ("runs/agent", "runs/agent"),
-        ("nan", "nan"),
+        ("-inf", -math.inf),
     ],
 )
 def test_values_from_text(text: str, value: Any) -> None:

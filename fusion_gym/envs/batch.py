@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
@@ -48,6 +49,7 @@ class EpisodeBatch:
         self.num_envs = num_envs
         self.layout = ObservationLayout(task)
         self.generators: list[np.random.Generator | None] = [None] * num_envs
+        self._episode_starts: list[Any] = [None] * num_envs
         self.state: Any = None
         self.tokens = task.bucket.start(num_envs)
         self.steps = np.zeros(num_envs, dtype=np.int64)
@@ -64,7 +66,13 @@ class EpisodeBatch:
         """Give these runs new generators; ``None`` keeps a run's generator if it has one."""
         for run, seed in zip(runs.tolist(), seeds, strict=True):
             if seed is not None or self.generators[run] is None:
-                self.generators[run], _ = seeding.np_random(seed)
+                self.use_generator(run, seeding.np_random(seed)[0])
+
+    def use_generator(self, run: int, generator: np.random.Generator) -> None:
+        """Draw this run's noise from ``generator``, from its present state on (if it is new)."""
+        if generator is not self.generators[run]:
+            self.generators[run] = generator
+            self._episode_starts[run] = None
 
     def reset(self, runs: NDArray[np.int64] | None = None, *, stagger: bool = False) -> None:
         """Begin new episodes in the given runs (all by default) and sense for the first time.
@@ -77,7 +85,7 @@ class EpisodeBatch:
         system = self.task.system
         noise = np.empty((len(runs), system.start_channels))
         for place, run in enumerate(runs.tolist()):
-            self._generator(run).standard_normal(out=noise[place])
+            self._next_episode(run).standard_normal(out=noise[place])
         self._draw(runs)
         fresh = system.start(np.ascontiguousarray(noise.T))
         row = self._ring[self._cursor % self._block]
@@ -95,7 +103,12 @@ class EpisodeBatch:
         """Answer the requests (sensors, N), update, fuse, reward; then move and sense.
 
         Runs that are ``finished`` are carried along without meaning until they are reset.
+
+        Raises:
+            ResetNeeded: before the first reset.
         """
+        if self.state is None:
+            raise ResetNeeded("call reset before the first step")
         task, system = self.task, self.task.system
         granted, spent, tokens = task.bucket.grant(self.tokens, requests, self.steps)
         state = system.deliver(self.state, granted)
@@ -112,7 +125,7 @@ class EpisodeBatch:
             self._draw(np.flatnonzero(used_up))
         self.delivered = state
         self.state = system.sense(state, self._ring[self._cursor % self._block])
-        self.finished = truncated
+        self.finished = truncated.copy()
         return Outcome(
             reward=reward_error + reward_cost,
             reward_error=reward_error,
@@ -144,11 +157,25 @@ class EpisodeBatch:
         }
         return Signals(values, self.task.hidden_signals)
 
+    def _next_episode(self, run: int) -> np.random.Generator:
+        """The run's generator at the start of its next episode.
+
+        Episodes begin 2⁶⁴ draws apart, so that the noise of one does not depend on how long the
+        one before it was.
+        """
+        if self.generators[run] is None:
+            self.use_generator(run, seeding.np_random(None)[0])
+        generator = self._generator(run)
+        bits = generator.bit_generator
+        if self._episode_starts[run] is not None:
+            bits.state = self._episode_starts[run]
+            bits.advance(2**64)  # type: ignore[attr-defined]
+        self._episode_starts[run] = bits.state
+        return generator
+
     def _generator(self, run: int) -> np.random.Generator:
         generator = self.generators[run]
-        if generator is None:
-            generator, _ = seeding.np_random(None)
-            self.generators[run] = generator
+        assert generator is not None, "reset gives every run a generator"
         return generator
 
     def _draw(self, runs: NDArray[np.int64]) -> None:

@@ -9,7 +9,7 @@ from gymnasium.envs.registration import load_env_creator
 
 from fusion_gym.envs.task import Task
 from fusion_gym.envs.vector import FusionVectorEnv
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, keys
 
 ENVIRONMENTS = {
     "fusion_gym/TobitOscillator-v0": "fusion_gym.envs.tobit_oscillator:TobitOscillator",
@@ -37,10 +37,12 @@ def make_task(env_id: str, **options: Any) -> Task:
         for name, spec in gymnasium.registry.items()
         if spec.vector_entry_point is not None and name.startswith("fusion_gym/")
     }
-    if env_id not in known:
-        raise ConfigurationError(
-            f"unknown environment {env_id!r}: known are {', '.join(sorted(known))}"
-        )
+    keys("environment", [env_id], known)
+    for name in ("num_envs", "autoreset_mode", "render_mode"):
+        if name in options:
+            raise ConfigurationError(
+                f"{name} = {options[name]!r} is not allowed: it is no option of a task"
+            )
     spec = gymnasium.spec(env_id)
     entry = spec.vector_entry_point
     creator = load_env_creator(entry) if isinstance(entry, str) else entry

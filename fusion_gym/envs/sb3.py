@@ -50,7 +50,6 @@ class FusionSB3VecEnv(VecEnv):
         self._returns = np.zeros(num_envs)
         self._spent = np.zeros(num_envs)
         self._began = time.perf_counter()
-        self._empty: list[dict[str, Any]] = [{} for _ in range(num_envs)]
 
     def reset(self) -> NDArray[np.float32]:
         """New episodes in all runs, with the seeds and options set before (used once).
@@ -89,11 +88,10 @@ class FusionSB3VecEnv(VecEnv):
         self._returns += outcome.reward
         self._spent += outcome.cost
         done = outcome.truncated
-        infos = self._empty
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done.any():
             runs = np.flatnonzero(done)
             final = self.batch.observe()[runs]
-            infos = list(self._empty)
             elapsed = round(time.perf_counter() - self._began, 6)
             for place, run in enumerate(runs.tolist()):
                 infos[run] = {
@@ -110,8 +108,6 @@ class FusionSB3VecEnv(VecEnv):
             self._returns[runs] = 0.0
             self._spent[runs] = 0.0
             self.batch.reset(runs)
-        else:
-            infos = list(infos)
         result = (self.batch.observe(), outcome.reward.astype(np.float32), done.copy(), infos)
         self.seconds += time.perf_counter() - began
         return result

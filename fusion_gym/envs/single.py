@@ -44,7 +44,7 @@ class FusionEnv(gymnasium.Env[Any, Any]):
         """
         validation.keys("reset option", options or {}, [])
         super().reset(seed=seed)
-        self.batch.generators[0] = self.np_random
+        self.batch.use_generator(0, self.np_random)
         self.batch.reset()
         return self.batch.observe()[0], _first(reset_infos(self.task, 1))
 

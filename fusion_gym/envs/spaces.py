@@ -29,10 +29,17 @@ def requests(task: Task, actions: Any, num_envs: int) -> NDArray[np.bool_]:
     Raises:
         ValueError: an action of another shape, not finite, or outside the action space.
     """
-    given = np.asarray(actions)
+    try:
+        given = np.asarray(actions)
+    except ValueError:
+        raise ValueError(f"action {actions!r} is not allowed: it must be an array") from None
     discrete = task.action == "discrete"
     wanted = (num_envs,) if discrete else (num_envs, task.sensors)
-    if given.shape != wanted or given.dtype == object:
+    if given.dtype.kind not in "biuf":
+        raise ValueError(
+            f"action {given.tolist()!r} of type {given.dtype} is not allowed: it must be numbers"
+        )
+    if given.shape != wanted:
         raise ValueError(f"action of shape {given.shape} is not allowed: it must be {wanted}")
     if discrete:
         high = 2**task.sensors - 1

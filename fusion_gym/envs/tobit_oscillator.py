@@ -44,7 +44,8 @@ class TobitOscillatorOptions:
     """Every option of the environment; the defaults are the paper's Section 4.
 
     Not given in the paper, our choice: ``initial_covariance``, ``information_shares`` (equal),
-    ``horizon``. The text gives x₀ = (5, 0), which we take as the mean.
+    ``horizon``. The text gives x₀ = (5, 0), which we take as the mean. The trigger's thresholds
+    (0.1, 0.2, 0.3) and decays (0.1, 0.2, 0.1) are repeated in turn for other numbers of sensors.
     """
 
     # Plant, equation (1)
@@ -74,8 +75,8 @@ class TobitOscillatorOptions:
     bound_young: tuple[float, float] = (1.5, 2.0)
     information_shares: ArrayLike | None = None
     # Dynamic event trigger, equations (11)-(15): the defaults of the policy, and Ξ of the filter
-    trigger_threshold: ArrayLike = (0.1, 0.2, 0.3)
-    trigger_decay: ArrayLike = (0.1, 0.2, 0.1)
+    trigger_threshold: ArrayLike | None = None
+    trigger_decay: ArrayLike | None = None
     trigger_divisor: ArrayLike = 5.0
     trigger_initial: ArrayLike = 1.5
     # Episode, observation, action, reward
@@ -94,9 +95,7 @@ def build(**options: Any) -> Task:
     Raises:
         ConfigurationError: an unknown option, or a value that is not allowed.
     """
-    if options.get("max_episode_steps") is not None:
-        options = options | {"horizon": options["max_episode_steps"]}
-    options.pop("max_episode_steps", None)
+    limit = options.pop("max_episode_steps", None)
     known = [field.name for field in fields(TobitOscillatorOptions)]
     validation.keys("option of fusion_gym/TobitOscillator-v0", options, known)
     chosen = TobitOscillatorOptions(**options)
@@ -110,8 +109,20 @@ def build(**options: Any) -> Task:
     )
     random_start = validation.boolean("random_start", chosen.random_start)
     trigger = {
-        "threshold": _per_sensor(chosen.trigger_threshold, "trigger_threshold", sensors.count),
-        "decay": _per_sensor(chosen.trigger_decay, "trigger_decay", sensors.count),
+        "threshold": _per_sensor(
+            np.resize((0.1, 0.2, 0.3), sensors.count)
+            if chosen.trigger_threshold is None
+            else chosen.trigger_threshold,
+            "trigger_threshold",
+            sensors.count,
+        ),
+        "decay": _per_sensor(
+            np.resize((0.1, 0.2, 0.1), sensors.count)
+            if chosen.trigger_decay is None
+            else chosen.trigger_decay,
+            "trigger_decay",
+            sensors.count,
+        ),
         "divisor": _per_sensor(chosen.trigger_divisor, "trigger_divisor", sensors.count),
         "initial": _per_sensor(chosen.trigger_initial, "trigger_initial", sensors.count),
     }
@@ -145,7 +156,9 @@ def build(**options: Any) -> Task:
         system=system,
         bucket=bucket,
         reward=reward,
-        horizon=horizon,
+        horizon=horizon
+        if limit is None
+        else min(horizon, validation.integer("max_episode_steps", limit, at_least=1)),
         information=chosen.information,
         action=chosen.action,
         settings=_plain(asdict(chosen)),
@@ -172,23 +185,19 @@ def _filter(
     chosen: TobitOscillatorOptions, sensors: CensoredSensors, trigger: dict[str, tuple[float, ...]]
 ) -> NodeFilter:
     kind = validation.choice("filter", chosen.filter, ("paper", "tobit", "kalman"))
+    constants = BoundConstants.create(chosen.bound_epsilon)
+    error = EventError.create(**trigger, young=chosen.bound_young, sensors=sensors.count)
+    silent, with_error = chosen.silent, chosen.event_error
+    if silent is not None:
+        validation.choice("silent", silent, ("hold", "predict"))
+    if with_error is not None:
+        validation.boolean("event_error", with_error)
     if kind == "paper":
-        silent = validation.choice("silent", chosen.silent or "hold", ("hold", "predict"))
-        with_error = chosen.event_error is None or validation.boolean(
-            "event_error", chosen.event_error
+        return BoundTobitFilter(
+            sensors, constants, None if with_error is False else error, hold=silent != "predict"
         )
-        error = (
-            EventError.create(**trigger, young=chosen.bound_young, sensors=sensors.count)
-            if with_error
-            else None
-        )
-        constants = BoundConstants.create(chosen.bound_epsilon)
-        return BoundTobitFilter(sensors, constants, error, hold=silent == "hold")
-    for name, value, allowed in (
-        ("silent", chosen.silent, (None, "predict")),
-        ("event_error", chosen.event_error, (None, False)),
-    ):
-        if value not in allowed:
+    for name, value, refused in (("silent", silent, "hold"), ("event_error", with_error, True)):
+        if value == refused:
             raise ConfigurationError(
                 f"{name} = {value!r} is not allowed with filter={kind!r}: it belongs to "
                 "filter='paper' (the others predict when nothing arrives and know no event error)"

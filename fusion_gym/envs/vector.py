@@ -77,7 +77,11 @@ class FusionVectorEnv(VectorEnv[Any, Any, Any]):
             super().reset(seed=int(seed))
             seeds = [int(seed) + run for run in range(self.num_envs)]
         else:
-            seeds = list(seed)
+            if not isinstance(seed, (Sequence, np.ndarray)) or isinstance(seed, str):
+                raise ValueError(
+                    f"seed = {seed!r} is not allowed: it must be a whole number or a sequence"
+                )
+            seeds = [None if entry is None else int(entry) for entry in seed]
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed has {len(seeds)} entries: it must have {self.num_envs}")
         mask = self._reset_mask(options or {})

@@ -74,17 +74,19 @@ class EventError:
     initial: Array
 
     def at(self, time: Array) -> Array:
-        """Ξ(G_t) at the steps ``time`` (N,) counted from 1, shape (sensors, N)."""
-        fixed, slope, gap = self._closed_form
-        steps = time + 1.0
-        return fixed + slope * steps + gap * self.growth**steps
+        """Ξ(G_{t-1}) at the steps t = ``time`` (N,) counted from 1, shape (sensors, N).
+
+        The trigger's first decision, at t = 1, uses η₀, whose square G₀ bounds.
+        """
+        rate, logarithm = self._growth_rate
+        ramp = np.where(rate == 0.0, time, np.expm1(logarithm * time) / np.where(rate, rate, 1.0))
+        return self.initial * np.exp(logarithm * time) + self.offset * ramp
 
     @functools.cached_property
-    def _closed_form(self) -> tuple[Array, Array, Array]:
-        """Fixed point, slope and first distance: G_t = fixed + slope t + gap growth^t."""
-        steady = self.growth != 1.0
-        fixed = np.divide(self.offset, 1.0 - self.growth, where=steady, out=0.0 * self.offset)
-        return fixed, np.where(steady, 0.0, self.offset), self.initial - fixed
+    def _growth_rate(self) -> tuple[Array, Array]:
+        """Growth - 1 and the growth's logarithm, exact also where the growth is nearly 1."""
+        rate = self.growth - 1.0
+        return rate, np.log1p(rate)
 
     @classmethod
     def create(
@@ -256,13 +258,11 @@ def _pinned_solve(
     n = right.shape[-2]
     stacked = np.concatenate([right, *(f[..., None, :] for f, _ in columns)], axis=-2)
     solved = linalg.solve(core, stacked)
-    shift: Array | float = 0.0
+    shift = np.zeros_like(columns[0][0])
     for place, (f, factor) in enumerate(columns):
         h = solved[..., n + place, :]
         weight = h / (1.0 + linalg.dot(f, h))[..., None, :]
-        if np.ndim(shift):
-            shift = shift - weight * linalg.dot(f, shift)[..., None, :]
-        shift = shift + weight * factor
+        shift = shift + weight * (factor - linalg.dot(f, shift)[..., None, :])
         projected = linalg.matvec(linalg.transpose(solved), f)
         solved = solved - linalg.outer(weight, projected)
-    return solved[..., :n, :], np.asarray(shift)
+    return solved[..., :n, :], shift

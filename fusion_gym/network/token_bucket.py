@@ -68,7 +68,7 @@ class TokenBucket:
         limit = validation.number("token_capacity", capacity, above=0.0)
         rule = validation.choice("sharing", sharing, SHARING_RULES)
         needed = float(costs.max()) * (sensors if rule == "equal" else 1)
-        if limit < needed and not unlimited:
+        if limit < needed * (1.0 - 1e-12) and not unlimited:
             reason = (
                 f"at least {needed:g}: under sharing='equal' each of the {sensors} sensors owns "
                 f"1/{sensors} of the bucket and a transmission costs up to {costs.max():g}"

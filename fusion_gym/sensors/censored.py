@@ -44,18 +44,16 @@ class CensoredSensors:
         """
         matrix = validation.array("measurement_matrices", measurement_matrix, (None, None, states))
         shape = matrix.shape[:2]
-        field = "censoring_threshold"
-        low = np.array(threshold, dtype=np.float64)
-        finite = validation.spread(field, np.where(np.isneginf(low), 0.0, low), shape)
-        low = np.broadcast_to(low, shape)
+        low = validation.spread("censoring_threshold", threshold, shape, minus_infinity=True)
+        uncensored = np.isneginf(low)
         noise = validation.positive("measurement_variance", variance, shape)[..., None]
         return cls(
             measurement_matrix=matrix[..., None],
             variance=noise,
-            threshold=low[..., None].copy(),
+            threshold=low[..., None],
             deviation=np.sqrt(noise),
-            uncensored=np.isneginf(low)[..., None],
-            finite_threshold=finite[..., None],
+            uncensored=uncensored[..., None],
+            finite_threshold=np.where(uncensored, 0.0, low)[..., None],
         )
 
     @property

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fusion_gym import validation
 from fusion_gym.systems import Signals
 from fusion_gym.triggers.base import (
     Requests,
     Trigger,
     check_at_most,
-    check_not_negative,
     strongest,
 )
 
@@ -27,7 +27,7 @@ class InformationGain(Trigger):
     at_most: int | None = 1
 
     def __post_init__(self) -> None:
-        check_not_negative("threshold", self.threshold)
+        validation.number("threshold", self.threshold, at_least=0.0)
         check_at_most(self.at_most)
 
     def __call__(self, signals: Signals) -> Requests:

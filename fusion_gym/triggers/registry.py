@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import dataclasses
 from typing import Any
 
@@ -33,7 +34,7 @@ TRIGGERS: dict[str, type[Trigger]] = {
 
 
 def parse_value(text: str) -> Any:
-    """A number, true, false, none, or a list as Python writes it; anything else stays text.
+    """A number, true, false, none, inf, or a list as Python writes it; all else stays text.
 
     Values for several sensors may also be written with slashes: ``0.1/0.2/0.3``.
     """
@@ -44,10 +45,10 @@ def parse_value(text: str) -> Any:
         parts = tuple(parse_value(part) for part in text.split("/"))
         if all(isinstance(part, (int, float)) for part in parts):
             return parts
-    try:
-        return ast.literal_eval(text)
-    except (ValueError, SyntaxError):
-        return text
+    for read in (ast.literal_eval, float):
+        with contextlib.suppress(ValueError, SyntaxError):
+            return read(text)
+    return text
 
 
 def parse_settings(kind: str, entries: list[str]) -> dict[str, Any]:
@@ -78,6 +79,10 @@ def make_trigger(spec: str, defaults: dict[str, dict[str, Any]] | None = None) -
         ConfigurationError: an unknown policy or parameter, or a value that is not allowed.
     """
     name, _, text = spec.partition(":")
+    if name == "model":
+        raise ConfigurationError(
+            f"policy {spec!r} is no analytic trigger: use fusion_gym.evaluation.make_policy"
+        )
     validation.keys("policy", [name], [*TRIGGERS, "model"])
     kind = TRIGGERS[name]
     parameters = parse_settings(f"parameter of policy {name!r}", text.split(",") if text else [])
