@@ -108,24 +108,7 @@ def build(**options: Any) -> Task:
         plant.size,
     )
     random_start = validation.boolean("random_start", chosen.random_start)
-    trigger = {
-        "threshold": _per_sensor(
-            np.resize((0.1, 0.2, 0.3), sensors.count)
-            if chosen.trigger_threshold is None
-            else chosen.trigger_threshold,
-            "trigger_threshold",
-            sensors.count,
-        ),
-        "decay": _per_sensor(
-            np.resize((0.1, 0.2, 0.1), sensors.count)
-            if chosen.trigger_decay is None
-            else chosen.trigger_decay,
-            "trigger_decay",
-            sensors.count,
-        ),
-        "divisor": _per_sensor(chosen.trigger_divisor, "trigger_divisor", sensors.count),
-        "initial": _per_sensor(chosen.trigger_initial, "trigger_initial", sensors.count),
-    }
+    trigger = _trigger(chosen, sensors.count)
     system = FederatedTobitSystem(
         plant=plant,
         filter=_filter(chosen, sensors, trigger),
@@ -205,8 +188,22 @@ def _filter(
     return TobitKalmanFilter(sensors) if kind == "tobit" else KalmanFilter(sensors)
 
 
-def _per_sensor(value: ArrayLike, name: str, sensors: int) -> tuple[float, ...]:
-    return tuple(validation.not_negative(name, value, (sensors,)).tolist())
+def _trigger(chosen: TobitOscillatorOptions, sensors: int) -> dict[str, tuple[float, ...]]:
+    """Parameters of the dynamic event trigger, one number a sensor."""
+    given: dict[str, Any] = {
+        "threshold": chosen.trigger_threshold,
+        "decay": chosen.trigger_decay,
+        "divisor": chosen.trigger_divisor,
+        "initial": chosen.trigger_initial,
+    }
+    paper = {"threshold": (0.1, 0.2, 0.3), "decay": (0.1, 0.2, 0.1)}
+    result = {}
+    for name, value in given.items():
+        if value is None and name in paper:
+            value = np.resize(paper[name], sensors)
+        values = validation.not_negative(f"trigger_{name}", value, (sensors,))
+        result[name] = tuple(values.tolist())
+    return result
 
 
 def _typical_magnitude(plant: LinearPlant, horizon: int, random_start: bool) -> Array:
