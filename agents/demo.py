@@ -19,11 +19,11 @@ from pathlib import Path
 
 from rich import box
 from rich.table import Table
-from tqdm import tqdm
 
 from agents import figures, tables
 from agents.config import Experiment, Sweep, load_experiment, load_sweep
 from agents.evaluate import write
+from agents.progress import progress_bar
 from agents.train import train
 from fusion_gym.envs import Task
 from fusion_gym.envs.registration import make_task
@@ -69,7 +69,7 @@ def run_all(
     """Every policy on the same seeds, with a progress bar."""
     made = {name: make_policy(name, task) for name in policies}
     total = len(policies) * episodes * task.horizon
-    with tqdm(total=total, unit="step", unit_scale=True, desc=description) as bar:
+    with progress_bar(total, description) as bar:
         return {
             name: run_episodes(task, policy, episodes, seed, bar.update)
             for name, policy in made.items()

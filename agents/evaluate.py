@@ -15,11 +15,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 import fusion_gym
 from agents import tables
 from agents.config import load_experiment
+from agents.progress import progress_bar
 from fusion_gym.evaluation import (
     EpisodeResults,
     make_policy,
@@ -97,13 +96,13 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     done = finished(arguments.json, report) if arguments.resume else {}
     results: dict[str, EpisodeResults] = {}
     steps = len(names) * arguments.episodes * task.horizon
-    with tqdm(total=steps, unit="step", unit_scale=True, desc="evaluating") as bar:
+    with progress_bar(steps, "evaluating") as bar:
         for name, policy in policies.items():
             if name in done:
                 report["policies"][name] = done[name]
                 bar.update(arguments.episodes * task.horizon)
                 continue
-            bar.set_postfix_str(name)
+            bar.set_postfix_str(name, refresh=False)
             results[name] = run_episodes(
                 task, policy, arguments.episodes, arguments.seed, bar.update
             )

@@ -12,10 +12,10 @@ import sys
 
 from rich import box
 from rich.table import Table
-from tqdm import tqdm
 
 from agents import tables
 from agents.config import Comparison, load_comparison
+from agents.progress import progress_bar
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation import EpisodeResults, make_policy, mean_interval, run_episodes
 from fusion_gym.validation import ConfigurationError
@@ -35,7 +35,7 @@ def run(comparison: Comparison, episodes: int, seed: int) -> list[tuple[str, ...
         made.append((row.label, task, make_policy(row.policy, task)))
     total = sum(episodes * task.horizon for _, task, _ in made)
     found = []
-    with tqdm(total=total, unit="step", unit_scale=True, desc="reproducing") as bar:
+    with progress_bar(total, "reproducing") as bar:
         for label, task, policy in made:
             found.append(_cells(label, run_episodes(task, policy, episodes, seed, bar.update)))
     return found

@@ -29,6 +29,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from tqdm import tqdm
 
 from agents.config import Experiment, load_experiment, parse
+from agents.progress import progress_bar
 from fusion_gym.envs import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
@@ -125,7 +126,9 @@ class Progress(BaseCallback):
         for key in ("return", "mse", "rate"):
             self.logger.record(f"validation/{key}", record[key])
         self.logger.dump(self.num_timesteps)
-        self.bar.set_postfix(mse=f"{record['mse']:.4f}", rate=f"{record['rate']:.3f}")
+        self.bar.set_postfix(
+            mse=f"{record['mse']:.4f}", rate=f"{record['rate']:.3f}", refresh=False
+        )
         if record["return"] > self.best:
             self.best = record["return"]
             save(self.model, self.folder / "best_model.zip")
@@ -240,11 +243,10 @@ def train(experiment: Experiment, *, resume: bool = False) -> dict[str, Any]:
     began = time.perf_counter()
     with (
         Interrupt() as interrupt,
-        tqdm(
-            total=experiment.training.timesteps, initial=begun, unit="step", unit_scale=True,
-            desc=f"training {experiment.algorithm.name}",
+        progress_bar(
+            experiment.training.timesteps, f"training {experiment.algorithm.name}", begun
         ) as bar,
-    ):  # fmt: skip
+    ):
         progress = Progress(experiment, folder, task, interrupt, bar)
         if remaining > 0:
             model.learn(remaining, callback=progress, reset_num_timesteps=False)
