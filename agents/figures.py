@@ -62,9 +62,7 @@ def pareto(
     for place, line in enumerate(lines):
         _draw(axes, line.label, line.results, colours(place % 20), marker="o")
     for place, (name, found) in enumerate(points.items()):
-        _draw(axes, None, [found], _INK, marker="s")
-        at, offset = (found.rate.mean(), found.mse.mean()), (6, 12 * (place % 2) - 8)
-        axes.annotate(name, at, offset, textcoords="offset points", fontsize=7.5)
+        _draw(axes, name, [found], _INK, marker="sD^vPX"[place % 6], size=4.5)
     hull = [*envelope]
     right = axes.get_xlim()[1]
     rates = [p.rate for p in hull] + [max(right, hull[-1].rate)]

@@ -55,12 +55,10 @@ def array(field: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
     return result
 
 
-def spread(
-    field: str, value: ArrayLike, shape: tuple[int, ...], *, minus_infinity: bool = False
-) -> Array:
+def spread(field: str, value: ArrayLike, shape: tuple[int, ...], *, infinity: int = 0) -> Array:
     """Like :func:`array`, but a value that broadcasts to ``shape`` (one number for all) will do.
 
-    ``minus_infinity`` allows that value as well.
+    ``infinity`` of 1 or -1 allows infinity of that sign as well.
 
     Raises:
         ConfigurationError: not numeric, not finite, or not broadcastable to ``shape``.
@@ -71,9 +69,10 @@ def spread(
         result = np.broadcast_to(given, shape).copy()
     except ValueError:
         raise _refuse(field, value, allowed) from None
-    valid = np.isfinite(result) | (np.isneginf(result) & minus_infinity)
+    valid = np.isfinite(result) | (np.isinf(result) & (np.sign(result) == infinity))
     if not valid.all():
-        raise _refuse(field, value, "finite" + (" or minus infinity" if minus_infinity else ""))
+        extra = {0: "", 1: " or infinity", -1: " or minus infinity"}[infinity]
+        raise _refuse(field, value, f"finite{extra}")
     return result
 
 

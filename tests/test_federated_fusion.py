@@ -14,7 +14,7 @@ from fusion_gym.filters import KalmanFilter, NodeFilter, TobitKalmanFilter
 from fusion_gym.fusion import FederatedFusion
 from fusion_gym.plants import LinearPlant
 from fusion_gym.sensors import CensoredSensors
-from fusion_gym.systems import FederatedTobitSystem
+from fusion_gym.systems import CensoredSystem, FederatedCentre
 
 Array = NDArray[np.float64]
 EQUAL = (1 / 3, 1 / 3, 1 / 3)
@@ -67,15 +67,15 @@ def test_what_is_distributed_fuses_to_what_it_was(share: Any) -> None:
     np.testing.assert_allclose(back_mean, mean, rtol=1e-9)
 
 
-def make_system(kind: Any, share: Any) -> FederatedTobitSystem:
+def make_system(kind: Any, share: Any) -> CensoredSystem:
     """Uncensored sensors that all differ, and a process covariance without an inverse."""
     plant = LinearPlant.create(TRANSITION, PROCESS, [2.0, -1.0], 0.4 * np.eye(2))
     sensors = CensoredSensors.create(MATRICES, VARIANCES, -np.inf, 2)
     node_filter: NodeFilter = kind(sensors)
-    return FederatedTobitSystem(
+    return CensoredSystem(
         plant=plant,
-        filter=node_filter,
-        fusion=FederatedFusion.create(share, 3),
+        model=plant,
+        centre=FederatedCentre(node_filter, FederatedFusion.create(share, 3)),
         random_start=False,
         state_names=("x1", "x2"),
         scale=np.ones(2),

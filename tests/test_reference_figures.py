@@ -416,7 +416,8 @@ class WronglyInformed:
 
 def misinformed_task(factor: float, **options: Any) -> Task:
     task = make_task(filter="tobit", **options)
-    sensors = task.system.filter.sensors
+    centre = task.system.centre
+    sensors = centre.sensors
     believed = CensoredSensors.create(
         sensors.measurement_matrix[..., 0],
         factor * sensors.variance[..., 0],
@@ -424,7 +425,8 @@ def misinformed_task(factor: float, **options: Any) -> Task:
         2,
     )
     node_filter = WronglyInformed(sensors, TobitKalmanFilter(believed))
-    return dataclasses.replace(task, system=dataclasses.replace(task.system, filter=node_filter))
+    centre = dataclasses.replace(centre, filter=node_filter)
+    return dataclasses.replace(task, system=dataclasses.replace(task.system, centre=centre))
 
 
 def consistency(task: Task, policy: str) -> tuple[float, float]:

@@ -12,6 +12,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from fusion_gym.envs.task import ObservationLayout, Task
+from fusion_gym.network import access_mask, first_request
 from fusion_gym.systems import Signals
 from fusion_gym.validation import Array
 
@@ -58,7 +59,8 @@ class EpisodeBatch:
         # Row (cursor mod block) of the ring holds the noise of the next sensing; a run's block
         # starts wherever the cursor stood at its reset, so that a row is one contiguous read.
         self._block = min(task.horizon + 1, _LONGEST_BLOCK)
-        self._ring = np.zeros((self._block, task.system.noise_channels, num_envs))
+        self._channels = task.system.noise_channels + (task.access == "random")
+        self._ring = np.zeros((self._block, self._channels, num_envs))
         self._cursor = 0
         self._block_start = np.zeros(num_envs, dtype=np.int64)
 
@@ -88,7 +90,7 @@ class EpisodeBatch:
             self._next_episode(run).standard_normal(out=noise[place])
         self._draw(runs)
         fresh = system.start(np.ascontiguousarray(noise.T))
-        row = self._ring[self._cursor % self._block]
+        row = self._noise()
         fresh = system.sense(fresh, row if everyone else row[:, runs])
         self.state = fresh if everyone else _merge(self.state, fresh, runs)
         self.tokens = _merge(self.tokens, self.task.bucket.start(len(runs)), runs)
@@ -110,7 +112,10 @@ class EpisodeBatch:
         if self.state is None:
             raise ResetNeeded("call reset before the first step")
         task, system = self.task, self.task.system
-        granted, spent, tokens = task.bucket.grant(self.tokens, requests, self.steps)
+        admitted = requests & self.admitted()
+        if task.access == "single":
+            admitted = first_request(admitted, self.steps)
+        granted, spent, tokens = task.bucket.grant(self.tokens, admitted, self.steps)
         state = system.deliver(self.state, granted)
         mean, covariance = system.fused(state)
         error = system.truth(state) - mean
@@ -124,7 +129,7 @@ class EpisodeBatch:
         if used_up.any():
             self._draw(np.flatnonzero(used_up))
         self.delivered = state
-        self.state = system.sense(state, self._ring[self._cursor % self._block])
+        self.state = system.sense(state, self._noise())
         self.finished = truncated.copy()
         return Outcome(
             reward=reward_error + reward_cost,
@@ -139,13 +144,23 @@ class EpisodeBatch:
 
     def observe(self) -> NDArray[np.float32]:
         """Observations (N, entries) of all runs, a fresh array."""
-        return self.layout.encode(self.state, self.tokens)
+        return self.layout.encode(self.state, self.tokens, self.admitted())
+
+    def admitted(self) -> NDArray[np.bool_]:
+        """The sensors (sensors, N) that the network's access rule admits in the coming step."""
+        noise = self._ring[self._cursor % self._block, -1] if self.task.access == "random" else None
+        return access_mask(self.task.access, self.task.sensors, self.steps, noise)
+
+    def _noise(self) -> Array:
+        """The system's noise (channels, N) at the cursor."""
+        return self._ring[self._cursor % self._block, : self.task.system.noise_channels]
 
     def signals(self) -> Signals:
         """The signals of all runs, without what the information mode withholds.
 
         To the system's own it adds ``tokens`` (N,), ``token_cost`` (sensors, 1), ``step`` (N,),
-        the steps taken in the episode, ``start`` (N,) bool, and ``observation`` (N, entries).
+        the steps taken in the episode, ``start`` (N,) bool, ``admitted`` (sensors, N) bool, and
+        ``observation`` (N, entries).
         """
         values = dict(self.task.system.read(self.state))
         values |= {
@@ -153,6 +168,7 @@ class EpisodeBatch:
             "token_cost": self.task.bucket.cost,
             "step": self.steps,
             "start": self.steps == 0,
+            "admitted": self.admitted,
             "observation": self.observe,
         }
         return Signals(values, self.task.hidden_signals)
@@ -180,8 +196,7 @@ class EpisodeBatch:
 
     def _draw(self, runs: NDArray[np.int64]) -> None:
         """Draw the next block of noise for these runs, to begin at the cursor."""
-        channels = self.task.system.noise_channels
-        noise = np.empty((len(runs), self._block, channels))
+        noise = np.empty((len(runs), self._block, self._channels))
         for place, run in enumerate(runs.tolist()):
             self._generator(run).standard_normal(out=noise[place])
         rows = (self._cursor + np.arange(self._block)) % self._block

@@ -17,7 +17,12 @@ def observation_space(layout: ObservationLayout) -> spaces.Box:
 
 
 def action_space(task: Task) -> spaces.MultiBinary | spaces.Discrete[Any]:
-    """``MultiBinary(sensors)``, or ``Discrete(2**sensors)`` for ``action="discrete"``."""
+    """``MultiBinary(sensors)``, or ``Discrete(2**sensors)`` for ``action="discrete"``.
+
+    With ``access="single"`` it is ``Discrete(sensors + 1)``.
+    """
+    if task.access == "single":
+        return spaces.Discrete(task.sensors + 1)
     if task.action == "discrete":
         return spaces.Discrete(2**task.sensors)
     return spaces.MultiBinary(task.sensors)
@@ -26,6 +31,8 @@ def action_space(task: Task) -> spaces.MultiBinary | spaces.Discrete[Any]:
 def requests(task: Task, actions: Any, num_envs: int) -> NDArray[np.bool_]:
     """Requests (sensors, N) from actions (N, sensors) of 0 and 1, or (N,) of whole numbers.
 
+    A whole number holds the requests as bits, or with ``access="single"`` the sensor from 1.
+
     Raises:
         ValueError: an action of another shape, not finite, or outside the action space.
     """
@@ -33,7 +40,8 @@ def requests(task: Task, actions: Any, num_envs: int) -> NDArray[np.bool_]:
         given = np.asarray(actions)
     except ValueError:
         raise ValueError(f"action {actions!r} is not allowed: it must be an array") from None
-    discrete = task.action == "discrete"
+    single = task.access == "single"
+    discrete = task.action == "discrete" or single
     wanted = (num_envs,) if discrete else (num_envs, task.sensors)
     if given.dtype.kind not in "biuf":
         raise ValueError(
@@ -42,10 +50,12 @@ def requests(task: Task, actions: Any, num_envs: int) -> NDArray[np.bool_]:
     if given.shape != wanted:
         raise ValueError(f"action of shape {given.shape} is not allowed: it must be {wanted}")
     if discrete:
-        high = 2**task.sensors - 1
+        high = task.sensors if single else 2**task.sensors - 1
         valid = (given >= 0) & (given <= high) & (given == np.floor(given))
         if not valid.all():
             raise ValueError(f"action {_first(given, valid)} is not allowed: it must be 0..{high}")
+        if single:
+            return np.arange(1, task.sensors + 1)[:, None] == given
         return (given.astype(np.int64) >> np.arange(task.sensors)[:, None] & 1).astype(np.bool_)
     result = given == 1
     valid = result | (given == 0)

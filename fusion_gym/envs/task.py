@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
-from fusion_gym.network import TokenBucket
+from fusion_gym.network import ACCESS_RULES, TokenBucket
 from fusion_gym.systems import Feature, System
 from fusion_gym.validation import Array
 
@@ -76,6 +76,8 @@ class Task:
     ``information`` is ``"sensors"`` (a coordinator that sees every sensor's new measurement) or
     ``"centre"`` (only what the fusion centre knows before anything is sent). ``action`` is
     ``"binary"`` (one bit a sensor) or ``"discrete"`` (the bits as one number, sensor 0 the lowest).
+    ``access`` is a rule of :func:`fusion_gym.network.access_mask`; with ``"single"`` the action is
+    0 for nobody or the number of the sensor, counted from 1.
     ``settings`` is what a user chose, for reports; ``policy_defaults`` the scenario's own
     parameters of named policies.
 
@@ -89,6 +91,7 @@ class Task:
     horizon: int
     information: str = "sensors"
     action: str = "binary"
+    access: str = "any"
     settings: dict[str, Any] = field(default_factory=dict)
     policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
 
@@ -96,6 +99,7 @@ class Task:
         validation.integer("horizon", self.horizon, at_least=1)
         validation.choice("information", self.information, INFORMATION_MODES)
         validation.choice("action", self.action, ACTION_KINDS)
+        validation.choice("access", self.access, ACCESS_RULES)
         if len(self.bucket.cost) != self.system.sensor_count:
             raise validation.ConfigurationError(
                 f"token_cost for {len(self.bucket.cost)} sensors is not allowed: the system has "
@@ -128,11 +132,15 @@ class ObservationLayout:
     """
 
     def __init__(self, task: Task) -> None:
-        blocks = (*task.system.features, (Feature("tokens", "centre", 0.0, 1.0),))
+        admitted = tuple(
+            Feature(f"admitted[{sensor}]", "centre", 0.0, 1.0)
+            for sensor in range(task.sensors if task.access in ("round_robin", "random") else 0)
+        )
+        blocks = (*task.system.features, (Feature("tokens", "centre", 0.0, 1.0),), admitted)
         self._kept = [
             number
             for number, block in enumerate(blocks)
-            if task.information == "sensors" or block[0].knowledge == "centre"
+            if block and (task.information == "sensors" or block[0].knowledge == "centre")
         ]
         entries = [entry for number in self._kept for entry in blocks[number]]
         self.names = tuple(entry.name for entry in entries)
@@ -141,9 +149,14 @@ class ObservationLayout:
         self._capacity = task.bucket.capacity
         self._system = task.system
 
-    def encode(self, state: Any, tokens: Array) -> np.ndarray[Any, np.dtype[np.float32]]:
-        """Observations (N, entries) float32, clipped to their bounds."""
-        blocks = (*self._system.observe(state), tokens[None] / self._capacity)
+    def encode(
+        self, state: Any, tokens: Array, admitted: NDArray[np.bool_]
+    ) -> np.ndarray[Any, np.dtype[np.float32]]:
+        """Observations (N, entries) float32, clipped to their bounds.
+
+        ``tokens`` (N,) and ``admitted`` (sensors, N) are the network's.
+        """
+        blocks = (*self._system.observe(state), tokens[None] / self._capacity, admitted)
         rows = np.concatenate([blocks[number] for number in self._kept])
         result = np.ascontiguousarray(rows.T, dtype=np.float32)
         np.maximum(result, self.low, out=result)

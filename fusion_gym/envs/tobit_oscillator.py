@@ -20,18 +20,19 @@ from fusion_gym.envs.single import FusionEnv
 from fusion_gym.envs.task import Reward, Task
 from fusion_gym.envs.vector import FusionVectorEnv
 from fusion_gym.filters import (
+    AssumedDensityFilter,
     BoundConstants,
     BoundTobitFilter,
     EventError,
     KalmanFilter,
-    NodeFilter,
     TobitKalmanFilter,
 )
 from fusion_gym.fusion import FederatedFusion
 from fusion_gym.network import TokenBucket
 from fusion_gym.plants import LinearPlant
 from fusion_gym.sensors import CensoredSensors
-from fusion_gym.systems import FederatedTobitSystem
+from fusion_gym.systems import CensoredSystem, FederatedCentre, SequentialCentre
+from fusion_gym.systems.centre import Centre
 from fusion_gym.validation import Array, ConfigurationError
 
 _ANGLE = 0.052 * math.pi
@@ -109,10 +110,10 @@ def build(**options: Any) -> Task:
     )
     random_start = validation.boolean("random_start", chosen.random_start)
     trigger = _trigger(chosen, sensors.count)
-    system = FederatedTobitSystem(
+    system = CensoredSystem(
         plant=plant,
-        filter=_filter(chosen, sensors, trigger),
-        fusion=FederatedFusion.create(chosen.information_shares, sensors.count),
+        model=plant,
+        centre=_centre(chosen, sensors, trigger),
         random_start=random_start,
         state_names=tuple(f"x{i + 1}" for i in range(plant.size)),
         scale=_typical_magnitude(plant, horizon, random_start),
@@ -164,10 +165,11 @@ def _plant(chosen: TobitOscillatorOptions) -> LinearPlant:
     )
 
 
-def _filter(
+def _centre(
     chosen: TobitOscillatorOptions, sensors: CensoredSensors, trigger: dict[str, tuple[float, ...]]
-) -> NodeFilter:
-    kind = validation.choice("filter", chosen.filter, ("paper", "tobit", "kalman"))
+) -> Centre:
+    kind = validation.choice("filter", chosen.filter, ("paper", "tobit", "kalman", "adf"))
+    fusion = FederatedFusion.create(chosen.information_shares, sensors.count)
     constants = BoundConstants.create(chosen.bound_epsilon)
     error = EventError.create(**trigger, young=chosen.bound_young, sensors=sensors.count)
     silent, with_error = chosen.silent, chosen.event_error
@@ -176,16 +178,25 @@ def _filter(
     if with_error is not None:
         validation.boolean("event_error", with_error)
     if kind == "paper":
-        return BoundTobitFilter(
+        bound = BoundTobitFilter(
             sensors, constants, None if with_error is False else error, hold=silent != "predict"
         )
+        return FederatedCentre(bound, fusion)
     for name, value, refused in (("silent", silent, "hold"), ("event_error", with_error, True)):
         if value == refused:
             raise ConfigurationError(
                 f"{name} = {value!r} is not allowed with filter={kind!r}: it belongs to "
                 "filter='paper' (the others predict when nothing arrives and know no event error)"
             )
-    return TobitKalmanFilter(sensors) if kind == "tobit" else KalmanFilter(sensors)
+    if kind == "adf":
+        if chosen.information_shares is not None:
+            raise ConfigurationError(
+                f"information_shares = {chosen.information_shares!r} is not allowed with "
+                "filter='adf': its centre takes the measurements itself and shares nothing"
+            )
+        return SequentialCentre(AssumedDensityFilter(sensors))
+    node = TobitKalmanFilter(sensors) if kind == "tobit" else KalmanFilter(sensors)
+    return FederatedCentre(node, fusion)
 
 
 def _trigger(chosen: TobitOscillatorOptions, sensors: int) -> dict[str, tuple[float, ...]]:

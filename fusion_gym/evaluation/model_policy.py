@@ -5,17 +5,17 @@ Loading a model unpickles parts of the file: load only files that you trust.
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
-import gymnasium
-import numpy as np
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from fusion_gym import validation
 from fusion_gym.envs import EpisodeBatch, Task, spaces
+from fusion_gym.envs.task import ACTION_KINDS
 from fusion_gym.systems import Signals
 from fusion_gym.triggers import Requests
 from fusion_gym.validation import ConfigurationError
@@ -37,8 +37,7 @@ class ModelPolicy:
     def __init__(self, model: BaseAlgorithm, task: Task, deterministic: bool = True) -> None:
         self.model = model
         self.deterministic = deterministic
-        self._sensors = task.sensors
-        self._discrete = isinstance(model.action_space, gymnasium.spaces.Discrete)
+        self._task = task
 
     def reset(self, num_envs: int, seed: int = 0) -> None:
         """Nothing to forget; a stochastic policy draws from the stream of ``seed``."""
@@ -48,10 +47,7 @@ class ModelPolicy:
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
         action, _ = self.model.predict(signals["observation"], deterministic=self.deterministic)
-        if self._discrete:
-            bits = np.asarray(action)[None] >> np.arange(self._sensors)[:, None] & 1
-            return bits.astype(np.bool_)
-        return np.ascontiguousarray(np.asarray(action).T == 1)
+        return spaces.requests(self._task, action, len(action))
 
 
 def load_model_policy(path: str, task: Task, deterministic: bool = True) -> ModelPolicy:
@@ -73,11 +69,12 @@ def load_model_policy(path: str, task: Task, deterministic: bool = True) -> Mode
         ) from None
     if not data or "observation_space" not in data:
         raise ConfigurationError(f"model {path!r} is not allowed: it has no observation space")
-    _check_layout(path, data, task)
+    task = _fitted(path, data, task)
     return ModelPolicy(_load(path, file, data), task, deterministic)
 
 
-def _check_layout(path: str, data: dict[str, Any], task: Task) -> None:
+def _fitted(path: str, data: dict[str, Any], task: Task) -> Task:
+    """The task with the kind of action that the model has, its observation layout checked."""
     layout = EpisodeBatch(task, 1).layout
     names = data.get(_TAG, {}).get("observation_names")
     if names is not None and list(names) != list(layout.names):
@@ -97,14 +94,18 @@ def _check_layout(path: str, data: dict[str, Any], task: Task) -> None:
             f"{have.shape}, the task (information={task.information!r}) has {wanted.shape}"
         )
     action = data["action_space"]
-    fits = action == gymnasium.spaces.MultiBinary(task.sensors) or (
-        isinstance(action, gymnasium.spaces.Discrete) and action.n == 2**task.sensors
+    kinds = (
+        [task]
+        if task.access == "single"
+        else [dataclasses.replace(task, action=kind) for kind in ACTION_KINDS]
     )
-    if not fits:
+    allowed = [spaces.action_space(kind) for kind in kinds]
+    if action not in allowed:
         raise ConfigurationError(
             f"model {path!r} has the action space {action}: the task has {task.sensors} sensors, "
-            f"so it must be MultiBinary({task.sensors}) or Discrete({2**task.sensors})"
+            f"so it must be {' or '.join(map(str, allowed))}"
         )
+    return kinds[allowed.index(action)]
 
 
 def _load(path: str, file: Path, data: dict[str, Any]) -> BaseAlgorithm:

@@ -1,11 +1,13 @@
 """Node filters: what a sensor's local filter makes of a delivery, and of its absence."""
 
+from fusion_gym.filters.assumed_density import AssumedDensityFilter
 from fusion_gym.filters.base import Expectation, NodeFilter, Plan
 from fusion_gym.filters.bound import BoundConstants, BoundTobitFilter, EventError
 from fusion_gym.filters.kalman import KalmanFilter
 from fusion_gym.filters.tobit import TobitKalmanFilter
 
 __all__ = [
+    "AssumedDensityFilter",
     "BoundConstants",
     "BoundTobitFilter",
     "EventError",

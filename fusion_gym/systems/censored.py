@@ -1,6 +1,7 @@
-"""Censored sensors, local Tobit filters, federated fusion with feedback.
+"""A linear plant and censored sensors, with nodes and a fusion centre.
 
-Source: tobit_token_bucket (Chen, Han, Song and Zhang, Complex Eng. Syst. 4:19, 2024).
+Source: tobit_token_bucket (Chen, Han, Song and Zhang, Complex Eng. Syst. 4:19, 2024);
+round_robin_tobit (Geng, Wang, Alsaadi, Alharbi and Cheng, 2020).
 """
 
 from __future__ import annotations
@@ -12,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg
-from fusion_gym.filters import Expectation, NodeFilter, Plan
-from fusion_gym.fusion import FederatedFusion
 from fusion_gym.plants import LinearPlant
 from fusion_gym.systems.base import Feature, Signal, SignalArray
+from fusion_gym.systems.centre import Centre, Outlook
 from fusion_gym.validation import Array
 
 _WHITE = 5.0  # whitened quantities are clipped at this many standard deviations
@@ -23,15 +23,14 @@ _LOG_RANGE = 5.0  # log variance ratios are clipped here: starved bounds grow as
 
 
 @dataclass(slots=True)
-class FederatedTobitState:
+class CensoredState:
     """Everything about N runs at one time; shapes with n states, l sensors, m components.
 
     ``truth`` (n, N) · ``measurement`` (l, m, N) · ``held`` (l, m, N), the last delivered
     measurement · ``age`` (l, N), steps since then · ``time`` (N,), the step in the episode ·
-    ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N), the centre's prediction · the
-    expectation and plan of the nodes (see :mod:`fusion_gym.filters.base`) · ``local_mean``
-    (l, n, N), ``local_covariance`` (l, n, n, N), the nodes' posterior before the feedback ·
-    ``mean`` (n, N), ``covariance`` (n, n, N), the fused posterior.
+    ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N), the centre's prediction · ``outlook``,
+    what is expected of the measurements · ``local_mean`` (l, n, N), the nodes' posterior before
+    the feedback · ``mean`` (n, N), ``covariance`` (n, n, N), the fused posterior.
     """
 
     truth: Array
@@ -41,10 +40,8 @@ class FederatedTobitState:
     time: Array
     prior_mean: Array
     prior_covariance: Array
-    expectation: Expectation | None
-    plan: Plan | None
+    outlook: Outlook | None
     local_mean: Array
-    local_covariance: Array
     mean: Array
     covariance: Array
 
@@ -72,8 +69,10 @@ SIGNALS = (
 
 
 @dataclass(frozen=True)
-class FederatedTobitSystem:
-    """Joins a plant, censored sensors, one node filter for each, and federated fusion.
+class CensoredSystem:
+    """Joins a plant, censored sensors, and a centre with or without nodes.
+
+    ``model`` is the plant that the filters believe in; the true one is ``plant``.
 
     ``random_start`` draws the initial mean, known to the filters, in a uniformly random direction
     with the length of the plant's initial mean; for the oscillator that is a random phase.
@@ -82,8 +81,8 @@ class FederatedTobitSystem:
     """
 
     plant: LinearPlant
-    filter: NodeFilter
-    fusion: FederatedFusion
+    model: LinearPlant
+    centre: Centre
     random_start: bool
     state_names: tuple[str, ...]
     scale: Array
@@ -92,17 +91,17 @@ class FederatedTobitSystem:
     @property
     def sensor_count(self) -> int:
         """Number of sensors."""
-        return self.filter.sensors.count
+        return self.centre.sensors.count
 
     @property
     def noise_channels(self) -> int:
         """Normals of one step: process noise, then the sensors' noises."""
-        return self.plant.noise_channels + self.filter.sensors.noise_channels
+        return self.plant.noise_channels + self.centre.sensors.noise_channels
 
     @property
     def start_channels(self) -> int:
         """Normals of a start: its direction, its deviation, the noise of the first measurement."""
-        return 2 * self.plant.size + self.filter.sensors.noise_channels
+        return 2 * self.plant.size + self.centre.sensors.noise_channels
 
     @property
     def signals(self) -> tuple[Signal, ...]:
@@ -112,7 +111,7 @@ class FederatedTobitSystem:
     @property
     def features(self) -> tuple[tuple[Feature, ...], ...]:
         """Blocks of the observation; see docs/tobit_oscillator.md."""
-        sensors, size = self.sensor_count, self.filter.sensors.size
+        sensors, size = self.sensor_count, self.centre.sensors.size
 
         def block(kind: str, knowledge: str, low: float, high: float) -> tuple[Feature, ...]:
             return tuple(
@@ -136,9 +135,9 @@ class FederatedTobitSystem:
             ),
         )
 
-    def start(self, noise: Array) -> FederatedTobitState:
+    def start(self, noise: Array) -> CensoredState:
         """Time 0: the state is drawn and every first measurement is known, free of charge."""
-        n, sensors = self.plant.size, self.filter.sensors
+        n, sensors = self.plant.size, self.centre.sensors
         mean = np.broadcast_to(self.plant.initial_mean, (n, noise.shape[-1])).copy()
         if self.random_start:
             direction = noise[:n] / np.sqrt(linalg.dot(noise[:n], noise[:n]))
@@ -146,9 +145,8 @@ class FederatedTobitSystem:
         truth = self.plant.start(mean, noise[n : 2 * n])
         measurement = sensors.measure(truth, noise[2 * n :])
         runs = noise.shape[-1]
-        covariance = np.broadcast_to(self.plant.initial_covariance, (n, n, runs)).copy()
-        nodes_mean, nodes_covariance = self.fusion.distribute(mean, covariance)
-        return FederatedTobitState(
+        covariance = np.broadcast_to(self.model.initial_covariance, (n, n, runs)).copy()
+        return CensoredState(
             truth=truth,
             measurement=measurement,
             held=measurement,
@@ -156,105 +154,90 @@ class FederatedTobitSystem:
             time=np.zeros(runs),
             prior_mean=mean,
             prior_covariance=covariance,
-            expectation=None,
-            plan=None,
-            local_mean=nodes_mean.copy(),
-            local_covariance=nodes_covariance,
+            outlook=None,
+            local_mean=np.broadcast_to(mean, (sensors.count, *mean.shape)).copy(),
             mean=mean,
             covariance=covariance,
         )
 
-    def sense(self, state: FederatedTobitState, noise: Array) -> FederatedTobitState:
+    def sense(self, state: CensoredState, noise: Array) -> CensoredState:
         """The plant moves, the sensors measure, centre and nodes predict.
 
         Source: tobit_token_bucket, equations (1), (2), (21), (23), (29).
         """
         r = self.plant.noise_channels
         truth = self.plant.advance(state.truth, noise[:r])
-        prior_mean, prior_covariance = self.plant.predict(state.mean, state.covariance)
-        nodes = self.fusion.distribute(prior_mean, prior_covariance)
-        expectation = self.filter.expect(nodes[0])
+        prior_mean, prior_covariance = self.model.predict(state.mean, state.covariance)
         time = state.time + 1.0
-        return FederatedTobitState(
+        return CensoredState(
             truth=truth,
-            measurement=self.filter.sensors.measure(truth, noise[r:]),
+            measurement=self.centre.sensors.measure(truth, noise[r:]),
             held=state.held,
             age=state.age + 1.0,
             time=time,
             prior_mean=prior_mean,
             prior_covariance=prior_covariance,
-            expectation=expectation,
-            plan=self.filter.plan(*nodes, expectation, state.held, time),
+            outlook=self.centre.look(prior_mean, prior_covariance, state.held, time),
             local_mean=state.local_mean,
-            local_covariance=state.local_covariance,
             mean=state.mean,
             covariance=state.covariance,
         )
 
-    def deliver(
-        self, state: FederatedTobitState, granted: NDArray[np.bool_]
-    ) -> FederatedTobitState:
-        """The nodes take the planned outcome of the network's answer, the centre fuses.
+    def deliver(self, state: CensoredState, granted: NDArray[np.bool_]) -> CensoredState:
+        """Nodes and centre update with what the network granted (sensors, N).
 
         Source: tobit_token_bucket, equations (20), (22), (30), (50).
         """
-        expectation, plan = _sensed(state)
-        innovation = state.measurement - expectation.value
-        update = linalg.matvec(linalg.transpose(plan.correction), innovation)
-        grant = granted[:, None]
-        local_mean = np.where(grant, state.prior_mean + update, plan.silent_mean)
-        local_covariance = np.where(
-            grant[:, None], plan.delivered_covariance, plan.silent_covariance
+        posterior = self.centre.update(
+            state.prior_mean, state.prior_covariance, _outlook(state), state.measurement, granted
         )
-        mean, covariance = self.fusion.fuse(local_mean, local_covariance)
-        return FederatedTobitState(
+        return CensoredState(
             truth=state.truth,
             measurement=state.measurement,
-            held=np.where(grant, state.measurement, state.held),
+            held=np.where(granted[:, None], state.measurement, state.held),
             age=np.where(granted, 0.0, state.age),
             time=state.time,
             prior_mean=state.prior_mean,
             prior_covariance=state.prior_covariance,
-            expectation=expectation,
-            plan=plan,
-            local_mean=local_mean,
-            local_covariance=local_covariance,
-            mean=mean,
-            covariance=covariance,
+            outlook=state.outlook,
+            local_mean=posterior.local_mean,
+            mean=posterior.mean,
+            covariance=posterior.covariance,
         )
 
-    def read(
-        self, state: FederatedTobitState
-    ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
+    def read(self, state: CensoredState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
         """The signals named in ``SIGNALS``."""
-        expectation, plan = _sensed(state)
-        threshold = self.filter.sensors.threshold
+        expectation, deviation, _ = _outlook(state)
+
+        def variances() -> tuple[Array, Array]:
+            return self.centre.variances(state.prior_mean, state.prior_covariance, _outlook(state))
+
         return {
             "measurement": state.measurement,
             "innovation": lambda: state.measurement - expectation.value,
-            "censored": lambda: state.measurement <= threshold,
+            "censored": lambda: self.centre.sensors.censored(state.measurement),
             "held": state.held,
             "age": state.age,
             "expected_measurement": expectation.value,
-            "innovation_deviation": lambda: self._deviation(state),
+            "innovation_deviation": deviation,
             "uncensored_probability": expectation.uncensored_probability,
             "prior_mean": state.prior_mean,
             "prior_covariance": state.prior_covariance,
-            "silent_variance": lambda: linalg.trace(self._silent(plan)[1]),
-            "variance_reduction": lambda: self._variance_reduction(plan),
+            "silent_variance": lambda: variances()[0],
+            "variance_reduction": lambda: variances()[1],
         }
 
-    def observe(self, state: FederatedTobitState) -> Sequence[Array]:
+    def observe(self, state: CensoredState) -> Sequence[Array]:
         """The blocks named in :attr:`features`, before clipping to their bounds."""
-        expectation, _ = _sensed(state)
+        expectation, deviation, _ = _outlook(state)
         runs = state.truth.shape[-1]
-        innovation = (state.measurement - expectation.value) / self._deviation(state)
-        sensors = self.filter.sensors
-        difference = (state.measurement - state.held) / (2.0 * np.sqrt(sensors.variance))
+        innovation = (state.measurement - expectation.value) / deviation
+        sensors = self.centre.sensors
+        difference = (state.measurement - state.held) / (2.0 * sensors.deviation)
         variance = linalg.diagonal(state.prior_covariance) / self.reference[:, None]
         return (
             innovation.reshape(-1, runs),
-            (state.measurement <= sensors.threshold).reshape(-1, runs).astype(np.float64),
+            sensors.censored(state.measurement).reshape(-1, runs).astype(np.float64),
             difference.reshape(-1, runs),
             expectation.uncensored_probability.reshape(-1, runs),
             state.age / (state.age + 10.0),
@@ -262,15 +245,15 @@ class FederatedTobitSystem:
             state.prior_mean / self.scale[:, None],
         )
 
-    def truth(self, state: FederatedTobitState) -> Array:
+    def truth(self, state: CensoredState) -> Array:
         """The plant's state (n, N)."""
         return state.truth
 
-    def fused(self, state: FederatedTobitState) -> tuple[Array, Array]:
+    def fused(self, state: CensoredState) -> tuple[Array, Array]:
         """The centre's mean (n, N) and covariance (n, n, N)."""
         return state.mean, state.covariance
 
-    def local_means(self, state: FederatedTobitState) -> Array:
+    def local_means(self, state: CensoredState) -> Array:
         """The nodes' posterior means (sensors, n, N) before the feedback."""
         return state.local_mean
 
@@ -278,27 +261,8 @@ class FederatedTobitSystem:
         """Mean error variance (n,) over t = 1..horizon of a centre that only predicts."""
         return self.plant.open_loop(horizon)
 
-    def _deviation(self, state: FederatedTobitState) -> Array:
-        """Predicted standard deviation of the innovation (sensors, m, N), from the centre's P."""
-        expectation, _ = _sensed(state)
-        matrix = self.filter.sensors.measurement_matrix
-        spread = (matrix * linalg.matmul(matrix, state.prior_covariance)).sum(-2)
-        q = expectation.uncensored_probability
-        floor = 1e-3 * self.filter.sensors.variance
-        return np.sqrt(q * q * spread + expectation.noise_variance + floor)
 
-    def _silent(self, plan: Plan) -> tuple[Array, Array]:
-        information = linalg.inverse(plan.silent_covariance)
-        return information, linalg.inverse(information.sum(0))
-
-    def _variance_reduction(self, plan: Plan) -> Array:
-        information, silent = self._silent(plan)
-        gained = linalg.inverse(plan.delivered_covariance) - information
-        fused = linalg.inverse(linalg.symmetrise(information.sum(0) + gained))
-        return linalg.trace(silent) - linalg.trace(fused)
-
-
-def _sensed(state: FederatedTobitState) -> tuple[Expectation, Plan]:
-    if state.expectation is None or state.plan is None:
+def _outlook(state: CensoredState) -> Outlook:
+    if state.outlook is None:
         raise RuntimeError("the state has no measurements yet: call sense first")
-    return state.expectation, state.plan
+    return state.outlook
