@@ -146,10 +146,11 @@ class Sweep(_Strict):
 
 
 class ComparisonRow(_Strict):
-    """One policy in one setting of the environment."""
+    """One policy in one setting of the comparison's environment, or of another."""
 
     label: str
     policy: str
+    environment: str | None = None
     options: dict[str, Any] = {}
 
 

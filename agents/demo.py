@@ -33,6 +33,7 @@ from fusion_gym.evaluation import (
     lower_envelope,
     make_policy,
     record_episode,
+    robust_summary,
     run_episodes,
     summarise,
 )
@@ -102,7 +103,6 @@ def demonstrate(
         "policies": {name: summarise(found) for name, found in baselines.items()}
         | {agent: summarise(learned)},
     }
-    write(folder / "evaluation.json", report)
     verdict = {
         "agent": agent,
         "rate": float(learned.rate.mean()),
@@ -114,6 +114,10 @@ def demonstrate(
     }
     (folder / "comparison.json").write_text(json.dumps(verdict, indent=1) + "\n")
     shown = [*sweep.points, *(point.name for point in envelope), agent]
+    quantiles = {name: robust_summary(found) for name, found in baselines.items()}
+    quantiles[agent] = robust_summary(learned)
+    report["quantiles"] = quantiles
+    write(folder / "evaluation.json", report)
     chosen = {name: report["policies"][name] for name in dict.fromkeys(shown)}
     console = tables.console()
     console.print(
@@ -121,6 +125,7 @@ def demonstrate(
             f"{setting.title}: single policies, the lower envelope of all {len(baselines)} "
             "baselines, and the agent",
             chosen,
+            quantiles,
             {},
         )
     )

@@ -23,6 +23,7 @@ from fusion_gym.evaluation import (
     EpisodeResults,
     make_policy,
     paired_difference,
+    robust_summary,
     run_episodes,
     summarise,
 )
@@ -92,14 +93,16 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         "horizon": task.horizon,
         "settings": task.settings,
         "policies": {},
+        "quantiles": {},
     }
-    done = finished(arguments.json, report) if arguments.resume else {}
+    done = finished(arguments.json, report) if arguments.resume else {"policies": {}}
     results: dict[str, EpisodeResults] = {}
     steps = len(names) * arguments.episodes * task.horizon
     with progress_bar(steps, "evaluating") as bar:
         for name, policy in policies.items():
-            if name in done:
-                report["policies"][name] = done[name]
+            if name in done["policies"]:
+                report["policies"][name] = done["policies"][name]
+                report["quantiles"][name] = done["quantiles"][name]
                 bar.update(arguments.episodes * task.horizon)
                 continue
             bar.set_postfix_str(name, refresh=False)
@@ -107,6 +110,7 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
                 task, policy, arguments.episodes, arguments.seed, bar.update
             )
             report["policies"][name] = summarise(results[name])
+            report["quantiles"][name] = robust_summary(results[name])
             write(arguments.json, report)
     differences = {
         name: paired_difference(found, results[arguments.reference])
@@ -122,7 +126,9 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     title = (
         f"{env_id}: {arguments.episodes} episodes of {task.horizon} steps, seed {arguments.seed}"
     )
-    tables.console().print(tables.evaluation_table(title, report["policies"], differences))
+    tables.console().print(
+        tables.evaluation_table(title, report["policies"], report["quantiles"], differences)
+    )
     return report
 
 
@@ -142,13 +148,13 @@ def environment(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
 
 
 def finished(path: Path, report: dict[str, Any]) -> dict[str, Any]:
-    """The policies that an earlier run of the same evaluation has written.
+    """What an earlier run of the same evaluation has written.
 
     Raises:
         ConfigurationError: the file is of another evaluation.
     """
     if not path.exists():
-        return {}
+        return {"policies": {}}
     earlier: dict[str, Any] = json.loads(path.read_text())
     plain = json.loads(json.dumps(report))
     for key in ("env", "episodes", "seed", "horizon", "settings"):
@@ -157,8 +163,7 @@ def finished(path: Path, report: dict[str, Any]) -> dict[str, Any]:
                 f"json {str(path)!r} holds another evaluation: its {key} is {earlier.get(key)!r}, "
                 f"asked for is {plain[key]!r}"
             )
-    found: dict[str, Any] = earlier["policies"]
-    return found
+    return earlier
 
 
 def write(path: Path | None, report: dict[str, Any]) -> None:

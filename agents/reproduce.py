@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 
+import numpy as np
 from rich import box
 from rich.table import Table
 
@@ -20,7 +21,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation import EpisodeResults, make_policy, mean_interval, run_episodes
 from fusion_gym.validation import ConfigurationError
 
-COLUMNS = ("setting", "requests", "rate", "MSE", "trace P", "NEES")
+COLUMNS = ("setting", "requests", "rate", "MSE", "median", "ARMSE", "trace P", "NEES")
 
 
 def run(comparison: Comparison, episodes: int, seed: int) -> list[tuple[str, ...]]:
@@ -31,7 +32,7 @@ def run(comparison: Comparison, episodes: int, seed: int) -> list[tuple[str, ...
     """
     made = []
     for row in comparison.rows:
-        task = make_task(comparison.environment, **row.options)
+        task = make_task(row.environment or comparison.environment, **row.options)
         made.append((row.label, task, make_policy(row.policy, task)))
     total = sum(episodes * task.horizon for _, task, _ in made)
     found = []
@@ -47,6 +48,8 @@ def _cells(label: str, results: EpisodeResults) -> tuple[str, ...]:
         " ".join(f"{rate:.3f}" for rate in results.requests.mean(0)),
         f"{results.rate.mean():.3f}",
         tables.number(mean_interval(results.mse)._asdict()),
+        f"{np.median(results.mse):.4g}",
+        " ".join(f"{error:.3f}" for error in np.sqrt(results.squared_error).mean(0)),
         tables.number(mean_interval(results.bound_trace)._asdict()),
         f"{results.nees.mean():.3f}",
     )
@@ -69,7 +72,8 @@ def main() -> None:
     except ConfigurationError as error:
         sys.exit(f"error: {error}")
     if arguments.markdown:
-        print("\n".join("| " + " | ".join(row) + " |" for row in [COLUMNS, *rows]))
+        lines = [COLUMNS, ("---",) * len(COLUMNS), *rows]
+        print("\n".join("| " + " | ".join(line) + " |" for line in lines))
         return
     table = Table(
         title=f"{arguments.episodes} episodes, seed {arguments.seed}", box=box.SIMPLE_HEAD

@@ -30,12 +30,15 @@ def difference(interval: Interval) -> str:
 
 
 def evaluation_table(
-    title: str, policies: Mapping[str, Mapping[str, Any]], differences: Mapping[str, Interval]
+    title: str,
+    policies: Mapping[str, Mapping[str, Any]],
+    quantiles: Mapping[str, Mapping[str, float]],
+    differences: Mapping[str, Interval],
 ) -> Table:
     """One row a policy; ``differences`` to a reference may be empty."""
     table = Table(title=title, box=box.SIMPLE_HEAD, caption=_CAPTION)
     table.add_column("policy", overflow="fold")
-    columns = ["MSE", "rate", "requests", "tokens", "denied", "trace P", "NEES", "return"]
+    columns = ["MSE", "median", "rate", "requests", "tokens", "denied", "trace P", "NEES", "return"]
     for column in columns:
         table.add_column(column, justify="right", no_wrap=True)
     if differences:
@@ -44,6 +47,7 @@ def evaluation_table(
         row = [
             name,
             number(found["mse"]),
+            f"{quantiles[name]['median']:.4g}",
             f"{sum(found['rate']) / len(found['rate']):.3f}",
             f"{sum(found['requests']) / len(found['requests']):.3f}",
             f"{found['tokens']['mean']:.3f}",
@@ -59,6 +63,6 @@ def evaluation_table(
 
 
 _CAPTION = (
-    "mean ± half width of the 95 % bootstrap interval over episodes; rate and requests per sensor "
-    "and step, tokens and denied per step; NEES is 1 for a consistent filter"
+    "mean ± half width of the 95 % bootstrap interval, and median, over episodes; rate and "
+    "requests per sensor and step, tokens and denied per step; NEES is 1 for a consistent filter"
 )

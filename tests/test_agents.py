@@ -61,14 +61,20 @@ def test_committed_experiments_are_valid(path: Path) -> None:
 
 
 def test_committed_sweep_and_comparison_name_policies_that_exist() -> None:
-    sweep = load_sweep(CONFIGS / "tobit_oscillator_sweep.yaml")
-    task = fusion_gym.make_task(ENV)
-    assert len(sweep.policies) == len(set(sweep.policies)) > 50
-    for policy in sweep.policies:
-        make_policy(policy, task)
-    comparison = load_comparison(CONFIGS / "tobit_oscillator_reproduce.yaml")
-    for row in comparison.rows:
-        make_policy(row.policy, fusion_gym.make_task(comparison.environment, **row.options))
+    for name, env_id in (
+        ("tobit_oscillator", ENV),
+        ("biased", "fusion_gym/BiasedOscillator-v0"),
+    ):
+        sweep = load_sweep(CONFIGS / f"{name}_sweep.yaml")
+        task = fusion_gym.make_task(env_id)
+        assert len(sweep.policies) == len(set(sweep.policies)) > 50
+        for policy in sweep.policies:
+            make_policy(policy, task)
+    for file in CONFIGS.glob("*_reproduce.yaml"):
+        comparison = load_comparison(file)
+        for row in comparison.rows:
+            env_id = row.environment or comparison.environment
+            make_policy(row.policy, fusion_gym.make_task(env_id, **row.options))
 
 
 @pytest.mark.parametrize(
@@ -172,7 +178,7 @@ def test_evaluation_writes_the_promised_json(tmp_path: Path) -> None:
     written = json.loads(file.read_text())
     assert written == json.loads(json.dumps(report))
     assert list(written) == [
-        *("env", "episodes", "seed", "horizon", "settings", "policies", "reference"),
+        *("env", "episodes", "seed", "horizon", "settings", "policies", "quantiles", "reference"),
     ]
     assert (written["env"], written["episodes"], written["horizon"]) == (ENV, 30, 20)
     assert written["settings"]["filter"] == "tobit"

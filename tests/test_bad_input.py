@@ -86,7 +86,7 @@ BAD_OPTIONS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
     ({"cost_weight": np.inf}, ("inf", "finite")),
     ({"state_weights": (1.0, 1.0, 1.0)}, ("(1.0, 1.0, 1.0)", "(2,)")),
     ({"state_weights": (1.0, -1.0)}, ("(1.0, -1.0)", ">= 0")),
-    ({"horizn": 5}, ("TobitOscillator-v0", "did you mean 'horizon'", "known are action")),
+    ({"horizn": 5}, ("TobitOscillator-v0", "did you mean 'horizon'", "known are access, action")),
 ]
 
 

@@ -209,8 +209,9 @@ def test_infos_and_the_terms_of_the_reward(sharing: str, error: str) -> None:
         token_rate=2.0,
     )
     _, info = env.reset(seed=11)
-    keys = {"cost", "cost_tokens", "rewards", "granted", "denied", "squared_error"}
+    keys = {"cost", "cost_tokens", "rewards", "granted", "denied", "squared_error", "diverged"}
     assert info.keys() == keys
+    assert not info["diverged"]
     assert info["cost"] == info["cost_tokens"] == 0.0
     assert info["rewards"] == {"error": 0.0, "cost": 0.0}
     assert not info["granted"].any()

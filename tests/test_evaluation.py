@@ -81,6 +81,7 @@ def test_metrics_against_a_plain_loop(task: Task, spec: str) -> None:
             rows["tokens"].append(info["cost"])
             rows["denied"].append(info["denied"].sum())
             rows["returns"].append(reward)
+            rows["diverged"].append(info["diverged"])
         assert len(rows["mse"]) == 12
         squared_error.append(rows.pop("squared_error"))
         for name, row in rows.items():

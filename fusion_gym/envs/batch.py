@@ -24,7 +24,8 @@ class Outcome(NamedTuple):
 
     ``reward`` (N,) is ``reward_error`` + ``reward_cost``; ``cost`` (N,) the tokens spent;
     ``requested``, ``granted`` (sensors, N) bool; ``squared_error`` (n, N) of the fused estimate;
-    ``truncated`` (N,) bool.
+    ``diverged`` (N,) bool, whether some state's squared error is not finite or above the task's
+    ``divergence_level``; ``truncated`` (N,) bool.
     """
 
     reward: Array
@@ -34,6 +35,7 @@ class Outcome(NamedTuple):
     requested: NDArray[np.bool_]
     granted: NDArray[np.bool_]
     squared_error: Array
+    diverged: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
 
 
@@ -112,9 +114,12 @@ class EpisodeBatch:
         if self.state is None:
             raise ResetNeeded("call reset before the first step")
         task, system = self.task, self.task.system
-        admitted = requests & self.admitted()
-        if task.access == "single":
-            admitted = first_request(admitted, self.steps)
+        if task.access == "any":
+            admitted = requests
+        elif task.access == "single":
+            admitted = first_request(requests, self.steps)
+        else:
+            admitted = requests & self.admitted()
         granted, spent, tokens = task.bucket.grant(self.tokens, admitted, self.steps)
         state = system.deliver(self.state, granted)
         mean, covariance = system.fused(state)
@@ -139,12 +144,13 @@ class EpisodeBatch:
             requested=requests,
             granted=granted,
             squared_error=squared_error,
+            diverged=~(squared_error <= task.divergence_level).all(0),
             truncated=truncated,
         )
 
     def observe(self) -> NDArray[np.float32]:
         """Observations (N, entries) of all runs, a fresh array."""
-        return self.layout.encode(self.state, self.tokens, self.admitted())
+        return self.layout.encode(self.state, self.tokens, self.admitted)
 
     def admitted(self) -> NDArray[np.bool_]:
         """The sensors (sensors, N) that the network's access rule admits in the coming step."""

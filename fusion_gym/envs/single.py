@@ -68,6 +68,6 @@ def _first(infos: Infos) -> Infos:
     return {
         key: _first(value)
         if isinstance(value, dict)
-        else (float(value[0]) if value.ndim == 1 else value[0].copy())
+        else (value[0].item() if value.ndim == 1 else value[0].copy())
         for key, value in infos.items()
     }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -117,6 +119,11 @@ class Task:
         """Number of sensors."""
         return self.system.sensor_count
 
+    @functools.cached_property
+    def divergence_level(self) -> Array:
+        """Squared errors (n, 1) beyond which a run counts as diverged: 100 times open loop."""
+        return 100.0 * self.system.open_loop(self.horizon)[:, None]
+
     @property
     def hidden_signals(self) -> tuple[str, ...]:
         """Names of the system's signals that the information mode withholds."""
@@ -146,17 +153,20 @@ class ObservationLayout:
         self.names = tuple(entry.name for entry in entries)
         self.low = np.array([entry.low for entry in entries], dtype=np.float32)
         self.high = np.array([entry.high for entry in entries], dtype=np.float32)
+        self._shows_admitted = bool(admitted)
         self._capacity = task.bucket.capacity
         self._system = task.system
 
     def encode(
-        self, state: Any, tokens: Array, admitted: NDArray[np.bool_]
+        self, state: Any, tokens: Array, admitted: Callable[[], NDArray[np.bool_]]
     ) -> np.ndarray[Any, np.dtype[np.float32]]:
         """Observations (N, entries) float32, clipped to their bounds.
 
-        ``tokens`` (N,) and ``admitted`` (sensors, N) are the network's.
+        ``tokens`` (N,) and ``admitted()`` (sensors, N) are the network's.
         """
-        blocks = (*self._system.observe(state), tokens[None] / self._capacity, admitted)
+        blocks = [*self._system.observe(state), tokens[None] / self._capacity]
+        if self._shows_admitted:
+            blocks.append(admitted().astype(np.float64))
         rows = np.concatenate([blocks[number] for number in self._kept])
         result = np.ascontiguousarray(rows.T, dtype=np.float32)
         np.maximum(result, self.low, out=result)

@@ -8,7 +8,7 @@ Systems 4:19, 2024, Section 4.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,9 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
+from fusion_gym.envs.options import choose, finish, typical_magnitude
 from fusion_gym.envs.single import FusionEnv
-from fusion_gym.envs.task import Reward, Task
+from fusion_gym.envs.task import Task
 from fusion_gym.envs.vector import FusionVectorEnv
 from fusion_gym.filters import (
     AssumedDensityFilter,
@@ -28,12 +29,11 @@ from fusion_gym.filters import (
     TobitKalmanFilter,
 )
 from fusion_gym.fusion import FederatedFusion
-from fusion_gym.network import TokenBucket
 from fusion_gym.plants import LinearPlant
 from fusion_gym.sensors import CensoredSensors
 from fusion_gym.systems import CensoredSystem, FederatedCentre, SequentialCentre
 from fusion_gym.systems.centre import Centre
-from fusion_gym.validation import Array, ConfigurationError
+from fusion_gym.validation import ConfigurationError
 
 _ANGLE = 0.052 * math.pi
 _COS, _SIN = math.cos(_ANGLE), math.sin(_ANGLE)
@@ -68,6 +68,7 @@ class TobitOscillatorOptions:
     initial_tokens: float = 10.0
     token_cost: ArrayLike = 3.0
     sharing: str = "equal"
+    access: str = "any"
     # Filters and fusion, equations (21)-(37), (50), (51)
     filter: str = "paper"
     silent: str | None = None
@@ -96,10 +97,7 @@ def build(**options: Any) -> Task:
     Raises:
         ConfigurationError: an unknown option, or a value that is not allowed.
     """
-    limit = options.pop("max_episode_steps", None)
-    known = [field.name for field in fields(TobitOscillatorOptions)]
-    validation.keys("option of fusion_gym/TobitOscillator-v0", options, known)
-    chosen = TobitOscillatorOptions(**options)
+    chosen, limit = choose(TobitOscillatorOptions, "fusion_gym/TobitOscillator-v0", options)
     horizon = validation.integer("horizon", chosen.horizon, at_least=1)
     plant = _plant(chosen)
     sensors = CensoredSensors.create(
@@ -116,38 +114,10 @@ def build(**options: Any) -> Task:
         centre=_centre(chosen, sensors, trigger),
         random_start=random_start,
         state_names=tuple(f"x{i + 1}" for i in range(plant.size)),
-        scale=_typical_magnitude(plant, horizon, random_start),
+        scale=typical_magnitude(plant, horizon, random_start),
         reference=plant.open_loop(horizon),
     )
-    unlimited = validation.choice("tokens", chosen.tokens, ("limited", "unlimited"))
-    bucket = TokenBucket.create(
-        rate=chosen.token_rate,
-        capacity=chosen.token_capacity,
-        initial=chosen.initial_tokens,
-        cost=chosen.token_cost,
-        sensors=sensors.count,
-        sharing=chosen.sharing,
-        unlimited=unlimited == "unlimited",
-    )
-    reward = Reward.create(
-        chosen.error,
-        chosen.error_weight,
-        chosen.cost_weight,
-        chosen.state_weights,
-        system.open_loop(horizon),
-    )
-    return Task(
-        system=system,
-        bucket=bucket,
-        reward=reward,
-        horizon=horizon
-        if limit is None
-        else min(horizon, validation.integer("max_episode_steps", limit, at_least=1)),
-        information=chosen.information,
-        action=chosen.action,
-        settings=_plain(asdict(chosen)),
-        policy_defaults={"dynamic_event": trigger},
-    )
+    return finish(chosen, system, limit, None, policy_defaults={"dynamic_event": trigger})
 
 
 def _plant(chosen: TobitOscillatorOptions) -> LinearPlant:
@@ -217,30 +187,6 @@ def _trigger(chosen: TobitOscillatorOptions, sensors: int) -> dict[str, tuple[fl
     return result
 
 
-def _typical_magnitude(plant: LinearPlant, horizon: int, random_start: bool) -> Array:
-    """Root of the mean second moment of each state over t = 0..horizon, shape (n,)."""
-    transition, process = plant.transition[..., 0], plant.process_covariance[..., 0]
-    mean = plant.initial_mean[:, 0]
-    moment = (
-        np.eye(plant.size) * (mean @ mean) / plant.size if random_start else np.outer(mean, mean)
-    )
-    moment = moment + plant.initial_covariance[..., 0]
-    total = np.diagonal(moment).copy()
-    for _ in range(horizon):
-        moment = transition @ moment @ transition.T + process
-        total += np.diagonal(moment)
-    return np.sqrt(total / (horizon + 1))
-
-
-def _plain(value: Any) -> Any:
-    """The settings as plain lists, numbers and strings, ready for JSON."""
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
-    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
-
-
 _PAGE = """
     An oscillator measured by three sensors that see nothing below a threshold, over a network
     with a token bucket: which sensor should transmit, and when?
@@ -286,7 +232,8 @@ _PAGE = """
 
     ## Info
     ``cost`` = ``cost_tokens`` (tokens spent, >= 0), ``rewards`` (``error``, ``cost``),
-    ``granted`` and ``denied`` (one a sensor), ``squared_error`` (one a state).
+    ``granted`` and ``denied`` (one a sensor), ``squared_error`` (one a state), ``diverged``
+    (a squared error above 100 times its open-loop mean, or not finite).
 
     ## Arguments
     The fields of :class:`TobitOscillatorOptions`; docs/tobit_oscillator.md explains each, and

@@ -168,6 +168,7 @@ def step_infos(outcome: Outcome) -> Infos:
         "granted": outcome.granted.T,
         "denied": (outcome.requested & ~outcome.granted).T,
         "squared_error": outcome.squared_error.T,
+        "diverged": outcome.diverged,
     }
 
 
@@ -181,6 +182,7 @@ def reset_infos(task: Task, num_envs: int) -> Infos:
         "granted": np.zeros((num_envs, sensors), dtype=np.bool_),
         "denied": np.zeros((num_envs, sensors), dtype=np.bool_),
         "squared_error": np.zeros((num_envs, states)),
+        "diverged": np.zeros(num_envs, dtype=np.bool_),
     }
 
 

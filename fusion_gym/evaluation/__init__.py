@@ -3,7 +3,7 @@
 from fusion_gym.evaluation.envelope import EnvelopePoint, compare_with_envelope, lower_envelope
 from fusion_gym.evaluation.episodes import EpisodeResults, Trajectory, record_episode, run_episodes
 from fusion_gym.evaluation.intervals import Interval, mean_interval
-from fusion_gym.evaluation.metrics import paired_difference, summarise
+from fusion_gym.evaluation.metrics import paired_difference, robust_summary, summarise
 from fusion_gym.evaluation.policies import make_policy
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "mean_interval",
     "paired_difference",
     "record_episode",
+    "robust_summary",
     "run_episodes",
     "summarise",
 ]

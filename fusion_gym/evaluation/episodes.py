@@ -25,7 +25,8 @@ class EpisodeResults:
     trace of the claimed covariance · ``nees`` (E,) normalised squared error divided by the number
     of states, 1 for a consistent filter · ``rate`` and ``requests`` (E, sensors) · ``tokens``
     (E,) spent and ``denied`` (E,) requests refused, per step · ``returns`` (E,) sum of the
-    rewards · ``squared_error`` (H, n), the mean over episodes at each time and state.
+    rewards · ``diverged`` (E,) share of diverged steps · ``squared_error`` (H, n), the mean over
+    episodes at each time and state.
     """
 
     mse: Array
@@ -36,6 +37,7 @@ class EpisodeResults:
     tokens: Array
     denied: Array
     returns: Array
+    diverged: Array
     squared_error: Array
 
     @property
@@ -86,6 +88,7 @@ def _run_batch(
     mse, trace, nees = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
     tokens, denied, returns = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
     rate, requests = np.zeros((sensors, episodes)), np.zeros((sensors, episodes))
+    diverged = np.zeros(episodes)
     squared_error = np.empty((horizon, states))
     for step in range(horizon):
         outcome = batch.step(policy(batch.signals()))
@@ -100,6 +103,7 @@ def _run_batch(
         tokens += outcome.cost
         denied += (outcome.requested & ~outcome.granted).sum(0)
         returns += outcome.reward
+        diverged += outcome.diverged
         if progress is not None:
             progress(episodes)
     return EpisodeResults(
@@ -111,6 +115,7 @@ def _run_batch(
         tokens=tokens / horizon,
         denied=denied / horizon,
         returns=returns,
+        diverged=diverged / horizon,
         squared_error=squared_error,
     )
 

@@ -32,6 +32,17 @@ def summarise(results: EpisodeResults) -> dict[str, Any]:
     }
 
 
+def robust_summary(results: EpisodeResults) -> dict[str, float]:
+    """What a few divergent episodes cannot spoil: quantiles of the episodes' MSE.
+
+    ``q05``, ``q25``, ``median``, ``q75``, ``q95`` and ``diverged``, the share of steps in which
+    some state's squared error was above 100 times its open-loop mean, or not finite.
+    """
+    names = {"q05": 0.05, "q25": 0.25, "median": 0.5, "q75": 0.75, "q95": 0.95}
+    quantiles = {name: float(np.quantile(results.mse, level)) for name, level in names.items()}
+    return quantiles | {"diverged": float(results.diverged.mean())}
+
+
 def paired_difference(results: EpisodeResults, reference: EpisodeResults) -> Interval:
     """Mean difference of the MSE to a reference over the same seeds, with its 95 % interval.
 

@@ -1,0 +1,123 @@
+"""What the environments' options have in common: network, episode, reward, reports."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, fields
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_gym import validation
+from fusion_gym.envs.task import Reward, Task
+from fusion_gym.network import TokenBucket
+from fusion_gym.plants import LinearPlant
+from fusion_gym.systems import System
+from fusion_gym.validation import Array
+
+
+class CommonOptions(Protocol):
+    """The options that every environment has, whatever its defaults."""
+
+    tokens: str
+    token_rate: float
+    token_capacity: float
+    initial_tokens: float
+    token_cost: ArrayLike
+    sharing: str
+    access: str
+    horizon: int
+    information: str
+    action: str
+    error: str
+    error_weight: float
+    cost_weight: float
+    state_weights: ArrayLike | None
+
+
+Options = TypeVar("Options")
+
+
+def choose(kind: type[Options], env_id: str, given: dict[str, Any]) -> tuple[Options, int | None]:
+    """The options as given, and ``max_episode_steps``, which every environment takes as well.
+
+    Raises:
+        ConfigurationError: an unknown option.
+    """
+    limit = given.pop("max_episode_steps", None)
+    known = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    validation.keys(f"option of {env_id}", given, known)
+    if limit is not None:
+        limit = validation.integer("max_episode_steps", limit, at_least=1)
+    return kind(**given), limit
+
+
+def make_bucket(chosen: CommonOptions, sensors: int) -> TokenBucket:
+    """The token bucket of the options.
+
+    Raises:
+        ConfigurationError: a value that is not allowed.
+    """
+    unlimited = validation.choice("tokens", chosen.tokens, ("limited", "unlimited"))
+    return TokenBucket.create(
+        rate=chosen.token_rate,
+        capacity=chosen.token_capacity,
+        initial=chosen.initial_tokens,
+        cost=chosen.token_cost,
+        sensors=sensors,
+        sharing=chosen.sharing,
+        unlimited=unlimited == "unlimited",
+    )
+
+
+def finish(
+    chosen: Any, system: System[Any], limit: int | None, weights: ArrayLike | None, **task: Any
+) -> Task:
+    """The task of a system with the options' network, reward and episode.
+
+    ``weights`` (n,) are the state weights if the options give none; ``limit`` shortens the episode
+    without changing any scale.
+
+    Raises:
+        ConfigurationError: a value that is not allowed.
+    """
+    reward = Reward.create(
+        chosen.error,
+        chosen.error_weight,
+        chosen.cost_weight,
+        weights if chosen.state_weights is None else chosen.state_weights,
+        system.open_loop(chosen.horizon),
+    )
+    return Task(
+        system=system,
+        bucket=make_bucket(chosen, system.sensor_count),
+        reward=reward,
+        horizon=chosen.horizon if limit is None else min(chosen.horizon, limit),
+        information=chosen.information,
+        action=chosen.action,
+        access=chosen.access,
+        settings=plain(asdict(chosen)),
+        **task,
+    )
+
+
+def typical_magnitude(plant: LinearPlant, horizon: int, random_start: bool) -> Array:
+    """Root of the mean second moment of each state over t = 0..horizon, shape (n,)."""
+    transition, process = plant.transition[..., 0], plant.process_covariance[..., 0]
+    mean, size = plant.initial_mean[:, 0], plant.size
+    moment = np.eye(size) * (mean @ mean) / size if random_start else np.outer(mean, mean)
+    moment = moment + plant.initial_covariance[..., 0]
+    total = np.diagonal(moment).copy()
+    for _ in range(horizon):
+        moment = transition @ moment @ transition.T + process
+        total += np.diagonal(moment)
+    return np.sqrt(total / (horizon + 1))
+
+
+def plain(value: Any) -> Any:
+    """Settings as plain lists, numbers and strings, ready for JSON."""
+    if isinstance(value, dict):
+        return {key: plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(entry) for entry in value]
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
