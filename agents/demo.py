@@ -10,34 +10,18 @@ episode. A finished or interrupted training in the output folder is gone on with
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich import box
-from rich.table import Table
-
-from agents import figures, tables
+from agents import figures
+from agents.compare import compare, run_all
 from agents.config import Experiment, Sweep, load_experiment, load_sweep
-from agents.evaluate import write
-from agents.progress import progress_bar
 from agents.train import train
-from fusion_gym.envs import Task
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation import (
-    EpisodeResults,
-    compare_with_envelope,
-    lower_envelope,
-    make_policy,
-    record_episode,
-    robust_summary,
-    run_episodes,
-    summarise,
-)
-from fusion_gym.evaluation.envelope import Comparison
+from fusion_gym.evaluation import make_policy, record_episode
 from fusion_gym.validation import ConfigurationError
 
 
@@ -64,19 +48,6 @@ SETTINGS = (
 )
 
 
-def run_all(
-    task: Task, policies: list[str], episodes: int, seed: int, description: str
-) -> dict[str, EpisodeResults]:
-    """Every policy on the same seeds, with a progress bar."""
-    made = {name: make_policy(name, task) for name in policies}
-    total = len(policies) * episodes * task.horizon
-    with progress_bar(total, description) as bar:
-        return {
-            name: run_episodes(task, policy, episodes, seed, bar.update)
-            for name, policy in made.items()
-        }
-
-
 def demonstrate(
     setting: Setting, experiment: Experiment, sweep: Sweep, arguments: argparse.Namespace
 ) -> bool:
@@ -92,51 +63,16 @@ def demonstrate(
         return False
     agent = f"model:{folder / 'agent' / 'best_model.zip'}"
     learned = run_all(task, [agent], arguments.episodes, arguments.seed, "agent")[agent]
-    comparison = compare_with_envelope(learned, baselines)
-    envelope = lower_envelope(baselines)
-    report = {
-        "env": experiment.environment.id,
-        "episodes": arguments.episodes,
-        "seed": arguments.seed,
-        "horizon": task.horizon,
-        "settings": task.settings,
-        "policies": {name: summarise(found) for name, found in baselines.items()}
-        | {agent: summarise(learned)},
-    }
-    verdict = {
-        "agent": agent,
-        "rate": float(learned.rate.mean()),
-        "mse": float(learned.mse.mean()),
-        "envelope": comparison.envelope,
-        "difference": comparison.difference._asdict(),
-        "between": list(comparison.between),
-        "training": summary,
-    }
-    (folder / "comparison.json").write_text(json.dumps(verdict, indent=1) + "\n")
-    shown = [*sweep.points, *(point.name for point in envelope), agent]
-    quantiles = {name: robust_summary(found) for name, found in baselines.items()}
-    quantiles[agent] = robust_summary(learned)
-    report["quantiles"] = quantiles
-    write(folder / "evaluation.json", report)
-    chosen = {name: report["policies"][name] for name in dict.fromkeys(shown)}
-    console = tables.console()
-    console.print(
-        tables.evaluation_table(
-            f"{setting.title}: single policies, the lower envelope of all {len(baselines)} "
-            "baselines, and the agent",
-            chosen,
-            quantiles,
-            {},
-        )
-    )
-    console.print(comparison_table(comparison, learned))
-    lines = [
-        figures.Line(curve.label, [baselines[name] for name in curve.policies])
-        for curve in sweep.curves
-    ]
-    points = {name: baselines[name] for name in sweep.points}
-    figures.pareto(
-        folder / "pareto.png", setting.title, lines, points, {"PPO agent": learned}, envelope
+    compare(
+        experiment.environment.id,
+        task,
+        setting.title,
+        baselines,
+        sweep,
+        agent,
+        learned,
+        arguments.seed,
+        folder,
     )
     for name, text in (("agent", agent), ("dynamic_event", "dynamic_event")):
         trajectory = record_episode(task, make_policy(text, task), arguments.seed)
@@ -145,23 +81,6 @@ def demonstrate(
             task.bucket.capacity,
         )  # fmt: skip
     return True
-
-
-def comparison_table(comparison: Comparison, learned: EpisodeResults) -> Table:
-    """The agent against the envelope at its own rate."""
-    table = Table(title="the agent against the lower envelope at its own rate", box=box.SIMPLE_HEAD)
-    for name in ("rate", "agent's MSE", "envelope's MSE", "difference [95 %]", "relative"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("envelope between", overflow="fold")
-    table.add_row(
-        f"{learned.rate.mean():.4f}",
-        f"{learned.mse.mean():.4f}",
-        f"{comparison.envelope:.4f}",
-        tables.difference(comparison.difference),
-        f"{comparison.difference.mean / comparison.envelope:+.1%}",
-        "\n".join(comparison.between),
-    )
-    return table
 
 
 def parser() -> argparse.ArgumentParser:

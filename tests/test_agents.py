@@ -251,7 +251,7 @@ def test_demo_from_baselines_to_figures(tmp_path: Path, monkeypatch: pytest.Monk
             assert (folder / figure).stat().st_size > 20_000
         verdict = json.loads((folder / "comparison.json").read_text())
         assert verdict["difference"]["mean"] == pytest.approx(verdict["mse"] - verdict["envelope"])
-        assert verdict["training"]["finished"]
+        assert json.loads((folder / "agent" / "summary.json").read_text())["finished"]
     began = (output / "paper" / "agent" / "final_model.zip").stat().st_mtime
     demo.main()
     records = train.read_records(output / "paper" / "agent")

@@ -144,7 +144,7 @@ class EpisodeBatch:
             requested=requests,
             granted=granted,
             squared_error=squared_error,
-            diverged=~(squared_error <= task.divergence_level).all(0),
+            diverged=np.asarray(~(squared_error <= task.divergence_level).all(0)),
             truncated=truncated,
         )
 
