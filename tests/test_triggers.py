@@ -383,6 +383,7 @@ LOOKS_AT = {
     "dynamic_event": "measurement",
     "innovation_threshold": "innovation",
     "send_on_delta": "measurement",
+    "adaptive_innovation": "innovation",
 }
 
 

@@ -13,6 +13,7 @@ from fusion_gym.validation import ConfigurationError, keys
 
 ENVIRONMENTS = {
     "fusion_gym/TobitOscillator-v0": "fusion_gym.envs.tobit_oscillator:TobitOscillator",
+    "fusion_gym/CorrelatedTracking-v0": "fusion_gym.envs.correlated_tracking:CorrelatedTracking",
     "fusion_gym/BiasedOscillator-v0": "fusion_gym.envs.biased:BiasedOscillator",
     "fusion_gym/BiasedTracking-v0": "fusion_gym.envs.biased:BiasedTracking",
 }

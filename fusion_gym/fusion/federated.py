@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fusion_gym import linalg, validation
+from fusion_gym import validation
+from fusion_gym.fusion.information import InformationFusion
 from fusion_gym.validation import Array, ConfigurationError
 
 
@@ -55,6 +56,4 @@ class FederatedFusion:
 
         Source: tobit_token_bucket, equation (50).
         """
-        information = linalg.inverse(covariance)
-        fused = linalg.inverse(information.sum(0))
-        return linalg.matvec(fused, linalg.matvec(information, mean).sum(0)), fused
+        return InformationFusion().fuse(mean, covariance)

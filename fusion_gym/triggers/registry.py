@@ -8,6 +8,7 @@ import dataclasses
 from typing import Any
 
 from fusion_gym import validation
+from fusion_gym.triggers.adaptive_innovation import AdaptiveInnovation
 from fusion_gym.triggers.base import Policy, Trigger
 from fusion_gym.triggers.constant import Always, Never
 from fusion_gym.triggers.dynamic_event import DynamicEvent
@@ -20,6 +21,7 @@ from fusion_gym.triggers.variance_threshold import VarianceThreshold
 from fusion_gym.validation import ConfigurationError
 
 TRIGGERS: dict[str, type[Trigger]] = {
+    "adaptive_innovation": AdaptiveInnovation,
     "always": Always,
     "dynamic_event": DynamicEvent,
     "information_gain": InformationGain,

@@ -1,0 +1,356 @@
+"""Sensors that share the plant's noise, the robust filter, and the joint error covariance.
+
+Oracles: FilterPy, conditioning of a joint Gaussian, the Lyapunov form of the paper, dense block
+matrices, and samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import filterpy.kalman
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fusion_gym.filters.robust import CorrelatedSensors, JointErrorCovariance, RobustKalmanFilter
+from fusion_gym.plants import LinearPlant
+from fusion_gym.validation import ConfigurationError
+
+Array = NDArray[np.float64]
+T = 0.01
+PHI = np.array([[1, T, T * T / 2], [0, 1, T], [0, 0, 1]])
+GAMMA = np.array([[T * T / 2], [T], [1.0]])
+ETA = np.array([0.64, 0.36, 0.49])
+BETA = np.array([0.2, 0.4, 0.1])
+
+
+def parts(
+    transition: Array,
+    gain: Array,
+    process: Array,
+    matrices: Array,
+    variance: Any,
+    coupling: Any,
+) -> tuple[LinearPlant, CorrelatedSensors]:
+    """A plant with noise gain Γ and noise variances (r,), and its sensors."""
+    n = len(transition)
+    factor = gain * np.sqrt(process)
+    plant = LinearPlant.create(transition, factor @ factor.T, np.zeros(n), np.eye(n))
+    plant = replace(plant, process_factor=factor[..., None])
+    return plant, CorrelatedSensors.create(matrices, variance, coupling, np.sqrt(process), plant)
+
+
+def paper_parts(coupling: Any = BETA) -> tuple[LinearPlant, CorrelatedSensors]:
+    return parts(PHI, GAMMA, np.array([0.16]), np.eye(3)[:, None], ETA, coupling)
+
+
+def random_parts(
+    seed: int, n: int = 4, r: int = 2, sensors: int = 3, m: int = 2
+) -> tuple[LinearPlant, CorrelatedSensors]:
+    """A stable plant and sensors of several components, all entries random."""
+    draw = np.random.default_rng(seed)
+    transition = draw.normal(size=(n, n))
+    transition *= 0.9 / np.abs(np.linalg.eigvals(transition)).max()
+    return parts(
+        transition,
+        draw.normal(size=(n, r)),
+        draw.uniform(0.1, 1.0, r),
+        draw.normal(size=(sensors, m, n)),
+        draw.uniform(0.2, 1.0, (sensors, m)),
+        draw.normal(size=(sensors, m, r)),
+    )
+
+
+def random_covariances(seed: int, sensors: int, n: int, runs: int) -> Array:
+    root = np.random.default_rng(seed).normal(size=(sensors, n, n + 2, runs))
+    return np.einsum("sijr,skjr->sikr", root, root)
+
+
+# --- sensors -----------------------------------------------------------------------------------
+
+
+def test_noise_covariances_of_the_papers_example() -> None:
+    plant, sensors = paper_parts()
+    for i in range(3):
+        np.testing.assert_allclose(
+            sensors.cross_covariance[i, :, :, 0], GAMMA * 0.16 * BETA[i], rtol=1e-14
+        )
+        for j in range(3):
+            expected = 0.16 * BETA[i] * BETA[j] + (ETA[i] if i == j else 0.0)
+            assert sensors.covariance[i, j, 0, 0, 0] == pytest.approx(expected, rel=1e-14)
+    np.testing.assert_allclose(plant.process_covariance[..., 0], GAMMA @ GAMMA.T * 0.16)
+
+
+def test_measured_noises_have_the_stated_covariances() -> None:
+    plant, sensors = random_parts(5)
+    runs = 400_000
+    draw = np.random.default_rng(3)
+    process = draw.standard_normal((plant.noise_channels, runs))
+    own = draw.standard_normal((sensors.noise_channels, runs))
+    state = draw.standard_normal((plant.size, runs))
+    moved = plant.advance(np.zeros((plant.size, runs)), process)
+    noise = sensors.measure(state, process, own)
+    noise -= np.einsum("smn,nr->smr", sensors.measurement_matrix[..., 0], state)
+    joint = np.cov(np.concatenate((moved, noise.reshape(-1, runs))))
+    cross = sensors.cross_covariance[..., 0].transpose(1, 0, 2).reshape(plant.size, -1)
+    own_part = sensors.covariance[..., 0].transpose(0, 2, 1, 3).reshape(sensors.noise_channels, -1)
+    expected = np.block([[plant.process_covariance[..., 0], cross], [cross.T, own_part]])
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert (np.abs(joint - expected) / scale).max() <= 5 * np.sqrt(2 / runs)
+
+
+# --- the filter ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_update_agrees_with_filterpys_correlated_update(size: int) -> None:
+    plant, sensors = random_parts(size, m=size)
+    node = RobustKalmanFilter(sensors)
+    covariance = random_covariances(size, 3, plant.size, 6)
+    mean = np.random.default_rng(1).normal(size=(3, plant.size, 6))
+    measurement = np.random.default_rng(2).normal(size=(3, size, 6))
+    plan, expected = node.plan(covariance), node.expect(mean)
+    for sensor in range(3):
+        for run in range(6):
+            other = filterpy.kalman.KalmanFilter(dim_x=plant.size, dim_z=size)
+            other.x, other.P = mean[sensor, :, run].copy(), covariance[sensor, ..., run].copy()
+            other.H = sensors.measurement_matrix[sensor, ..., 0]
+            other.R = sensors.covariance[sensor, sensor, ..., 0]
+            other.M = sensors.cross_covariance[sensor, ..., 0]
+            other.update_correlated(measurement[sensor, :, run])
+            gain = plan.gain[sensor, ..., run]
+            innovation = measurement[sensor, :, run] - expected[sensor, :, run]
+            np.testing.assert_allclose(gain, other.K, rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(
+                mean[sensor, :, run] + gain @ innovation, other.x, rtol=1e-9, atol=1e-12
+            )
+            np.testing.assert_allclose(
+                plan.delivered_covariance[sensor, ..., run], other.P, rtol=1e-8, atol=1e-10
+            )
+
+
+def test_uncorrelated_node_that_always_receives_is_filterpys_kalman_filter() -> None:
+    plant, sensors = paper_parts(coupling=0.0)
+    node = RobustKalmanFilter(sensors)
+    draw = np.random.default_rng(4)
+    mean, covariance = np.zeros((3, 3, 1)), np.tile(np.eye(3)[None, ..., None], (3, 1, 1, 1))
+    others = []
+    for sensor in range(3):
+        other = filterpy.kalman.KalmanFilter(dim_x=3, dim_z=1)
+        other.x, other.P, other.F = np.zeros(3), np.eye(3), PHI
+        other.Q, other.R, other.H = (
+            GAMMA @ GAMMA.T * 0.16,
+            ETA[sensor],
+            np.eye(3)[sensor : sensor + 1],
+        )
+        others.append(other)
+    for _ in range(50):
+        measurement = draw.normal(size=(3, 1, 1))
+        mean, covariance = plant.predict(mean, covariance)
+        plan = node.plan(covariance)
+        mean = mean + plan.gain[:, :, 0] * (measurement - node.expect(mean))
+        covariance = plan.delivered_covariance
+        for sensor, other in enumerate(others):
+            other.predict()
+            other.update(measurement[sensor, :, 0])
+            np.testing.assert_allclose(mean[sensor, :, 0], other.x, rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(covariance[sensor, ..., 0], other.P, rtol=1e-9, atol=1e-12)
+
+
+def test_update_conditions_the_joint_gaussian_of_state_and_measurement() -> None:
+    plant, sensors = random_parts(11)
+    before = random_covariances(12, 1, plant.size, 1)[0, ..., 0]
+    phi, gamma = plant.transition[..., 0], plant.process_factor[..., 0]
+    # From (error, w normals, own normals) to (state, measurement).
+    n, r, m = plant.size, plant.noise_channels, sensors.size
+    source = np.block([[before, np.zeros((n, r + m))], [np.zeros((r + m, n)), np.eye(r + m)]])
+    prior = phi @ before @ phi.T + gamma @ gamma.T
+    plan = RobustKalmanFilter(sensors).plan(np.tile(prior[None, ..., None], (3, 1, 1, 1)))
+    for sensor in range(3):
+        matrix = sensors.measurement_matrix[sensor, ..., 0]
+        state = np.hstack([phi, gamma, np.zeros((n, m))])
+        own = np.diag(sensors.deviation[sensor, :, 0])
+        seen = matrix @ state + np.hstack([np.zeros((m, n)), sensors.coupling[sensor, ..., 0], own])
+        cross, variance = state @ source @ seen.T, seen @ source @ seen.T
+        posterior = state @ source @ state.T - cross @ np.linalg.solve(variance, cross.T)
+        np.testing.assert_allclose(plan.innovation_covariance[sensor, ..., 0], variance, rtol=1e-10)
+        np.testing.assert_allclose(
+            plan.gain[sensor, ..., 0], cross @ np.linalg.inv(variance), rtol=1e-8, atol=1e-12
+        )
+        np.testing.assert_allclose(
+            plan.delivered_covariance[sensor, ..., 0], posterior, rtol=1e-8, atol=1e-10
+        )
+
+
+def test_posterior_is_the_papers_lyapunov_form_and_its_gain_the_best() -> None:
+    """(18), (19) with Ψ = (I - K H) Φ and noise gain [I - K H, -K]; any other gain is worse."""
+    plant, sensors = random_parts(21)
+    before = random_covariances(22, 3, plant.size, 1)
+    _, prior = plant.predict(np.zeros((3, plant.size, 1)), before)
+    plan = RobustKalmanFilter(sensors).plan(prior)
+
+    def lyapunov(sensor: int, gain: Array) -> Array:
+        kept = np.eye(plant.size) - gain @ sensors.measurement_matrix[sensor, ..., 0]
+        cross = sensors.cross_covariance[sensor, ..., 0]
+        noise = np.block(
+            [
+                [plant.process_covariance[..., 0], cross],
+                [cross.T, sensors.covariance[sensor, sensor, ..., 0]],
+            ]
+        )
+        psi, through = kept @ plant.transition[..., 0], np.hstack([kept, -gain])
+        result: Array = psi @ before[sensor, ..., 0] @ psi.T + through @ noise @ through.T
+        return result
+
+    for sensor in range(3):
+        gain = plan.gain[sensor, ..., 0]
+        best = lyapunov(sensor, gain)
+        np.testing.assert_allclose(plan.delivered_covariance[sensor, ..., 0], best, rtol=1e-8)
+        for seed in range(5):
+            worse = lyapunov(sensor, gain + np.random.default_rng(seed).normal(size=gain.shape))
+            assert np.linalg.eigvalsh(worse - best)[0] >= -1e-9
+            assert np.trace(worse) > np.trace(best)
+
+
+# --- the joint error covariance ------------------------------------------------------------------
+
+
+def walk(
+    plant: LinearPlant, sensors: CorrelatedSensors, scale: float, seed: int, steps: int, runs: int
+) -> tuple[Array, Array, Array, Array]:
+    """Errors, tracked and dense covariances, conservative local ones, under random deliveries.
+
+    The fused estimate takes an arbitrary weighted mean with matrices that add up to I. Deliveries
+    and weights are the same in all runs, so that samples over runs meet the covariances.
+    """
+    draw = np.random.default_rng(seed)
+    node, tracker = RobustKalmanFilter(sensors), JointErrorCovariance.create(plant, sensors)
+    n, count = plant.size, sensors.count
+    truth = np.sqrt(scale) * draw.standard_normal((n, runs))
+    mean = np.zeros((count + 1, n, runs))
+    covariance = np.tile(np.eye(n)[None, ..., None], (count, 1, 1, 1))
+    factor = np.array([scale])
+    joint = tracker.start(factor)
+    dense = scale * np.kron(np.ones((count + 1, count + 1)), np.eye(n))
+    for _ in range(steps):
+        process = np.sqrt(scale) * draw.standard_normal((plant.noise_channels, runs))
+        own = np.sqrt(scale) * draw.standard_normal((sensors.noise_channels, runs))
+        truth = plant.advance(truth, process)
+        measurement = sensors.measure(truth, process, own)
+        mean = np.einsum("ij,sjr->sir", plant.transition[..., 0], mean)
+        _, covariance = plant.predict(np.zeros((count, n, 1)), covariance)
+        plan = node.plan(covariance)
+        granted = draw.random((count, 1)) < 0.5
+        weights = draw.normal(size=(count + 1, n, n, 1)) * 0.3
+        weights[0] = np.eye(n)[..., None] - weights[1:].sum(0)
+        gain = np.where(granted[:, None, None], plan.gain, 0.0)
+        mean[1:] += np.einsum("sim,smr->sir", gain[..., 0], measurement - node.expect(mean[1:]))
+        mean[0] = np.einsum("sij,sjr->ir", weights[..., 0], mean)
+        covariance = np.where(granted[:, None, None], plan.delivered_covariance, covariance)
+        joint = tracker.predict(joint, factor)
+        joint = tracker.fuse(tracker.update(joint, plan.gain, granted, factor), weights)
+        dense = dense_step(plant, sensors, dense, gain[..., 0], weights[..., 0], scale)
+    blocks = dense.reshape(count + 1, n, count + 1, n).transpose(0, 2, 1, 3)
+    return (truth - mean).reshape(-1, runs), joint[..., 0], blocks, covariance[..., 0]
+
+
+def dense_step(
+    plant: LinearPlant,
+    sensors: CorrelatedSensors,
+    joint: Array,
+    gain: Array,
+    weights: Array,
+    scale: float,
+) -> Array:
+    """One step of the joint recursion with plain matrices and independent normals as noise."""
+    n, r, count, m = plant.size, plant.noise_channels, sensors.count, sensors.size
+    every = np.arange(n * (count + 1)).reshape(count + 1, n)
+    moving = np.kron(np.eye(count + 1), plant.transition[..., 0])
+    noise = np.zeros((n * (count + 1), r + count * m))
+    for estimate in range(count + 1):
+        noise[every[estimate], :r] = plant.process_factor[..., 0]
+    for node in range(count):
+        rows, own = every[node + 1], r + m * node + np.arange(m)
+        kept = np.eye(n) - gain[node] @ sensors.measurement_matrix[node, ..., 0]
+        moving[rows] = kept @ moving[rows]
+        noise[rows] = kept @ noise[rows]
+        noise[rows, :r] -= gain[node] @ sensors.coupling[node, ..., 0]
+        noise[np.ix_(rows, own)] -= gain[node] * sensors.deviation[node, :, 0]
+    joined = np.eye(n * (count + 1))
+    joined[:n] = np.hstack(list(weights))
+    moving, noise = joined @ moving, joined @ noise
+    result: Array = moving @ joint @ moving.T + scale * noise @ noise.T
+    return result
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.4])
+def test_joint_covariance_agrees_with_dense_matrices(scale: float) -> None:
+    for seed in range(4):
+        plant, sensors = random_parts(30 + seed)
+        _, joint, dense, _ = walk(plant, sensors, scale, seed, steps=25, runs=1)
+        np.testing.assert_allclose(joint, dense, rtol=1e-8, atol=1e-10 * np.abs(dense).max())
+
+
+def test_joint_covariance_is_that_of_the_errors() -> None:
+    plant, sensors = paper_parts()
+    runs = 40_000
+    errors, joint, _, _ = walk(plant, sensors, 0.6, 7, steps=15, runs=runs)
+    flat = joint.transpose(0, 2, 1, 3).reshape(12, 12)
+    scale = np.sqrt(np.outer(np.diag(flat), np.diag(flat)))
+    assert (np.abs(np.cov(errors) - flat) / scale).max() <= 5 * np.sqrt(2 / runs)
+    # Without the common noise of the measurements the same samples would not fit.
+    _, ignoring, _, _ = walk(*paper_parts(coupling=0.0), 0.6, 7, steps=15, runs=1)
+    other = ignoring.transpose(0, 2, 1, 3).reshape(12, 12)
+    assert (np.abs(np.cov(errors) - other) / scale).max() > 5 * np.sqrt(2 / runs)
+
+
+def test_conservative_covariance_is_actual_at_the_bounds_and_above_it_below() -> None:
+    """Theorem 1 for any deliveries that do not depend on the noise."""
+    for seed in range(5):
+        plant, sensors = random_parts(40 + seed)
+        _, joint, _, conservative = walk(plant, sensors, 1.0, seed, steps=40, runs=1)
+        _, smaller, _, same = walk(plant, sensors, 0.4, seed, steps=40, runs=1)
+        np.testing.assert_array_equal(conservative, same)
+        for node in range(3):
+            own = joint[node + 1, node + 1]
+            np.testing.assert_allclose(own, conservative[node], rtol=1e-7, atol=1e-9)
+            gap = np.linalg.eigvalsh(conservative[node] - smaller[node + 1, node + 1])
+            assert gap[0] > 0.0
+
+
+# --- bad input -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"matrices": np.eye(3)}, "measurement_matrices"),
+        ({"matrices": np.ones((3, 1, 2))}, "measurement_matrices"),
+        ({"variance": (1.0, 2.0)}, "measurement_variance"),
+        ({"variance": (1.0, 0.0, 1.0)}, "measurement_variance"),
+        ({"variance": [[1.0], [2.0, 3.0]]}, "measurement_variance"),
+        ({"coupling": (0.1, 0.2)}, "noise_coupling"),
+        ({"coupling": float("nan")}, "noise_coupling"),
+        ({"coupling": "much"}, "noise_coupling"),
+    ],
+)
+def test_what_cannot_be_used_is_refused(change: dict[str, Any], message: str) -> None:
+    arguments: dict[str, Any] = {
+        "matrices": np.eye(3)[:, None],
+        "variance": ETA,
+        "coupling": BETA,
+    }
+    with pytest.raises(ConfigurationError, match=message):
+        parts(PHI, GAMMA, np.array([0.16]), **(arguments | change))
+
+
+def test_one_number_for_all_sensors_or_one_for_each() -> None:
+    _, sensors = parts(PHI, GAMMA, np.array([0.16]), np.eye(3)[:, None], 0.5, 0.3)
+    np.testing.assert_allclose(sensors.deviation[:, 0, 0] ** 2, 0.5)
+    np.testing.assert_allclose(sensors.coupling[:, 0, 0, 0], 0.3 * 0.4)
+    wide = np.ones((3, 2, 3))
+    _, sensors = parts(PHI, GAMMA, np.array([0.16]), wide, ETA, BETA)
+    np.testing.assert_allclose(sensors.deviation[:, 0, 0], np.sqrt(ETA))
+    np.testing.assert_allclose(sensors.deviation[:, 1, 0], np.sqrt(ETA))

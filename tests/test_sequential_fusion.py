@@ -1,0 +1,171 @@
+"""Sequential fusion against the two-sensor rules applied by hand, and what its gains are for."""
+
+from __future__ import annotations
+
+from itertools import permutations, product
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fusion_gym import ConfigurationError
+from fusion_gym.fusion.covariance_intersection import (
+    covariance_intersection,
+    inverse_covariance_intersection,
+)
+from fusion_gym.fusion.sequential import SequentialFusion, SequentialResult
+
+Array = NDArray[np.float64]
+RULES = {"ci": covariance_intersection, "ici": inverse_covariance_intersection}
+PATTERNS = np.array(list(product([False, True], repeat=3))).T  # every set of three sensors
+
+
+def estimates(runs: int, size: int = 3, sensors: int = 3) -> tuple[Array, Array]:
+    """Entry 0 is the prediction and the others are the sensors' estimates."""
+    generator = np.random.default_rng(runs)
+    factor = generator.normal(size=(sensors + 1, size, size + 1, runs))
+    return (
+        generator.normal(size=(sensors + 1, size, runs)),
+        np.einsum("sikN,sjkN->sijN", factor, factor),
+    )
+
+
+def fuse(rule: Any, order: Any, mean: Array, covariance: Array, active: Any) -> SequentialResult:
+    return SequentialFusion(rule, order).fuse(
+        mean[0], covariance[0], mean[1:], covariance[1:], active
+    )
+
+
+@pytest.mark.parametrize("order", [None, *permutations(range(3))])
+@pytest.mark.parametrize("rule", RULES)
+def test_it_is_the_two_sensor_rule_again_and_again(rule: str, order: Any) -> None:
+    runs = PATTERNS.shape[1]
+    mean, covariance = estimates(runs)
+    result = fuse(rule, order, mean, covariance, PATTERNS)
+    for run in range(runs):
+        one = slice(run, run + 1)
+        wanted_mean, wanted = mean[0][:, one], covariance[0][..., one]
+        for sensor in (0, 1, 2) if order is None else order:
+            if PATTERNS[sensor, run]:
+                wanted_mean, wanted, *_ = RULES[rule](
+                    wanted_mean,
+                    wanted,
+                    mean[sensor + 1][:, one],
+                    covariance[sensor + 1][..., one],
+                )
+        np.testing.assert_allclose(result.mean[:, one], wanted_mean, rtol=1e-9)
+        np.testing.assert_allclose(result.covariance[..., one], wanted, rtol=1e-9)
+
+
+@pytest.mark.parametrize("order", [None, (2, 0, 1)])
+@pytest.mark.parametrize("rule", RULES)
+def test_gains_add_up_to_one_make_the_mean_and_skip_the_silent(rule: str, order: Any) -> None:
+    mean, covariance = estimates(PATTERNS.shape[1])
+    result = fuse(rule, order, mean, covariance, PATTERNS)
+    assert result.gains.shape == (4, 3, 3, 8)
+    identity = np.broadcast_to(np.eye(3)[..., None], (3, 3, 8))
+    np.testing.assert_allclose(result.gains.sum(0), identity, atol=1e-12)
+    np.testing.assert_allclose(
+        np.einsum("sijN,sjN->iN", result.gains, mean), result.mean, atol=1e-10
+    )
+    silent = np.abs(result.gains[1:]).max((1, 2))[~PATTERNS]
+    assert np.all(silent == 0.0)
+    assert np.any(result.gains[1:] != 0.0, axis=(1, 2))[PATTERNS].mean() > 0.5
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_nobody_active_leaves_the_prediction(rule: str) -> None:
+    mean, covariance = estimates(5)
+    result = fuse(rule, None, mean, covariance, np.zeros((3, 5), dtype=np.bool_))
+    assert np.array_equal(result.mean, mean[0])
+    assert np.array_equal(result.covariance, covariance[0])
+    assert np.array_equal(result.gains[0], np.broadcast_to(np.eye(3)[..., None], (3, 3, 5)))
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_inactive_estimates_are_not_read_and_inputs_not_written(rule: str) -> None:
+    mean, covariance = estimates(8)
+    clean = fuse(rule, None, mean, covariance, PATTERNS)
+    mean[1:] = np.where(PATTERNS[:, None], mean[1:], np.nan)
+    covariance[1:] = np.where(PATTERNS[:, None, None], covariance[1:], np.nan)
+    before = mean.copy(), covariance.copy()
+    dirty = fuse(rule, None, mean, covariance, PATTERNS)
+    for one, other in zip(dirty, clean, strict=True):
+        assert np.array_equal(one, other)
+    np.testing.assert_array_equal(mean, before[0])
+    np.testing.assert_array_equal(covariance, before[1])
+
+
+@pytest.mark.parametrize("order", list(permutations(range(3))))
+def test_covariance_intersection_bounds_the_actual_covariance(order: Any) -> None:
+    """Σ Θ_i P̄_ij Θ_jᵀ with any joint covariance whose diagonal blocks are the estimates' own."""
+    generator = np.random.default_rng(7)
+    runs, ratios = 200, []
+    mean, covariance = estimates(runs)
+    active = generator.random((3, runs)) < 0.7
+    result = fuse("ci", order, mean, covariance, active)
+    for run in range(runs):
+        # A joint factor with orthonormal rows in each block, so that every block has its own P.
+        rank = int(generator.integers(3, 7))
+        parts = [np.linalg.qr(generator.normal(size=(rank, 3)))[0].T for _ in range(4)]
+        roots = np.linalg.cholesky(covariance[..., run])
+        error = sum(result.gains[s, :, :, run] @ roots[s] @ part for s, part in enumerate(parts))
+        whitened = np.linalg.solve(np.linalg.cholesky(result.covariance[..., run]), error)
+        ratios.append(np.linalg.norm(whitened, 2) ** 2)
+    assert max(ratios) <= 1 + 1e-9
+    assert max(ratios) > 0.8  # and not by being far too large
+
+
+def test_the_inverse_form_is_smaller_and_the_order_matters() -> None:
+    mean, covariance = estimates(100)
+    active = np.ones((3, 100), dtype=np.bool_)
+    traces = {
+        (rule, order): np.einsum("iiN->N", fuse(rule, order, mean, covariance, active).covariance)
+        for rule in RULES
+        for order in ((0, 1, 2), (2, 1, 0))
+    }
+    for order in ((0, 1, 2), (2, 1, 0)):
+        assert traces["ici", order].mean() < 0.95 * traces["ci", order].mean()
+    for rule in RULES:
+        assert np.any(np.abs(traces[rule, (0, 1, 2)] - traces[rule, (2, 1, 0)]) > 1e-2)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_lane_is_the_same_alone_and_in_a_batch(rule: str) -> None:
+    mean, covariance = estimates(8)
+    batch = fuse(rule, (1, 2, 0), mean, covariance, PATTERNS)
+    for run in range(8):
+        one = slice(run, run + 1)
+        alone = fuse(rule, (1, 2, 0), mean[..., one], covariance[..., one], PATTERNS[:, one])
+        for single, many in zip(alone, batch, strict=True):
+            np.testing.assert_allclose(single, many[..., one], rtol=1e-9, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    "order", [(), (0, 0, 1), (1, 2, 3), (0, 2), (-1, 0, 1), (0.0, 1.0), (True, False), ("a",)]
+)
+def test_an_order_that_is_no_permutation_is_refused(order: Any) -> None:
+    with pytest.raises(ConfigurationError) as refused:
+        SequentialFusion("ci", order)
+    message = str(refused.value)
+    assert message.startswith(f"order = {order!r} is not allowed")
+    assert "exactly once" in message
+
+
+@pytest.mark.parametrize("order", [7, "01", [0, 1]])
+def test_an_order_that_is_no_tuple_is_refused(order: Any) -> None:
+    with pytest.raises(ConfigurationError, match=r"order = .* is not allowed"):
+        SequentialFusion("ci", order)
+
+
+@pytest.mark.parametrize("order", [(0, 1), (3, 2, 1, 0)])
+def test_an_order_for_another_number_of_sensors_is_refused(order: Any) -> None:
+    mean, covariance = estimates(2)
+    with pytest.raises(ConfigurationError, match="each of the sensors 0 to 2 exactly once"):
+        fuse("ci", order, mean, covariance, np.ones((3, 2), dtype=np.bool_))
+
+
+def test_an_unknown_rule_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match=r"rule = 'cii' .*'ci', 'ici'"):
+        SequentialFusion("cii")  # type: ignore[arg-type]
