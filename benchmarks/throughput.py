@@ -61,11 +61,12 @@ def single(options: dict[str, Any]) -> Workload:
     return _timed(step, 1)
 
 
-def vector(options: dict[str, Any], num_envs: int) -> Workload:
+def vector(options: dict[str, Any], num_envs: int, env_id: str = ENV) -> Workload:
     """``gym.make_vec`` with autoreset."""
-    env = gymnasium.make_vec(ENV, num_envs, vectorization_mode="vector_entry_point", **options)
+    env = gymnasium.make_vec(env_id, num_envs, vectorization_mode="vector_entry_point", **options)
     env.reset(seed=0)
-    actions = np.random.default_rng(0).integers(0, 2, (16, num_envs, 3), dtype=np.int8)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(16)]
     count = iter(range(10**12))
     return _timed(lambda: env.step(actions[next(count) % 16]), num_envs)
 
@@ -121,6 +122,7 @@ def main() -> None:
     seconds = parser.parse_args().seconds
     paper: dict[str, Any] = {}
     tobit: dict[str, Any] = {"filter": "tobit"}
+    adf: dict[str, Any] = {"filter": "adf"}
     rows: dict[str, Workload] = {
         "plain loop with FilterPy's Kalman filter": filterpy_loop(),
         "gym.make, paper's filter": single(paper),
@@ -133,6 +135,10 @@ def main() -> None:
         "gym.make_vec, 1,024, paper's filter": vector(paper, 1024),
         "gym.make_vec, 1,024, Tobit filter": vector(tobit, 1024),
         "gym.make_vec, 4,096, Tobit filter": vector(tobit, 4096),
+        "CorrelatedTracking, 1,024": vector({}, 1024, "fusion_gym/CorrelatedTracking-v0"),
+        "BiasedOscillator, 1,024": vector({}, 1024, "fusion_gym/BiasedOscillator-v0"),
+        "BiasedOscillator, 1,024, adf": vector(adf, 1024, "fusion_gym/BiasedOscillator-v0"),
+        "BiasedTracking, 1,024": vector({}, 1024, "fusion_gym/BiasedTracking-v0"),
     }
     figures: dict[str, list[float]] = {name: [] for name in rows}
     for workload in rows.values():
@@ -143,7 +149,7 @@ def main() -> None:
     medians = {name: statistics.median(found) for name, found in figures.items()}
     names = list(rows)
     table = Table(
-        title=f"{ENV}: steps per second, one thread, median of {TURNS} turns",
+        title=f"steps per second, one thread, median of {TURNS} turns ({ENV} where not named)",
         box=box.SIMPLE_HEAD,
     )
     table.add_column("what")

@@ -13,21 +13,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.envs.options import choose, finish, typical_magnitude
-from fusion_gym.envs.single import FusionEnv
+from fusion_gym.envs.options import assumed_density_centre, choose, finish, typical_magnitude
+from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
 from fusion_gym.envs.task import Task
-from fusion_gym.envs.vector import FusionVectorEnv
-from fusion_gym.filters import AssumedDensityFilter, KalmanFilter, TobitKalmanFilter
+from fusion_gym.filters import KalmanFilter, TobitKalmanFilter
 from fusion_gym.fusion import FederatedFusion
 from fusion_gym.plants import LinearPlant
 from fusion_gym.sensors import CensoredSensors
-from fusion_gym.systems import CensoredSystem, FederatedCentre, SequentialCentre
+from fusion_gym.systems import CensoredSystem, FederatedCentre
 from fusion_gym.systems.centre import Centre
-from fusion_gym.validation import Array, ConfigurationError
+from fusion_gym.validation import Array
 
 _ANGLE = 0.052 * math.pi
 _COS, _SIN = math.cos(_ANGLE), math.sin(_ANGLE)
@@ -188,12 +186,7 @@ def _centre(chosen: BiasedOscillatorOptions, sensors: CensoredSensors) -> Centre
     kind = validation.choice("filter", chosen.filter, ("paper", "adf", "kalman"))
     fusion = FederatedFusion.create(chosen.information_shares, sensors.count)
     if kind == "adf":
-        if chosen.information_shares is not None:
-            raise ConfigurationError(
-                f"information_shares = {chosen.information_shares!r} is not allowed with "
-                "filter='adf': its centre takes the measurements itself and shares nothing"
-            )
-        return SequentialCentre(AssumedDensityFilter(sensors))
+        return assumed_density_centre(sensors, chosen.information_shares)
     node = TobitKalmanFilter(sensors) if kind == "paper" else KalmanFilter(sensors)
     return FederatedCentre(node, fusion)
 
@@ -239,49 +232,29 @@ _PAGE = """
 """
 
 
-class BiasedOscillatorEnv(FusionEnv):
+class BiasedOscillatorEnv(RegisteredEnv):
     __doc__ = _PAGE.format(
         title="An oscillator with a stochastic bias, seen by two sensors that saturate at ±5.",
         start="(5, 0), 0.1 I",
         options="BiasedOscillatorOptions",
     )
-
-    def __init__(self, render_mode: str | None = None, **options: Any) -> None:
-        super().__init__(build_oscillator(**options), render_mode)
+    build = staticmethod(build_oscillator)
 
 
-class BiasedOscillatorVectorEnv(FusionVectorEnv):
+class BiasedOscillatorVectorEnv(RegisteredVectorEnv):
     __doc__ = BiasedOscillatorEnv.__doc__
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        render_mode: str | None = None,
-        **options: Any,
-    ) -> None:
-        super().__init__(build_oscillator(**options), num_envs, autoreset_mode, render_mode)
+    build = staticmethod(build_oscillator)
 
 
-class BiasedTrackingEnv(FusionEnv):
+class BiasedTrackingEnv(RegisteredEnv):
     __doc__ = _PAGE.format(
         title="A target with an unknown acceleration, its position and velocity measured.",
         start="(10, 0), I",
         options="BiasedTrackingOptions",
     )
-
-    def __init__(self, render_mode: str | None = None, **options: Any) -> None:
-        super().__init__(build_tracking(**options), render_mode)
+    build = staticmethod(build_tracking)
 
 
-class BiasedTrackingVectorEnv(FusionVectorEnv):
+class BiasedTrackingVectorEnv(RegisteredVectorEnv):
     __doc__ = BiasedTrackingEnv.__doc__
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        render_mode: str | None = None,
-        **options: Any,
-    ) -> None:
-        super().__init__(build_tracking(**options), num_envs, autoreset_mode, render_mode)
+    build = staticmethod(build_tracking)

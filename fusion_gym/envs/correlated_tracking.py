@@ -11,14 +11,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.envs.options import choose, finish, typical_magnitude
-from fusion_gym.envs.single import FusionEnv
+from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
 from fusion_gym.envs.task import Task
-from fusion_gym.envs.vector import FusionVectorEnv
 from fusion_gym.filters.robust import CorrelatedSensors, JointErrorCovariance, RobustKalmanFilter
 from fusion_gym.fusion.sequential import SequentialFusion
 from fusion_gym.plants import LinearPlant
@@ -243,21 +241,11 @@ _PAGE = """
 """
 
 
-class CorrelatedTrackingEnv(FusionEnv):
+class CorrelatedTrackingEnv(RegisteredEnv):
     __doc__ = _PAGE
-
-    def __init__(self, render_mode: str | None = None, **options: Any) -> None:
-        super().__init__(build(**options), render_mode)
+    build = staticmethod(build)
 
 
-class CorrelatedTrackingVectorEnv(FusionVectorEnv):
+class CorrelatedTrackingVectorEnv(RegisteredVectorEnv):
     __doc__ = _PAGE
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        render_mode: str | None = None,
-        **options: Any,
-    ) -> None:
-        super().__init__(build(**options), num_envs, autoreset_mode, render_mode)
+    build = staticmethod(build)

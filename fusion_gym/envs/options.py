@@ -10,10 +10,12 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.envs.task import Reward, Task
+from fusion_gym.filters import AssumedDensityFilter
 from fusion_gym.network import TokenBucket
 from fusion_gym.plants import LinearPlant
-from fusion_gym.systems import System
-from fusion_gym.validation import Array
+from fusion_gym.sensors import CensoredSensors
+from fusion_gym.systems import SequentialCentre, System
+from fusion_gym.validation import Array, ConfigurationError
 
 
 class CommonOptions(Protocol):
@@ -121,3 +123,17 @@ def plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain(entry) for entry in value]
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+
+
+def assumed_density_centre(sensors: CensoredSensors, shares: ArrayLike | None) -> SequentialCentre:
+    """The centre of ``filter="adf"``.
+
+    Raises:
+        ConfigurationError: information shares, which belong to federated fusion.
+    """
+    if shares is not None:
+        raise ConfigurationError(
+            f"information_shares = {shares!r} is not allowed with filter='adf': its centre takes "
+            "the measurements itself and shares nothing"
+        )
+    return SequentialCentre(AssumedDensityFilter(sensors))

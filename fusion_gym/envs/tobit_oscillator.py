@@ -12,16 +12,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.envs.options import choose, finish, typical_magnitude
-from fusion_gym.envs.single import FusionEnv
+from fusion_gym.envs.options import assumed_density_centre, choose, finish, typical_magnitude
+from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
 from fusion_gym.envs.task import Task
-from fusion_gym.envs.vector import FusionVectorEnv
 from fusion_gym.filters import (
-    AssumedDensityFilter,
     BoundConstants,
     BoundTobitFilter,
     EventError,
@@ -31,7 +28,7 @@ from fusion_gym.filters import (
 from fusion_gym.fusion import FederatedFusion
 from fusion_gym.plants import LinearPlant
 from fusion_gym.sensors import CensoredSensors
-from fusion_gym.systems import CensoredSystem, FederatedCentre, SequentialCentre
+from fusion_gym.systems import CensoredSystem, FederatedCentre
 from fusion_gym.systems.centre import Centre
 from fusion_gym.validation import ConfigurationError
 
@@ -159,12 +156,7 @@ def _centre(
                 "filter='paper' (the others predict when nothing arrives and know no event error)"
             )
     if kind == "adf":
-        if chosen.information_shares is not None:
-            raise ConfigurationError(
-                f"information_shares = {chosen.information_shares!r} is not allowed with "
-                "filter='adf': its centre takes the measurements itself and shares nothing"
-            )
-        return SequentialCentre(AssumedDensityFilter(sensors))
+        return assumed_density_centre(sensors, chosen.information_shares)
     node = TobitKalmanFilter(sensors) if kind == "tobit" else KalmanFilter(sensors)
     return FederatedCentre(node, fusion)
 
@@ -244,21 +236,11 @@ _PAGE = """
 """
 
 
-class TobitOscillatorEnv(FusionEnv):
+class TobitOscillatorEnv(RegisteredEnv):
     __doc__ = _PAGE
-
-    def __init__(self, render_mode: str | None = None, **options: Any) -> None:
-        super().__init__(build(**options), render_mode)
+    build = staticmethod(build)
 
 
-class TobitOscillatorVectorEnv(FusionVectorEnv):
+class TobitOscillatorVectorEnv(RegisteredVectorEnv):
     __doc__ = _PAGE
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        render_mode: str | None = None,
-        **options: Any,
-    ) -> None:
-        super().__init__(build(**options), num_envs, autoreset_mode, render_mode)
+    build = staticmethod(build)
