@@ -19,7 +19,8 @@ from fusion_gym.triggers import TRIGGERS
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 PAGE = (ROOT / "docs" / "tobit_oscillator.md").read_text()
-BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", README + PAGE, re.DOTALL | re.MULTILINE)
+PAGES = [path.read_text() for path in sorted((ROOT / "docs").glob("*.md"))]
+BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", README + "".join(PAGES), re.DOTALL | re.MULTILINE)
 EXAMPLES = [text for language, text in BLOCKS if language == "python"]
 
 
@@ -39,7 +40,7 @@ def test_the_evaluation_command_runs(tmp_path: Path) -> None:
 
 def test_files_and_configs_that_the_readme_names_exist() -> None:
     linked = re.findall(r"\]\(([\w/.]+)\)", README)
-    configs = re.findall(r"--config (\S+)", README)
+    configs = re.findall(r"(?:--config|--sweep) (\S+)", README)
     assert linked
     assert configs
     for name in (*linked, *configs):
