@@ -282,3 +282,14 @@ def test_limit_of_the_vector_environment(options: dict[str, int]) -> None:
         _, _, terminated, truncated, _ = env.step(np.zeros((3, 3), dtype=np.int8))
         assert not terminated.any()
         assert (truncated == (step % 14 == 13)).all()  # every 14th step is the reset
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_bound_starved_for_thousands_of_steps_does_not_overflow() -> None:
+    env = gymnasium.make("fusion_gym/TobitOscillator-v0", horizon=4000)
+    env.reset(seed=0)
+    for _ in range(4000):
+        observation, reward, _, truncated, _ = env.step(np.zeros(3, dtype=np.int8))
+        assert np.isfinite(reward)
+        assert np.isfinite(observation).all()
+    assert truncated

@@ -24,6 +24,8 @@ from fusion_gym.validation import Array, ConfigurationError
 _SMALLEST_PROBABILITY = 1e-290
 # The same where a held value is divided by q, and the ratio is squared.
 _SMALLEST_DIVISOR = 1e-140
+# Starved, the bound grows as 1.25^t; it is kept below this trace, where squares do not overflow.
+_LARGEST_TRACE = 1e100
 
 
 @dataclass(frozen=True)
@@ -206,7 +208,11 @@ class BoundTobitFilter:
             linalg.transpose(whitened), uncensored
         )
         bound = k1 * covariance - k1**2 * linalg.matmul(linalg.transpose(cross), whitened)
-        return mean + k1 * step, linalg.symmetrise(bound)
+        bound = linalg.symmetrise(bound)
+        trace = linalg.trace(bound)
+        if np.any(trace > _LARGEST_TRACE):
+            bound *= np.minimum(1.0, _LARGEST_TRACE / trace)[:, None, None]
+        return mean + k1 * step, bound
 
 
 def _pinned_columns(
