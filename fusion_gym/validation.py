@@ -21,7 +21,7 @@ class ConfigurationError(ValueError):
 
 
 def _refuse(field: str, value: Any, allowed: str) -> ConfigurationError:
-    text = np.array2string(value, separator=", ") if isinstance(value, np.ndarray) else repr(value)
+    text = repr(value.tolist() if isinstance(value, np.ndarray) else value)
     return ConfigurationError(f"{field} = {text} is not allowed: it must be {allowed}")
 
 
