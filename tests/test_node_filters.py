@@ -255,14 +255,14 @@ def test_kappas_of_any_epsilon(epsilon: tuple[float, ...]) -> None:
 
 @pytest.mark.parametrize(
     ("epsilon", "value"),
-    [((0.1,) * 13, "0.1"), ((0.1,) * 13 + (0.0,), "0. "), ((-1.0,) * 14, "-1."), (0.1, "0.1")],
+    [((0.1,) * 13, "0.1"), ((0.1,) * 13 + (0.0,), " 0.0]"), ((-1.0,) * 14, "-1.0"), (0.1, "0.1")],
 )
 def test_bad_epsilons_are_refused(epsilon: Any, value: str) -> None:
     with pytest.raises(ConfigurationError) as refused:
         BoundConstants.create(epsilon)
     field, _, rest = str(refused.value).partition(" = ")
     assert field == "bound_epsilon"
-    assert value in rest.replace("]", " ")
+    assert value in rest
     assert " is not allowed: " in rest
 
 
