@@ -1,0 +1,337 @@
+"""The adaptive innovation trigger and the correlated-noise environment from the outside."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.envs import EpisodeBatch
+from fusion_gym.envs.correlated_tracking import (
+    CorrelatedTrackingEnv,
+    CorrelatedTrackingOptions,
+    CorrelatedTrackingVectorEnv,
+    build,
+)
+from fusion_gym.systems import Signals
+from fusion_gym.triggers import make_trigger
+from fusion_gym.triggers.adaptive_innovation import AdaptiveInnovation
+from fusion_gym.triggers.random import Random
+from fusion_gym.validation import ConfigurationError
+
+Array = NDArray[np.float64]
+ROOT = Path(__file__).parent.parent
+
+
+# --- the trigger ---------------------------------------------------------------------------------
+
+
+def signals(innovation: Array, start: bool) -> Signals:
+    runs = innovation.shape[-1]
+    return Signals(
+        {
+            "innovation": innovation,
+            "start": np.full(runs, start),
+            "tokens": np.zeros(runs),
+            "token_cost": np.ones((len(innovation), 1)),
+        }
+    )
+
+
+def test_threshold_follows_the_last_requested_innovation() -> None:
+    trigger = AdaptiveInnovation(threshold=(0.6, 1.0), offset=(0.2, 0.0), sensitivity=(0.9, 2.0))
+    draw, last = np.random.default_rng(1), np.zeros((2, 5))
+    for step in range(60):
+        if step in (0, 30):  # a new episode forgets
+            last[:] = 0.0
+        innovation = draw.normal(size=(2, 1, 5))
+        found = trigger(signals(innovation, step in (0, 30)))
+        for sensor, (a, b, c) in enumerate(((0.6, 0.2, 0.9), (1.0, 0.0, 2.0))):
+            for lane in range(5):
+                size = abs(innovation[sensor, 0, lane])
+                asks = size**2 >= a * math.exp(-(b + c * last[sensor, lane]))
+                assert found[sensor, lane] == asks
+                last[sensor, lane] = size if asks else last[sensor, lane]
+
+
+def test_memory_of_one_run_restarts_alone_and_reset_forgets() -> None:
+    trigger = AdaptiveInnovation(threshold=1.0, offset=0.0, sensitivity=10.0)
+    large, small = np.full((1, 1, 2), 3.0), np.full((1, 1, 2), 0.5)
+    assert trigger(signals(large, True)).all()
+    mixed = dict(signals(small, False)) | {"start": np.array([True, False])}
+    assert trigger(Signals(mixed)).tolist() == [[False, True]]
+    trigger.reset(2)
+    assert not trigger(signals(small, False)).any()
+
+
+def test_special_cases_of_the_trigger() -> None:
+    draw = np.random.default_rng(2)
+    fixed, always = AdaptiveInnovation(0.7, 0.3, 0.0), AdaptiveInnovation(threshold=0.0)
+    for step in range(20):
+        innovation = draw.normal(size=(3, 2, 4))
+        size = (innovation**2).sum(1)
+        np.testing.assert_array_equal(
+            fixed(signals(innovation, step == 0)), size >= 0.7 * math.exp(-0.3)
+        )
+        assert always(signals(0.0 * innovation, step == 0)).all()
+
+
+@pytest.mark.parametrize("name", ["threshold", "offset", "sensitivity"])
+@pytest.mark.parametrize("value", [-1.0, float("nan"), "high", (1.0, -2.0)])
+def test_parameters_of_the_trigger_are_checked(name: str, value: Any) -> None:
+    with pytest.raises(ConfigurationError, match=name):
+        AdaptiveInnovation(**{name: value})
+
+
+# --- the environment -----------------------------------------------------------------------------
+
+
+def test_existing_policies_work_on_its_signals() -> None:
+    for information in ("sensors", "centre"):
+        task = build(information=information, tokens="limited")
+        batch = EpisodeBatch(task, 6)
+        batch.reset()
+        axes_of = {
+            signal.name: len([axis for axis in signal.axes.strip("()").split(",") if axis])
+            for signal in task.system.signals
+        }
+        names = ["variance_threshold:threshold=0.001", "information_gain", "periodic", "random"]
+        if information == "sensors":
+            names += ["innovation_threshold", "send_on_delta", "dynamic_event"]
+        for name in names:
+            policy = make_trigger(name)
+            policy.reset(6)
+            asked = 0
+            for _ in range(30):
+                found = policy(batch.signals())
+                assert found.shape == (3, 6)
+                assert found.dtype == np.bool_
+                asked += int(found.sum())
+                batch.step(found)
+            assert asked > 0, name
+        offered = batch.signals()
+        for name, axes in axes_of.items():
+            if name not in task.hidden_signals:
+                assert offered[name].ndim == axes, name
+    with pytest.raises(LookupError, match="withholds"):
+        AdaptiveInnovation()(batch.signals())
+
+
+def test_variance_signals_are_what_a_delivery_brings() -> None:
+    for fusion in ("sici", "sci", "ci"):
+        task = build(fusion=fusion)
+        weights = task.reward.state_weights[:, 0]
+        batch = EpisodeBatch(task, 4)
+        batch.seed(np.arange(4), [1, 2, 3, 4])
+        batch.reset()
+        policy = Random(0.4)
+        policy.reset(4)
+        for step in range(12):
+            offered = batch.signals()
+            silent, gain = offered["silent_variance"], offered["variance_reduction"]
+            asked = policy(offered)
+            if step % 4 < 3:  # this sensor alone
+                asked = np.zeros((3, 4), dtype=bool)
+                asked[step % 4] = True
+            batch.step(asked)
+            claimed = batch.delivered.covariance[0]
+            trace = np.einsum("i,iir->r", weights, claimed)
+            if step % 4 < 3:
+                np.testing.assert_allclose(silent - gain[step % 4], trace, rtol=1e-10)
+        batch.step(np.zeros((3, 4), dtype=bool))
+        prior = batch.delivered.prior_covariance[0]
+        np.testing.assert_array_equal(batch.delivered.covariance[0], prior)
+
+
+def test_reward_weighs_the_states_alike_and_never_costs_one() -> None:
+    task = build()
+    np.testing.assert_allclose(task.reward.state_weights[:, 0] * task.system.open_loop(200), 1 / 3)
+    batch = EpisodeBatch(task, 1000)
+    batch.seed(np.arange(1000), list(range(1000)))
+    batch.reset()
+    never = np.zeros((3, 1000), dtype=bool)
+    total = sum(batch.step(never).reward.mean() for _ in range(200)) / 200
+    assert total == pytest.approx(-1.0, abs=0.15)
+    custom = build(state_weights=(1.0, 0.0, 0.0))
+    assert custom.system.state_weights.tolist() == [1.0, 0.0, 0.0]
+
+
+def test_actual_covariance_is_on_demand_and_changes_nothing() -> None:
+    plain, tracked = (EpisodeBatch(build(track_actual=on), 3) for on in (False, True))
+    for batch in (plain, tracked):
+        batch.seed(np.arange(3), [5, 6, 7])
+        batch.reset()
+        policy = Random(0.5)
+        policy.reset(3, 9)
+        for _ in range(20):
+            batch.step(policy(batch.signals()))
+    np.testing.assert_array_equal(plain.observe(), tracked.observe())
+    assert plain.state.joint is None
+    with pytest.raises(ConfigurationError, match="track_actual"):
+        plain.task.system.actual_covariance(plain.delivered)
+    offered = {name for name in tracked.signals() if "actual" in name or name == "scale"}
+    assert not offered
+
+
+def test_noise_scale_is_drawn_for_each_episode() -> None:
+    batch = EpisodeBatch(build(noise_scale="random", horizon=3), 4000)
+    batch.seed(np.arange(4000), list(range(4000)))
+    batch.reset()
+    first = batch.state.scale.copy()
+    assert 0.4 <= first.min() < 0.41
+    assert 0.99 < first.max() <= 1.0
+    assert first.mean() == pytest.approx(0.7, abs=4 * 0.6 / math.sqrt(12 * 4000))
+    batch.step(np.zeros((3, 4000), dtype=bool))
+    np.testing.assert_array_equal(batch.state.scale, first)
+    batch.reset()
+    assert (batch.state.scale != first).all()
+
+
+def test_smaller_noises_are_the_same_noises_scaled() -> None:
+    paths = []
+    for scale in (1.0, 0.25):
+        batch = EpisodeBatch(build(noise_scale=scale, initial_mean=(0.0, 0.0, 0.0)), 2)
+        batch.seed(np.arange(2), [1, 2])
+        batch.reset()
+        paths.append(np.concatenate((batch.state.truth, batch.state.measurement[:, 0])))
+    np.testing.assert_allclose(paths[1], 0.5 * paths[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("information", ["sensors", "centre"])
+def test_gymnasium_accepts_it_and_its_observations(information: str) -> None:
+    env = CorrelatedTrackingEnv(information=information, noise_scale="random")
+    check_env(env, skip_render_check=True)
+    assert len(env.observation_names) == (25 if information == "sensors" else 19)
+    sees = any("innovation" in name for name in env.observation_names)
+    assert sees == (information == "sensors")
+
+
+def test_vector_and_single_environments_agree() -> None:
+    vector = CorrelatedTrackingVectorEnv(num_envs=4, noise_scale="random", tokens="limited")
+    seen, _ = vector.reset(seed=11)
+    actions = np.random.default_rng(0).integers(0, 2, (40, 4, 3), dtype=np.int8)
+    singles = [CorrelatedTrackingEnv(noise_scale="random", tokens="limited") for _ in range(4)]
+    for run_number, env in enumerate(singles):
+        np.testing.assert_allclose(env.reset(seed=11 + run_number)[0], seen[run_number], rtol=1e-6)
+    for action in actions:
+        seen, reward, *_ = vector.step(action)
+        for run_number, env in enumerate(singles):
+            observation, value, *_ = env.step(action[run_number])
+            assert value == pytest.approx(reward[run_number], rel=1e-10)
+            np.testing.assert_allclose(observation, seen[run_number], rtol=1e-5, atol=1e-6)
+
+
+def test_other_sizes_and_fusions_run() -> None:
+    draw = np.random.default_rng(3)
+    shape: dict[str, Any] = {
+        "transition": 0.9 * np.eye(2),
+        "process_gain": np.eye(2),
+        "process_variance": (0.3, 0.2),
+        "initial_mean": (0.0, 1.0),
+        "initial_covariance": np.eye(2),
+        "measurement_matrices": draw.normal(size=(4, 2, 2)),
+        "measurement_variance": (0.5, 0.6, 0.7, 0.8),
+        "noise_coupling": draw.normal(size=(4, 2, 2)),
+        "horizon": 20,
+        "track_actual": True,
+    }
+    for fusion in ("sici", "sci", "ci"):
+        task = build(fusion=fusion, **shape)
+        batch = EpisodeBatch(task, 8)
+        batch.seed(np.arange(8), list(range(8)))
+        batch.reset()
+        policy = make_trigger("adaptive_innovation", task.policy_defaults)
+        for _ in range(20):
+            outcome = batch.step(policy(batch.signals()))
+            assert np.isfinite(outcome.reward).all()
+            assert linalg.is_positive_definite(batch.delivered.covariance).all()
+        assert np.isfinite(batch.observe()).all()
+        assert task.system.state_names == ("x1", "x2")
+
+
+@pytest.mark.parametrize("horizon", [1, 3000])
+def test_short_and_long_episodes_of_rare_deliveries(horizon: int) -> None:
+    batch = EpisodeBatch(build(horizon=horizon), 4)
+    batch.reset()
+    policy = Random(0.01)
+    policy.reset(4)
+    for _ in range(horizon):
+        outcome = batch.step(policy(batch.signals()))
+        assert np.isfinite(outcome.reward).all()
+    assert outcome.truncated.all()
+    assert linalg.is_positive_definite(batch.delivered.covariance).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"noise_scale": 0.0}, r"noise_scale = 0.0 .* > 0"),
+        ({"noise_scale": 1.5}, r"noise_scale = 1.5 .* <= 1"),
+        ({"noise_scale": "often"}, r"noise_scale = 'often' .* 'random'"),
+        ({"noise_scale": True}, "noise_scale = True"),
+        ({"noise_scale": None}, "noise_scale = None"),
+        ({"fusion": "information"}, r"fusion = 'information' .* process noise"),
+        ({"fusion": "federated"}, r"fusion = 'federated' .* 'sici'"),
+        ({"fusion": "scii"}, r"did you mean 'sci"),
+        ({"fusion": 3}, r"fusion = 3 .* 'sici'"),
+        ({"fusion": "ci", "order": (0, 1, 2)}, r"order = .* fusion='ci'"),
+        ({"order": (0, 1)}, "order"),
+        ({"order": (0, 1, 1)}, r"order = \(0, 1, 1\) .* once"),
+        ({"order": (1, 2, 3)}, "order"),
+        ({"order": "first"}, "order"),
+        ({"track_actual": 1}, "track_actual = 1"),
+        ({"transition": ((1.0, 0.1),)}, "transition"),
+        ({"process_gain": (1.0, 1.0, 1.0)}, "process_gain"),
+        ({"process_variance": 0.0}, "process_variance"),
+        ({"initial_mean": (0.0, 0.0)}, "initial_mean"),
+        ({"initial_covariance": -np.eye(3)}, "initial_covariance"),
+        ({"measurement_variance": -1.0}, "measurement_variance"),
+        ({"noise_coupling": (0.1, 0.2)}, "noise_coupling"),
+        ({"trigger_threshold": -0.1}, "trigger_threshold"),
+        ({"trigger_offset": (0.1, 0.2)}, "trigger_offset"),
+        ({"trigger_sensitivity": "high"}, "trigger_sensitivity"),
+        ({"tokens": "many"}, "tokens = 'many'"),
+        ({"horizon": 0}, "horizon = 0"),
+        ({"state_weights": (1.0, 1.0)}, "state_weights"),
+        ({"thresholds": 1.0}, "unknown option .*trigger_threshold"),
+    ],
+)
+def test_what_is_not_allowed_is_said_in_one_error(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        build(**options)
+
+
+def test_trigger_options_are_the_policys_defaults() -> None:
+    task = build(trigger_threshold=(0.1, 0.2, 0.3), trigger_sensitivity=0.0)
+    policy = make_trigger("adaptive_innovation", task.policy_defaults)
+    assert policy == AdaptiveInnovation((0.1, 0.2, 0.3), (0.2,) * 3, (0.0,) * 3)
+    changed = make_trigger("adaptive_innovation:threshold=0.5", task.policy_defaults)
+    assert changed == AdaptiveInnovation(0.5, (0.2,) * 3, (0.0,) * 3)
+
+
+def test_page_names_every_option_and_observation_and_configs_are_of_this_environment() -> None:
+    page = (ROOT / "docs" / "correlated_tracking.md").read_text()
+    options = [field.name for field in dataclasses.fields(CorrelatedTrackingOptions)]
+    assert not [name for name in options if f"`{name}`" not in page]
+    task = build()
+    kinds = {name.split("[")[0] for name in EpisodeBatch(task, 1).layout.names}
+    assert not [kind for kind in kinds if f"`{kind}" not in page]
+    training = yaml.safe_load((ROOT / "configs" / "correlated_tracking_ppo.yaml").read_text())
+    assert training["environment"]["id"] == "fusion_gym/CorrelatedTracking-v0"
+    task = build(**training["environment"]["options"])
+    sweep = yaml.safe_load((ROOT / "configs" / "correlated_tracking_sweep.yaml").read_text())
+    specs = [curve["policy"].format(value=curve["values"][0]) for curve in sweep["curves"]]
+    for spec in (*sweep["points"], *specs):
+        batch = EpisodeBatch(task, 2)
+        batch.reset()
+        policy = make_trigger(spec, task.policy_defaults)
+        policy.reset(2)
+        assert policy(batch.signals()).shape == (3, 2), spec
