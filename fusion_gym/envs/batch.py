@@ -45,6 +45,9 @@ class EpisodeBatch:
     Each run draws all its noise from its own generator, in blocks and whatever the actions: a
     seed fixes an episode's noise (common random numbers), and a run does not depend on what
     stands beside it (batch invariance).
+
+    ``state`` is the system's after sensing, ``delivered`` its state after the last delivery,
+    for metrics and figures.
     """
 
     def __init__(self, task: Task, num_envs: int) -> None:
@@ -54,6 +57,7 @@ class EpisodeBatch:
         self.generators: list[np.random.Generator | None] = [None] * num_envs
         self._episode_starts: list[Any] = [None] * num_envs
         self.state: Any = None
+        self.delivered: Any = None
         self.tokens = task.bucket.start(num_envs)
         self.steps = np.zeros(num_envs, dtype=np.int64)
         self.finished = np.ones(num_envs, dtype=np.bool_)

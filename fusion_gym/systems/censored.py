@@ -6,6 +6,7 @@ round_robin_tobit (Geng, Wang, Alsaadi, Alharbi and Cheng, 2020).
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -209,6 +210,7 @@ class CensoredSystem:
         """The signals named in ``SIGNALS``."""
         expectation, deviation, _ = _outlook(state)
 
+        @functools.cache
         def variances() -> tuple[Array, Array]:
             return self.centre.variances(state.prior_mean, state.prior_covariance, _outlook(state))
 
