@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.envs.options import assumed_density_centre, choose, finish, typical_magnitude
+from fusion_gym.envs.options import (
+    CommonOptions,
+    assumed_density_centre,
+    choose,
+    finish,
+    typical_magnitude,
+)
 from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
 from fusion_gym.envs.task import Task
 from fusion_gym.filters import KalmanFilter, TobitKalmanFilter
@@ -33,7 +39,7 @@ _PERIOD = 0.1  # seconds between two samples of the tracking example
 
 
 @dataclass(frozen=True)
-class BiasedOscillatorOptions:
+class BiasedOscillatorOptions(CommonOptions):
     """Every option; the defaults are the oscillator of the paper's Section IV.A.
 
     Not given in the paper, our choice: ``information_shares`` (equal) and the reward.
@@ -61,20 +67,10 @@ class BiasedOscillatorOptions:
     token_rate: float = 1.0
     token_capacity: float = 15.0
     initial_tokens: float = 6.0
-    token_cost: ArrayLike = 3.0
-    sharing: str = "rotating"
     # Filters and fusion, equations (18)-(28)
     filter: str = "paper"
     bias_aware: bool = True
     information_shares: ArrayLike | None = None
-    # Episode, observation, action, reward
-    horizon: int = 100
-    information: str = "sensors"
-    action: str = "binary"
-    error: str = "squared"
-    error_weight: float = 1.0
-    cost_weight: float = 0.01
-    state_weights: ArrayLike | None = None
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.envs.options import choose, finish, typical_magnitude
+from fusion_gym.envs.options import CommonOptions, choose, finish, typical_magnitude
 from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
 from fusion_gym.envs.task import Task
 from fusion_gym.filters.robust import CorrelatedSensors, JointErrorCovariance, RobustKalmanFilter
@@ -27,7 +27,7 @@ _T = 0.01  # the paper's sampling time
 
 
 @dataclass(frozen=True)
-class CorrelatedTrackingOptions:
+class CorrelatedTrackingOptions(CommonOptions):
     """Every option of the environment; the defaults are the paper's Section 6.
 
     Not given in the paper, our choice: ``horizon`` (the paper runs 600 steps), the token bucket
@@ -49,11 +49,6 @@ class CorrelatedTrackingOptions:
     # Network
     tokens: str = "unlimited"
     token_rate: float = 3.0
-    token_capacity: float = 30.0
-    initial_tokens: float = 10.0
-    token_cost: ArrayLike = 3.0
-    sharing: str = "rotating"
-    access: str = "any"
     # Fusion, equations (37)-(57)
     fusion: str = "sici"
     order: ArrayLike | None = None
@@ -62,14 +57,9 @@ class CorrelatedTrackingOptions:
     trigger_threshold: ArrayLike = 0.6
     trigger_offset: ArrayLike = 0.2
     trigger_sensitivity: ArrayLike = 0.9
-    # Episode, observation, action, reward
+    # Episode and reward
     horizon: int = 200
-    information: str = "sensors"
-    action: str = "binary"
-    error: str = "squared"
-    error_weight: float = 1.0
     cost_weight: float = 0.001
-    state_weights: ArrayLike | None = None
 
 
 def build(**options: Any) -> Task:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields
-from typing import Any, Protocol, TypeVar
+from dataclasses import asdict, dataclass, fields
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,26 +18,30 @@ from fusion_gym.systems import SequentialCentre, System
 from fusion_gym.validation import Array, ConfigurationError
 
 
-class CommonOptions(Protocol):
-    """The options that every environment has, whatever its defaults."""
+@dataclass(frozen=True)
+class CommonOptions:
+    """The options that every environment has; each gives them its own defaults.
 
-    tokens: str
-    token_rate: float
-    token_capacity: float
-    initial_tokens: float
-    token_cost: ArrayLike
-    sharing: str
-    access: str
-    horizon: int
-    information: str
-    action: str
-    error: str
-    error_weight: float
-    cost_weight: float
-    state_weights: ArrayLike | None
+    Network, access and token bucket; episode, observation, action and reward.
+    """
+
+    access: str = "any"
+    tokens: str = "limited"
+    token_rate: float = 5.0
+    token_capacity: float = 30.0
+    initial_tokens: float = 10.0
+    token_cost: ArrayLike = 3.0
+    sharing: str = "rotating"
+    horizon: int = 100
+    information: str = "sensors"
+    action: str = "binary"
+    error: str = "squared"
+    error_weight: float = 1.0
+    cost_weight: float = 0.01
+    state_weights: ArrayLike | None = None
 
 
-Options = TypeVar("Options")
+Options = TypeVar("Options", bound=CommonOptions)
 
 
 def choose(kind: type[Options], env_id: str, given: dict[str, Any]) -> tuple[Options, int | None]:
@@ -47,7 +51,7 @@ def choose(kind: type[Options], env_id: str, given: dict[str, Any]) -> tuple[Opt
         ConfigurationError: an unknown option.
     """
     limit = given.pop("max_episode_steps", None)
-    known = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    known = [field.name for field in fields(kind)]
     validation.keys(f"option of {env_id}", given, known)
     if limit is not None:
         limit = validation.integer("max_episode_steps", limit, at_least=1)
@@ -73,7 +77,11 @@ def make_bucket(chosen: CommonOptions, sensors: int) -> TokenBucket:
 
 
 def finish(
-    chosen: Any, system: System[Any], limit: int | None, weights: ArrayLike | None, **task: Any
+    chosen: CommonOptions,
+    system: System[Any],
+    limit: int | None,
+    weights: ArrayLike | None,
+    **task: Any,
 ) -> Task:
     """The task of a system with the options' network, reward and episode.
 

@@ -15,7 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.envs.options import assumed_density_centre, choose, finish, typical_magnitude
+from fusion_gym.envs.options import (
+    CommonOptions,
+    assumed_density_centre,
+    choose,
+    finish,
+    typical_magnitude,
+)
 from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
 from fusion_gym.envs.task import Task
 from fusion_gym.filters import (
@@ -38,7 +44,7 @@ _IDENTITY = ((1.0, 0.0), (0.0, 1.0))
 
 
 @dataclass(frozen=True)
-class TobitOscillatorOptions:
+class TobitOscillatorOptions(CommonOptions):
     """Every option of the environment; the defaults are the paper's Section 4.
 
     Not given in the paper, our choice: ``initial_covariance``, ``information_shares`` (equal),
@@ -59,13 +65,7 @@ class TobitOscillatorOptions:
     measurement_variance: ArrayLike = 0.5
     censoring_threshold: ArrayLike = 0.0
     # Network, equations (16)-(18)
-    tokens: str = "limited"
-    token_rate: float = 5.0
-    token_capacity: float = 30.0
-    initial_tokens: float = 10.0
-    token_cost: ArrayLike = 3.0
     sharing: str = "equal"
-    access: str = "any"
     # Filters and fusion, equations (21)-(37), (50), (51)
     filter: str = "paper"
     silent: str | None = None
@@ -78,14 +78,6 @@ class TobitOscillatorOptions:
     trigger_decay: ArrayLike | None = None
     trigger_divisor: ArrayLike = 5.0
     trigger_initial: ArrayLike = 1.5
-    # Episode, observation, action, reward
-    horizon: int = 100
-    information: str = "sensors"
-    action: str = "binary"
-    error: str = "squared"
-    error_weight: float = 1.0
-    cost_weight: float = 0.01
-    state_weights: ArrayLike | None = None
 
 
 def build(**options: Any) -> Task:
