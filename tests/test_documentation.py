@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 import shlex
 import subprocess
@@ -13,12 +12,11 @@ import pytest
 
 import fusion_gym
 from fusion_gym.envs import EpisodeBatch
-from fusion_gym.envs.tobit_oscillator import TobitOscillatorOptions
+from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.triggers import TRIGGERS
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
-PAGE = (ROOT / "docs" / "tobit_oscillator.md").read_text()
 PAGES = [path.read_text() for path in sorted((ROOT / "docs").glob("*.md"))]
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", README + "".join(PAGES), re.DOTALL | re.MULTILINE)
 EXAMPLES = [text for language, text in BLOCKS if language == "python"]
@@ -52,17 +50,12 @@ def test_every_policy_is_in_the_readme() -> None:
     assert not missing
 
 
-def test_every_option_and_observation_is_on_the_page() -> None:
-    options = [field.name for field in dataclasses.fields(TobitOscillatorOptions)]
-    assert not [name for name in options if f"`{name}`" not in PAGE]
-    names = EpisodeBatch(fusion_gym.make_task("fusion_gym/TobitOscillator-v0"), 1).layout.names
-    kinds = {name.split("[")[0] for name in names}
-    assert not [kind for kind in kinds if f"`{kind}" not in PAGE]
-
-
-def test_registered_environments_are_in_the_readme() -> None:
-    import gymnasium
-
-    registered = [name for name in gymnasium.registry if name.startswith("fusion_gym/")]
-    assert registered
-    assert not [name for name in registered if name not in README]
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_every_option_and_observation_is_on_the_page(env_id: str) -> None:
+    row = re.search(rf"\[`{env_id}`\]\((docs/\w+\.md)\)", README)
+    assert row is not None
+    page = (ROOT / row[1]).read_text()
+    task = fusion_gym.make_task(env_id)
+    assert not [name for name in task.settings if f"`{name}`" not in page]
+    names = EpisodeBatch(task, 1).layout.names
+    assert not [name for name in names if f"`{name.split('[')[0]}" not in page]

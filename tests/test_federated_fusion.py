@@ -14,7 +14,7 @@ from fusion_gym.filters import KalmanFilter, NodeFilter, TobitKalmanFilter
 from fusion_gym.fusion import FederatedFusion
 from fusion_gym.plants import LinearPlant
 from fusion_gym.sensors import CensoredSensors
-from fusion_gym.systems import CensoredSystem, FederatedCentre
+from fusion_gym.systems import CensoredSystem, FeedbackCentre
 
 Array = NDArray[np.float64]
 EQUAL = (1 / 3, 1 / 3, 1 / 3)
@@ -75,7 +75,7 @@ def make_system(kind: Any, share: Any) -> CensoredSystem:
     return CensoredSystem(
         plant=plant,
         model=plant,
-        centre=FederatedCentre(node_filter, FederatedFusion.create(share, 3)),
+        centre=FeedbackCentre(node_filter, FederatedFusion.create(share, 3)),
         random_start=False,
         state_names=("x1", "x2"),
         scale=np.ones(2),

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusion_gym.filters.robust import CorrelatedSensors, JointErrorCovariance, RobustKalmanFilter
+from fusion_gym.filters import JointErrorCovariance, RobustKalmanFilter
 from fusion_gym.plants import LinearPlant
+from fusion_gym.sensors import CorrelatedSensors
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]

@@ -16,30 +16,27 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.envs.options import (
-    CommonOptions,
-    assumed_density_centre,
-    choose,
-    finish,
-    typical_magnitude,
-)
+from fusion_gym.envs.feedback import FeedbackOptions, assumed_density_centre, feedback_centre
+from fusion_gym.envs.options import choose, finish, typical_magnitude
 from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
 from fusion_gym.envs.task import Task
 from fusion_gym.filters import KalmanFilter, TobitKalmanFilter
-from fusion_gym.fusion import FederatedFusion
 from fusion_gym.plants import LinearPlant
 from fusion_gym.sensors import CensoredSensors
-from fusion_gym.systems import CensoredSystem, FederatedCentre
+from fusion_gym.systems import CensoredSystem
 from fusion_gym.systems.centre import Centre
 from fusion_gym.validation import Array
 
 _ANGLE = 0.052 * math.pi
 _COS, _SIN = math.cos(_ANGLE), math.sin(_ANGLE)
 _PERIOD = 0.1  # seconds between two samples of the tracking example
+# Observed variances are relative to those after so many silent steps: over a whole episode the
+# target, a double integrator of a random walk, drifts thousands of times as far as it is known.
+_REFERENCE_HORIZON = 10
 
 
 @dataclass(frozen=True)
-class BiasedOscillatorOptions(CommonOptions):
+class BiasedOscillatorOptions(FeedbackOptions):
     """Every option; the defaults are the oscillator of the paper's Section IV.A.
 
     Not given in the paper, our choice: ``information_shares`` (equal) and the reward.
@@ -67,10 +64,9 @@ class BiasedOscillatorOptions(CommonOptions):
     token_rate: float = 1.0
     token_capacity: float = 15.0
     initial_tokens: float = 6.0
-    # Filters and fusion, equations (18)-(28)
+    # Filters, equations (18)-(25)
     filter: str = "paper"
     bias_aware: bool = True
-    information_shares: ArrayLike | None = None
 
 
 @dataclass(frozen=True)
@@ -133,7 +129,7 @@ def _build(chosen: BiasedOscillatorOptions, limit: int | None) -> Task:
         state_names=tuple(f"x{i + 1}" for i in range(states))
         + (("b",) if biases == 1 else tuple(f"b{i + 1}" for i in range(biases))),
         scale=typical_magnitude(plant, horizon, random_start),
-        reference=plant.open_loop(horizon),
+        reference=plant.open_loop(min(horizon, _REFERENCE_HORIZON)),
     )
     # Every state counts alike, relative to its variance without any transmission.
     weights = 1.0 / (plant.size * system.open_loop(horizon))
@@ -180,11 +176,10 @@ def _diagonal(first: Array, second: Array) -> Array:
 
 def _centre(chosen: BiasedOscillatorOptions, sensors: CensoredSensors) -> Centre:
     kind = validation.choice("filter", chosen.filter, ("paper", "adf", "kalman"))
-    fusion = FederatedFusion.create(chosen.information_shares, sensors.count)
     if kind == "adf":
-        return assumed_density_centre(sensors, chosen.information_shares)
+        return assumed_density_centre(chosen, sensors)
     node = TobitKalmanFilter(sensors) if kind == "paper" else KalmanFilter(sensors)
-    return FederatedCentre(node, fusion)
+    return feedback_centre(chosen, node)
 
 
 _PAGE = """

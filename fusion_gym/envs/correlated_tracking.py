@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.envs.options import CommonOptions, choose, finish, typical_magnitude
+from fusion_gym.envs.options import CommonOptions, arrival_order, choose, finish, typical_magnitude
 from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
 from fusion_gym.envs.task import Task
-from fusion_gym.filters.robust import CorrelatedSensors, JointErrorCovariance, RobustKalmanFilter
-from fusion_gym.fusion.sequential import SequentialFusion
+from fusion_gym.filters import JointErrorCovariance, RobustKalmanFilter
+from fusion_gym.fusion import ParallelFusion, SequentialFusion
 from fusion_gym.plants import LinearPlant
-from fusion_gym.systems.correlated_tracking import CorrelatedTrackingSystem, ParallelFusion
+from fusion_gym.sensors import CorrelatedSensors
+from fusion_gym.systems import CorrelatedTrackingSystem
 from fusion_gym.validation import ConfigurationError
 
 _T = 0.01  # the paper's sampling time
@@ -133,26 +134,21 @@ def _fusion(chosen: CorrelatedTrackingOptions, sensors: int) -> SequentialFusion
             "errors of these estimates are correlated (all contain the same process noise), and "
             "adding their information would count it several times"
         )
-    kind = validation.choice("fusion", kind, ("sici", "sci", "ci"))
-    if kind == "ci":
-        if chosen.order is not None:
-            raise ConfigurationError(
-                f"order = {chosen.order!r} is not allowed with fusion='ci': it belongs to the "
-                "sequential rules 'sici' and 'sci'"
-            )
-        return ParallelFusion()
-    order = None if chosen.order is None else _order(chosen.order, sensors)
-    return SequentialFusion("ici" if kind == "sici" else "ci", order)
-
-
-def _order(value: ArrayLike, sensors: int) -> tuple[int, ...]:
-    given = validation.array("order", value, (sensors,))
-    if sorted(given.tolist()) != list(range(sensors)):
+    kind = validation.choice("fusion", kind, ("sici", "sci", "ci", "ici"))
+    if kind in ("ci", "ici") and chosen.order is not None:
         raise ConfigurationError(
-            f"order = {value!r} is not allowed: it must hold each of the sensors 0 to "
-            f"{sensors - 1} once"
+            f"order = {chosen.order!r} is not allowed with fusion={kind!r}: it belongs to the "
+            "sequential rules 'sici' and 'sci'"
         )
-    return tuple(int(sensor) for sensor in given)
+    if kind == "ici" and sensors != 1:
+        raise ConfigurationError(
+            f"fusion = 'ici' is not allowed with {sensors} sensors: it joins two estimates, and "
+            "the centre's prediction is one of them; it must be 'sici' (two at a time) for more"
+        )
+    if kind == "ci":
+        return ParallelFusion()
+    order = arrival_order(chosen.order, sensors)
+    return SequentialFusion("ci" if kind == "sci" else "ici", order)
 
 
 def _trigger(chosen: CorrelatedTrackingOptions, sensors: int) -> dict[str, tuple[float, ...]]:

@@ -10,11 +10,9 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.envs.task import Reward, Task
-from fusion_gym.filters import AssumedDensityFilter
 from fusion_gym.network import TokenBucket
 from fusion_gym.plants import LinearPlant
-from fusion_gym.sensors import CensoredSensors
-from fusion_gym.systems import SequentialCentre, System
+from fusion_gym.systems import System
 from fusion_gym.validation import Array, ConfigurationError
 
 
@@ -133,15 +131,18 @@ def plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
 
-def assumed_density_centre(sensors: CensoredSensors, shares: ArrayLike | None) -> SequentialCentre:
-    """The centre of ``filter="adf"``.
+def arrival_order(value: ArrayLike | None, sensors: int) -> tuple[int, ...] | None:
+    """The option ``order``: a permutation of the sensors 0 to l - 1, or ``None``.
 
     Raises:
-        ConfigurationError: information shares, which belong to federated fusion.
+        ConfigurationError: not a permutation.
     """
-    if shares is not None:
+    if value is None:
+        return None
+    given = validation.array("order", value, (sensors,))
+    if sorted(given.tolist()) != list(range(sensors)):
         raise ConfigurationError(
-            f"information_shares = {shares!r} is not allowed with filter='adf': its centre takes "
-            "the measurements itself and shares nothing"
+            f"order = {value!r} is not allowed: it must hold each of the sensors 0 to "
+            f"{sensors - 1} once"
         )
-    return SequentialCentre(AssumedDensityFilter(sensors))
+    return tuple(int(sensor) for sensor in given)

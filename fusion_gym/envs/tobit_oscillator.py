@@ -15,13 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.envs.options import (
-    CommonOptions,
-    assumed_density_centre,
-    choose,
-    finish,
-    typical_magnitude,
-)
+from fusion_gym.envs.feedback import FeedbackOptions, assumed_density_centre, feedback_centre
+from fusion_gym.envs.options import choose, finish, typical_magnitude
 from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
 from fusion_gym.envs.task import Task
 from fusion_gym.filters import (
@@ -31,10 +26,9 @@ from fusion_gym.filters import (
     KalmanFilter,
     TobitKalmanFilter,
 )
-from fusion_gym.fusion import FederatedFusion
 from fusion_gym.plants import LinearPlant
 from fusion_gym.sensors import CensoredSensors
-from fusion_gym.systems import CensoredSystem, FederatedCentre
+from fusion_gym.systems import CensoredSystem
 from fusion_gym.systems.centre import Centre
 from fusion_gym.validation import ConfigurationError
 
@@ -44,7 +38,7 @@ _IDENTITY = ((1.0, 0.0), (0.0, 1.0))
 
 
 @dataclass(frozen=True)
-class TobitOscillatorOptions(CommonOptions):
+class TobitOscillatorOptions(FeedbackOptions):
     """Every option of the environment; the defaults are the paper's Section 4.
 
     Not given in the paper, our choice: ``initial_covariance``, ``information_shares`` (equal),
@@ -66,13 +60,12 @@ class TobitOscillatorOptions(CommonOptions):
     censoring_threshold: ArrayLike = 0.0
     # Network, equations (16)-(18)
     sharing: str = "equal"
-    # Filters and fusion, equations (21)-(37), (50), (51)
+    # Filters, equations (21)-(37)
     filter: str = "paper"
     silent: str | None = None
     event_error: bool | None = None
     bound_epsilon: ArrayLike = (0.05,) * 5 + (0.7,) * 8 + (1.0,)
     bound_young: tuple[float, float] = (1.5, 2.0)
-    information_shares: ArrayLike | None = None
     # Dynamic event trigger, equations (11)-(15): the defaults of the policy, and Ξ of the filter
     trigger_threshold: ArrayLike | None = None
     trigger_decay: ArrayLike | None = None
@@ -128,7 +121,6 @@ def _centre(
     chosen: TobitOscillatorOptions, sensors: CensoredSensors, trigger: dict[str, tuple[float, ...]]
 ) -> Centre:
     kind = validation.choice("filter", chosen.filter, ("paper", "tobit", "kalman", "adf"))
-    fusion = FederatedFusion.create(chosen.information_shares, sensors.count)
     constants = BoundConstants.create(chosen.bound_epsilon)
     error = EventError.create(**trigger, young=chosen.bound_young, sensors=sensors.count)
     silent, with_error = chosen.silent, chosen.event_error
@@ -140,7 +132,7 @@ def _centre(
         bound = BoundTobitFilter(
             sensors, constants, None if with_error is False else error, hold=silent != "predict"
         )
-        return FederatedCentre(bound, fusion)
+        return feedback_centre(chosen, bound)
     for name, value, refused in (("silent", silent, "hold"), ("event_error", with_error, True)):
         if value == refused:
             raise ConfigurationError(
@@ -148,9 +140,9 @@ def _centre(
                 "filter='paper' (the others predict when nothing arrives and know no event error)"
             )
     if kind == "adf":
-        return assumed_density_centre(sensors, chosen.information_shares)
+        return assumed_density_centre(chosen, sensors)
     node = TobitKalmanFilter(sensors) if kind == "tobit" else KalmanFilter(sensors)
-    return FederatedCentre(node, fusion)
+    return feedback_centre(chosen, node)
 
 
 def _trigger(chosen: TobitOscillatorOptions, sensors: int) -> dict[str, tuple[float, ...]]:

@@ -4,6 +4,7 @@ from fusion_gym.filters.assumed_density import AssumedDensityFilter
 from fusion_gym.filters.base import Expectation, NodeFilter, Plan
 from fusion_gym.filters.bound import BoundConstants, BoundTobitFilter, EventError
 from fusion_gym.filters.kalman import KalmanFilter
+from fusion_gym.filters.robust import JointErrorCovariance, RobustKalmanFilter, RobustPlan
 from fusion_gym.filters.tobit import TobitKalmanFilter
 
 __all__ = [
@@ -12,8 +13,11 @@ __all__ = [
     "BoundTobitFilter",
     "EventError",
     "Expectation",
+    "JointErrorCovariance",
     "KalmanFilter",
     "NodeFilter",
     "Plan",
+    "RobustKalmanFilter",
+    "RobustPlan",
     "TobitKalmanFilter",
 ]

@@ -7,13 +7,19 @@ from fusion_gym.fusion.covariance_intersection import (
     inverse_covariance_intersection,
 )
 from fusion_gym.fusion.federated import FederatedFusion
+from fusion_gym.fusion.feedback import INTERSECTION_RULES, FeedbackFusion, IntersectionFusion
 from fusion_gym.fusion.information import InformationFusion
+from fusion_gym.fusion.parallel import ParallelFusion
 from fusion_gym.fusion.sequential import SequentialFusion, SequentialResult
 
 __all__ = [
+    "INTERSECTION_RULES",
     "FederatedFusion",
+    "FeedbackFusion",
     "Fused",
     "InformationFusion",
+    "IntersectionFusion",
+    "ParallelFusion",
     "SequentialFusion",
     "SequentialResult",
     "covariance_intersection",

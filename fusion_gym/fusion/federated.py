@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fusion_gym import validation
+from fusion_gym import linalg, validation
 from fusion_gym.fusion.information import InformationFusion
 from fusion_gym.validation import Array, ConfigurationError
 
@@ -57,3 +57,10 @@ class FederatedFusion:
         Source: tobit_token_bucket, equation (50).
         """
         return InformationFusion().fuse(mean, covariance)
+
+    def fuse_alone(self, silent: Array, delivered: Array) -> tuple[Array, Array]:
+        """See :class:`fusion_gym.fusion.FeedbackFusion`: informations are sums."""
+        information = linalg.inverse(silent)
+        total = information.sum(0)
+        gained = linalg.inverse(delivered) - information
+        return linalg.inverse(total), linalg.inverse(linalg.symmetrise(total + gained))

@@ -53,10 +53,16 @@ class SequentialFusion:
     def __post_init__(self) -> None:
         validation.choice("rule", self.rule, _RULES)
         if self.order is not None:
-            self._check_order(len(self.order) if isinstance(self.order, tuple) else None)
+            self.check_order(len(self.order) if isinstance(self.order, tuple) else 0)
 
-    def _check_order(self, sensors: int | None) -> None:
-        """The order holds each sensor once; ``None`` stands for something that is no tuple."""
+    def check_order(self, sensors: int) -> None:
+        """Whether the order, if there is one, is a permutation of so many sensors.
+
+        Raises:
+            ConfigurationError: it is none.
+        """
+        if self.order is None:
+            return
         given = self.order if isinstance(self.order, tuple) else ()
         whole = all(
             isinstance(sensor, (int, np.integer)) and not isinstance(sensor, bool)
@@ -91,7 +97,7 @@ class SequentialFusion:
         """
         sensors, size = means.shape[:2]
         if self.order is not None and len(self.order) != sensors:
-            self._check_order(sensors)
+            self.check_order(sensors)
         join = _RULES[self.rule]
         result = SequentialResult(
             mean.copy(), covariance.copy(), np.zeros((sensors + 1, *covariance.shape))

@@ -1,5 +1,6 @@
 """Sensors: how the state is measured."""
 
 from fusion_gym.sensors.censored import CensoredSensors
+from fusion_gym.sensors.correlated import CorrelatedSensors
 
-__all__ = ["CensoredSensors"]
+__all__ = ["CensoredSensors", "CorrelatedSensors"]

@@ -2,13 +2,19 @@
 
 from fusion_gym.systems.base import Feature, Signal, Signals, System
 from fusion_gym.systems.censored import CensoredState, CensoredSystem
-from fusion_gym.systems.centre import FederatedCentre, SequentialCentre
+from fusion_gym.systems.centre import FeedbackCentre, SequentialCentre
+from fusion_gym.systems.correlated_tracking import (
+    CorrelatedTrackingState,
+    CorrelatedTrackingSystem,
+)
 
 __all__ = [
     "CensoredState",
     "CensoredSystem",
+    "CorrelatedTrackingState",
+    "CorrelatedTrackingSystem",
     "Feature",
-    "FederatedCentre",
+    "FeedbackCentre",
     "SequentialCentre",
     "Signal",
     "Signals",

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.filters import AssumedDensityFilter, Expectation, NodeFilter, Plan
-from fusion_gym.fusion import FederatedFusion
+from fusion_gym.fusion import FeedbackFusion
 from fusion_gym.sensors import CensoredSensors
 from fusion_gym.validation import Array
 
@@ -65,15 +65,15 @@ class Centre(Protocol):
 
 
 @dataclass(frozen=True)
-class FederatedCentre:
-    """A node filter for each sensor, federated fusion, feedback.
+class FeedbackCentre:
+    """A node filter for each sensor, fusion, and the result fed back to the nodes.
 
     Source: tobit_token_bucket, equations (20)-(23), (29)-(37), (50), (51); round_robin_tobit,
     equations (18)-(28).
     """
 
     filter: NodeFilter
-    fusion: FederatedFusion
+    fusion: FeedbackFusion
 
     @property
     def sensors(self) -> CensoredSensors:
@@ -111,11 +111,9 @@ class FederatedCentre:
     def variances(self, mean: Array, covariance: Array, outlook: Outlook) -> tuple[Array, Array]:
         """See :class:`Centre`; by the bound where the filter minimises one."""
         plan = _planned(outlook)
-        information = linalg.inverse(plan.silent_covariance)
-        silent = linalg.trace(linalg.inverse(information.sum(0)))
-        gained = linalg.inverse(plan.delivered_covariance) - information
-        fused = linalg.inverse(linalg.symmetrise(information.sum(0) + gained))
-        return silent, silent - linalg.trace(fused)
+        fused = self.fusion.fuse_alone(plan.silent_covariance, plan.delivered_covariance)
+        silent, alone = (linalg.trace(covariance) for covariance in fused)
+        return silent, silent - alone
 
 
 @dataclass(frozen=True)

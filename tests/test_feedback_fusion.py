@@ -1,0 +1,179 @@
+"""Covariance intersection of nodes with feedback, and fusion rules in every environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import fusion_gym
+from fusion_gym.evaluation import EpisodeResults, make_policy, run_episodes
+from fusion_gym.fusion import FederatedFusion, FeedbackFusion, IntersectionFusion
+from fusion_gym.validation import ConfigurationError
+
+Array = NDArray[np.float64]
+TOBIT = "fusion_gym/TobitOscillator-v0"
+BIASED = "fusion_gym/BiasedOscillator-v0"
+TRACKING = "fusion_gym/BiasedTracking-v0"
+CORRELATED = "fusion_gym/CorrelatedTracking-v0"
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def positive_definite(generator: np.random.Generator, size: int) -> Array:
+    factor = generator.normal(size=(size, size + 1))
+    return factor @ factor.T * 10.0 ** generator.uniform(-2, 2)
+
+
+def node_posteriors(seed: int, sensors: int) -> tuple[Array, list[Array], list[Array]]:
+    """A common prior of size 2, and each node's posterior and gain for y = H x + v of its own."""
+    generator = np.random.default_rng(seed)
+    prior = positive_definite(generator, 2)
+    gains, posteriors = [], []
+    for _ in range(sensors):
+        matrix, noise = generator.normal(size=(1, 2)), generator.uniform(0.01, 10.0)
+        gain = prior @ matrix.T / (matrix @ prior @ matrix.T + noise)
+        gains.append(gain @ matrix)
+        posteriors.append(prior - gain @ matrix @ prior)
+    return prior, gains, posteriors
+
+
+@given(seed=SEEDS)
+@settings(max_examples=60, deadline=None)
+@pytest.mark.parametrize(("rule", "sensors"), [("ici", 2), ("ci", 2), ("sci", 3), ("ci", 3)])
+def test_the_fused_covariance_bounds_the_error(rule: str, sensors: int, seed: int) -> None:
+    """Errors e_i = (I - K_i H_i) e - K_i v_i share the prior's; the fused weights come from runs
+    in which each node's mean is a unit vector."""
+    prior, gains, posteriors = node_posteriors(seed, sensors)
+    fusion = IntersectionFusion.create(rule, sensors)
+    covariance = np.stack(posteriors)[..., None].repeat(2 * sensors, axis=-1)
+    mean = np.zeros((sensors, 2, 2 * sensors))
+    for node in range(sensors):
+        mean[node, :, 2 * node : 2 * node + 2] = np.eye(2)
+    weights, fused = fusion.fuse(mean, covariance)
+    actual = np.zeros((2, 2))
+    for i in range(sensors):
+        for j in range(sensors):
+            left = weights[:, 2 * i : 2 * i + 2]
+            right = weights[:, 2 * j : 2 * j + 2]
+            common = (np.eye(2) - gains[i]) @ prior @ (np.eye(2) - gains[j]).T
+            actual += left @ (posteriors[i] if i == j else common) @ right.T
+    np.testing.assert_allclose(sum(np.split(weights, sensors, axis=1)), np.eye(2), atol=1e-7)
+    smallest = np.linalg.eigvalsh(fused[..., 0] - actual)[0]
+    assert smallest >= -1e-7 * np.trace(fused[..., 0])
+
+
+@given(seed=SEEDS)
+@settings(max_examples=40, deadline=None)
+@pytest.mark.parametrize("rule", ["ci", "sci", "sici"])
+def test_a_single_delivery_is_taken_as_it_is(rule: str, seed: int) -> None:
+    prior, _, posteriors = node_posteriors(seed, 3)
+    fusion = IntersectionFusion.create(rule, 3, (2, 0, 1) if rule != "ci" else None)
+    covariance = np.stack((prior, posteriors[1], prior))[..., None]
+    mean = np.array([[1.0, 2.0], [-3.0, 0.5], [1.0, 2.0]])[..., None]
+    fused_mean, fused = fusion.fuse(mean, covariance)
+    np.testing.assert_allclose(np.trace(fused[..., 0]), np.trace(posteriors[1]), rtol=2e-6)
+    # The trace is flat where the posterior nearly equals the prior: its optimum is what counts.
+    assert np.trace(fused[..., 0]) <= np.trace(prior) * (1 + 1e-9)
+    if np.trace(posteriors[1]) < 0.5 * np.trace(prior):
+        np.testing.assert_allclose(fused_mean[:, 0], mean[1, :, 0], atol=1e-2)
+
+
+@pytest.mark.parametrize("rule", ["federated", "ci", "ici", "sci", "sici"])
+def test_deliveries_of_each_node_alone(rule: str) -> None:
+    """``fuse_alone`` against ``fuse`` of the covariances that it stands for."""
+    fusion: FeedbackFusion = (
+        FederatedFusion.create(None, 2)
+        if rule == "federated"
+        else IntersectionFusion.create(rule, 2)
+    )
+    generator = np.random.default_rng(3)
+    silent = np.stack([positive_definite(generator, 3) for _ in range(2)])[..., None]
+    delivered = 0.3 * silent
+    nobody, alone = fusion.fuse_alone(silent, delivered)
+    zero = np.zeros((2, 3, 1))
+    np.testing.assert_allclose(nobody, fusion.fuse(zero, silent)[1], rtol=1e-9)
+    for node in range(2):
+        chosen = silent.copy()
+        chosen[node] = delivered[node]
+        np.testing.assert_allclose(alone[node], fusion.fuse(zero, chosen)[1], rtol=1e-9)
+
+
+def results(env_id: str, policy: str, **options: Any) -> EpisodeResults:
+    task = fusion_gym.make_task(env_id, **options)
+    return run_episodes(task, make_policy(policy, task), 300, seed=0)
+
+
+def test_intersection_is_conservative_where_federation_is_exact() -> None:
+    """The target is linear and uncensored: NEES is 1 with federated fusion, below it with CI."""
+    settings_ = {"access": "any", "tokens": "unlimited"}
+    exact = results(TRACKING, "always", **settings_)
+    assert exact.nees.mean() == pytest.approx(1.0, abs=0.03)
+    for rule in ("ci", "ici"):
+        found = results(TRACKING, "always", fusion=rule, **settings_)
+        assert found.nees.mean() < 0.9
+        assert exact.mse.mean() < found.mse.mean() < 1.15 * exact.mse.mean()
+
+
+@pytest.mark.parametrize("env_id", [TOBIT, BIASED, TRACKING])
+@pytest.mark.parametrize("rule", ["ci", "sci", "sici"])
+def test_rules_agree_where_one_node_delivers(env_id: str, rule: str) -> None:
+    """With one sensor a step every rule returns that node's filter, as federated fusion does."""
+    options = {"access": "single", "tokens": "unlimited", "horizon": 20}
+    if env_id == TOBIT:
+        options["filter"] = "tobit"
+    other = results(env_id, "round_robin", fusion=rule, **options)
+    federated = results(env_id, "round_robin", **options)
+    np.testing.assert_allclose(other.mse.mean(), federated.mse.mean(), rtol=0.02)
+
+
+def test_order_of_arrival_matters_to_the_sequential_rules() -> None:
+    first = results(TOBIT, "always", filter="tobit", fusion="sci")
+    same = results(TOBIT, "always", filter="tobit", fusion="sci", order=(0, 1, 2))
+    assert np.array_equal(first.mse, same.mse)
+    matrices = (((1.0, 0.0),), ((0.3, 1.0),), ((0.0, 1.0),))
+    options: dict[str, Any] = {"filter": "tobit", "measurement_matrices": matrices}
+    forward = results(TOBIT, "always", fusion="sci", **options)
+    backward = results(TOBIT, "always", fusion="sci", order=(2, 1, 0), **options)
+    assert not np.allclose(forward.bound_trace, backward.bound_trace, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options", "parts"),
+    [
+        (TOBIT, {"fusion": "information"}, ("'information'", "same prediction", "'federated'")),
+        (TOBIT, {"fusion": "cii"}, ("'cii'", "did you mean 'ci'", "'federated'")),
+        (TOBIT, {"fusion": "ici"}, ("'ici'", "3 sensors", "'sici'")),
+        (TOBIT, {"fusion": "ci", "information_shares": (0.5, 0.3, 0.2)}, ("(0.5, 0.3, 0.2)", "ci")),
+        (TOBIT, {"order": (0, 1, 2)}, ("(0, 1, 2)", "federated", "'sci'")),
+        (TOBIT, {"fusion": "ci", "order": (0, 1, 2)}, ("(0, 1, 2)", "'ci'", "'sci'")),
+        (TOBIT, {"fusion": "sci", "order": (0, 1)}, ("(0, 1)", "(3)")),
+        (TOBIT, {"fusion": "sci", "order": (0, 1, 1)}, ("(0, 1, 1)", "0 to 2")),
+        (TOBIT, {"filter": "adf", "fusion": "ci"}, ("'ci'", "filter='adf'", "nodes")),
+        (BIASED, {"filter": "adf", "order": (0, 1)}, ("(0, 1)", "filter='adf'", "nodes")),
+        (CORRELATED, {"fusion": "federated"}, ("'federated'", "'sici'", "correlated")),
+        (CORRELATED, {"fusion": "information"}, ("'information'", "'sici'", "correlated")),
+        (CORRELATED, {"fusion": "ici"}, ("'ici'", "3 sensors", "prediction", "'sici'")),
+        (CORRELATED, {"fusion": "ci", "order": (0, 1, 2)}, ("(0, 1, 2)", "'ci'")),
+    ],
+)
+def test_what_does_not_fit_is_refused(
+    env_id: str, options: dict[str, Any], parts: tuple[str, ...]
+) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        fusion_gym.make_task(env_id, **options)
+    assert [part for part in parts if part not in str(caught.value)] == []
+
+
+def test_a_single_correlated_sensor_may_use_ici() -> None:
+    options: dict[str, Any] = {
+        "measurement_matrices": (((1.0, 0.0, 0.0),),),
+        "measurement_variance": 0.64,
+        "noise_coupling": 0.2,
+    }
+    inverse = results(CORRELATED, "always", fusion="ici", **options)
+    sequential = results(CORRELATED, "always", fusion="sici", **options)
+    assert np.array_equal(inverse.mse, sequential.mse)
