@@ -59,6 +59,7 @@ class EpisodeBatch:
         self.state: Any = None
         self.delivered: Any = None
         self.tokens = task.bucket.start(num_envs)
+        self.price = task.reward.price.draw(np.zeros(num_envs))
         self.steps = np.zeros(num_envs, dtype=np.int64)
         self.finished = np.ones(num_envs, dtype=np.bool_)
         self._limit = np.full(num_envs, task.horizon, dtype=np.int64)
@@ -94,6 +95,9 @@ class EpisodeBatch:
         noise = np.empty((len(runs), system.start_channels))
         for place, run in enumerate(runs.tolist()):
             self._next_episode(run).standard_normal(out=noise[place])
+        if self.task.reward.price.fixed is None:
+            drawn = np.array([self._far_uniform(run) for run in runs.tolist()])
+            self.price = _merge(self.price, self.task.reward.price.draw(drawn), runs)
         self._draw(runs)
         fresh = system.start(np.ascontiguousarray(noise.T))
         row = self._noise()
@@ -129,7 +133,7 @@ class EpisodeBatch:
         mean, covariance = system.fused(state)
         error = system.truth(state) - mean
         squared_error = error * error
-        reward_error, reward_cost = task.reward.terms(squared_error, covariance, spent)
+        reward_error, reward_cost = task.reward.terms(squared_error, covariance, spent, self.price)
         self.tokens = tokens
         self.steps = self.steps + 1
         truncated = self.steps >= self._limit
@@ -154,7 +158,7 @@ class EpisodeBatch:
 
     def observe(self) -> NDArray[np.float32]:
         """Observations (N, entries) of all runs, a fresh array."""
-        return self.layout.encode(self.state, self.tokens, self.admitted)
+        return self.layout.encode(self.state, self.tokens, self.admitted, self.price)
 
     def admitted(self) -> NDArray[np.bool_]:
         """The sensors (sensors, N) that the network's access rule admits in the coming step."""
@@ -168,7 +172,8 @@ class EpisodeBatch:
     def signals(self) -> Signals:
         """The signals of all runs, without what the information mode withholds.
 
-        To the system's own it adds ``tokens`` (N,), ``token_cost`` (sensors, 1), ``step`` (N,),
+        To the system's own it adds ``tokens`` (N,), ``token_cost`` (sensors, 1), ``price`` (N,) of
+        a token, ``step`` (N,),
         the steps taken in the episode, ``start`` (N,) bool, ``admitted`` (sensors, N) bool, and
         ``observation`` (N, entries).
         """
@@ -176,6 +181,7 @@ class EpisodeBatch:
         values |= {
             "tokens": self.tokens,
             "token_cost": self.task.bucket.cost,
+            "price": self.price,
             "step": self.steps,
             "start": self.steps == 0,
             "admitted": self.admitted,
@@ -198,6 +204,16 @@ class EpisodeBatch:
             bits.advance(2**64)  # type: ignore[attr-defined]
         self._episode_starts[run] = bits.state
         return generator
+
+    def _far_uniform(self, run: int) -> float:
+        """A uniform number of the episode from beyond all its noise, which it does not shift."""
+        generator = self._generator(run)
+        bits = generator.bit_generator
+        here = bits.state
+        bits.advance(2**63)  # type: ignore[attr-defined]
+        drawn = generator.random()
+        bits.state = here
+        return drawn
 
     def _generator(self, run: int) -> np.random.Generator:
         generator = self.generators[run]

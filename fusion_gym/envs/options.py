@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
+from fusion_gym.envs.price import Price
 from fusion_gym.envs.task import Reward, Task
 from fusion_gym.network import TokenBucket
 from fusion_gym.plants import LinearPlant
@@ -35,7 +36,8 @@ class CommonOptions:
     action: str = "binary"
     error: str = "squared"
     error_weight: float = 1.0
-    cost_weight: float = 0.01
+    cost_weight: float | str = 0.01
+    price_range: ArrayLike | None = None
     state_weights: ArrayLike | None = None
 
 
@@ -92,7 +94,7 @@ def finish(
     reward = Reward.create(
         chosen.error,
         chosen.error_weight,
-        chosen.cost_weight,
+        Price.create(chosen.cost_weight, chosen.price_range),
         weights if chosen.state_weights is None else chosen.state_weights,
         system.open_loop(chosen.horizon),
     )

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
+from fusion_gym.envs.price import Price
 from fusion_gym.network import ACCESS_RULES, TokenBucket
 from fusion_gym.systems import Feature, System
 from fusion_gym.validation import Array
@@ -18,11 +19,12 @@ from fusion_gym.validation import Array
 INFORMATION_MODES = ("sensors", "centre")
 ACTION_KINDS = ("binary", "discrete")
 ERROR_KINDS = ("squared", "trace")
+_NOTHING = np.empty((0, 1))
 
 
 @dataclass(frozen=True)
 class Reward:
-    """reward = -(error_weight · Σᵢ wᵢ error_i + cost_weight · tokens spent).
+    """reward = -(error_weight · Σᵢ wᵢ error_i + price · tokens spent).
 
     ``error="squared"`` takes the squared error of the fused estimate, ``"trace"`` the diagonal of
     its covariance as the filter claims it (which a policy can game, see the documentation).
@@ -31,7 +33,7 @@ class Reward:
 
     error: str
     error_weight: float
-    cost_weight: float
+    price: Price
     state_weights: Array
 
     @classmethod
@@ -39,7 +41,7 @@ class Reward:
         cls,
         error: str,
         error_weight: float,
-        cost_weight: float,
+        price: Price,
         state_weights: ArrayLike | None,
         open_loop: Array,
     ) -> Reward:
@@ -58,17 +60,20 @@ class Reward:
         return cls(
             error=validation.choice("error", error, ERROR_KINDS),
             error_weight=validation.number("error_weight", error_weight, at_least=0.0),
-            cost_weight=validation.number("cost_weight", cost_weight, at_least=0.0),
+            price=price,
             state_weights=weights[:, None],
         )
 
-    def terms(self, squared_error: Array, covariance: Array, spent: Array) -> tuple[Array, Array]:
+    def terms(
+        self, squared_error: Array, covariance: Array, spent: Array, price: Array
+    ) -> tuple[Array, Array]:
         """The two terms of the reward (N,), both <= 0: error and cost.
 
-        From squared errors (n, N), the fused covariance (n, n, N) and tokens spent (N,).
+        From squared errors (n, N), the fused covariance (n, n, N), tokens spent (N,) and the
+        price of a token (N,).
         """
         error = squared_error if self.error == "squared" else linalg.diagonal(covariance)
-        return -self.error_weight * (self.state_weights * error).sum(0), -self.cost_weight * spent
+        return -self.error_weight * (self.state_weights * error).sum(0), -price * spent
 
 
 @dataclass(frozen=True)
@@ -143,7 +148,10 @@ class ObservationLayout:
             Feature(f"admitted[{sensor}]", "centre", 0.0, 1.0)
             for sensor in range(task.sensors if task.access in ("round_robin", "random") else 0)
         )
-        blocks = (*task.system.features, (Feature("tokens", "centre", 0.0, 1.0),), admitted)
+        self._price = task.reward.price if task.reward.price.span is not None else None
+        price = () if self._price is None else (Feature("price", "centre", 0.0, 1.0),)
+        tokens = (Feature("tokens", "centre", 0.0, 1.0),)
+        blocks = (*task.system.features, tokens, admitted, price)
         self._kept = [
             number
             for number, block in enumerate(blocks)
@@ -158,15 +166,17 @@ class ObservationLayout:
         self._system = task.system
 
     def encode(
-        self, state: Any, tokens: Array, admitted: Callable[[], NDArray[np.bool_]]
+        self, state: Any, tokens: Array, admitted: Callable[[], NDArray[np.bool_]], price: Array
     ) -> np.ndarray[Any, np.dtype[np.float32]]:
         """Observations (N, entries) float32, clipped to their bounds.
 
-        ``tokens`` (N,) and ``admitted()`` (sensors, N) are the network's.
+        ``tokens`` (N,) and ``admitted()`` (sensors, N) are the network's, ``price`` (N,) is that
+        of a token.
         """
         blocks = [*self._system.observe(state), tokens[None] / self._capacity]
-        if self._shows_admitted:
-            blocks.append(admitted().astype(np.float64))
+        blocks.append(admitted().astype(np.float64) if self._shows_admitted else _NOTHING)
+        if self._price is not None:
+            blocks.append(self._price.encode(price)[None])
         rows = np.concatenate([blocks[number] for number in self._kept])
         result = np.ascontiguousarray(rows.T, dtype=np.float32)
         np.maximum(result, self.low, out=result)

@@ -9,12 +9,14 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from fusion_gym import validation
 from fusion_gym.envs import EpisodeBatch, Task, spaces
+from fusion_gym.envs.price import Price
 from fusion_gym.envs.task import ACTION_KINDS
 from fusion_gym.systems import Signals
 from fusion_gym.triggers import Requests
@@ -32,12 +34,28 @@ def tag_model(model: BaseAlgorithm, task: Task) -> None:
 
 
 class ModelPolicy:
-    """Asks a Stable-Baselines3 model, which sees the task's observation and nothing else."""
+    """Asks a Stable-Baselines3 model, which sees the task's observation and nothing else.
 
-    def __init__(self, model: BaseAlgorithm, task: Task, deterministic: bool = True) -> None:
+    ``price`` stands for the task's own price of a token in an observation that shows it, so that
+    one agent can be asked for any point of its trade-off.
+
+    Raises:
+        ConfigurationError: a price for a task that does not show it, or outside its range.
+    """
+
+    def __init__(
+        self,
+        model: BaseAlgorithm,
+        task: Task,
+        deterministic: bool = True,
+        price: float | None = None,
+    ) -> None:
         self.model = model
         self.deterministic = deterministic
         self._task = task
+        self._price: tuple[int, float] | None = None
+        if price is not None:
+            self._price = _observed_price(task, price)
 
     def reset(self, num_envs: int, seed: int = 0) -> None:
         """Nothing to forget; a stochastic policy draws from the stream of ``seed``."""
@@ -46,11 +64,29 @@ class ModelPolicy:
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
-        action, _ = self.model.predict(signals["observation"], deterministic=self.deterministic)
+        observation = signals["observation"]
+        if self._price is not None:
+            entry, value = self._price
+            observation[:, entry] = value
+        action, _ = self.model.predict(observation, deterministic=self.deterministic)
         return spaces.requests(self._task, action, len(action))
 
 
-def load_model_policy(path: str, task: Task, deterministic: bool = True) -> ModelPolicy:
+def _observed_price(task: Task, price: float) -> tuple[int, float]:
+    """The observation's entry for the price, and the price as it stands there."""
+    span = task.reward.price.span
+    if span is None:
+        raise ConfigurationError(
+            f"price = {price!r} is not allowed: the task shows no price (set its price_range)"
+        )
+    chosen = Price.create(price, span)
+    names = EpisodeBatch(task, 1).layout.names
+    return names.index("price"), float(chosen.encode(chosen.draw(np.zeros(1)))[0])
+
+
+def load_model_policy(
+    path: str, task: Task, deterministic: bool = True, price: float | None = None
+) -> ModelPolicy:
     """The agent saved at ``path`` (with or without ``.zip``), checked against the task.
 
     Raises:
@@ -70,7 +106,7 @@ def load_model_policy(path: str, task: Task, deterministic: bool = True) -> Mode
     if not data or "observation_space" not in data:
         raise ConfigurationError(f"model {path!r} is not allowed: it has no observation space")
     task = _fitted(path, data, task)
-    return ModelPolicy(_load(path, file, data), task, deterministic)
+    return ModelPolicy(_load(path, file, data), task, deterministic, price)
 
 
 def _fitted(path: str, data: dict[str, Any], task: Task) -> Task:

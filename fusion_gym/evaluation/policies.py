@@ -8,7 +8,9 @@ from fusion_gym.validation import ConfigurationError, keys
 
 
 def make_policy(spec: str, task: Task) -> Policy:
-    """The policy that ``NAME``, ``NAME:key=value,…`` or ``model:PATH[,deterministic=false]`` names.
+    """The policy that ``NAME``, ``NAME:key=value,…`` or ``model:PATH`` names.
+
+    A model takes ``deterministic=false``, and ``price=P`` where the task shows a price.
 
     The signals that it looks at are checked against the task's information mode.
 
@@ -25,7 +27,7 @@ def make_policy(spec: str, task: Task) -> Policy:
         if path.startswith("path="):
             path = path.removeprefix("path=")
         options = parse_settings("parameter of policy 'model'", settings)
-        keys("parameter of policy 'model'", options, ["deterministic"])
+        keys("parameter of policy 'model'", options, ["deterministic", "price"])
         return load_model_policy(path, task, **options)
     policy = make_trigger(spec, task.policy_defaults)
     _try_out(spec, policy, task)

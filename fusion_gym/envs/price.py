@@ -1,0 +1,77 @@
+"""The price of a token: fixed, or drawn for each episode and shown to the policy."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fusion_gym import validation
+from fusion_gym.validation import Array, ConfigurationError
+
+
+@dataclass(frozen=True)
+class Price:
+    """What a token costs in the reward.
+
+    ``fixed`` is the price, or ``None`` where each episode draws its own, evenly in the logarithm,
+    from ``span`` (low, high). With a span the observation shows the price, so that one agent can
+    learn the whole trade-off between error and transmissions.
+    """
+
+    fixed: float | None
+    span: tuple[float, float] | None = None
+
+    @classmethod
+    def create(cls, cost_weight: Any, price_range: Any = None) -> Price:
+        """The options ``cost_weight`` (a number >= 0 or "random") and ``price_range``.
+
+        Raises:
+            ConfigurationError: a negative price, a range that is not 0 < low < high, a random
+                price without a range, or a fixed one outside its range.
+        """
+        span = None if price_range is None else _span(price_range)
+        if isinstance(cost_weight, str):
+            validation.choice("cost_weight", cost_weight, ("random",))
+            if span is None:
+                raise ConfigurationError(
+                    "price_range = None is not allowed with cost_weight='random': it must be a "
+                    "pair (low, high) with 0 < low < high"
+                )
+            return cls(None, span)
+        price = validation.number("cost_weight", cost_weight, at_least=0.0)
+        if span is not None and not span[0] <= price <= span[1]:
+            raise ConfigurationError(
+                f"cost_weight = {price} is not allowed: it must lie in price_range = {list(span)}"
+            )
+        return cls(price, span)
+
+    def draw(self, uniform: Array) -> Array:
+        """Prices (N,) from uniform numbers in [0, 1); fixed ones do not depend on them."""
+        if self.fixed is not None or self.span is None:
+            return np.full(uniform.shape, self.fixed)
+        low, high = self.span
+        return low * (high / low) ** uniform
+
+    def encode(self, price: Array) -> Array:
+        """Position of the price in the range, 0 to 1 in the logarithm; same shape.
+
+        Raises:
+            ConfigurationError: there is no range.
+        """
+        if self.span is None:
+            raise ConfigurationError("price_range = None is not allowed here: no price is observed")
+        low, high = self.span
+        return np.log(price / low) / math.log(high / low)
+
+
+def _span(value: Any) -> tuple[float, float]:
+    pair = validation.positive("price_range", validation.array("price_range", value, (2,)), (2,))
+    low, high = pair.tolist()
+    if low >= high:
+        raise ConfigurationError(
+            f"price_range = {[low, high]} is not allowed: it must be a pair with 0 < low < high"
+        )
+    return low, high

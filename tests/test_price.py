@@ -1,0 +1,107 @@
+"""The price of a token: fixed, drawn for each episode, seen by the policy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fusion_gym
+from fusion_gym.envs import EpisodeBatch
+from fusion_gym.evaluation import make_policy, run_episodes
+from fusion_gym.validation import ConfigurationError
+
+ENV_ID = "fusion_gym/TobitOscillator-v0"
+SPAN = (0.001, 0.1)
+
+
+def started(runs: int, **options: Any) -> EpisodeBatch:
+    batch = EpisodeBatch(fusion_gym.make_task(ENV_ID, **options), runs)
+    batch.seed(np.arange(runs), list(range(runs)))
+    batch.reset()
+    return batch
+
+
+def test_a_random_price_is_even_in_the_logarithm_and_observed() -> None:
+    batch = started(4000, cost_weight="random", price_range=SPAN)
+    place = np.log(batch.price / SPAN[0]) / np.log(SPAN[1] / SPAN[0])
+    assert place.min() >= 0.0
+    assert place.max() < 1.0
+    assert place.mean() == pytest.approx(0.5, abs=4 * np.sqrt(1 / 12 / 4000))
+    assert place.std() == pytest.approx(np.sqrt(1 / 12), abs=0.01)
+    entry = batch.layout.names.index("price")
+    np.testing.assert_allclose(batch.observe()[:, entry], place, atol=1e-6)
+    np.testing.assert_array_equal(batch.signals()["price"], batch.price)
+
+
+def test_the_price_shifts_no_noise() -> None:
+    plain = started(3)
+    priced = started(3, cost_weight="random", price_range=SPAN)
+    for _ in range(5):
+        requests = np.ones((3, 3), dtype=np.bool_)
+        before, after = plain.step(requests), priced.step(requests)
+        np.testing.assert_array_equal(before.squared_error, after.squared_error)
+        np.testing.assert_allclose(after.reward_cost, -priced.price * after.cost)
+    for batch in (plain, priced):
+        batch.reset(np.array([1]))
+    outcomes = [batch.step(np.ones((3, 3), dtype=np.bool_)) for batch in (plain, priced)]
+    np.testing.assert_array_equal(outcomes[0].squared_error, outcomes[1].squared_error)
+
+
+def test_every_episode_draws_its_own_price() -> None:
+    batch = started(2, cost_weight="random", price_range=SPAN)
+    first = batch.price.copy()
+    batch.reset(np.array([1]))
+    assert batch.price[0] == first[0]
+    assert batch.price[1] != first[1]
+    assert started(2, cost_weight="random", price_range=SPAN).price[1] == first[1]
+
+
+def test_a_fixed_price_in_a_range_is_observed() -> None:
+    batch = started(2, cost_weight=0.01, price_range=SPAN)
+    entry = batch.layout.names.index("price")
+    np.testing.assert_allclose(batch.observe()[:, entry], 0.5, atol=1e-6)
+    assert "price" not in started(2, cost_weight=0.01).layout.names
+
+
+def test_an_agent_is_asked_at_any_price(tmp_path: Any) -> None:
+    from stable_baselines3 import PPO
+
+    from fusion_gym.envs.sb3 import FusionSB3VecEnv
+    from fusion_gym.evaluation.model_policy import tag_model
+
+    options = {"filter": "tobit", "cost_weight": "random", "price_range": SPAN}
+    task = fusion_gym.make_task(ENV_ID, **options)
+    model = PPO("MlpPolicy", FusionSB3VecEnv(task, 4), n_steps=8, batch_size=16, device="cpu")
+    tag_model(model, task)
+    path = tmp_path / "model.zip"
+    model.save(path)
+    fixed = fusion_gym.make_task(ENV_ID, **(options | {"cost_weight": 0.05}))
+    asked = make_policy(f"model:{path},price=0.05", task)
+    own = make_policy(f"model:{path}", fixed)
+    np.testing.assert_array_equal(
+        run_episodes(task, asked, 5, seed=0).mse, run_episodes(fixed, own, 5, seed=0).mse
+    )
+    with pytest.raises(ConfigurationError, match=r"price_range = \[0.001, 0.1\]"):
+        make_policy(f"model:{path},price=0.5", task)
+    with pytest.raises(ConfigurationError, match="another observation layout"):
+        make_policy(f"model:{path},price=0.05", fusion_gym.make_task(ENV_ID, filter="tobit"))
+
+
+@pytest.mark.parametrize(
+    ("options", "parts"),
+    [
+        ({"cost_weight": "random"}, ("price_range", "0 < low < high")),
+        ({"cost_weight": "rand", "price_range": SPAN}, ("'rand'", "did you mean 'random'")),
+        ({"price_range": (0.1, 0.001)}, ("[0.1, 0.001]", "0 < low < high")),
+        ({"price_range": (0.0, 0.1)}, ("price_range", "> 0")),
+        ({"price_range": 0.1}, ("price_range", "(2)")),
+        ({"cost_weight": 0.5, "price_range": SPAN}, ("cost_weight = 0.5", "[0.001, 0.1]")),
+        ({"cost_weight": -0.1}, ("-0.1", ">= 0")),
+    ],
+)
+def test_prices_that_cannot_be_are_refused(options: dict[str, Any], parts: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        fusion_gym.make_task(ENV_ID, **options)
+    assert [part for part in parts if part not in str(caught.value)] == []
