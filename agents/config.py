@@ -59,6 +59,19 @@ class PPOConfig(_Algorithm):
     max_grad_norm: Rate = 0.5
 
 
+class MaskablePPOConfig(PPOConfig):
+    """sb3-contrib's MaskablePPO: PPO that cannot choose what the tokens do not allow."""
+
+    name: Literal["maskable_ppo"]  # type: ignore[assignment]
+
+
+class RecurrentPPOConfig(PPOConfig):
+    """sb3-contrib's RecurrentPPO: PPO with a memory, for modes that hide the sensors' signals."""
+
+    name: Literal["recurrent_ppo"]  # type: ignore[assignment]
+    memory: Positive = 64
+
+
 class A2CConfig(_Algorithm):
     """Stable-Baselines3's A2C; the names are its own."""
 
@@ -106,7 +119,9 @@ class Experiment(_Strict):
     """One training: environment, algorithm, length, validation, and where results go."""
 
     environment: EnvironmentConfig
-    algorithm: PPOConfig | A2CConfig | DQNConfig = pydantic.Field(discriminator="name")
+    algorithm: PPOConfig | MaskablePPOConfig | RecurrentPPOConfig | A2CConfig | DQNConfig = (
+        pydantic.Field(discriminator="name")
+    )
     training: TrainingConfig
     validation: ValidationConfig = ValidationConfig()
     output: str

@@ -39,6 +39,8 @@ from fusion_gym.validation import ConfigurationError
 
 # Training seeds lie far from the validation's and from the small numbers that tests use.
 TRAINING_SEEDS = 1_000_000_000
+# Algorithms that know no MultiBinary actions (the recurrent one fails on them while it trains).
+DISCRETE_ONLY = ("dqn", "recurrent_ppo")
 
 
 class Interrupt:
@@ -164,16 +166,19 @@ def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
     """A new model of the config's algorithm."""
     settings = experiment.algorithm.model_dump()
     name, network = settings.pop("name"), settings.pop("network")
-    end = settings.pop("learning_rate_end")
+    end, memory = settings.pop("learning_rate_end"), settings.pop("memory", None)
     if end is not None:
         settings["learning_rate"] = LinearSchedule(settings["learning_rate"], end, 1.0)
     activation = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[network["activation"]]
+    shape = {"net_arch": list(network["hidden"]), "activation_fn": activation}
+    if memory is not None:
+        shape["lstm_hidden_size"] = memory
     model = ALGORITHMS[name](
-        "MlpPolicy",
+        "MlpPolicy" if memory is None else "MlpLstmPolicy",
         env,
         seed=experiment.training.seed,
         device="cpu",
-        policy_kwargs={"net_arch": list(network["hidden"]), "activation_fn": activation},
+        policy_kwargs=shape,
         **settings,
     )
     tag_model(model, env.task)
@@ -219,10 +224,11 @@ def train(experiment: Experiment, *, resume: bool = False) -> dict[str, Any]:
         ConfigurationError: a config, environment or folder that does not fit.
     """
     task = make_task(experiment.environment.id, **experiment.environment.options)
-    if experiment.algorithm.name == "dqn" and task.action != "discrete":
+    name = experiment.algorithm.name
+    if name in DISCRETE_ONLY and task.action != "discrete" and task.access != "single":
         raise ConfigurationError(
-            f"action = {task.action!r} is not allowed with algorithm 'dqn': set the environment's "
-            "option action: discrete"
+            f"action = {task.action!r} is not allowed with algorithm {name!r}: set the "
+            "environment's option action: discrete"
         )
     folder = Path(experiment.output)
     prepare(experiment, folder, resume)

@@ -27,6 +27,14 @@ ENV = "fusion_gym/TobitOscillator-v0"
 EXPERIMENTS = [f for f in sorted(CONFIGS.glob("*.yaml")) if "algorithm" in f.read_text()]
 SMALL: dict[str, dict[str, Any]] = {
     "ppo": {"name": "ppo", "n_steps": 16, "batch_size": 128, "n_epochs": 1},
+    "maskable_ppo": {"name": "maskable_ppo", "n_steps": 16, "batch_size": 128, "n_epochs": 1},
+    "recurrent_ppo": {
+        "name": "recurrent_ppo",
+        "n_steps": 16,
+        "batch_size": 128,
+        "n_epochs": 1,
+        "memory": 8,
+    },
     "a2c": {"name": "a2c", "n_steps": 8},
     "dqn": {
         "name": "dqn",
@@ -46,7 +54,7 @@ def small_config(folder: Path, kind: str = "ppo", **changes: Any) -> Path:
         "validation": {"every": 512, "episodes": 4},
         "output": str(folder / "run"),
     }
-    if kind == "dqn":
+    if kind in train.DISCRETE_ONLY:
         content["environment"]["options"]["action"] = "discrete"
     path = folder / "config.yaml"
     path.write_text(yaml.safe_dump(content | changes))
@@ -57,7 +65,8 @@ def small_config(folder: Path, kind: str = "ppo", **changes: Any) -> Path:
 def test_committed_experiments_are_valid(path: Path) -> None:
     experiment = load_experiment(path)
     task = fusion_gym.make_task(experiment.environment.id, **experiment.environment.options)
-    assert (experiment.algorithm.name == "dqn") == (task.action == "discrete")
+    needed = experiment.algorithm.name in train.DISCRETE_ONLY and task.access != "single"
+    assert needed == (task.action == "discrete")
 
 
 def test_committed_sweep_and_comparison_name_policies_that_exist() -> None:

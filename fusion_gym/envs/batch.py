@@ -165,6 +165,16 @@ class EpisodeBatch:
         noise = self._ring[self._cursor % self._block, -1] if self.task.access == "random" else None
         return access_mask(self.task.access, self.task.sensors, self.steps, noise)
 
+    def grantable(self) -> NDArray[np.bool_]:
+        """The sensors (sensors, N) whose request alone the network would grant now."""
+        admitted = self.admitted()
+        result = np.zeros_like(admitted)
+        for sensor in range(self.task.sensors):
+            alone = np.zeros_like(admitted)
+            alone[sensor] = admitted[sensor]
+            result[sensor] = self.task.bucket.grant(self.tokens, alone, self.steps).granted[sensor]
+        return result
+
     def _noise(self) -> Array:
         """The system's noise (channels, N) at the cursor."""
         return self._ring[self._cursor % self._block, : self.task.system.noise_channels]
@@ -174,8 +184,8 @@ class EpisodeBatch:
 
         To the system's own it adds ``tokens`` (N,), ``token_cost`` (sensors, 1), ``price`` (N,) of
         a token, ``step`` (N,),
-        the steps taken in the episode, ``start`` (N,) bool, ``admitted`` (sensors, N) bool, and
-        ``observation`` (N, entries).
+        the steps taken in the episode, ``start`` (N,) bool, ``admitted`` and
+        ``grantable`` (sensors, N) bool, and ``observation`` (N, entries).
         """
         values = dict(self.task.system.read(self.state))
         values |= {
@@ -185,6 +195,7 @@ class EpisodeBatch:
             "step": self.steps,
             "start": self.steps == 0,
             "admitted": self.admitted,
+            "grantable": self.grantable,
             "observation": self.observe,
         }
         return Signals(values, self.task.hidden_signals)

@@ -112,6 +112,13 @@ class FusionSB3VecEnv(VecEnv):
         self.seconds += time.perf_counter() - began
         return result
 
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Open choices (N, choices) for sb3-contrib's MaskablePPO.
+
+        Closed are requests that the network would not grant even alone.
+        """
+        return spaces.action_masks(self.task, self.batch.grantable())
+
     def close(self) -> None:
         """Nothing to release."""
 
@@ -137,11 +144,14 @@ class FusionSB3VecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """Refused: the runs are not separate objects.
+        """``action_masks``, one row a run; anything else is refused: runs are no objects.
 
         Raises:
-            AttributeError: always.
+            AttributeError: another method.
         """
+        if method_name == "action_masks":
+            masks = self.action_masks()
+            return [masks[run] for run in self._get_indices(indices)]
         raise AttributeError(f"the runs share one batch and have no method {method_name!r}")
 
     def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:

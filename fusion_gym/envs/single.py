@@ -62,6 +62,10 @@ class FusionEnv(gymnasium.Env[Any, Any]):
         infos = _first(step_infos(outcome))
         return observation, float(outcome.reward[0]), False, bool(outcome.truncated[0]), infos
 
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Open choices (choices,), for sb3-contrib's MaskablePPO."""
+        return spaces.action_masks(self.task, self.batch.grantable())[0]
+
 
 def _first(infos: Infos) -> Infos:
     """The info of the only run: numbers and arrays without the batch axis."""

@@ -64,6 +64,24 @@ def requests(task: Task, actions: Any, num_envs: int) -> NDArray[np.bool_]:
     return np.ascontiguousarray(result.T)
 
 
+def action_masks(task: Task, allowed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which choices of an action are open (N, choices), where sensors (sensors, N) are allowed.
+
+    In the layout of sb3-contrib's MaskablePPO: for ``MultiBinary`` two choices a sensor, silence
+    and a request; for ``Discrete`` one a number. A number is closed if any of its requests is.
+    """
+    sensors, runs = allowed.shape
+    if task.access == "single":
+        return np.concatenate((np.ones((1, runs), dtype=np.bool_), allowed)).T
+    if task.action == "discrete":
+        numbers = np.arange(2**sensors)
+        bits = (numbers >> np.arange(sensors)[:, None] & 1).astype(np.bool_)
+        return np.asarray(~(bits[:, None] & ~allowed[:, :, None]).any(axis=0))
+    result = np.ones((runs, sensors, 2), dtype=np.bool_)
+    result[..., 1] = allowed.T
+    return result.reshape(runs, 2 * sensors)
+
+
 def _first(given: NDArray[Any], valid: NDArray[np.bool_]) -> str:
     place = tuple(int(i) for i in np.argwhere(~valid)[0])
     return f"{list(place)} = {given[place]}"

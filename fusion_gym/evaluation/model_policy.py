@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
@@ -22,14 +23,21 @@ from fusion_gym.systems import Signals
 from fusion_gym.triggers import Requests
 from fusion_gym.validation import ConfigurationError
 
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"a2c": A2C, "dqn": DQN, "ppo": PPO}
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "a2c": A2C,
+    "dqn": DQN,
+    "maskable_ppo": MaskablePPO,
+    "ppo": PPO,
+    "recurrent_ppo": RecurrentPPO,
+}
 _TAG = "fusion_gym_model"
 
 
 def tag_model(model: BaseAlgorithm, task: Task) -> None:
     """Write algorithm and observation layout into the model, to be saved with it."""
     names = EpisodeBatch(task, 1).layout.names
-    tag = {"algorithm": type(model).__name__.lower(), "observation_names": list(names)}
+    algorithm = next(name for name, kind in ALGORITHMS.items() if type(model) is kind)
+    tag = {"algorithm": algorithm, "observation_names": list(names)}
     setattr(model, _TAG, tag)
 
 
@@ -53,12 +61,14 @@ class ModelPolicy:
         self.model = model
         self.deterministic = deterministic
         self._task = task
+        self._memory: Any = None  # of a recurrent policy
         self._price: tuple[int, float] | None = None
         if price is not None:
             self._price = _observed_price(task, price)
 
     def reset(self, num_envs: int, seed: int = 0) -> None:
-        """Nothing to forget; a stochastic policy draws from the stream of ``seed``."""
+        """Forget the memory of a recurrent policy; draw from the stream of ``seed``."""
+        self._memory = None
         if not self.deterministic:
             self.model.set_random_seed(seed)
 
@@ -68,7 +78,16 @@ class ModelPolicy:
         if self._price is not None:
             entry, value = self._price
             observation[:, entry] = value
-        action, _ = self.model.predict(observation, deterministic=self.deterministic)
+        masks = {}
+        if isinstance(self.model, MaskablePPO):
+            masks["action_masks"] = spaces.action_masks(self._task, signals["grantable"])
+        action, self._memory = self.model.predict(
+            observation,
+            state=self._memory,
+            episode_start=signals["start"],
+            deterministic=self.deterministic,
+            **masks,
+        )
         return spaces.requests(self._task, action, len(action))
 
 
