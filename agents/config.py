@@ -99,12 +99,17 @@ class DQNConfig(_Algorithm):
 
 
 class TrainingConfig(_Strict):
-    """How long, with how many runs side by side, from which seed, on how many threads."""
+    """How long, with how many runs side by side, from which seed, on how many threads.
+
+    ``target_rate`` trains to an average rate of transmissions per sensor and step: the price of a
+    token starts at the environment's ``cost_weight`` and is adapted.
+    """
 
     timesteps: Positive
     num_envs: Positive = 256
     seed: int = pydantic.Field(default=0, ge=0)
     threads: Positive = 1
+    target_rate: float | None = pydantic.Field(default=None, gt=0, le=1)
 
 
 class ValidationConfig(_Strict):

@@ -11,6 +11,7 @@ the training after the current step with a checkpoint; ``--resume`` goes on from
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import signal
 import sys
@@ -23,14 +24,16 @@ import numpy as np
 import torch
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 from tqdm import tqdm
 
 from agents.config import Experiment, load_experiment, parse
+from agents.constraint import TargetRate, score
 from agents.progress import progress_bar
 from fusion_gym.envs import Task
+from fusion_gym.envs.price import Price
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.evaluation import run_episodes
@@ -74,7 +77,8 @@ class Progress(BaseCallback):
         self.experiment, self.folder, self.task = experiment, folder, task
         self.interrupt, self.bar = interrupt, bar
         self.records = read_records(folder)
-        self.best = max((r["return"] for r in self.records), default=-np.inf)
+        self.target = experiment.training.target_rate
+        self.best = max((score(r, self.target) for r in self.records), default=(-np.inf, -np.inf))
         self.seconds = {"environment": 0.0, "policy": 0.0, "update": 0.0, "validation": 0.0}
         self._mark = 0.0
         self._env_mark = 0.0
@@ -131,8 +135,8 @@ class Progress(BaseCallback):
         self.bar.set_postfix(
             mse=f"{record['mse']:.4f}", rate=f"{record['rate']:.3f}", refresh=False
         )
-        if record["return"] > self.best:
-            self.best = record["return"]
+        if score(record, self.target) > self.best:
+            self.best = score(record, self.target)
             save(self.model, self.folder / "best_model.zip")
 
     def save(self) -> None:
@@ -214,6 +218,26 @@ def prepare(experiment: Experiment, folder: Path, resume: bool) -> None:
     file.write_text(yaml.safe_dump(plain, sort_keys=False))
 
 
+def validation_task(experiment: Experiment, task: Task) -> Task:
+    """The task that validation runs on: with a target rate its tokens are free of charge.
+
+    Raises:
+        ConfigurationError: a target rate, but a price that is drawn or zero.
+    """
+    if experiment.training.target_rate is None:
+        return task
+    price = task.reward.price
+    if price.span is not None or not price.fixed:
+        raise ConfigurationError(
+            f"target_rate = {experiment.training.target_rate} is not allowed with cost_weight = "
+            f"{experiment.environment.options.get('cost_weight')!r} and price_range = "
+            f"{price.span}: it starts from a fixed cost_weight > 0 without a price_range"
+        )
+    return dataclasses.replace(
+        task, reward=dataclasses.replace(task.reward, price=Price.create(0.0))
+    )
+
+
 def train(experiment: Experiment, *, resume: bool = False) -> dict[str, Any]:
     """Run the training and return its summary.
 
@@ -253,9 +277,14 @@ def train(experiment: Experiment, *, resume: bool = False) -> dict[str, Any]:
             experiment.training.timesteps, f"training {experiment.algorithm.name}", begun
         ) as bar,
     ):
-        progress = Progress(experiment, folder, task, interrupt, bar)
+        progress = Progress(experiment, folder, validation_task(experiment, task), interrupt, bar)
+        callbacks: list[BaseCallback] = [progress]
+        if experiment.training.target_rate is not None:
+            price = task.reward.price.fixed
+            assert price is not None  # validation_task refuses a drawn price
+            callbacks.append(TargetRate(experiment.training.target_rate, price))
         if remaining > 0:
-            model.learn(remaining, callback=progress, reset_num_timesteps=False)
+            model.learn(remaining, callback=CallbackList(callbacks), reset_num_timesteps=False)
             progress.num_timesteps = model.num_timesteps
             bar.update(model.num_timesteps - bar.n)
             if not interrupt.raised:
@@ -265,7 +294,7 @@ def train(experiment: Experiment, *, resume: bool = False) -> dict[str, Any]:
     finished = model.num_timesteps >= experiment.training.timesteps
     if finished:
         save(model, folder / "final_model.zip")
-    best = max(progress.records, key=lambda record: record["return"], default=None)
+    best = max(progress.records, key=lambda r: score(r, progress.target), default=None)
     summary = {
         "timesteps": model.num_timesteps,
         "finished": finished,
@@ -308,6 +337,9 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument("--config", required=True, help="the experiment, see configs/")
     result.add_argument("--timesteps", type=int, help="instead of the config's")
     result.add_argument("--seed", type=int, help="instead of the config's")
+    result.add_argument(
+        "--target-rate", type=float, help="average transmissions per sensor and step to train to"
+    )
     result.add_argument("--output", help="folder, instead of the config's")
     result.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
     return result
@@ -320,7 +352,7 @@ def with_overrides(experiment: Experiment, arguments: argparse.Namespace) -> Exp
         ConfigurationError: a value that is not allowed.
     """
     plain = experiment.model_dump()
-    for key in ("timesteps", "seed"):
+    for key in ("timesteps", "seed", "target_rate"):
         value = getattr(arguments, key)
         if value is not None:
             plain["training"][key] = value

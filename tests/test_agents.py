@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -13,10 +14,12 @@ from typing import Any
 
 import pytest
 import yaml
+from stable_baselines3 import PPO
 
 import fusion_gym
 from agents import demo, evaluate, reproduce, train
 from agents.config import load_comparison, load_experiment, load_sweep
+from agents.constraint import score
 from fusion_gym.evaluation import make_policy
 from fusion_gym.evaluation.metrics import summarise
 from fusion_gym.validation import ConfigurationError
@@ -146,6 +149,45 @@ def test_training_writes_its_results_and_resumes(tmp_path: Path, algorithm: str)
 def test_dqn_needs_the_discrete_action(tmp_path: Path) -> None:
     config = small_config(tmp_path, "dqn", environment={"id": ENV, "options": {}})
     with pytest.raises(ConfigurationError, match="action: discrete"):
+        train.train(load_experiment(config))
+
+
+def test_training_to_a_target_rate_moves_the_price(tmp_path: Path) -> None:
+    """A target far above what the agent sends makes tokens cheaper, one far below dearer."""
+    prices = {}
+    for target in (0.001, 1.0):
+        experiment = load_experiment(
+            small_config(
+                tmp_path,
+                training={"timesteps": 2048, "num_envs": 8, "target_rate": target},
+                output=str(tmp_path / f"run{target}"),
+            )
+        )
+        train.train(experiment)
+        model = PPO.load(tmp_path / f"run{target}" / "final_model.zip")
+        prices[target] = model.token_price
+    assert prices[1.0] < 0.01 < prices[0.001]
+    # 16 rollouts of 128 steps; each raises the logarithm by at most 0.05.
+    assert prices[0.001] == pytest.approx(0.01 * math.exp(16 * 0.05), rel=1e-6)
+
+
+def test_the_best_model_under_a_target_keeps_its_rate() -> None:
+    records = [
+        {"return": -1.0, "rate": 0.5},
+        {"return": -3.0, "rate": 0.1},
+        {"return": -2.0, "rate": 0.102},
+    ]
+    assert max(records, key=lambda r: score(r, 0.1)) == records[2]
+    assert max(records, key=lambda r: score(r, None)) == records[0]
+
+
+def test_a_target_rate_needs_a_fixed_price(tmp_path: Path) -> None:
+    options = {"cost_weight": "random", "price_range": [0.01, 0.1]}
+    config = small_config(
+        tmp_path, environment={"id": ENV, "options": options},
+        training={"timesteps": 64, "num_envs": 8, "target_rate": 0.1},
+    )  # fmt: skip
+    with pytest.raises(ConfigurationError, match=r"target_rate = 0.1 is not allowed"):
         train.train(load_experiment(config))
 
 

@@ -33,6 +33,7 @@ class FusionSB3VecEnv(VecEnv):
         task: the task.
         observation_names: a name for each entry of an observation.
         seconds: wall time spent in :meth:`step_wait` and :meth:`reset` so far.
+        totals: tokens spent and steps made so far, over all runs.
     """
 
     def __init__(self, task: Task, num_envs: int, *, stagger: bool = False) -> None:
@@ -42,6 +43,7 @@ class FusionSB3VecEnv(VecEnv):
         self.observation_names = self.batch.layout.names
         self.stagger = validation.boolean("stagger", stagger)
         self.seconds = 0.0
+        self.totals = (0.0, 0)
         self.render_mode = None
         super().__init__(
             num_envs, spaces.observation_space(self.batch.layout), spaces.action_space(task)
@@ -87,6 +89,10 @@ class FusionSB3VecEnv(VecEnv):
         outcome = self.batch.step(requests)
         self._returns += outcome.reward
         self._spent += outcome.cost
+        self.totals = (
+            self.totals[0] + float(outcome.cost.sum()),
+            self.totals[1] + self.num_envs,
+        )
         done = outcome.truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done.any():
@@ -111,6 +117,19 @@ class FusionSB3VecEnv(VecEnv):
         result = (self.batch.observe(), outcome.reward.astype(np.float32), done.copy(), infos)
         self.seconds += time.perf_counter() - began
         return result
+
+    def set_price(self, price: float) -> None:
+        """From now on every token costs ``price``, for training to a budget.
+
+        Raises:
+            ConfigurationError: a negative price, or a task that shows a price of its own.
+        """
+        if self.task.reward.price.span is not None:
+            raise validation.ConfigurationError(
+                f"price_range = {list(self.task.reward.price.span)} is not allowed here: it must "
+                "be none, for the price is adapted in training and not shown"
+            )
+        self.batch.price[:] = validation.number("price", price, at_least=0.0)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Open choices (N, choices) for sb3-contrib's MaskablePPO.
