@@ -23,10 +23,14 @@ class _Strict(pydantic.BaseModel):
 
 
 class EnvironmentConfig(_Strict):
-    """A registered environment and the options of ``gym.make`` that differ from its defaults."""
+    """A registered environment and the options of ``gym.make`` that differ from its defaults.
+
+    ``local`` trains one policy that every sensor runs by itself, on what it sees by itself.
+    """
 
     id: str
     options: dict[str, Any] = {}
+    local: bool = False
 
 
 class NetworkConfig(_Strict):

@@ -117,9 +117,8 @@ class Progress(BaseCallback):
     def validate(self) -> None:
         """Run the validation episodes, log them, and keep the model if it is the best so far."""
         settings = self.experiment.validation
-        found = run_episodes(
-            self.task, ModelPolicy(self.model, self.task), settings.episodes, settings.seed
-        )
+        policy = ModelPolicy(self.model, self.task, local=self.experiment.environment.local)
+        found = run_episodes(self.task, policy, settings.episodes, settings.seed)
         record = {
             "timesteps": self.num_timesteps,
             "return": float(found.returns.mean()),
@@ -185,7 +184,7 @@ def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
         policy_kwargs=shape,
         **settings,
     )
-    tag_model(model, env.task)
+    tag_model(model, env.task, local=experiment.environment.local)
     return model
 
 
@@ -249,7 +248,13 @@ def train(experiment: Experiment, *, resume: bool = False) -> dict[str, Any]:
     """
     task = make_task(experiment.environment.id, **experiment.environment.options)
     name = experiment.algorithm.name
-    if name in DISCRETE_ONLY and task.action != "discrete" and task.access != "single":
+    local = experiment.environment.local
+    if (
+        name in DISCRETE_ONLY
+        and not local
+        and task.action != "discrete"
+        and task.access != "single"
+    ):
         raise ConfigurationError(
             f"action = {task.action!r} is not allowed with algorithm {name!r}: set the "
             "environment's option action: discrete"
@@ -257,7 +262,7 @@ def train(experiment: Experiment, *, resume: bool = False) -> dict[str, Any]:
     folder = Path(experiment.output)
     prepare(experiment, folder, resume)
     torch.set_num_threads(experiment.training.threads)
-    env = FusionSB3VecEnv(task, experiment.training.num_envs, stagger=True)
+    env = FusionSB3VecEnv(task, experiment.training.num_envs, stagger=True, local=local)
     checkpoint = folder / "latest.zip"
     if resume and checkpoint.exists():
         model = ALGORITHMS[experiment.algorithm.name].load(checkpoint, env=env, device="cpu")

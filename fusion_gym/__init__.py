@@ -11,18 +11,31 @@ from fusion_gym.envs.registration import make_task, register
 from fusion_gym.validation import ConfigurationError
 
 if TYPE_CHECKING:
+    from fusion_gym.envs.parallel import FusionParallelEnv, parallel_env
     from fusion_gym.envs.sb3 import FusionSB3VecEnv, make_sb3_vec_env
 
 __version__ = "0.1.0"
-__all__ = ["ConfigurationError", "FusionSB3VecEnv", "make_sb3_vec_env", "make_task", "register"]
+__all__ = [
+    "ConfigurationError",
+    "FusionParallelEnv",
+    "FusionSB3VecEnv",
+    "make_sb3_vec_env",
+    "make_task",
+    "parallel_env",
+    "register",
+]
 
 register()
 
 
 def __getattr__(name: str) -> Any:
-    """Stable-Baselines3 and torch are imported only where they are used."""
+    """Stable-Baselines3, torch and PettingZoo are imported only where they are used."""
     if name in ("FusionSB3VecEnv", "make_sb3_vec_env"):
         from fusion_gym.envs import sb3
 
         return getattr(sb3, name)
+    if name in ("FusionParallelEnv", "parallel_env"):
+        from fusion_gym.envs import parallel
+
+        return getattr(parallel, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

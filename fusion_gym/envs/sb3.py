@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
@@ -14,6 +15,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from fusion_gym import validation
 from fusion_gym.envs import spaces
 from fusion_gym.envs.batch import EpisodeBatch
+from fusion_gym.envs.local import LocalView
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.task import Task
 
@@ -29,25 +31,36 @@ class FusionSB3VecEnv(VecEnv):
     ``stagger`` spreads the lengths of the first episodes from 1 to the horizon. PPO asks for one
     value of each truncated run, so episodes that all end together would stall it.
 
+    With ``local`` every sensor of every run is a row of its own, with the observation of
+    :class:`~fusion_gym.envs.local.LocalView` and the action space ``Discrete(2)``: one shared
+    policy learns what each sensor can run by itself. All rows of a run get the run's reward.
+
     Attributes:
         task: the task.
+        view: the local view, if there is one.
         observation_names: a name for each entry of an observation.
         seconds: wall time spent in :meth:`step_wait` and :meth:`reset` so far.
         totals: tokens spent and steps made so far, over all runs.
     """
 
-    def __init__(self, task: Task, num_envs: int, *, stagger: bool = False) -> None:
-        validation.integer("num_envs", num_envs, at_least=1)
+    def __init__(
+        self, task: Task, num_envs: int, *, stagger: bool = False, local: bool = False
+    ) -> None:
+        self.runs = validation.integer("num_envs", num_envs, at_least=1)
         self.task = task
         self.batch = EpisodeBatch(task, num_envs)
-        self.observation_names = self.batch.layout.names
+        self.view = LocalView(task) if validation.boolean("local", local) else None
+        self._rows = 1 if self.view is None else task.sensors  # of each run
+        self.observation_names = (self.view or self.batch.layout).names
         self.stagger = validation.boolean("stagger", stagger)
         self.seconds = 0.0
         self.totals = (0.0, 0)
         self.render_mode = None
-        super().__init__(
-            num_envs, spaces.observation_space(self.batch.layout), spaces.action_space(task)
-        )
+        if self.view is None:
+            shown, choices = spaces.observation_space(self.batch.layout), spaces.action_space(task)
+        else:
+            shown, choices = self.view.space, Discrete(2)
+        super().__init__(num_envs * self._rows, shown, choices)
         self._actions: Any = None
         self._returns = np.zeros(num_envs)
         self._spent = np.zeros(num_envs)
@@ -62,16 +75,25 @@ class FusionSB3VecEnv(VecEnv):
         began = time.perf_counter()
         for option in self._options:
             validation.keys("reset option", option, [])
-        self.batch.seed(np.arange(self.num_envs), self._seeds)
+        self.batch.seed(np.arange(self.runs), self._seeds[:: self._rows])
         self.batch.reset(stagger=self.stagger)
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self._returns[:] = 0.0
         self._spent[:] = 0.0
-        observation = self.batch.observe()
+        observation = self._observe()
         self.seconds += time.perf_counter() - began
         return observation
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Run i gets ``seed + i`` at the next reset (with ``local``, all rows of a run the same).
+
+        Returns the seed of every row.
+        """
+        first = int(np.random.randint(0, 2**32 - 1)) if seed is None else seed  # noqa: NPY002
+        self._seeds = [first + row // self._rows for row in range(self.num_envs)]
+        return self._seeds
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Keep the actions for :meth:`step_wait`."""
@@ -84,24 +106,39 @@ class FusionSB3VecEnv(VecEnv):
             ValueError: an action that is not in the action space.
         """
         began = time.perf_counter()
-        requests = spaces.requests(self.task, self._actions, self.num_envs)
+        if self.view is None:
+            requests = spaces.requests(self.task, self._actions, self.runs)
+        else:
+            requests = self.view.requests(self._actions)
         lengths = self.batch.steps
         outcome = self.batch.step(requests)
         self._returns += outcome.reward
         self._spent += outcome.cost
-        self.totals = (
-            self.totals[0] + float(outcome.cost.sum()),
-            self.totals[1] + self.num_envs,
-        )
+        self.totals = (self.totals[0] + float(outcome.cost.sum()), self.totals[1] + self.runs)
         done = outcome.truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done.any():
-            runs = np.flatnonzero(done)
-            final = self.batch.observe()[runs]
-            elapsed = round(time.perf_counter() - self._began, 6)
-            for place, run in enumerate(runs.tolist()):
-                infos[run] = {
-                    "terminal_observation": final[place],
+            self._finish(np.flatnonzero(done), lengths, infos)
+        reward = outcome.reward.astype(np.float32)
+        result = (
+            self._observe(),
+            reward.repeat(self._rows),
+            done.repeat(self._rows),
+            infos,
+        )
+        self.seconds += time.perf_counter() - began
+        return result
+
+    def _finish(
+        self, runs: NDArray[np.int64], lengths: NDArray[np.int64], infos: list[dict[str, Any]]
+    ) -> None:
+        """Write the infos of finished runs (one a row) and begin their next episodes."""
+        final = self._observe()
+        elapsed = round(time.perf_counter() - self._began, 6)
+        for run in runs.tolist():
+            for row in range(run * self._rows, (run + 1) * self._rows):
+                infos[row] = {
+                    "terminal_observation": final[row],
                     "TimeLimit.truncated": True,
                     "episode": {
                         "r": float(self._returns[run]),
@@ -110,13 +147,14 @@ class FusionSB3VecEnv(VecEnv):
                         "cost": float(self._spent[run]),
                     },
                 }
-                self.reset_infos[run] = {}
-            self._returns[runs] = 0.0
-            self._spent[runs] = 0.0
-            self.batch.reset(runs)
-        result = (self.batch.observe(), outcome.reward.astype(np.float32), done.copy(), infos)
-        self.seconds += time.perf_counter() - began
-        return result
+                self.reset_infos[row] = {}
+        self._returns[runs] = 0.0
+        self._spent[runs] = 0.0
+        self.batch.reset(runs)
+
+    def _observe(self) -> NDArray[np.float32]:
+        observation = self.batch.observe()
+        return observation if self.view is None else self.view.rows(observation)
 
     def set_price(self, price: float) -> None:
         """From now on every token costs ``price``, for training to a budget.
@@ -136,7 +174,10 @@ class FusionSB3VecEnv(VecEnv):
 
         Closed are requests that the network would not grant even alone.
         """
-        return spaces.action_masks(self.task, self.batch.grantable())
+        allowed = self.batch.grantable()
+        if self.view is None:
+            return spaces.action_masks(self.task, allowed)
+        return self.view.action_masks(allowed)
 
     def close(self) -> None:
         """Nothing to release."""
@@ -181,9 +222,17 @@ class FusionSB3VecEnv(VecEnv):
 
 
 def make_sb3_vec_env(
-    env_id: str, num_envs: int, *, seed: int | None = None, stagger: bool = False, **options: Any
+    env_id: str,
+    num_envs: int,
+    *,
+    seed: int | None = None,
+    stagger: bool = False,
+    local: bool = False,
+    **options: Any,
 ) -> FusionSB3VecEnv:
     """A native SB3 ``VecEnv`` of a registered environment.
+
+    With ``local`` it has a row for each sensor of each of the ``num_envs`` runs.
 
     ``options`` are those of ``gym.make``; ``seed`` (run i gets ``seed + i``) is used by the next
     reset.
@@ -191,7 +240,7 @@ def make_sb3_vec_env(
     Raises:
         ConfigurationError: an unknown id or option, or a value that is not allowed.
     """
-    env = FusionSB3VecEnv(make_task(env_id, **options), num_envs, stagger=stagger)
+    env = FusionSB3VecEnv(make_task(env_id, **options), num_envs, stagger=stagger, local=local)
     if seed is not None:
         env.seed(seed)
     return env

@@ -104,6 +104,12 @@ class Task:
 
     def __post_init__(self) -> None:
         validation.integer("horizon", self.horizon, at_least=1)
+        if self.information == "local":
+            raise validation.ConfigurationError(
+                "information = 'local' is not allowed here: it must be one of "
+                f"{', '.join(map(repr, INFORMATION_MODES))}; sensors that decide by themselves are "
+                "fusion_gym.parallel_env(id) and make_sb3_vec_env(id, n, local=True)"
+            )
         validation.choice("information", self.information, INFORMATION_MODES)
         validation.choice("action", self.action, ACTION_KINDS)
         validation.choice("access", self.access, ACCESS_RULES)
@@ -140,17 +146,20 @@ class Task:
 class ObservationLayout:
     """Which entries an agent's observation has, by name, and how it is filled.
 
-    ``names`` has one name an entry, ``low`` and ``high`` (entries,) float32 its bounds.
+    ``entries`` are its features, ``names`` has one name an entry, ``low`` and ``high`` (entries,)
+    float32 are its bounds.
     """
 
     def __init__(self, task: Task) -> None:
         admitted = tuple(
-            Feature(f"admitted[{sensor}]", "centre", 0.0, 1.0)
+            Feature(f"admitted[{sensor}]", "centre", 0.0, 1.0, sensor=sensor)
             for sensor in range(task.sensors if task.access in ("round_robin", "random") else 0)
         )
         self._price = task.reward.price if task.reward.price.span is not None else None
-        price = () if self._price is None else (Feature("price", "centre", 0.0, 1.0),)
-        tokens = (Feature("tokens", "centre", 0.0, 1.0),)
+        price = (
+            () if self._price is None else (Feature("price", "centre", 0.0, 1.0, broadcast=True),)
+        )
+        tokens = (Feature("tokens", "centre", 0.0, 1.0, broadcast=True),)
         blocks = (*task.system.features, tokens, admitted, price)
         self._kept = [
             number
@@ -158,6 +167,7 @@ class ObservationLayout:
             if block and (task.information == "sensors" or block[0].knowledge == "centre")
         ]
         entries = [entry for number in self._kept for entry in blocks[number]]
+        self.entries = tuple(entries)
         self.names = tuple(entry.name for entry in entries)
         self.low = np.array([entry.low for entry in entries], dtype=np.float32)
         self.high = np.array([entry.high for entry in entries], dtype=np.float32)

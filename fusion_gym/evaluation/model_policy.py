@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -17,6 +18,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from fusion_gym import validation
 from fusion_gym.envs import EpisodeBatch, Task, spaces
+from fusion_gym.envs.local import LocalView
 from fusion_gym.envs.price import Price
 from fusion_gym.envs.task import ACTION_KINDS
 from fusion_gym.systems import Signals
@@ -33,11 +35,14 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
 _TAG = "fusion_gym_model"
 
 
-def tag_model(model: BaseAlgorithm, task: Task) -> None:
-    """Write algorithm and observation layout into the model, to be saved with it."""
-    names = EpisodeBatch(task, 1).layout.names
+def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
+    """Write algorithm and observation layout into the model, to be saved with it.
+
+    ``local`` marks a policy that every sensor runs on its own view.
+    """
+    names = (LocalView(task) if local else EpisodeBatch(task, 1).layout).names
     algorithm = next(name for name, kind in ALGORITHMS.items() if type(model) is kind)
-    tag = {"algorithm": algorithm, "observation_names": list(names)}
+    tag = {"algorithm": algorithm, "observation_names": list(names), "local": local}
     setattr(model, _TAG, tag)
 
 
@@ -45,7 +50,8 @@ class ModelPolicy:
     """Asks a Stable-Baselines3 model, which sees the task's observation and nothing else.
 
     ``price`` stands for the task's own price of a token in an observation that shows it, so that
-    one agent can be asked for any point of its trade-off.
+    one agent can be asked for any point of its trade-off. With ``local`` every sensor asks the
+    model by itself, about its own view.
 
     Raises:
         ConfigurationError: a price for a task that does not show it, or outside its range.
@@ -57,9 +63,11 @@ class ModelPolicy:
         task: Task,
         deterministic: bool = True,
         price: float | None = None,
+        local: bool = False,
     ) -> None:
         self.model = model
         self.deterministic = deterministic
+        self._view = LocalView(task) if local else None
         self._task = task
         self._memory: Any = None  # of a recurrent policy
         self._price: tuple[int, float] | None = None
@@ -78,17 +86,27 @@ class ModelPolicy:
         if self._price is not None:
             entry, value = self._price
             observation[:, entry] = value
-        masks = {}
+        start, masks = signals["start"], {}
+        if self._view is not None:
+            observation = self._view.rows(observation)
+            start = start.repeat(self._view.sensors)
         if isinstance(self.model, MaskablePPO):
-            masks["action_masks"] = spaces.action_masks(self._task, signals["grantable"])
+            masks["action_masks"] = self._masks(signals["grantable"])
         action, self._memory = self.model.predict(
             observation,
             state=self._memory,
-            episode_start=signals["start"],
+            episode_start=start,
             deterministic=self.deterministic,
             **masks,
         )
+        if self._view is not None:
+            return self._view.requests(action)
         return spaces.requests(self._task, action, len(action))
+
+    def _masks(self, allowed: Requests) -> NDArray[np.bool_]:
+        if self._view is None:
+            return spaces.action_masks(self._task, allowed)
+        return LocalView.action_masks(allowed)
 
 
 def _observed_price(task: Task, price: float) -> tuple[int, float]:
@@ -124,13 +142,14 @@ def load_model_policy(
         ) from None
     if not data or "observation_space" not in data:
         raise ConfigurationError(f"model {path!r} is not allowed: it has no observation space")
-    task = _fitted(path, data, task)
-    return ModelPolicy(_load(path, file, data), task, deterministic, price)
+    local = bool(data.get(_TAG, {}).get("local"))
+    task = _fitted(path, data, task, local)
+    return ModelPolicy(_load(path, file, data), task, deterministic, price, local)
 
 
-def _fitted(path: str, data: dict[str, Any], task: Task) -> Task:
+def _fitted(path: str, data: dict[str, Any], task: Task, local: bool) -> Task:
     """The task with the kind of action that the model has, its observation layout checked."""
-    layout = EpisodeBatch(task, 1).layout
+    layout = LocalView(task) if local else EpisodeBatch(task, 1).layout
     names = data.get(_TAG, {}).get("observation_names")
     if names is not None and list(names) != list(layout.names):
         missing = [name for name in names if name not in layout.names]
@@ -141,13 +160,15 @@ def _fitted(path: str, data: dict[str, Any], task: Task) -> Task:
             f"missing are {missing[:4] or 'none'}, unknown to the model {extra[:4] or 'none'}"
             + ("" if missing or extra else " (the order differs)")
         )
-    wanted = spaces.observation_space(layout)
+    wanted = layout.low
     have = data["observation_space"]
     if have.shape != wanted.shape:
         raise ConfigurationError(
             f"model {path!r} was trained for another observation layout: it expects shape "
             f"{have.shape}, the task (information={task.information!r}) has {wanted.shape}"
         )
+    if local:
+        return task
     action = data["action_space"]
     kinds = (
         [task]

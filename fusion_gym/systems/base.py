@@ -35,13 +35,17 @@ class Signal:
 class Feature:
     """One entry of an agent's observation: its name, who knows it, and its bounds.
 
-    A block of ``Feature`` entries is filled by one array of as many rows.
+    ``sensor`` is the number of the sensor whose node knows the entry by itself, ``broadcast``
+    marks what every node is told; other entries are none of a single sensor's knowledge. A block
+    of ``Feature`` entries is filled by one array of as many rows.
     """
 
     name: str
     knowledge: Knowledge
     low: float
     high: float
+    sensor: int | None = None
+    broadcast: bool = False
 
 
 class Signals(Mapping[str, SignalArray]):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.plants import LinearPlant
-from fusion_gym.systems.base import Feature, Signal, SignalArray
+from fusion_gym.systems.base import Feature, Knowledge, Signal, SignalArray
 from fusion_gym.systems.centre import Centre, Outlook
 from fusion_gym.validation import Array
 
@@ -114,11 +114,17 @@ class CensoredSystem:
         """Blocks of the observation; see docs/tobit_oscillator.md."""
         sensors, size = self.sensor_count, self.centre.sensors.size
 
-        def block(kind: str, knowledge: str, low: float, high: float) -> tuple[Feature, ...]:
+        def block(kind: str, knowledge: Knowledge, low: float, high: float) -> tuple[Feature, ...]:
             return tuple(
-                Feature(f"{kind}[{s},{c}]", knowledge, low, high)  # type: ignore[arg-type]
+                Feature(f"{kind}[{s},{c}]", knowledge, low, high, sensor=s)
                 for s in range(sensors)
                 for c in range(size)
+            )
+
+        def fed_back(kind: str, limit: float) -> tuple[Feature, ...]:
+            return tuple(
+                Feature(f"{kind}[{name}]", "centre", -limit, limit, broadcast=True)
+                for name in self.state_names
             )
 
         return (
@@ -126,14 +132,9 @@ class CensoredSystem:
             block("censored", "sensor", 0.0, 1.0),
             block("held_difference", "sensor", -_WHITE, _WHITE),
             block("uncensored_probability", "centre", 0.0, 1.0),
-            tuple(Feature(f"age[{s}]", "centre", 0.0, 1.0) for s in range(sensors)),
-            tuple(
-                Feature(f"log_variance[{name}]", "centre", -_LOG_RANGE, _LOG_RANGE)
-                for name in self.state_names
-            ),
-            tuple(
-                Feature(f"estimate[{name}]", "centre", -_WHITE, _WHITE) for name in self.state_names
-            ),
+            tuple(Feature(f"age[{s}]", "centre", 0.0, 1.0, sensor=s) for s in range(sensors)),
+            fed_back("log_variance", _LOG_RANGE),
+            fed_back("estimate", _WHITE),
         )
 
     def start(self, noise: Array) -> CensoredState:

@@ -115,15 +115,20 @@ class CorrelatedTrackingSystem:
     def features(self) -> tuple[tuple[Feature, ...], ...]:
         """Blocks of the observation; see docs/correlated_tracking.md."""
         nodes = range(self.sensor_count)
-        components = [f"{node},{c}" for node in nodes for c in range(self.filter.sensors.size)]
-        local_states = [f"{node},{name}" for node in nodes for name in self.state_names]
+        components = [
+            (node, f"{node},{c}") for node in nodes for c in range(self.filter.sensors.size)
+        ]
+        local_states = [(node, f"{node},{name}") for node in nodes for name in self.state_names]
+        fused = [(None, name) for name in self.state_names]
         return (
             _block("whitened_innovation", components, "sensor", _RANGE),
-            _block("fused_innovation", components, "sensor", _RANGE),
-            _block("age", nodes, "centre"),
+            _block(
+                "fused_innovation", [(None, place) for _, place in components], "sensor", _RANGE
+            ),
+            _block("age", [(node, f"{node}") for node in nodes], "centre"),
             _block("local_log_deviation", local_states, "centre", _RANGE),
-            _block("log_deviation", self.state_names, "centre", _RANGE),
-            _block("estimate", self.state_names, "centre", _RANGE),
+            _block("log_deviation", fused, "centre", _RANGE),
+            _block("estimate", fused, "centre", _RANGE),
         )
 
     def start(self, noise: Array) -> CorrelatedTrackingState:
@@ -285,11 +290,16 @@ class CorrelatedTrackingSystem:
 
 
 def _block(
-    kind: str, places: Iterable[object], knowledge: Knowledge, limit: float | None = None
+    kind: str,
+    places: Iterable[tuple[int | None, str]],
+    knowledge: Knowledge,
+    limit: float | None = None,
 ) -> tuple[Feature, ...]:
-    """Entries between -limit and limit, or from 0 to 1."""
+    """Entries of the nodes that know them, between -limit and limit, or from 0 to 1."""
     low, high = (0.0, 1.0) if limit is None else (-limit, limit)
-    return tuple(Feature(f"{kind}[{place}]", knowledge, low, high) for place in places)
+    return tuple(
+        Feature(f"{kind}[{place}]", knowledge, low, high, sensor=node) for node, place in places
+    )
 
 
 def _deviation(covariance: Array) -> Array:
