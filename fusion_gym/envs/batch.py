@@ -185,7 +185,8 @@ class EpisodeBatch:
         To the system's own it adds ``tokens`` (N,), ``token_cost`` (sensors, 1), ``price`` (N,) of
         a token, ``step`` (N,),
         the steps taken in the episode, ``start`` (N,) bool, ``admitted`` and
-        ``grantable`` (sensors, N) bool, and ``observation`` (N, entries).
+        ``grantable`` (sensors, N) bool, ``observation`` (N, entries), and the system's ``state``,
+        which only a policy that plans with the system's own methods has a use for.
         """
         values = dict(self.task.system.read(self.state))
         values |= {
@@ -197,6 +198,7 @@ class EpisodeBatch:
             "admitted": self.admitted,
             "grantable": self.grantable,
             "observation": self.observe,
+            "state": self.state,
         }
         return Signals(values, self.task.hidden_signals)
 

@@ -140,7 +140,8 @@ class Task:
         """Names of the system's signals that the information mode withholds."""
         if self.information == "sensors":
             return ()
-        return tuple(s.name for s in self.system.signals if s.knowledge == "sensor")
+        hidden = (s.name for s in self.system.signals if s.knowledge == "sensor")
+        return ("state", *hidden)
 
 
 class ObservationLayout:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fusion_gym.envs import Task
+from fusion_gym.evaluation.lookahead import Lookahead
 from fusion_gym.triggers import Policy, make_trigger, parse_settings
 from fusion_gym.validation import ConfigurationError, keys
 
@@ -29,6 +30,10 @@ def make_policy(spec: str, task: Task) -> Policy:
         options = parse_settings("parameter of policy 'model'", settings)
         keys("parameter of policy 'model'", options, ["deterministic", "price"])
         return load_model_policy(path, task, **options)
+    if name == "lookahead":
+        options = parse_settings("parameter of policy 'lookahead'", text.split(",") if text else [])
+        keys("parameter of policy 'lookahead'", options, ["price", "steps"])
+        return Lookahead(task, **options)
     policy = make_trigger(spec, task.policy_defaults)
     _try_out(spec, policy, task)
     return policy

@@ -1,9 +1,8 @@
 """Covariance intersection and inverse covariance intersection, batch axis last.
 
 In the coordinates in which both covariances are diagonal (:func:`diagonalise`) the two-sensor
-rules are scalar, and their trace is a convex sum whose minimum :func:`best_weight` finds. Several
-estimates at once are joined by a Newton method over the weights, each step of which is a
-two-sensor problem again.
+rules are scalar, and their trace is a convex sum whose minimum :func:`best_weight` finds. More
+than two at once: :mod:`fusion_gym.fusion.several`.
 """
 
 from __future__ import annotations
@@ -11,15 +10,18 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.fusion.diagonal import DiagonalPair, best_weight, diagonalise
+from fusion_gym.fusion.several import covariance_intersection_many
 from fusion_gym.validation import Array
 
-_GAP = 1e-6  # relative optimality gap at which the search over several weights ends
-_STEPS = 100  # cap of its steps; up to six estimates need about ten
-_RIDGE = 1e-10  # keeps its curvature invertible where estimates are alike
+__all__ = [
+    "Fused",
+    "covariance_intersection",
+    "covariance_intersection_many",
+    "inverse_covariance_intersection",
+]
 
 
 class Fused(NamedTuple):
@@ -118,106 +120,3 @@ def inverse_covariance_intersection(
     total = weight + (1.0 - weight) * square
     fused = d * (weight + (1.0 - weight) * d) / total
     return _join(mean_a, mean_b, pair, fused, weight / total, weight)
-
-
-def covariance_intersection_many(
-    means: Array, covariances: Array, active: NDArray[np.bool_] | None = None
-) -> tuple[Array, Array, Array]:
-    """Covariance intersection of l estimates at once, of the smallest trace.
-
-    P = (Σ w_i P_i⁻¹)⁻¹ and x = P Σ w_i P_i⁻¹ x_i with w_i >= 0 and Σ w_i = 1: a bound for every
-    correlation of the errors, as with two estimates. With Y_i = P_i⁻¹ the trace of P exceeds its
-    minimum by at most the gap max_i tr(P Y_i P) - tr P.
-
-    Args:
-        means: (l, n, N).
-        covariances: (l, n, n, N), symmetric positive definite where active.
-        active: (l, N), the estimates that take part; all by default. Others are not read and get
-            the weight 0.
-
-    Returns:
-        Mean (n, N), covariance (n, n, N) and weights (l, N). The search ends at a gap of a
-        relative 1e-6, or after 100 steps of a lane (each lowers the trace). In a lane without
-        active estimates, which is for the caller to avoid, and in one with a covariance that is
-        not positive definite, mean and covariance are NaN.
-
-    The multiplicative update w_i <- w_i sqrt(tr(P Y_i P)) has the same optimum, but where
-    estimates are alike thousands of its steps do not reach it; ours need about ten.
-
-    Source: the optimum is an A-optimal design, and the gap is J. Kiefer's, "General equivalence
-    theory for optimum designs", Annals of Statistics 2, 1974.
-    """
-    chosen = np.ones(means.shape[::2], dtype=np.bool_) if active is None else active
-    information = np.where(chosen[:, None, None], linalg.inverse(covariances), 0.0)
-    weights = chosen / np.maximum(chosen.sum(0), 1)
-    lanes = np.arange(weights.shape[-1])
-    for _ in range(_STEPS):
-        fused, gain = _gradient(information[..., lanes], weights[:, lanes])
-        total = linalg.trace(fused)
-        open_lanes = gain.max(0) - total > _GAP * total
-        lanes = lanes[open_lanes]
-        if not lanes.size:
-            break
-        weights[:, lanes] = _step(
-            information[..., lanes], weights[:, lanes], fused[..., open_lanes], gain[:, open_lanes]
-        )
-    fused = linalg.inverse(_weighted(weights, information))
-    known = np.where(chosen[:, None], means, 0.0)
-    vector = (weights[:, None] * linalg.matvec(information, known)).sum(0)
-    return linalg.matvec(fused, vector), fused, weights
-
-
-def _weighted(weights: Array, information: Array) -> Array:
-    """Σ w_i Y_i, (n, n, N)."""
-    total: Array = (weights[:, None, None] * information).sum(0)
-    return total
-
-
-def _gradient(information: Array, weights: Array) -> tuple[Array, Array]:
-    """P (n, n, N) and tr(P Y_i P) (l, N), by which its trace falls with each weight."""
-    fused = linalg.inverse(_weighted(weights, information))
-    return fused, linalg.trace(linalg.matmul(information, linalg.matmul(fused, fused)))
-
-
-def _step(information: Array, weights: Array, fused: Array, gain: Array) -> Array:
-    """Weights (l, N) of a smaller trace, from P and the tr(P Y_i P) at the given ones.
-
-    The step goes along Newton's direction among the estimates of positive weight and the one of
-    the largest gain, or, if that would make a weight of zero negative, from the smallest gain to
-    the largest. The line is searched exactly, as far as the simplex reaches: it joins two sums of
-    informations, so it is covariance intersection of two estimates.
-    """
-    direction = _newton_direction(information, fused, gain, (weights > 0.0) | (gain == gain.max(0)))
-    sound = np.isfinite(direction).all(0) & ~((weights == 0.0) & (direction < 0.0)).any(0)
-    each = np.arange(len(weights))[:, None]
-    smallest = np.where(weights > 0.0, gain, np.inf).argmin(0)
-    exchange = (each == gain.argmax(0)) * 1.0 - (each == smallest)
-    direction = np.where(sound, direction, exchange)
-    reach = np.full_like(direction, np.inf)
-    np.divide(weights, -direction, out=reach, where=direction < 0.0)
-    length = np.minimum(reach.min(0), 2.0)  # Newton's step has length 1
-    end = np.where(reach <= length, 0.0, weights + length * direction)
-    pair = diagonalise(fused, linalg.inverse(_weighted(end, information)))
-    share = best_weight(pair.power * pair.ratio, np.ones_like(pair.ratio), pair.ratio)
-    moved: Array = share * weights + (1.0 - share) * end
-    moved /= moved.sum(0)
-    return moved
-
-
-def _newton_direction(
-    information: Array, fused: Array, gain: Array, free: NDArray[np.bool_]
-) -> Array:
-    """Newton's direction (l, N) for the trace, of sum 0 and zero outside ``free`` (l, N).
-
-    The trace's gradient is -``gain`` and its curvature 2 tr(P Y_i P Y_j P).
-    """
-    root = linalg.transpose(linalg.cholesky(fused))
-    legs = linalg.matmul(root, linalg.matmul(information, fused))
-    legs = np.where(free[:, None], legs.reshape(len(gain), -1, gain.shape[-1]), 0.0)
-    curvature = 2.0 * linalg.matmul(legs, linalg.transpose(legs))
-    ridge = np.where(free, _RIDGE * linalg.diagonal(curvature), 1.0)
-    right = np.stack((np.where(free, gain, 0.0), free * 1.0), axis=1)
-    solved = linalg.solve(linalg.add_diagonal(curvature, ridge), right)
-    level = solved[:, 0].sum(0) / solved[:, 1].sum(0)
-    direction: Array = solved[:, 0] - level * solved[:, 1]
-    return direction

@@ -39,10 +39,10 @@ def diagonalise(covariance_a: Array, covariance_b: Array) -> DiagonalPair:
     rows are orthogonal is left untouched, so that its result does not depend on the others.
     """
     size = covariance_a.shape[0]
-    factor = linalg.cholesky(covariance_a)
+    factor = linalg.cholesky(np.ascontiguousarray(covariance_a))
     runs = max(covariance_a.shape[-1], covariance_b.shape[-1])
     rows = np.zeros((size, 3 * size, runs))  # [G, C⁻¹, Cᵀ], rotated together
-    rows[:, :size] = linalg.cholesky(covariance_b)
+    rows[:, :size] = linalg.cholesky(np.ascontiguousarray(covariance_b))
     rows[:, size : 2 * size] = linalg.identity(size)
     for k in range(size):
         rows[k, : 2 * size] /= factor[k, k]
