@@ -37,10 +37,11 @@ class ParallelFusion:
         result = SequentialResult(mean.copy(), covariance.copy(), gains)
         lanes = np.flatnonzero(active.any(0))
         if lanes.size:
-            every = every[..., lanes]
-            chosen = np.concatenate((np.ones((1, lanes.size), dtype=np.bool_), active[:, lanes]))
+            every = every.take(lanes, axis=-1)
+            everywhere = np.ones((1, lanes.size), dtype=np.bool_)
+            chosen = np.concatenate((everywhere, active.take(lanes, axis=-1)))
             fused_mean, fused, weights = covariance_intersection_many(
-                estimates[..., lanes], every, chosen
+                estimates.take(lanes, axis=-1), every, chosen
             )
             result.mean[:, lanes], result.covariance[..., lanes] = fused_mean, fused
             shares = weights[:, None, None] * linalg.inverse(every)

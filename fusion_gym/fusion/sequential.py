@@ -109,16 +109,21 @@ class SequentialFusion:
             if chosen.any():
                 lanes = slice(None) if chosen.all() else np.flatnonzero(chosen)
                 fused = join(
-                    result.mean[:, lanes],
-                    result.covariance[..., lanes],
-                    means[sensor][:, lanes],
-                    covariances[sensor][..., lanes],
+                    _lanes(result.mean, lanes),
+                    _lanes(result.covariance, lanes),
+                    _lanes(means[sensor], lanes),
+                    _lanes(covariances[sensor], lanes),
                 )
                 result.mean[:, lanes] = fused.mean
                 result.covariance[..., lanes] = fused.covariance
                 for earlier in joined:
                     gain = result.gains[earlier]
-                    gain[..., lanes] = linalg.matmul(fused.gain_first, gain[..., lanes])
+                    gain[..., lanes] = linalg.matmul(fused.gain_first, _lanes(gain, lanes))
                 result.gains[sensor + 1][..., lanes] = fused.gain_second
                 joined.append(sensor + 1)
         return result
+
+
+def _lanes(array: Array, lanes: slice | NDArray[np.int64]) -> Array:
+    """These lanes with the batch axis contiguous, which plain indexing would not leave it."""
+    return array if isinstance(lanes, slice) else array.take(lanes, axis=-1)
