@@ -69,7 +69,7 @@ def test_an_agent_is_asked_at_any_price(tmp_path: Any) -> None:
     from stable_baselines3 import PPO
 
     from fusion_gym.envs.sb3 import FusionSB3VecEnv
-    from fusion_gym.evaluation.model_policy import tag_model
+    from fusion_gym.evaluation.model_policy import ModelPolicy, tag_model
 
     options = {"filter": "tobit", "cost_weight": "random", "price_range": SPAN}
     task = fusion_gym.make_task(ENV_ID, **options)
@@ -83,10 +83,21 @@ def test_an_agent_is_asked_at_any_price(tmp_path: Any) -> None:
     np.testing.assert_array_equal(
         run_episodes(task, asked, 5, seed=0).mse, run_episodes(fixed, own, 5, seed=0).mse
     )
+    unseen = fusion_gym.make_task(ENV_ID, filter="tobit", cost_weight=0.002)
+    for price in (0.05, 0.01):
+        here = make_policy(f"model:{path},price={price}", unseen)
+        there = make_policy(f"model:{path},price={price}", task)
+        np.testing.assert_array_equal(
+            run_episodes(unseen, here, 5, seed=0).mse, run_episodes(task, there, 5, seed=0).mse
+        )
+    by_itself = run_episodes(unseen, make_policy(f"model:{path}", unseen), 5, seed=0)
+    own = run_episodes(unseen, make_policy(f"model:{path},price=0.002", unseen), 5, seed=0)
+    np.testing.assert_array_equal(by_itself.mse, own.mse)
     with pytest.raises(ConfigurationError, match=r"price_range = \[0.001, 0.1\]"):
         make_policy(f"model:{path},price=0.5", task)
-    with pytest.raises(ConfigurationError, match="another observation layout"):
-        make_policy(f"model:{path},price=0.05", fusion_gym.make_task(ENV_ID, filter="tobit"))
+    plain = PPO("MlpPolicy", FusionSB3VecEnv(unseen, 4), device="cpu")
+    with pytest.raises(ConfigurationError, match=r"price = 0\.05 is not allowed"):
+        ModelPolicy(plain, unseen, price=0.05)
 
 
 @pytest.mark.parametrize(

@@ -42,19 +42,24 @@ def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
     """
     names = (LocalView(task) if local else EpisodeBatch(task, 1).layout).names
     algorithm = next(name for name, kind in ALGORITHMS.items() if type(model) is kind)
-    tag = {"algorithm": algorithm, "observation_names": list(names), "local": local}
+    tag = {
+        "algorithm": algorithm,
+        "observation_names": list(names),
+        "local": local,
+        "price_range": task.reward.price.span,
+    }
     setattr(model, _TAG, tag)
 
 
 class ModelPolicy:
     """Asks a Stable-Baselines3 model, which sees the task's observation and nothing else.
 
-    ``price`` stands for the task's own price of a token in an observation that shows it, so that
-    one agent can be asked for any point of its trade-off. With ``local`` every sensor asks the
-    model by itself, about its own view.
+    A model that was trained to see the price of a token (``price_range``) can be asked for any
+    point of its trade-off: ``price`` stands for the task's own price, whether or not the task
+    shows it. With ``local`` every sensor asks the model by itself, about its own view.
 
     Raises:
-        ConfigurationError: a price for a task that does not show it, or outside its range.
+        ConfigurationError: a price for a model that knows none, or outside its range.
     """
 
     def __init__(
@@ -64,15 +69,28 @@ class ModelPolicy:
         deterministic: bool = True,
         price: float | None = None,
         local: bool = False,
+        price_range: tuple[float, float] | None = None,
     ) -> None:
         self.model = model
         self.deterministic = deterministic
-        self._view = LocalView(task) if local else None
-        self._task = task
+        self._shown = task.reward.price.span is not None
+        self._task = _priced(task, price_range)
+        self._view = LocalView(self._task) if local else None
         self._memory: Any = None  # of a recurrent policy
-        self._price: tuple[int, float] | None = None
+        span = self._task.reward.price.span
+        self._price: float | None = None  # as the model sees it, in place of the task's own
+        if price is None and span is not None and not self._shown:
+            fixed = task.reward.price.fixed
+            assert fixed is not None  # a drawn price is always shown
+            price = min(max(fixed, span[0]), span[1])
         if price is not None:
-            self._price = _observed_price(task, price)
+            if span is None:
+                raise ConfigurationError(
+                    f"price = {price!r} is not allowed: the model was trained without a "
+                    "price_range, for one price alone"
+                )
+            chosen = Price.create(price, span)
+            self._price = float(chosen.encode(chosen.draw(np.zeros(1)))[0])
 
     def reset(self, num_envs: int, seed: int = 0) -> None:
         """Forget the memory of a recurrent policy; draw from the stream of ``seed``."""
@@ -84,8 +102,9 @@ class ModelPolicy:
         """Requests (sensors, N)."""
         observation = signals["observation"]
         if self._price is not None:
-            entry, value = self._price
-            observation[:, entry] = value
+            own = observation[:, :-1] if self._shown else observation  # the price comes last
+            column = np.full((len(own), 1), self._price, dtype=np.float32)
+            observation = np.concatenate((own, column), axis=1)
         start, masks = signals["start"], {}
         if self._view is not None:
             observation = self._view.rows(observation)
@@ -109,16 +128,12 @@ class ModelPolicy:
         return LocalView.action_masks(allowed)
 
 
-def _observed_price(task: Task, price: float) -> tuple[int, float]:
-    """The observation's entry for the price, and the price as it stands there."""
-    span = task.reward.price.span
-    if span is None:
-        raise ConfigurationError(
-            f"price = {price!r} is not allowed: the task shows no price (set its price_range)"
-        )
-    chosen = Price.create(price, span)
-    names = EpisodeBatch(task, 1).layout.names
-    return names.index("price"), float(chosen.encode(chosen.draw(np.zeros(1)))[0])
+def _priced(task: Task, price_range: tuple[float, float] | None) -> Task:
+    """The task with the price in its observation, if the model saw one and the task shows none."""
+    if price_range is None or task.reward.price.span is not None:
+        return task
+    price = Price(None, (price_range[0], price_range[1]))
+    return dataclasses.replace(task, reward=dataclasses.replace(task.reward, price=price))
 
 
 def load_model_policy(
@@ -142,9 +157,11 @@ def load_model_policy(
         ) from None
     if not data or "observation_space" not in data:
         raise ConfigurationError(f"model {path!r} is not allowed: it has no observation space")
-    local = bool(data.get(_TAG, {}).get("local"))
-    task = _fitted(path, data, task, local)
-    return ModelPolicy(_load(path, file, data), task, deterministic, price, local)
+    tag = data.get(_TAG, {})
+    local, price_range = bool(tag.get("local")), tag.get("price_range")
+    kind = _fitted(path, data, _priced(task, price_range), local).action
+    task = dataclasses.replace(task, action=kind)
+    return ModelPolicy(_load(path, file, data), task, deterministic, price, local, price_range)
 
 
 def _fitted(path: str, data: dict[str, Any], task: Task, local: bool) -> Task:
