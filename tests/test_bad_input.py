@@ -155,7 +155,7 @@ def test_calls(call: Callable[[], Any], parts: tuple[str, ...]) -> None:
     ("spec", "parts"),
     [
         ("randm", ("unknown policy 'randm'", "did you mean 'random'")),
-        ("", ("unknown policy ''", "always, dynamic_event")),
+        ("", ("unknown policy ''", "always, centre_variance")),
         ("random:rat=0.1", ("'rat'", "did you mean 'rate'")),
         ("always:rate=1", ("'rate'", "'always'")),
         ("random:rate", ("'rate'", "key=value")),

@@ -384,6 +384,8 @@ LOOKS_AT = {
     "innovation_threshold": "innovation",
     "send_on_delta": "measurement",
     "adaptive_innovation": "innovation",
+    "stochastic_event": "innovation",
+    "adaptive_threshold": "measurement",
 }
 
 

@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.envs.feedback import FeedbackOptions, assumed_density_centre, feedback_centre
+from fusion_gym.envs.feedback import (
+    FeedbackOptions,
+    assumed_density_centre,
+    feedback_centre,
+    stochastic_centre,
+    stochastic_defaults,
+)
 from fusion_gym.envs.options import choose, finish, typical_magnitude
 from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
 from fusion_gym.envs.task import Task
@@ -133,7 +139,8 @@ def _build(chosen: BiasedOscillatorOptions, limit: int | None) -> Task:
     )
     # Every state counts alike, relative to its variance without any transmission.
     weights = 1.0 / (plant.size * system.open_loop(horizon))
-    return finish(chosen, system, limit, weights)
+    defaults = stochastic_defaults(chosen, chosen.filter)
+    return finish(chosen, system, limit, weights, policy_defaults=defaults)
 
 
 def _augmented(chosen: BiasedOscillatorOptions, aware: bool) -> tuple[LinearPlant, int]:
@@ -175,11 +182,13 @@ def _diagonal(first: Array, second: Array) -> Array:
 
 
 def _centre(chosen: BiasedOscillatorOptions, sensors: CensoredSensors) -> Centre:
-    kind = validation.choice("filter", chosen.filter, ("paper", "adf", "kalman"))
+    kind = validation.choice("filter", chosen.filter, ("paper", "adf", "kalman", "stochastic"))
+    if kind == "stochastic":
+        return stochastic_centre(chosen, sensors)
     if kind == "adf":
         return assumed_density_centre(chosen, sensors)
-    node = TobitKalmanFilter(sensors) if kind == "paper" else KalmanFilter(sensors)
-    return feedback_centre(chosen, node)
+    paper = kind == "paper"
+    return feedback_centre(chosen, TobitKalmanFilter(sensors) if paper else KalmanFilter(sensors))
 
 
 _PAGE = """

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from numpy.typing import ArrayLike
 
-from fusion_gym.envs.options import CommonOptions, arrival_order
-from fusion_gym.filters import AssumedDensityFilter, NodeFilter
+from fusion_gym.envs.options import CommonOptions, arrival_order, plain
+from fusion_gym.filters import AssumedDensityFilter, NodeFilter, StochasticEventFilter
 from fusion_gym.fusion import (
     INTERSECTION_RULES,
     FederatedFusion,
@@ -25,11 +26,13 @@ class FeedbackOptions(CommonOptions):
 
     ``fusion`` is "federated" (with ``information_shares``, equal by default) or a form of
     covariance intersection, the sequential ones with an ``order`` of arrival.
+    ``stochastic_weight`` belongs to ``filter="stochastic"`` and its policy.
     """
 
     fusion: str | None = None
     information_shares: ArrayLike | None = None
     order: ArrayLike | None = None
+    stochastic_weight: ArrayLike | None = None
 
 
 def feedback_centre(chosen: FeedbackOptions, node: NodeFilter) -> FeedbackCentre:
@@ -39,6 +42,27 @@ def feedback_centre(chosen: FeedbackOptions, node: NodeFilter) -> FeedbackCentre
         ConfigurationError: a rule that does not fit, or an option that is not the rule's.
     """
     return FeedbackCentre(node, _fusion(chosen, node.sensors.count))
+
+
+def stochastic_centre(chosen: FeedbackOptions, sensors: CensoredSensors) -> FeedbackCentre:
+    """The centre of ``filter="stochastic"``.
+
+    Raises:
+        ConfigurationError: no weight or one that is not allowed, or an option that does not fit.
+    """
+    return feedback_centre(chosen, StochasticEventFilter.create(sensors, chosen.stochastic_weight))
+
+
+def stochastic_defaults(chosen: FeedbackOptions, kind: str) -> dict[str, dict[str, Any]]:
+    """The scenario's parameters of the policy ``stochastic_event``, if the filter knows it.
+
+    Raises:
+        ConfigurationError: a weight for another filter.
+    """
+    if kind == "stochastic":
+        return {"stochastic_event": {"weight": plain(chosen.stochastic_weight)}}
+    _refuse(chosen, ("stochastic_weight",), f"filter={kind!r}", "filter='stochastic'")
+    return {}
 
 
 def _fusion(chosen: FeedbackOptions, sensors: int) -> FeedbackFusion:

@@ -14,6 +14,8 @@ from fusion_gym.validation import ConfigurationError, keys
 ENVIRONMENTS = {
     "fusion_gym/TobitOscillator-v0": "fusion_gym.envs.tobit_oscillator:TobitOscillator",
     "fusion_gym/CorrelatedTracking-v0": "fusion_gym.envs.correlated_tracking:CorrelatedTracking",
+    "fusion_gym/MarkovJumpTracking-v0": "fusion_gym.envs.markov_jump:MarkovJumpTracking",
+    "fusion_gym/UnknownInput-v0": "fusion_gym.envs.unknown_input:UnknownInput",
     "fusion_gym/BiasedOscillator-v0": "fusion_gym.envs.biased:BiasedOscillator",
     "fusion_gym/BiasedTracking-v0": "fusion_gym.envs.biased:BiasedTracking",
 }

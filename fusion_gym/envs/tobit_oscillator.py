@@ -15,7 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.envs.feedback import FeedbackOptions, assumed_density_centre, feedback_centre
+from fusion_gym.envs.feedback import (
+    FeedbackOptions,
+    assumed_density_centre,
+    feedback_centre,
+    stochastic_centre,
+    stochastic_defaults,
+)
 from fusion_gym.envs.options import choose, finish, typical_magnitude
 from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
 from fusion_gym.envs.task import Task
@@ -99,7 +105,8 @@ def build(**options: Any) -> Task:
         scale=typical_magnitude(plant, horizon, random_start),
         reference=plant.open_loop(horizon),
     )
-    return finish(chosen, system, limit, None, policy_defaults={"dynamic_event": trigger})
+    defaults = {"dynamic_event": trigger} | stochastic_defaults(chosen, chosen.filter)
+    return finish(chosen, system, limit, None, policy_defaults=defaults)
 
 
 def _plant(chosen: TobitOscillatorOptions) -> LinearPlant:
@@ -120,7 +127,9 @@ def _plant(chosen: TobitOscillatorOptions) -> LinearPlant:
 def _centre(
     chosen: TobitOscillatorOptions, sensors: CensoredSensors, trigger: dict[str, tuple[float, ...]]
 ) -> Centre:
-    kind = validation.choice("filter", chosen.filter, ("paper", "tobit", "kalman", "adf"))
+    kind = validation.choice(
+        "filter", chosen.filter, ("paper", "tobit", "kalman", "adf", "stochastic")
+    )
     constants = BoundConstants.create(chosen.bound_epsilon)
     error = EventError.create(**trigger, young=chosen.bound_young, sensors=sensors.count)
     silent, with_error = chosen.silent, chosen.event_error
@@ -141,8 +150,10 @@ def _centre(
             )
     if kind == "adf":
         return assumed_density_centre(chosen, sensors)
-    node = TobitKalmanFilter(sensors) if kind == "tobit" else KalmanFilter(sensors)
-    return feedback_centre(chosen, node)
+    if kind == "stochastic":
+        return stochastic_centre(chosen, sensors)
+    tobit = kind == "tobit"
+    return feedback_centre(chosen, TobitKalmanFilter(sensors) if tobit else KalmanFilter(sensors))
 
 
 def _trigger(chosen: TobitOscillatorOptions, sensors: int) -> dict[str, tuple[float, ...]]:

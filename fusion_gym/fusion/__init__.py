@@ -9,6 +9,7 @@ from fusion_gym.fusion.covariance_intersection import (
 from fusion_gym.fusion.federated import FederatedFusion
 from fusion_gym.fusion.feedback import INTERSECTION_RULES, FeedbackFusion, IntersectionFusion
 from fusion_gym.fusion.information import InformationFusion
+from fusion_gym.fusion.matrix_weighted import IntersectionOfCopies, MatrixWeightedFusion
 from fusion_gym.fusion.parallel import ParallelFusion
 from fusion_gym.fusion.sequential import SequentialFusion, SequentialResult
 
@@ -19,6 +20,8 @@ __all__ = [
     "Fused",
     "InformationFusion",
     "IntersectionFusion",
+    "IntersectionOfCopies",
+    "MatrixWeightedFusion",
     "ParallelFusion",
     "SequentialFusion",
     "SequentialResult",

@@ -7,6 +7,8 @@ from fusion_gym.systems.correlated_tracking import (
     CorrelatedTrackingState,
     CorrelatedTrackingSystem,
 )
+from fusion_gym.systems.markov_jump import MarkovJumpState, MarkovJumpSystem
+from fusion_gym.systems.unknown_input import UnknownInputSystem
 
 __all__ = [
     "CensoredState",
@@ -15,8 +17,11 @@ __all__ = [
     "CorrelatedTrackingSystem",
     "Feature",
     "FeedbackCentre",
+    "MarkovJumpState",
+    "MarkovJumpSystem",
     "SequentialCentre",
     "Signal",
     "Signals",
     "System",
+    "UnknownInputSystem",
 ]

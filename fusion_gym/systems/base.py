@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TypeVar
 
@@ -46,6 +46,22 @@ class Feature:
     high: float
     sensor: int | None = None
     broadcast: bool = False
+
+
+def feature_block(
+    kind: str,
+    places: Iterable[tuple[int | None, str]],
+    knowledge: Knowledge,
+    limit: float | None = None,
+) -> tuple[Feature, ...]:
+    """Entries ``kind[place]`` of (the sensor that knows it by itself, place).
+
+    Between -limit and limit, or without a limit from 0 to 1.
+    """
+    low, high = (0.0, 1.0) if limit is None else (-limit, limit)
+    return tuple(
+        Feature(f"{kind}[{place}]", knowledge, low, high, sensor=node) for node, place in places
+    )
 
 
 class Signals(Mapping[str, SignalArray]):

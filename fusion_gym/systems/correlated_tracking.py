@@ -6,7 +6,7 @@ based on adaptive innovation event-triggered mechanism for uncertain networked s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from fusion_gym import linalg
 from fusion_gym.filters import JointErrorCovariance, RobustKalmanFilter, RobustPlan
 from fusion_gym.fusion import ParallelFusion, SequentialFusion
 from fusion_gym.plants import LinearPlant
-from fusion_gym.systems.base import Feature, Knowledge, Signal, SignalArray
+from fusion_gym.systems.base import Feature, Signal, SignalArray, feature_block
 from fusion_gym.validation import Array, ConfigurationError
 
 _RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
@@ -121,14 +121,14 @@ class CorrelatedTrackingSystem:
         local_states = [(node, f"{node},{name}") for node in nodes for name in self.state_names]
         fused = [(None, name) for name in self.state_names]
         return (
-            _block("whitened_innovation", components, "sensor", _RANGE),
-            _block(
+            feature_block("whitened_innovation", components, "sensor", _RANGE),
+            feature_block(
                 "fused_innovation", [(None, place) for _, place in components], "sensor", _RANGE
             ),
-            _block("age", [(node, f"{node}") for node in nodes], "centre"),
-            _block("local_log_deviation", local_states, "centre", _RANGE),
-            _block("log_deviation", fused, "centre", _RANGE),
-            _block("estimate", fused, "centre", _RANGE),
+            feature_block("age", [(node, f"{node}") for node in nodes], "centre"),
+            feature_block("local_log_deviation", local_states, "centre", _RANGE),
+            feature_block("log_deviation", fused, "centre", _RANGE),
+            feature_block("estimate", fused, "centre", _RANGE),
         )
 
     def start(self, noise: Array) -> CorrelatedTrackingState:
@@ -287,19 +287,6 @@ class CorrelatedTrackingSystem:
             fused = self.fusion.fuse(mean[0], covariance[0], mean[1:], delivered, alone)
             result[sensor] = silent - self._weighted_trace(fused.covariance)
         return result
-
-
-def _block(
-    kind: str,
-    places: Iterable[tuple[int | None, str]],
-    knowledge: Knowledge,
-    limit: float | None = None,
-) -> tuple[Feature, ...]:
-    """Entries of the nodes that know them, between -limit and limit, or from 0 to 1."""
-    low, high = (0.0, 1.0) if limit is None else (-limit, limit)
-    return tuple(
-        Feature(f"{kind}[{place}]", knowledge, low, high, sensor=node) for node, place in places
-    )
 
 
 def _deviation(covariance: Array) -> Array:

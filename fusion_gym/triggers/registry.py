@@ -9,28 +9,38 @@ from typing import Any
 
 from fusion_gym import validation
 from fusion_gym.triggers.adaptive_innovation import AdaptiveInnovation
+from fusion_gym.triggers.adaptive_threshold import AdaptiveThreshold
 from fusion_gym.triggers.base import Policy, Trigger
+from fusion_gym.triggers.centre_variance import CentreVariance
 from fusion_gym.triggers.constant import Always, Never
 from fusion_gym.triggers.dynamic_event import DynamicEvent
 from fusion_gym.triggers.information_gain import InformationGain
 from fusion_gym.triggers.innovation_threshold import InnovationThreshold
+from fusion_gym.triggers.local_variance import LocalVariance
+from fusion_gym.triggers.paced import Paced
 from fusion_gym.triggers.periodic import Periodic, RoundRobin
 from fusion_gym.triggers.random import Random
 from fusion_gym.triggers.send_on_delta import SendOnDelta
+from fusion_gym.triggers.stochastic_event import StochasticEvent
 from fusion_gym.triggers.variance_threshold import VarianceThreshold
 from fusion_gym.validation import ConfigurationError
 
 TRIGGERS: dict[str, type[Trigger]] = {
     "adaptive_innovation": AdaptiveInnovation,
+    "adaptive_threshold": AdaptiveThreshold,
     "always": Always,
+    "centre_variance": CentreVariance,
     "dynamic_event": DynamicEvent,
     "information_gain": InformationGain,
     "innovation_threshold": InnovationThreshold,
+    "local_variance": LocalVariance,
     "never": Never,
+    "paced": Paced,
     "periodic": Periodic,
     "random": Random,
     "round_robin": RoundRobin,
     "send_on_delta": SendOnDelta,
+    "stochastic_event": StochasticEvent,
     "variance_threshold": VarianceThreshold,
 }
 

@@ -1,0 +1,37 @@
+"""Uniform numbers for policies that draw: a stream of its own for each run."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+_BLOCK = 64  # steps drawn at a time
+
+
+class Chance:
+    """Draws uniform numbers in [0, 1), apart from the noise of the same seeds.
+
+    Run i has the stream of ``seed + i`` and the policy's own ``stream`` number, so what a run
+    draws depends neither on what stands beside it nor on any signal.
+    """
+
+    def __init__(self, stream: int) -> None:
+        self._stream = stream
+        self.reset(0)
+
+    def reset(self, num_envs: int, seed: int = 0) -> None:
+        """Begin again."""
+        runs = range(num_envs)
+        self._generators = [np.random.default_rng([seed + run, self._stream]) for run in runs]
+        self._drawn: NDArray[np.float64] | None = None
+        self._used = 0
+
+    def draw(self, sensors: int, runs: int) -> NDArray[np.float64]:
+        """The numbers (sensors, N) of the next step."""
+        if len(self._generators) != runs:
+            self.reset(runs)
+        if self._drawn is None or self._used == _BLOCK:
+            drawn = [generator.random((_BLOCK, sensors)) for generator in self._generators]
+            self._drawn, self._used = np.stack(drawn, axis=-1), 0
+        self._used += 1
+        return self._drawn[self._used - 1]

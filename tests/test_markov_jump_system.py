@@ -1,0 +1,363 @@
+"""The Markov jump system, its environment and its triggers from the outside."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
+from reference_markov_jump import PAPER, Run, options, random_model
+
+from fusion_gym import linalg
+from fusion_gym.envs import EpisodeBatch
+from fusion_gym.envs.markov_jump import (
+    MarkovJumpTrackingEnv,
+    MarkovJumpTrackingVectorEnv,
+    build,
+)
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.systems import Signals
+from fusion_gym.triggers import make_trigger
+from fusion_gym.triggers.centre_variance import CentreVariance
+from fusion_gym.triggers.local_variance import LocalVariance
+from fusion_gym.triggers.random import Random
+from fusion_gym.validation import ConfigurationError
+
+Array = NDArray[np.float64]
+
+
+# --- the system ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [None, 1, 2])
+def test_runs_agree_with_plain_loops(seed: int | None) -> None:
+    """State, node estimates, copies, fused mean and covariance, from the same normals."""
+    model = PAPER if seed is None else random_model(seed)
+    system = build(horizon=40, **options(model)).system
+    draw, runs = np.random.default_rng(seed), 3
+    noise = draw.standard_normal((system.start_channels, runs))
+    state = system.start(noise)
+    others = [Run(model, noise[:, run]) for run in range(runs)]
+    for _ in range(40):
+        noise = draw.standard_normal((system.noise_channels, runs))
+        state = system.sense(state, noise)
+        sent = draw.random((system.sensor_count, runs)) < 0.4
+        state = system.deliver(state, sent)
+        mean, covariance = system.fused(state)
+        for run, other in enumerate(others):
+            other.sense(noise[:, run])
+            expected_mean, expected = other.deliver(sent[:, run])
+            assert state.mode[run] == other.mode
+            np.testing.assert_allclose(system.truth(state)[:, run], other.x, atol=1e-9)
+            np.testing.assert_allclose(state.node_mean[..., run], other.node, atol=1e-9)
+            np.testing.assert_allclose(state.copy_mean[..., run], other.copy, atol=1e-9)
+            # Pseudo-inverses lose digits where two copies have almost become one.
+            np.testing.assert_allclose(mean[:, run], expected_mean, atol=1e-2)
+            np.testing.assert_allclose(covariance[..., run], expected, atol=1e-3)
+            if seed is None:
+                np.testing.assert_allclose(mean[:, run], expected_mean, atol=1e-5)
+                np.testing.assert_allclose(covariance[..., run], expected, atol=1e-7)
+
+
+def test_a_run_does_not_depend_on_its_neighbours_nor_on_their_times() -> None:
+    task = build(horizon=30)
+    alone, together = EpisodeBatch(task, 1), EpisodeBatch(task, 5)
+    alone.seed(np.arange(1), [3])
+    alone.reset()
+    together.seed(np.arange(5), [9, 8, 7, 6, 5])
+    together.reset()
+    draw = np.random.default_rng(0)
+    for _ in range(11):
+        together.step(draw.random((3, 5)) < 0.3)
+    together.seed(np.array([2]), [3])
+    together.reset(np.array([2]))
+    for _ in range(30):
+        requests = draw.random((3, 5)) < 0.3
+        np.testing.assert_allclose(together.observe()[2], alone.observe()[0], rtol=1e-6, atol=1e-7)
+        one, many = alone.step(requests[:, 2:3]), together.step(requests)
+        assert many.reward[2] == pytest.approx(one.reward[0], rel=1e-10)
+        together.finished[:] = False
+
+
+def test_copies_are_predicted_and_replaced() -> None:
+    task = build()
+    batch = EpisodeBatch(task, 4)
+    batch.seed(np.arange(4), [1, 2, 3, 4])
+    batch.reset()
+    sent = np.zeros((3, 4), dtype=bool)
+    sent[1] = True
+    for step in range(8):
+        before = batch.signals()
+        batch.step(sent)
+        after = batch.signals()
+        np.testing.assert_array_equal(after["held"][1], before["measurement"][1])
+        np.testing.assert_array_equal(after["held"][0], np.zeros((2, 4)))
+        np.testing.assert_array_equal(after["age"][:, 0], [step + 2, 1, step + 2])
+        # Sensor 1 samples at every second step: in between its node learns nothing new.
+        moved = np.abs(after["innovation"][1]).max()
+        assert (moved < 1e-12) == (not after["sampled"][1, 0])
+        deviation = after["innovation_deviation"][1]
+        assert (deviation > 0.0).all()
+        assert (deviation.max() < 1e-6) == (not after["sampled"][1, 0])
+
+
+def test_nothing_that_was_not_sent_leaks_into_the_centres_signals() -> None:
+    """Other measurements, fadings and modes: the same packets, the same knowledge."""
+    task = build()
+    system = task.system
+    draw, runs = np.random.default_rng(1), 6
+    state = system.start(draw.standard_normal((system.start_channels, runs)))
+    nobody = np.zeros((3, runs), dtype=bool)
+    for _ in range(10):
+        state = system.sense(state, draw.standard_normal((system.noise_channels, runs)))
+        offered = Signals(system.read(state))
+        for signal in system.signals:
+            value = np.asarray(offered[signal.name], dtype=np.float64)
+            same = np.abs(value - value[..., :1]).max() == 0.0
+            assert same == (signal.knowledge == "centre"), signal.name
+        for block, values in zip(system.features, system.observe(state), strict=True):
+            same = bool((values == values[..., :1]).all())
+            assert same == (block[0].knowledge == "centre"), block[0].name
+            assert values.shape == (len(block), runs)
+        state = system.deliver(state, nobody)
+
+
+def test_variance_signals_are_what_a_delivery_brings() -> None:
+    for fusion in ("matrix", "ci"):
+        task = build(fusion=fusion)
+        weights = task.reward.state_weights[:, 0]
+        np.testing.assert_allclose(weights, 1.0 / (2 * task.system.open_loop(task.horizon)))
+        batch = EpisodeBatch(task, 5)
+        batch.reset()
+        policy = Random(0.3)
+        policy.reset(5)
+        for step in range(20):
+            offered = batch.signals()
+            silent, gain = offered["silent_variance"], offered["variance_reduction"]
+            plain, greedy = offered["centre_variance"], offered["greedy_variance"]
+            local = offered["local_variance"]
+            order = np.argsort(-greedy, axis=0)
+            kind, sent = step % 5, policy(offered)
+            if kind < 3:
+                sent = np.zeros((3, 5), dtype=bool)
+                sent[kind] = True
+            elif kind == 3:  # the first two of the greedy order
+                sent = np.zeros((3, 5), dtype=bool)
+                np.put_along_axis(sent, order[:2], True, axis=0)
+            batch.step(sent)
+            covariance = task.system.fused(batch.delivered)[1]
+            weighted = np.einsum("i,iir->r", weights, covariance)
+            if kind < 3:
+                np.testing.assert_allclose(silent - gain[kind], weighted, rtol=1e-9)
+                other = np.delete(greedy.max(0), 0)
+                np.testing.assert_allclose(other, plain[1:], rtol=1e-12)
+            elif kind == 3:
+                third = np.take_along_axis(greedy, order[2:], axis=0)[0]
+                np.testing.assert_allclose(third, linalg.trace(covariance), rtol=1e-9)
+            assert (linalg.trace(covariance) <= local.max(0) * 3).all()
+        before = batch.signals()
+        batch.step(np.zeros((3, 5), dtype=bool))
+        mean, covariance = task.system.fused(batch.delivered)
+        np.testing.assert_array_equal(before["prior_mean"], mean)
+        np.testing.assert_array_equal(before["prior_covariance"], covariance)
+        np.testing.assert_allclose(before["centre_variance"], linalg.trace(covariance))
+
+
+def test_existing_policies_work_on_its_signals() -> None:
+    for information in ("sensors", "centre"):
+        task = build(information=information, tokens="limited")
+        batch = EpisodeBatch(task, 6)
+        batch.reset()
+        axes_of = {
+            signal.name: len([axis for axis in signal.axes.strip("()").split(",") if axis])
+            for signal in task.system.signals
+        }
+        names = ["variance_threshold", "information_gain", "periodic", "random", "round_robin"]
+        if information == "sensors":
+            names += ["innovation_threshold", "innovation_threshold:whitened=true"]
+            names += ["send_on_delta", "dynamic_event", "adaptive_innovation"]
+        policies = [(name, make_trigger(name)) for name in names]
+        reference = task.policy_defaults["local_variance"]
+        policies += [("local", LocalVariance(**reference)), ("centre", CentreVariance(1.6))]
+        for name, policy in policies:
+            policy.reset(6)
+            asked = 0
+            for _ in range(30):
+                found = policy(batch.signals())
+                assert found.shape == (3, 6)
+                assert found.dtype == np.bool_
+                asked += int(found.sum())
+                batch.step(found)
+            assert asked > 0, name
+        offered = batch.signals()
+        for name, axes in axes_of.items():
+            if name not in task.hidden_signals:
+                assert offered[name].ndim == axes, name
+
+
+def test_whitened_differences_have_unit_variance_under_random_requests() -> None:
+    task = build(horizon=12)
+    batch = EpisodeBatch(task, 20_000)
+    batch.seed(np.arange(20_000), list(range(20_000)))
+    batch.reset()
+    policy = Random(0.3)
+    policy.reset(20_000)
+    for step in range(12):
+        offered = batch.signals()
+        deviation = offered["innovation_deviation"]
+        known = deviation > 1e-6
+        whitened = np.where(known, offered["innovation"] / deviation, 0.0)
+        share = known.mean(-1)
+        found = (whitened**2).sum(-1) / np.maximum(known.sum(-1), 1)
+        spread = np.sqrt(((whitened**4).sum(-1) / np.maximum(known.sum(-1), 1)) / 20_000)
+        limit = 5 * spread / np.sqrt(np.maximum(share, 1e-3))
+        assert (np.abs(found - 1.0) <= np.where(share > 0.05, limit, np.inf)).all(), step
+        assert (share > 0.05).any()
+        batch.step(policy(offered))
+
+
+# --- the environment -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("information", ["sensors", "centre"])
+def test_gymnasium_accepts_it_and_its_observations(information: str) -> None:
+    env = MarkovJumpTrackingEnv(information=information)
+    check_env(env, skip_render_check=True)
+    assert len(env.observation_names) == (32 if information == "sensors" else 23)
+    sees = any("whitened" in name for name in env.observation_names)
+    assert sees == (information == "sensors")
+    assert "copy_log_deviation[2,velocity]" in env.observation_names
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_vector_and_single_environments_agree_across_resets(mode: str) -> None:
+    vector = MarkovJumpTrackingVectorEnv(4, autoreset_mode=mode, tokens="limited", horizon=15)
+    seen, _ = vector.reset(seed=11)
+    draw = np.random.default_rng(0)
+    singles = [MarkovJumpTrackingEnv(tokens="limited", horizon=15) for _ in range(4)]
+    for number, env in enumerate(singles):
+        np.testing.assert_allclose(env.reset(seed=11 + number)[0], seen[number], rtol=1e-6)
+    over = np.zeros(4, dtype=bool)
+    for _ in range(40):
+        action = draw.integers(0, 2, (4, 3), dtype=np.int8)
+        seen, reward, _, truncated, _ = vector.step(action)
+        for number, env in enumerate(singles):
+            if over[number] and mode == "NextStep":
+                observation, value = env.reset()[0], 0.0
+                over[number] = False
+            else:
+                observation, found, _, over[number], _ = env.step(action[number])
+                value = float(found)
+                if over[number] and mode == "SameStep":
+                    observation = env.reset()[0]
+            assert value == pytest.approx(reward[number], rel=1e-10)
+            np.testing.assert_allclose(observation, seen[number], rtol=1e-5, atol=1e-6)
+        if mode == "NextStep":
+            np.testing.assert_array_equal(over, truncated)
+
+
+@pytest.mark.parametrize("fusion", ["matrix", "ci", "sci", "sici"])
+def test_other_sizes_and_fusions_run(fusion: str) -> None:
+    for seed, sensors, n in ((1, 4, 3), (2, 1, 1)):
+        model = random_model(seed, modes=2, n=n, sensors=sensors)
+        task = build(fusion=fusion, horizon=20, **options(model))
+        batch = EpisodeBatch(task, 8)
+        batch.reset()
+        policy = Random(0.4)
+        policy.reset(8)
+        for _ in range(20):
+            outcome = batch.step(policy(batch.signals()))
+            assert np.isfinite(outcome.reward).all()
+            assert linalg.is_positive_definite(task.system.fused(batch.delivered)[1]).all()
+            assert np.isfinite(batch.observe()).all()
+        assert task.system.state_names == tuple(f"x{i + 1}" for i in range(n))
+
+
+@pytest.mark.parametrize("horizon", [1, 2500])
+def test_short_and_long_episodes_of_rare_deliveries(horizon: int) -> None:
+    task = build(horizon=horizon)
+    batch = EpisodeBatch(task, 4)
+    batch.reset()
+    policy = Random(0.01)
+    policy.reset(4)
+    for _ in range(horizon):
+        outcome = batch.step(policy(batch.signals()))
+        assert np.isfinite(outcome.reward).all()
+        assert linalg.is_positive_definite(task.system.fused(batch.delivered)[1]).all()
+    assert outcome.truncated.all()
+
+
+def test_open_loop_is_what_never_costs() -> None:
+    results = run_episodes(build(), make_trigger("never"), 3000, 0)
+    task = build()
+    expected = task.system.open_loop(task.horizon)
+    np.testing.assert_allclose(results.squared_error.mean(0), expected, rtol=0.05)
+    assert results.bound_trace.mean() == pytest.approx(expected.sum(), rel=1e-9)
+    assert results.returns.mean() / task.horizon == pytest.approx(-1.0, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"fusion": "information"}, r"fusion = 'information' .* correlated"),
+        ({"fusion": "federated"}, r"fusion = 'federated' .* fed back"),
+        ({"fusion": "matrx"}, r"did you mean 'matrix'"),
+        ({"fusion": 3}, "fusion = 3"),
+        ({"mode_transition": ((0.6, 0.3), (0.4, 0.6))}, r"mode_transition .* \[0.9, 1.0\]"),
+        ({"transitions": (((1.1, 0.0), (0.0, 1.0)),) * 2}, "mean-square stable"),
+        ({"sampling_periods": 0}, "sampling_periods"),
+        ({"sampling_periods": "often"}, "sampling_periods"),
+        ({"fading_values": ((0.5,), (0.5,))}, "fading_values"),
+        ({"process_covariance": ((1.0, 2.0),)}, "process_covariance"),
+        ({"process_covariance": "large"}, "process_covariance"),
+        ({"measurement_variance": -1.0}, "measurement_variance"),
+        ({"noise_coupling": (0.1, 0.2)}, "noise_coupling"),
+        ({"state_weights": (1.0, 1.0, 1.0)}, "state_weights"),
+        ({"tokens": "many"}, "tokens = 'many'"),
+        ({"horizon": 0}, "horizon = 0"),
+        ({"sampling_period": 2}, "unknown option .*sampling_periods"),
+    ],
+)
+def test_what_is_not_allowed_is_said_in_one_error(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        build(**given)
+
+
+# --- the triggers --------------------------------------------------------------------------------
+
+
+def test_local_variance_follows_the_papers_rule() -> None:
+    variance = np.array([[1.0, 2.0], [2.1, 3.0], [0.5, 2.2]])
+    offered = Signals({"local_variance": variance})
+    found = LocalVariance(m=0.9, reference=1.2)(offered)
+    np.testing.assert_array_equal(found, variance >= 2.1)
+    each = LocalVariance(m=(-0.5, 5.0, 1.0), reference=1.0)(offered)
+    np.testing.assert_array_equal(each, [[True, True], [False, False], [False, True]])
+
+
+def test_centre_variance_takes_the_fewest() -> None:
+    before = np.array([[3.0, 3.0, 1.0], [2.0, 1.2, 0.5], [1.0, 1.5, 0.9]])
+    offered = Signals({"greedy_variance": before, "age": np.ones((3, 3))})
+    np.testing.assert_array_equal(CentreVariance(1.5)(offered), before >= 1.5)
+    found = CentreVariance(1.5, at_most=1)(offered)
+    np.testing.assert_array_equal(found.sum(0), [1, 1, 0])
+    assert found[0, :2].all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters"),
+    [
+        (LocalVariance, {"m": "high"}),
+        (LocalVariance, {"m": float("nan")}),
+        (LocalVariance, {"m": (0.1, float("inf"))}),
+        (LocalVariance, {"reference": -1.0}),
+        (CentreVariance, {"threshold": -1.0}),
+        (CentreVariance, {"threshold": True}),
+        (CentreVariance, {"at_most": 0}),
+    ],
+)
+def test_parameters_of_the_triggers_are_checked(kind: Any, parameters: dict[str, Any]) -> None:
+    with pytest.raises(ConfigurationError, match=next(iter(parameters))):
+        kind(**parameters)

@@ -1,0 +1,463 @@
+"""The stochastic event trigger, and the filter for which its silence is a measurement."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from filter_problems import outcomes, random_problem
+from filterpy.kalman import KalmanFilter as FilterPyFilter
+from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
+
+from fusion_gym import ConfigurationError, make_task
+from fusion_gym.envs import EpisodeBatch, Task
+from fusion_gym.evaluation import EpisodeResults, make_policy, run_episodes
+from fusion_gym.filters import KalmanFilter, StochasticEventFilter
+from fusion_gym.sensors import CensoredSensors
+from fusion_gym.triggers import make_trigger
+from fusion_gym.triggers.stochastic_event import StochasticEvent
+
+OSCILLATOR = "fusion_gym/TobitOscillator-v0"
+TRACKING = "fusion_gym/BiasedTracking-v0"
+INFINITY = float("inf")
+DEVIATIONS = 4.5  # tolerance of a Monte Carlo mean, in its standard errors
+
+Array = NDArray[np.float64]
+
+# Uncensored systems in which every request is granted, by environment and options.
+TARGET: dict[str, Any] = {
+    "env_id": TRACKING,
+    "access": "any",
+    "censoring_threshold": -INFINITY,
+    "censoring_upper": INFINITY,
+}
+ROTATION: dict[str, Any] = {  # three sensors that differ in everything, of two components each
+    "env_id": OSCILLATOR,
+    "tokens": "unlimited",
+    "process_noise": "full",
+    "censoring_threshold": -INFINITY,
+    "information_shares": (0.5, 0.3, 0.2),
+    "measurement_variance": ((0.5, 0.3), (0.4, 1.0), (0.2, 0.6)),
+    "measurement_matrices": (((1, 0), (0, 1)), ((1, 1), (0, 1)), ((1, 0), (-1, 1))),
+}
+SCALAR: dict[str, Any] = {
+    "env_id": OSCILLATOR,
+    "tokens": "unlimited",
+    "transition": ((0.95,),),
+    "process_gain": (1.0,),
+    "process_variance": 0.3,
+    "initial_mean": (2.0,),
+    "initial_covariance": ((0.5,),),
+    "measurement_matrices": (((1.0,),),),
+    "measurement_variance": 0.4,
+    "censoring_threshold": -INFINITY,
+}
+SYSTEMS = [
+    pytest.param(TARGET, (2.0, 0.5), id="target"),
+    pytest.param(ROTATION, (1.0, 0.3, 3.0), id="three sensors"),
+    pytest.param(SCALAR, 1.5, id="scalar"),
+]
+
+
+def task_of(system: dict[str, Any], weight: Any, **options: Any) -> Task:
+    chosen = {"filter": "stochastic", "stochastic_weight": weight} | system | options
+    return make_task(chosen.pop("env_id"), **chosen)
+
+
+def evaluate(task: Task, policy: str = "stochastic_event", episodes: int = 2000) -> EpisodeResults:
+    return run_episodes(task, make_policy(policy, task), episodes, seed=0)
+
+
+def deviations(values: Array) -> float:
+    """The mean of independent values in its standard errors."""
+    return float(values.mean() / (values.std() / np.sqrt(len(values))))
+
+
+def started(task: Task, runs: int) -> EpisodeBatch:
+    batch = EpisodeBatch(task, runs)
+    batch.seed(np.arange(runs), list(range(runs)))
+    batch.reset()
+    return batch
+
+
+# --- exactness ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("system", "weight"), SYSTEMS)
+def test_the_filter_is_exact_for_its_trigger(system: dict[str, Any], weight: Any) -> None:
+    results = evaluate(task_of(system, weight))
+    assert 0.1 < results.rate.mean() < 0.6
+    assert abs(deviations(results.nees - 1.0)) < DEVIATIONS
+    assert abs(deviations(results.bound_trace - results.mse)) < DEVIATIONS
+    assert results.nees.mean() == pytest.approx(1.0, abs=0.03)
+    assert results.bound_trace.mean() == pytest.approx(results.mse.mean(), rel=0.03)
+
+
+@pytest.mark.parametrize(("system", "weight"), SYSTEMS)
+def test_the_error_is_gaussian_after_a_delivery_and_after_silence(
+    system: dict[str, Any], weight: Any
+) -> None:
+    """d² = eᵀ P⁻¹ e is chi-squared with n degrees of freedom, however many sensors were silent."""
+    runs = 4000
+    task = task_of(system, weight, horizon=30)
+    policy, batch = make_policy("stochastic_event", task), started(task, runs)
+    policy.reset(runs, 0)
+    for _ in range(30):
+        outcome = batch.step(policy(batch.signals()))
+    mean, covariance = task.system.fused(batch.delivered)
+    error = (task.system.truth(batch.delivered) - mean).T
+    distance = (
+        error * np.linalg.solve(covariance.transpose(2, 0, 1), error[..., None])[..., 0]
+    ).sum(1)
+    states = error.shape[1]
+    for deliveries in range(task.sensors + 1):
+        kind = distance[outcome.granted.sum(0) == deliveries]
+        if len(kind) < 100:
+            continue
+        assert abs(deviations(kind - states)) < DEVIATIONS
+        assert abs(deviations(kind**2 - states * (states + 2))) < DEVIATIONS
+    assert np.unique(outcome.granted.sum(0)).size > 1
+
+
+@pytest.mark.parametrize(("system", "weight"), SYSTEMS)
+def test_the_ordinary_filter_claims_too_much_variance(system: dict[str, Any], weight: Any) -> None:
+    known = task_of(system, weight)
+    unknown = task_of(system, None, filter="kalman")
+    text = "/".join(map(str, np.atleast_1d(weight)))
+    results = evaluate(unknown, f"stochastic_event:weight={text}")
+    assert deviations(results.nees - 1.0) < -10
+    assert deviations(results.bound_trace - results.mse) > 10
+    better = evaluate(known)
+    assert deviations(results.mse - better.mse) > DEVIATIONS  # what silence is worth
+    assert better.rate.mean() <= results.rate.mean() * 1.01  # and not for more transmissions
+
+
+@pytest.mark.parametrize(
+    ("options", "policy"),
+    [
+        pytest.param({"tokens": "limited", "token_rate": 1.0}, "stochastic_event", id="denials"),
+        pytest.param({"censoring_threshold": 0.0}, "stochastic_event", id="censoring"),
+        pytest.param({}, "stochastic_event:weight=0.2", id="a more silent policy"),
+        pytest.param({}, "paced:rate=0.4", id="a policy by the clock"),
+    ],
+)
+def test_silence_is_over_interpreted_elsewhere(options: dict[str, Any], policy: str) -> None:
+    results = evaluate(task_of(ROTATION, (1.0, 0.3, 3.0), **options), policy, 500)
+    assert deviations(results.nees - 1.0) > 10
+    assert deviations(results.bound_trace - results.mse) < -10
+
+
+# --- the update ---------------------------------------------------------------------------------
+
+
+def test_silence_against_quadrature() -> None:
+    """One state: prior times the probability of silence, integrated over state and measurement."""
+    prior_mean, prior, gain, noise, weight = 0.7, 1.3, 0.8, 0.5, 0.9
+    sensors = CensoredSensors.create([[[gain]]], noise, -INFINITY, 1)
+    node = StochasticEventFilter.create(sensors, weight)
+    mean, covariance = np.array([[[prior_mean]]]), np.array([[[[prior]]]])
+    expectation = node.expect(mean)
+    plan = node.plan(mean, covariance, expectation, np.zeros((1, 1, 1)), np.ones(1))
+    x = (prior_mean + np.sqrt(prior) * np.linspace(-9, 9, 1501))[:, None]
+    y = (gain * prior_mean + np.linspace(-14, 14, 2001))[None]
+    density = np.exp(-((x - prior_mean) ** 2) / (2 * prior) - (y - gain * x) ** 2 / (2 * noise))
+    density *= np.exp(-weight * (y - gain * prior_mean) ** 2 / 2)
+    posterior = density.sum(1) / density.sum()
+    centre = (posterior * x[:, 0]).sum()
+    assert plan.silent_mean[0, 0, 0] == pytest.approx(centre, abs=1e-10)
+    spread = (posterior * (x[:, 0] - centre) ** 2).sum()
+    assert plan.silent_covariance[0, 0, 0, 0] == pytest.approx(spread, rel=1e-9)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_silence_adds_information(size: int) -> None:
+    """P'⁻¹ = P⁻¹ + Cᵀ (R + Z⁻¹)⁻¹ C, one matrix at a time; a delivery is the Kalman filter's."""
+    problem = random_problem(5 + size, size, 3, lanes=6, threshold=-INFINITY)
+    weight = (0.7, 4.0)
+    node = StochasticEventFilter.create(problem.sensors, weight)
+    found = outcomes(node, problem)
+    plain = outcomes(KalmanFilter(problem.sensors), problem)
+    for place in (0, 1, 2):  # deliveries, and the silent mean
+        np.testing.assert_array_equal(found[place], plain[place])
+    for sensor in range(2):
+        matrix = problem.sensors.measurement_matrix[sensor, :, :, 0]
+        noise = np.diag(problem.sensors.variance[sensor, :, 0] + 1 / weight[sensor])
+        for lane in range(6):
+            prior = np.linalg.inv(problem.covariance[sensor, :, :, lane])
+            wanted = np.linalg.inv(prior + matrix.T @ np.linalg.solve(noise, matrix))
+            silent = found[3][sensor, :, :, lane]
+            np.testing.assert_allclose(silent, wanted, rtol=1e-9, atol=1e-11)
+            np.testing.assert_array_equal(silent, silent.T)
+
+
+def test_silence_without_weight_says_nothing_and_with_all_weight_everything() -> None:
+    problem = random_problem(9, 2, 3, lanes=5, threshold=-INFINITY)
+    nothing = outcomes(StochasticEventFilter(problem.sensors, np.zeros((2, 1))), problem)
+    np.testing.assert_allclose(nothing[3], problem.covariance, rtol=1e-14)
+    everything = outcomes(StochasticEventFilter.create(problem.sensors, 1e14), problem)
+    np.testing.assert_allclose(everything[3], everything[1], rtol=1e-8, atol=1e-10)
+
+
+def test_federation_is_one_filter_that_takes_silence_as_a_measurement() -> None:
+    """Against FilterPy with all sensors stacked: y with R, or C x̂ with R + Z⁻¹ when silent."""
+    weight, runs = (1.0, 0.3, 3.0), 3
+    task = task_of(ROTATION, weight)
+    plant, sensors = task.system.plant, task.system.centre.sensors
+    filters = []
+    for _ in range(runs):
+        other = FilterPyFilter(dim_x=2, dim_z=6)
+        other.x, other.P = plant.initial_mean[:, 0].copy(), plant.initial_covariance[..., 0]
+        other.F, other.Q = plant.transition[..., 0], plant.process_covariance[..., 0]
+        other.H = sensors.measurement_matrix[..., 0].reshape(6, 2)
+        filters.append(other)
+    generator, batch = np.random.default_rng(2), started(task, runs)
+    for _ in range(25):
+        granted = generator.random((3, runs)) < 0.4
+        measurement = batch.signals()["measurement"].copy()
+        batch.step(granted)
+        mean, covariance = task.system.fused(batch.delivered)
+        for run, other in enumerate(filters):
+            other.predict()
+            told = np.repeat(granted[:, run], 2)
+            value = np.where(told, measurement[..., run].ravel(), other.H @ other.x)
+            noise = sensors.variance[..., 0].ravel() + ~told / np.repeat(weight, 2)
+            other.update(value, R=np.diag(noise))
+            np.testing.assert_allclose(mean[:, run], other.x, rtol=1e-8, atol=1e-10)
+            np.testing.assert_allclose(covariance[..., run], other.P, rtol=1e-8, atol=1e-12)
+
+
+# --- the rate -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("system", "weight"), SYSTEMS)
+def test_the_rate_is_one_less_the_root_of_a_determinant(
+    system: dict[str, Any], weight: Any
+) -> None:
+    """P(silent) = det(I + (C P Cᵀ + R) Z)^(-1/2) given P, for z ~ N(0, C P Cᵀ + R).
+
+    Requests less their probabilities are differences of a martingale: the variance of their sum
+    is the sum of p (1 - p).
+    """
+    runs = 500
+    task = task_of(system, weight)
+    sensors, weights = task.system.centre.sensors, np.broadcast_to(weight, task.sensors)
+    policy, batch = make_policy("stochastic_event", task), started(task, runs)
+    policy.reset(runs, 0)
+    excess, variance = np.zeros(task.sensors), np.zeros(task.sensors)
+    for _ in range(60):
+        signals = batch.signals()
+        prior = signals["prior_covariance"].transpose(2, 0, 1)
+        requests = policy(signals)
+        for sensor in range(task.sensors):
+            matrix = sensors.measurement_matrix[sensor, :, :, 0]
+            spread = matrix @ prior @ matrix.T + np.diag(sensors.variance[sensor, :, 0])
+            silence = np.linalg.det(np.eye(len(matrix)) + weights[sensor] * spread) ** -0.5
+            excess[sensor] += (requests[sensor] - (1 - silence)).sum()
+            variance[sensor] += (silence * (1 - silence)).sum()
+        batch.step(requests)
+    assert np.all(np.abs(excess) < DEVIATIONS * np.sqrt(variance))
+    assert np.all(np.sqrt(variance) / (60 * runs) < 0.003)  # so much is a rate known
+
+
+def chain_of_variances(weight: float, horizon: int) -> tuple[Array, Array]:
+    """Expected rate and posterior variance at the steps 1..horizon of the scalar system.
+
+    The prior variance is a Markov chain of its own: silent with probability
+    (1 + (P + R) w)^(-1/2). Its distribution is followed on a grid, mass divided between neighbours.
+    """
+    a, q, r = 0.95, 0.3, 0.4
+    low, high, points = 0.3, 4.0, 4001
+    grid = np.linspace(low, high, points)
+    silence = (1 + (grid + r) * weight) ** -0.5
+    delivered, silent = grid * r / (grid + r), 1 / (1 / grid + 1 / (r + 1 / weight))
+
+    def spread(value: Array, mass: Array) -> Array:
+        place = (a * a * value + q - low) / (grid[1] - grid[0])
+        cell = np.floor(place).astype(int)
+        result = np.bincount(cell, mass * (1 - (place - cell)), points)
+        return result + np.bincount(cell + 1, mass * (place - cell), points)
+
+    mass = spread(np.full(1, 0.5), np.ones(1))
+    rate, variance = np.empty(horizon), np.empty(horizon)
+    for step in range(horizon):
+        rate[step] = (mass * (1 - silence)).sum()
+        variance[step] = (mass * (silence * silent + (1 - silence) * delivered)).sum()
+        mass = spread(delivered, mass * (1 - silence)) + spread(silent, mass * silence)
+    return rate, variance
+
+
+@pytest.mark.parametrize("weight", [0.2, 1.5, 20.0])
+def test_the_steady_rate_and_variance_of_a_scalar_system(weight: float) -> None:
+    results = evaluate(task_of(SCALAR, weight))
+    rate, variance = chain_of_variances(weight, 100)
+    assert abs(deviations(results.rate[:, 0] - rate.mean())) < DEVIATIONS
+    assert abs(deviations(results.bound_trace - variance.mean())) < DEVIATIONS
+    assert abs(deviations(results.mse - variance.mean())) < DEVIATIONS
+
+
+# --- the trigger --------------------------------------------------------------------------------
+
+
+def signals_of(innovation: Array, deviation: Array | None = None) -> Any:
+    runs = innovation.shape[-1]
+    return {
+        "tokens": np.ones(runs),
+        "token_cost": np.ones((len(innovation), 1)),
+        "innovation": innovation,
+        "innovation_deviation": np.ones_like(innovation) if deviation is None else deviation,
+    }
+
+
+@pytest.mark.parametrize("whitened", [False, True])
+def test_the_probability_of_silence(whitened: bool) -> None:
+    """Runs that all see the same innovation; every sensor has its own weight."""
+    runs, steps, weights = 500, 130, np.array([0.3, 1.0, 2.5])
+    innovation = np.array([[1.0, -0.5], [0.4, 0.9], [0.0, 0.6]])
+    scale = np.array([[2.0, 0.5], [1.0, 1.5], [0.3, 0.7]])
+    policy = make_trigger(f"stochastic_event:weight=0.3/1/2.5,whitened={whitened}")
+    policy.reset(runs, 7)
+    repeat = np.ones(runs)
+    signals = signals_of(innovation[..., None] * repeat, scale[..., None] * repeat)
+    taken = np.array([policy(signals) for _ in range(steps)])
+    seen = innovation / scale if whitened else innovation
+    wanted = np.exp(-weights * (seen**2).sum(1) / 2)
+    tolerance = DEVIATIONS * np.sqrt(wanted * (1 - wanted) / (runs * steps))
+    assert np.all(np.abs(1 - taken.mean((0, 2)) - wanted) < tolerance)
+    # Draws of other sensors, of other steps and of other runs have nothing to do with each other.
+    excess = taken - (1 - wanted)[:, None]
+    others = (
+        excess[:, 0] * excess[:, 1],
+        excess[1:, :2] * excess[:-1, :2],
+        excess[:, :2, 1:] * excess[:, :2, :-1],
+    )
+    for product in others:
+        assert abs(deviations(product.ravel())) < DEVIATIONS
+
+
+def test_no_weight_never_requests_and_all_weight_always() -> None:
+    innovation = np.random.default_rng(0).normal(size=(3, 2, 200))
+    for weight, answer in ((0, False), (1e12, True)):
+        policy = make_trigger(f"stochastic_event:weight={weight}")
+        assert all((policy(signals_of(innovation)) == answer).all() for _ in range(70))
+    for weight, rate in ((1e-14, 0.0), (1e14, 1.0)):
+        assert evaluate(task_of(ROTATION, weight), episodes=20).rate.mean() == rate
+
+
+def test_a_larger_weight_requests_wherever_a_smaller_one_does() -> None:
+    """The draws do not depend on the parameters: policies are compared on common numbers."""
+    generator = np.random.default_rng(1)
+    small, large = StochasticEvent(0.4), StochasticEvent(1.1)
+    small.reset(50, 3)
+    large.reset(50, 3)
+    differ = 0
+    for _ in range(100):
+        signals = signals_of(generator.normal(size=(2, 1, 50)))
+        fewer, more = small(signals), large(signals)
+        assert not (fewer & ~more).any()
+        differ += (more & ~fewer).sum()
+    assert differ > 0
+
+
+def test_a_run_decides_alone() -> None:
+    """Run i of a batch with seed s is the only run of one with seed s + i, over several blocks."""
+    generator, runs, steps = np.random.default_rng(4), 5, 150
+    innovation = generator.normal(size=(steps, 3, 2, runs))
+
+    def decide(seed: int, chosen: slice) -> NDArray[np.bool_]:
+        policy = StochasticEvent((0.5, 1.0, 2.0))
+        policy.reset(len(range(runs)[chosen]), seed)
+        return np.array([policy(signals_of(part[..., chosen])) for part in innovation])
+
+    together = decide(11, slice(None))
+    for run in range(runs):
+        np.testing.assert_array_equal(
+            decide(11 + run, slice(run, run + 1))[..., 0], together[..., run]
+        )
+    np.testing.assert_array_equal(decide(11, slice(None)), together)
+    assert not np.array_equal(decide(12, slice(None)), together)
+
+
+def test_an_episode_does_not_depend_on_what_stands_beside_it() -> None:
+    task = task_of(ROTATION, (1.0, 0.3, 3.0))
+    policy = make_policy("stochastic_event", task)
+    together = run_episodes(task, policy, 6, seed=20)
+    alone = run_episodes(task, policy, 1, seed=24)
+    np.testing.assert_array_equal(together.rate[4], alone.rate[0])
+    np.testing.assert_allclose(together.mse[4], alone.mse[0], rtol=1e-10)
+
+
+def test_the_noise_of_an_episode_is_untouched() -> None:
+    truths = []
+    for spec in ("never", "stochastic_event"):
+        task = task_of(TARGET, 1.0)
+        policy, batch = make_policy(spec, task), started(task, 4)
+        policy.reset(4, 0)
+        for _ in range(80):
+            batch.step(policy(batch.signals()))
+        truths.append(task.system.truth(batch.delivered))
+    np.testing.assert_array_equal(*truths)
+
+
+# --- options ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("system", "weight"), SYSTEMS)
+def test_the_policys_weight_comes_from_the_scenario(system: dict[str, Any], weight: Any) -> None:
+    task = task_of(system, weight)
+    same: Any = make_policy("stochastic_event", task)
+    np.testing.assert_array_equal(np.atleast_1d(same.weight), np.atleast_1d(weight))
+    own: Any = make_policy("stochastic_event:weight=0.25,whitened=true", task)
+    assert (own.weight, own.whitened) == (0.25, True)
+    other: Any = make_policy("stochastic_event", task_of(system, None, filter="kalman"))
+    assert other.weight == StochasticEvent().weight
+
+
+@pytest.mark.parametrize("env_id", [OSCILLATOR, "fusion_gym/BiasedOscillator-v0", TRACKING])
+@pytest.mark.parametrize(
+    ("options", "parts"),
+    [
+        ({"filter": "stochastic"}, ("stochastic_weight = None", "filter='stochastic'", "> 0")),
+        ({"filter": "stochastic", "stochastic_weight": 0.0}, ("stochastic_weight = 0.0", "> 0")),
+        ({"filter": "stochastic", "stochastic_weight": (1.0, -2.0)}, ("(1.0, -2.0)",)),
+        (
+            {"filter": "stochastic", "stochastic_weight": (1.0,) * 5},
+            ("stochastic_weight", "(1.0, 1.0, 1.0, 1.0, 1.0)"),
+        ),
+        ({"filter": "stochastic", "stochastic_weight": INFINITY}, ("inf", "finite")),
+        ({"stochastic_weight": 1.0}, ("stochastic_weight = 1.0", "filter='paper'", "'stochastic'")),
+        ({"filter": "kalman", "stochastic_weight": 1.0}, ("filter='kalman'", "'stochastic'")),
+        ({"filter": "adf", "stochastic_weight": 1.0}, ("filter='adf'", "'stochastic'")),
+    ],
+)
+def test_weights_that_do_not_fit_are_refused(
+    env_id: str, options: dict[str, Any], parts: tuple[str, ...]
+) -> None:
+    with pytest.raises(ConfigurationError, match="is not allowed") as caught:
+        make_task(env_id, **options)
+    assert [part for part in parts if part not in str(caught.value)] == []
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("stochastic_event:weight=-1", "weight = -1"),
+        ("stochastic_event:weight=inf", "weight = inf"),
+        ("stochastic_event:weight=1/2", "weight = (1, 2)"),
+        ("stochastic_event:whitened=1", "whitened = 1"),
+        ("stochastic_event:rate=1", "unknown parameter of policy 'stochastic_event' 'rate'"),
+    ],
+)
+def test_bad_parameters_are_named(spec: str, message: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        make_policy(spec, make_task(OSCILLATOR))
+    assert message in str(caught.value)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("system", "weight"), SYSTEMS[:2])
+def test_the_checker_finds_nothing(system: dict[str, Any], weight: Any) -> None:
+    options = {"filter": "stochastic", "stochastic_weight": weight} | system
+    check_env(gymnasium.make(options.pop("env_id"), **options).unwrapped)

@@ -1,0 +1,368 @@
+"""Gains, models, bound tables, fusion and trigger of the unknown-input system.
+
+Oracles: plain matrices and loops, FilterPy, closed forms with explicit inverses, samples.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import filterpy.kalman
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.linalg import null_space
+
+from fusion_gym import linalg
+from fusion_gym.filters.input_state import InputModel, InputSensors, JointGain
+from fusion_gym.filters.input_state_bound import BoundTables
+from fusion_gym.filters.input_state_fusion import NodeFusion, tracked_intersection
+from fusion_gym.filters.random_walk_input import RandomWalkInputFilter
+from fusion_gym.fusion.covariance_intersection import covariance_intersection_many
+from fusion_gym.plants.unknown_input import UnknownInputPlant
+from fusion_gym.systems import Signals
+from fusion_gym.triggers.adaptive_threshold import AdaptiveThreshold
+from fusion_gym.validation import ConfigurationError
+
+Array = NDArray[np.float64]
+
+
+def random_plant(seed: int, n: int = 4, q: int = 2, period: int = 2) -> UnknownInputPlant:
+    """A stable plant with random entries."""
+    draw = np.random.default_rng(seed)
+    transition = draw.normal(size=(n, n))
+    transition *= 0.95 / np.abs(np.linalg.eigvals(transition)).max()
+    root = draw.normal(size=(n, n))
+    return UnknownInputPlant.create(
+        transition,
+        draw.normal(size=(n, q)),
+        0.1 * root @ root.T,
+        period,
+        draw.normal(size=n),
+        0.5 * np.eye(n),
+    )
+
+
+def random_sensors(
+    seed: int, plant: UnknownInputPlant, count: int = 3, size: int = 3
+) -> InputSensors:
+    draw = np.random.default_rng(seed)
+    root = draw.normal(size=(count, size, size + 2))
+    noise = 0.1 * root @ root.swapaxes(1, 2)
+    return InputSensors.create(draw.normal(size=(count, size, plant.size)), noise, plant)
+
+
+def random_covariances(seed: int, shape: tuple[int, ...], n: int, runs: int) -> Array:
+    root = np.random.default_rng(seed).normal(size=(*shape, n, n + 2, runs))
+    return linalg.matmul(root, linalg.transpose(root))
+
+
+# --- gains ---------------------------------------------------------------------------------------
+
+
+def textbook_gain(
+    plant: UnknownInputPlant, c: Array, phi: Array, noise: Array
+) -> tuple[Array, Array]:
+    """N and L with explicit inverses, as in the literature."""
+    b = plant.input_matrix[..., 0]
+    omega, seen = c @ phi @ c.T + noise, c @ b
+    inverse = np.linalg.inv(omega)
+    left = np.linalg.inv(seen.T @ inverse @ seen) @ seen.T @ inverse
+    n = b @ left
+    u = null_space(seen.T)
+    if u.shape[1]:
+        n = n + (phi @ c.T - b @ left @ omega) @ u @ np.linalg.inv(u.T @ omega @ u) @ u.T
+    return n, left
+
+
+@given(st.integers(0, 10**6), st.integers(1, 2), st.integers(2, 4))
+@settings(max_examples=25, deadline=None)
+def test_gain_hides_the_input_and_is_the_textbooks(seed: int, q: int, size: int) -> None:
+    plant = random_plant(seed, q=q)
+    sensors = random_sensors(seed + 1, plant, size=size)
+    joint = JointGain.create(plant, sensors)
+    phi = random_covariances(seed, (3,), 4, 2)
+    gain = joint.gain(phi, sensors.covariance)
+    seen = linalg.matmul(sensors.matrix, plant.input_matrix)
+    through = linalg.matmul(gain, seen)
+    scale = np.abs(gain).max()
+    np.testing.assert_allclose(
+        through[:, :4], np.broadcast_to(plant.input_matrix, through[:, :4].shape), atol=1e-9 * scale
+    )
+    np.testing.assert_allclose(
+        through[:, 4:],
+        np.broadcast_to(linalg.identity(q), through[:, 4:].shape),
+        atol=1e-9 * scale,
+    )
+    for sensor in range(3):
+        n, left = textbook_gain(
+            plant,
+            sensors.matrix[sensor, ..., 0],
+            phi[sensor, ..., 1],
+            sensors.covariance[sensor, ..., 0],
+        )
+        wanted = np.concatenate((n, left))
+        np.testing.assert_allclose(gain[sensor, ..., 1], wanted, rtol=1e-5, atol=1e-6 * scale)
+
+
+def test_no_other_gain_that_hides_the_input_has_a_smaller_covariance() -> None:
+    plant = random_plant(4)
+    sensors = random_sensors(5, plant, size=4)
+    joint = JointGain.create(plant, sensors)
+    phi = random_covariances(6, (3,), 4, 1)
+    best = joint.gain(phi, sensors.covariance)
+    least = joint.covariance(best, phi, sensors.covariance)
+    draw = np.random.default_rng(7)
+    for size in (1e-3, 1.0):
+        other = best + size * linalg.matmul(
+            draw.normal(size=(3, 6, 2, 1)), linalg.transpose(sensors.complement)
+        )
+        gap = joint.covariance(other, phi, sensors.covariance) - least
+        eigenvalues = np.linalg.eigvalsh(np.moveaxis(gap, -1, 0))
+        assert eigenvalues.min() > -1e-9 * size**2 - 1e-13
+        assert eigenvalues.max() > 1e-3 * size**2
+
+
+def test_joint_covariance_is_that_of_the_errors() -> None:
+    plant = random_plant(8)
+    sensors = random_sensors(9, plant, count=1)
+    joint = JointGain.create(plant, sensors)
+    phi = random_covariances(10, (1,), 4, 1)
+    gain = joint.gain(phi, sensors.covariance)
+    claimed = joint.covariance(gain, phi, sensors.covariance)[0, ..., 0]
+    draw, runs = np.random.default_rng(11), 40_000
+    past = np.linalg.cholesky(phi[0, ..., 0]) @ draw.standard_normal((4, runs))
+    inputs = 50.0 * draw.standard_normal((2, runs))  # however large: it must not matter
+    truth = past + plant.input_matrix[..., 0] @ inputs
+    measured = sensors.measure(truth, draw.standard_normal((3, runs)))[0]
+    error = gain[0, ..., 0] @ measured - np.concatenate((truth, inputs))
+    actual = error @ error.T / runs
+    scale = np.sqrt(np.diag(claimed))
+    np.testing.assert_allclose(
+        actual / np.outer(scale, scale), claimed / np.outer(scale, scale), atol=0.04
+    )
+
+
+def test_paper_gain_is_exact_to_rounding() -> None:
+    """The paper's C ℬ is nearly singular; normal equations would leave a residual of 1e-7."""
+    plant = UnknownInputPlant.create(
+        ((0.26, 0.3), (0.2, 0.1)),
+        ((1.10, 1.12), (1.15, 1.13)),
+        0.001 * np.eye(2),
+        2,
+        (0.17, 0.17),
+        0.01 * np.eye(2),
+    )
+    sensors = InputSensors.create(
+        (((1.12, 1.13), (1.10, 1.12)), ((1.31, 1.13), (1.31, 1.21))), 0.001, plant
+    )
+    joint = JointGain.create(plant, sensors)
+    gain = joint.gain(random_covariances(0, (2,), 2, 1), sensors.covariance)
+    through = linalg.matmul(gain, linalg.matmul(sensors.matrix, plant.input_matrix))[..., 0]
+    residual = through - np.concatenate((plant.input_matrix[..., 0], np.eye(2)))
+    assert np.abs(residual).max() < 3e-11
+    kept = linalg.identity(2) - linalg.matmul(gain[:, :2], sensors.matrix)
+    assert np.abs(kept).max() < 1e-9  # N C = I: the estimate has no memory
+
+
+# --- models and filters --------------------------------------------------------------------------
+
+
+def model_of(plant: UnknownInputPlant, memory: Any = (0.9, 0.5)) -> InputModel:
+    return InputModel.create(plant, memory, (0.3, 0.2), (0.7, 0.6))
+
+
+def dense_model(plant: UnknownInputPlant) -> tuple[Array, Array]:
+    """F and the covariance of its noise."""
+    a, b = plant.transition[..., 0], plant.input_matrix[..., 0]
+    memory = np.diag([0.9, 0.5])
+    f = np.block([[a, b @ memory], [np.zeros((2, 4)), memory]])
+    lift = np.concatenate((b, np.eye(2)))
+    q = lift @ np.diag([0.09, 0.04]) @ lift.T
+    q[:4, :4] += plant.process_covariance[..., 0]
+    return f, q
+
+
+def test_predictions_are_those_of_the_augmented_plant() -> None:
+    plant = random_plant(12)
+    model, (f, q) = model_of(plant), dense_model(plant)
+    covariance = random_covariances(13, (3,), 6, 2)
+    mean = np.random.default_rng(14).normal(size=(3, 6, 2))
+    np.testing.assert_allclose(model.predict(mean)[1, :, 1], f @ mean[1, :, 1], rtol=1e-12)
+    np.testing.assert_allclose(
+        model.predict_covariance(covariance)[2, ..., 1],
+        f @ covariance[2, ..., 1] @ f.T + q,
+        rtol=1e-10,
+    )
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_random_walk_filter_is_filterpys_kalman_filter(size: int) -> None:
+    plant = random_plant(15)
+    draw = np.random.default_rng(16)
+    # Its gain needs no sight of the input, so a sensor of one component will do.
+    matrix = draw.normal(size=(1, size, 4))
+    noise = random_covariances(17, (1,), size, 1)
+    sensors = InputSensors(matrix[..., None], noise, noise, noise, noise)
+    model = model_of(plant)
+    node = filterpy.kalman.KalmanFilter(dim_x=6, dim_z=size)
+    node.F, node.Q = dense_model(plant)
+    node.H = np.concatenate((matrix[0], np.zeros((size, 2))), axis=1)
+    node.R = noise[0, ..., 0]
+    mean, covariance = model.initial_mean[None], model.initial_covariance[None]
+    node.x, node.P = mean[0, :, 0].copy(), covariance[0, ..., 0].copy()
+    for _ in range(5):
+        y = draw.normal(size=size)
+        node.predict()
+        node.update(y)
+        mean, prior = model.predict(mean), model.predict_covariance(covariance)
+        gain, covariance = RandomWalkInputFilter(model, sensors).update(prior, noise)
+        mean = mean + linalg.matvec(gain, y[None, :, None] - sensors.expect(mean))
+        np.testing.assert_allclose(mean[0, :, 0], node.x, rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(covariance[0, ..., 0], node.P, rtol=1e-8, atol=1e-10)
+
+
+def test_bound_tables_are_the_recursion_with_explicit_inverses() -> None:
+    plant = random_plant(18, n=3, q=1)
+    sensors = random_sensors(19, plant, count=2, size=3)
+    joint, model = JointGain.create(plant, sensors), InputModel.create(plant, 0.9, 0.3, 0.7)
+    limit, epsilon = (0.05, 0.2), (0.3, 0.1)
+    tables = BoundTables.create(joint, model, limit, epsilon, 12)
+    a = plant.transition[..., 0]
+    for sensor in range(2):
+        c, v = sensors.matrix[sensor, ..., 0], sensors.covariance[sensor, ..., 0]
+        e, xi = epsilon[sensor], plant.initial_covariance[..., 0]
+        noise = (1 + e) * v + (1 + 1 / e) * limit[sensor] * np.eye(3)
+        for time in range(1, 13):
+            phi = (1 + e) * (a @ xi @ a.T + plant.process_covariance[..., 0])
+            n, left = textbook_gain(plant, c, phi, noise)
+            kept = np.eye(3) - n @ c
+            xi = kept @ phi @ kept.T + n @ noise @ n.T
+            omega = c @ phi @ c.T + noise
+            table = tables.covariance[sensor, ..., time]
+            np.testing.assert_allclose(
+                tables.gain[sensor, ..., time], np.concatenate((n, left)), rtol=1e-6, atol=1e-8
+            )
+            np.testing.assert_allclose(table[:3, :3], xi, rtol=1e-7, atol=1e-9)
+            np.testing.assert_allclose(table[3:, 3:], left @ omega @ left.T, rtol=1e-7)
+        radius = np.abs(np.linalg.eigvals(np.sqrt(1 + e) * kept @ a)).max()
+        assert tables.radius[sensor] == pytest.approx(radius, abs=0.02)
+        smaller = tables.covariance[sensor] - tables.delivered[sensor]
+        assert np.linalg.eigvalsh(np.moveaxis(smaller, -1, 0)).min() > -1e-9
+
+
+def test_a_bound_that_grows_without_limit_is_refused() -> None:
+    """A force and two velocities: the positions' drift cannot be seen once the input is hidden."""
+    plant = UnknownInputPlant.create(
+        ((1.0, 0.1), (0.0, 0.9)), ((0.0,), (1.0,)), 0.01 * np.eye(2), 2, (0.0, 0.0), np.eye(2)
+    )
+    sensors = InputSensors.create((((0.0, 1.0), (0.0, 0.5)),), 0.1, plant)
+    joint, model = JointGain.create(plant, sensors), InputModel.create(plant, 1.0, 0.1, 1.0)
+    with pytest.raises(ConfigurationError, match=r"spectral radius .* sensor 0|sensor 0.* radius"):
+        BoundTables.create(joint, model, 0.05, 0.2, 10)
+
+
+# --- fusion --------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 10**6), st.integers(2, 4), st.integers(2, 4))
+@settings(max_examples=20, deadline=None)
+def test_tracked_weights_give_covariance_intersection_and_reach_its_optimum(
+    seed: int, nodes: int, n: int
+) -> None:
+    covariance = random_covariances(seed, (nodes,), n, 3)
+    mean = np.random.default_rng(seed).normal(size=(nodes, n, 3))
+    weights = np.full((nodes, 3), 1.0 / nodes)
+    for _ in range(40):
+        fused = tracked_intersection(mean, covariance, weights)
+        weights = fused.weights
+    np.testing.assert_allclose(weights.sum(0), 1.0, rtol=1e-12)
+    assert (weights >= 0).all()
+    for run in range(3):
+        inverses = np.linalg.inv(covariance[..., run])
+        total = np.linalg.inv((weights[:, run, None, None] * inverses).sum(0))
+        np.testing.assert_allclose(fused.covariance[..., run], total, rtol=1e-7)
+        vector = sum(weights[i, run] * inverses[i] @ mean[i, :, run] for i in range(nodes))
+        np.testing.assert_allclose(fused.mean[:, run], total @ vector, rtol=1e-6, atol=1e-9)
+    optimum = linalg.trace(covariance_intersection_many(mean, covariance)[1])
+    ratio = linalg.trace(fused.covariance) / optimum
+    assert (ratio >= 1 - 1e-6).all()
+    assert (ratio <= 1.02).all()
+
+
+def test_state_and_input_are_fused_apart() -> None:
+    covariance = random_covariances(20, (3,), 5, 4)
+    mean = np.random.default_rng(21).normal(size=(3, 5, 4))
+    fusion = NodeFusion("exact_ci", 4)
+    fused = fusion.fuse(mean, covariance, fusion.start(3, 4))
+    state = covariance_intersection_many(mean[:, :4], covariance[:, :4, :4])
+    np.testing.assert_allclose(fused.mean[:4], state[0], rtol=1e-12)
+    np.testing.assert_allclose(fused.covariance[:4, :4], state[1], rtol=1e-12)
+    best = covariance[:, 4, 4].argmin(0)
+    np.testing.assert_allclose(fused.mean[4], mean[best, 4, np.arange(4)])
+    np.testing.assert_allclose(fused.covariance[4, 4], covariance[:, 4, 4].min(0))
+    assert not fused.covariance[:4, 4].any()
+
+
+# --- trigger -------------------------------------------------------------------------------------
+
+
+def signals(measurement: Array, held: Array, start: bool) -> Signals:
+    sensors, _, runs = measurement.shape
+    return Signals(
+        {
+            "measurement": measurement,
+            "held": held,
+            "start": np.full(runs, start),
+            "tokens": np.zeros(runs),
+            "token_cost": np.ones((sensors, 1)),
+        }
+    )
+
+
+def test_adaptive_threshold_is_the_papers_recursion_and_keeps_its_promise() -> None:
+    draw = np.random.default_rng(22)
+    limit, first, adaptation = (0.5, 0.8), (0.1, 0.0), 0.3
+    trigger = AdaptiveThreshold(limit, first, adaptation)
+    trigger.reset(3)
+    held, rho = np.zeros((2, 2, 3)), np.repeat(np.array(first)[:, None], 3, 1)
+    sent = 0
+    for step in range(30):
+        if step == 15:  # a new episode
+            rho = np.repeat(np.array(first)[:, None], 3, 1)
+        measurement = held + 0.4 * draw.normal(size=held.shape)
+        request = trigger(signals(measurement, held, step in (0, 15)))
+        for sensor in range(2):
+            for run in range(3):
+                sigma = measurement[sensor, :, run] - held[sensor, :, run]
+                square = sigma @ sigma
+                assert request[sensor, run] == (square > rho[sensor, run])
+                if not request[sensor, run]:
+                    assert square <= limit[sensor]
+                share = square / (adaptation + square)
+                new = limit[sensor] + share * (rho[sensor, run] - limit[sensor])
+                assert new >= rho[sensor, run]
+                rho[sensor, run] = new
+        held = np.where(request[:, None], measurement, held)
+        sent += int(request.sum())
+    assert 30 < sent < 150
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"rho_bar": 1.5}, "rho_bar = 1.5"),
+        ({"rho_bar": -0.1}, "rho_bar = -0.1"),
+        ({"rho_bar": 0.05, "rho_initial": 0.06}, r"rho_initial = 0.06 .* <= rho_bar = 0.05"),
+        ({"rho_initial": -0.01}, "rho_initial = -0.01"),
+        ({"rho_bar": (0.1, 0.2), "rho_initial": (0.1, 0.1, 0.1)}, "rho_initial"),
+        ({"adaptation": 0.0}, "adaptation = 0.0"),
+        ({"adaptation": float("nan")}, "adaptation"),
+        ({"scale": -1.0}, "scale"),
+    ],
+)
+def test_thresholds_that_are_not_allowed(parameters: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        AdaptiveThreshold(**parameters)

@@ -1,0 +1,318 @@
+"""The unknown-input environment: against a plain loop, its options, its errors, its invariances."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import null_space
+from scipy.special import ndtr
+
+from fusion_gym import linalg
+from fusion_gym.envs import EpisodeBatch
+from fusion_gym.envs.unknown_input import (
+    UnknownInputEnv,
+    UnknownInputVectorEnv,
+    build,
+)
+from fusion_gym.envs.unknown_input_examples import EXAMPLES, two_carts
+from fusion_gym.evaluation import run_episodes
+from fusion_gym.fusion.covariance_intersection import covariance_intersection_many
+from fusion_gym.triggers import make_trigger
+from fusion_gym.triggers.adaptive_threshold import AdaptiveThreshold
+from fusion_gym.triggers.constant import Always, Never
+from fusion_gym.triggers.random import Random
+
+Array = NDArray[np.float64]
+ROOT = Path(__file__).parents[1]
+CARTS = EXAMPLES["two_carts"]
+
+
+# --- a plain loop, one run at a time -------------------------------------------------------------
+
+
+def reference(
+    kind: str, start: Array, noise: Array, asked: NDArray[np.bool_], hold: float | None = None
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Truth (T, 5), node means (T, 3, 5), node covariances, fused covariance, held."""
+    a1, b1, w1 = two_carts()
+    a, b, w = a1 @ a1, a1 @ b1 + b1, a1 @ w1 @ a1.T + w1
+    cs = np.array(CARTS["measurement_matrices"])
+    vs = [np.diag(v) for v in CARTS["measurement_covariance"]]
+    values, vectors = np.linalg.eigh(w)
+    factor = vectors * np.sqrt(values)
+    x = np.sqrt(0.1) * start[:4]
+    held = [cs[i] @ x + np.sqrt(vs[i]) @ start[4 + 2 * i : 6 + 2 * i] for i in range(3)]
+    phase = 2 * np.pi * ndtr(start[10:])
+    f = np.block([[a, 0.9 * b], [np.zeros((1, 4)), 0.9 * np.eye(1)]])
+    lift = np.concatenate((b, np.eye(1)))
+    q = 0.09 * lift @ lift.T
+    q[:4, :4] += w
+    mean = np.zeros((3, 5))
+    cov = np.tile(np.diag([0.1, 0.1, 0.1, 0.1, 0.49]), (3, 1, 1))
+    rho, e, rows = 0.09, 0.2, []
+    for k in range(len(noise)):
+        d = np.array([0.8, 0.6]) @ np.sin(2 * np.pi * k / np.array([60.0, 25.0]) + phase)
+        x = a @ x + b[:, 0] * d + factor @ noise[k, :4]
+        for i in range(3):
+            c, v = cs[i], vs[i]
+            y = c @ x + np.sqrt(v) @ noise[k, 4 + 2 * i : 6 + 2 * i]
+            if asked[k, i]:
+                held[i] = y
+            ahead, prior = f @ mean[i], f @ cov[i] @ f.T + q
+            if kind == "random_walk":
+                if not asked[k, i] and hold is None:
+                    mean[i], cov[i] = ahead, prior
+                    continue
+                h = np.concatenate((c, np.zeros((2, 1))), axis=1)
+                extra = 0.0 if asked[k, i] else hold
+                gain = prior @ h.T @ np.linalg.inv(h @ prior @ h.T + v + extra * np.eye(2))
+                mean[i] = ahead + gain @ (held[i] - h @ ahead)
+                cov[i] = (np.eye(5) - gain @ h) @ prior
+                continue
+            paper = kind == "paper"
+            if not asked[k, i] and not paper:
+                mean[i], cov[i] = ahead, prior
+                continue
+            grow = 1 + e if paper else 1.0
+            phi = grow * (a @ cov[i][:4, :4] @ a.T + w)
+            r = grow * v + (1 + 1 / e) * rho * np.eye(2) * paper
+            omega, seen = c @ phi @ c.T + r, c @ b
+            inverse = np.linalg.inv(omega)
+            left = np.linalg.inv(seen.T @ inverse @ seen) @ seen.T @ inverse
+            u = null_space(seen.T)
+            n = b @ left
+            n = n + (phi @ c.T - n @ omega) @ u @ np.linalg.inv(u.T @ omega @ u) @ u.T
+            surprise = held[i] - c @ a @ mean[i][:4]
+            mean[i] = np.concatenate((a @ mean[i][:4] + n @ surprise, left @ surprise))
+            kept = np.concatenate((np.eye(4) - n @ c, -left @ c))
+            both = np.concatenate((n, left))
+            cov[i] = kept @ phi @ kept.T + both @ r @ both.T
+        rows.append((np.append(x, d), mean.copy(), cov.copy(), np.array(held)))
+    truth, means, covariances, kept_values = zip(*rows, strict=True)
+    return (*(np.array(row) for row in (truth, means, covariances, kept_values)),)  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize(
+    ("kind", "hold"),
+    [("random_walk", None), ("random_walk", 0.05), ("predict", None), ("paper", None)],
+)
+def test_library_and_plain_loop_walk_the_same_trajectories(kind: str, hold: float | None) -> None:
+    system = build(filter=kind, hold_variance=hold, fusion="exact_ci").system
+    runs, steps = 3, 100
+    draw = np.random.default_rng(8)
+    start = draw.standard_normal((system.start_channels, runs))
+    noise = draw.standard_normal((steps, system.noise_channels, runs))
+    asked = draw.random((steps, 3, runs)) < 0.4
+    state = system.start(start)
+    found = []
+    for step in range(steps):
+        state = system.sense(state, noise[step])
+        state = system.deliver(state, asked[step])
+        mean, fused = system.fused(state)
+        found.append((system.truth(state), system.local_means(state), state.held, mean, fused))
+    truths, means, helds, fused_means, fused_covariances = (
+        np.array(row) for row in zip(*found, strict=True)
+    )
+    for run in range(runs):
+        truth, mean, covariance, held = reference(
+            kind, start[:, run], noise[..., run], asked[..., run], hold
+        )
+        np.testing.assert_allclose(truths[..., run], truth, rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(means[..., run], mean, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(helds[..., run], held, rtol=1e-8, atol=1e-8)
+        # The centre: covariance intersection of what the loop has, state and input apart.
+        columns = np.ascontiguousarray(np.moveaxis(covariance, 0, -1))
+        others = np.ascontiguousarray(np.moveaxis(mean, 0, -1))
+        x, p, _ = covariance_intersection_many(others[:, :4], columns[:, :4, :4])
+        np.testing.assert_allclose(fused_covariances[:, :4, :4, run].transpose(1, 2, 0), p, 1e-4)
+        np.testing.assert_allclose(fused_means[:, :4, run].T, x, rtol=1e-2, atol=1e-2)
+        least = columns[:, 4, 4].min(0)
+        np.testing.assert_allclose(fused_covariances[:, 4, 4, run], least, rtol=1e-6)
+
+
+def test_tracked_weights_stay_near_the_best() -> None:
+    """The default fusion against the search for the best weights, along the same episodes."""
+    claimed, errors = [], []
+    for fusion in ("ci", "exact_ci"):
+        found = run_episodes(build(fusion=fusion), Random(0.3), 40, 0)
+        claimed.append(found.bound_trace.mean())
+        errors.append(found.mse.mean())
+    assert 1.0 <= claimed[0] / claimed[1] < 1.03
+    assert abs(errors[0] / errors[1] - 1.0) < 0.05
+
+
+# --- policies ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["random_walk", "predict"])
+def test_there_is_something_to_learn(kind: str) -> None:
+    """Never costs 1 a step and 5 times always, and every sensor helps."""
+    task = build(filter=kind, cost_weight=0.0)
+    always, never = (run_episodes(task, policy, 60, 0) for policy in (Always(), Never()))
+    assert -never.returns.mean() / 100 == pytest.approx(1.0, abs=0.12)
+    assert never.returns.mean() < 5 * always.returns.mean()
+    for sensor in range(3):
+        rate = [0.0, 0.0, 0.0]
+        rate[sensor] = 1.0
+        alone = run_episodes(task, Random(tuple(rate)), 60, 0).returns.mean()
+        assert never.returns.mean() * 0.6 < alone < always.returns.mean() * 1.1
+
+
+def test_larger_thresholds_give_fewer_transmissions_and_larger_errors() -> None:
+    for example in ("two_carts", "paper"):
+        task = build(example=example, filter="random_walk")
+        defaults = task.policy_defaults["adaptive_threshold"]
+        rates, errors = [], []
+        for scale in (0.0, 0.25, 1.0, 4.0, 16.0):
+            found = run_episodes(task, AdaptiveThreshold(**defaults, scale=scale), 60, 0)
+            rates.append(found.rate.mean())
+            errors.append(found.squared_error[:, : task.system.plant.size].mean())
+        assert rates[0] == 1.0
+        assert (np.diff(rates) < 0).all()
+        assert (np.diff(errors) > 0).all()
+
+
+def test_every_generic_policy_finds_its_signals() -> None:
+    for options in ({}, {"filter": "paper"}, {"filter": "predict", "fusion": "sci"}):
+        task = build(horizon=30, **options)
+        for spec in (
+            "innovation_threshold:threshold=1,whitened=true",
+            "send_on_delta",
+            "variance_threshold",
+            "information_gain:threshold=0.001",
+            "dynamic_event",
+            "adaptive_innovation",
+            "round_robin",
+        ):
+            found = run_episodes(task, make_trigger(spec, task.policy_defaults), 3, 0)
+            assert 0.0 < found.rate.mean() <= 1.0, spec
+        batch = EpisodeBatch(task, 4)
+        batch.seed(np.arange(4), [1, 2, 3, 4])
+        batch.reset()
+        read = batch.signals()
+        for signal in task.system.signals:
+            axes = {"sensors": 3, "m": 2, "n": 4, "N": 4}
+            names = signal.axes.strip("()").replace(" ", "").split(",")
+            assert read[signal.name].shape == tuple(axes[a] for a in names if a), signal.name
+        for _ in range(20):
+            batch.step(np.random.default_rng(0).random((3, 4)) < 0.3)
+        reduction = batch.signals()["variance_reduction"]
+        assert (reduction.max(0) > 0).all()
+        if task.settings["filter"] != "predict":  # an update there forgets the input before
+            assert (reduction > -1e-6 * batch.signals()["silent_variance"]).all()
+
+
+def test_variance_reduction_is_what_a_delivery_brings() -> None:
+    """Whatever is measured; the signals' traces have the reward's weights."""
+    for options in ({"fusion": "exact_ci"}, {"fusion": "sci", "hold_variance": 0.1}):
+        task = build(**options)
+        batch = EpisodeBatch(task, 5)
+        batch.seed(np.arange(5), list(range(5)))
+        batch.reset()
+        for _ in range(10):
+            batch.step(np.random.default_rng(1).random((3, 5)) < 0.4)
+        read = batch.signals()
+        weights = task.reward.state_weights
+        for sensor in (None, 0, 1, 2):
+            granted = np.zeros((3, 5), dtype=np.bool_)
+            predicted = read["silent_variance"]
+            if sensor is not None:
+                granted[sensor] = True
+                predicted = predicted - read["variance_reduction"][sensor]
+            fused = task.system.fused(task.system.deliver(batch.state, granted))[1]
+            trace = (weights * linalg.diagonal(fused)).sum(0)
+            np.testing.assert_allclose(predicted, trace, rtol=1e-9)
+
+
+def test_predicted_innovation_deviation_is_the_actual_one() -> None:
+    """Under the filter's own model of the input: a walk with its memory and its variance."""
+    model = {"input_memory": float(np.exp(-0.1)), "input_change": 0.7 * (1 - np.exp(-0.2)) ** 0.5}
+    task = build(input_signal="random_walk", input_amplitude=0.7, input_period=10.0, **model)
+    batch, policy = EpisodeBatch(task, 400), Random(0.4)
+    batch.seed(np.arange(400), list(range(400)))
+    batch.reset()
+    policy.reset(400, 1)
+    squares = []
+    for step in range(60):
+        read = batch.signals()
+        if step > 5:
+            squares.append((read["innovation"] / read["innovation_deviation"]) ** 2)
+        batch.step(policy(read))
+    np.testing.assert_allclose(np.mean(squares, axis=(0, 3)), 1.0, atol=0.04)
+
+
+def test_a_denied_request_changes_nothing_that_is_held() -> None:
+    task = build(tokens="limited", initial_tokens=0.0, token_rate=0.0)
+    batch = EpisodeBatch(task, 2)
+    batch.seed(np.arange(2), [0, 1])
+    batch.reset()
+    held = batch.state.held.copy()
+    outcome = batch.step(np.ones((3, 2), dtype=np.bool_))
+    assert not outcome.granted.any()
+    np.testing.assert_array_equal(batch.delivered.held, held)
+    assert (batch.delivered.age == 1).all()
+
+
+# --- reward and scales ---------------------------------------------------------------------------
+
+
+def test_reward_weighs_state_and_input() -> None:
+    for weight, share in ((1.0, 0.2), (0.0, 0.0), (6.0, 0.6)):
+        task = build(input_weight=weight)
+        weights = task.reward.state_weights[:, 0]
+        parts = weights * task.system.open_loop(100)
+        assert parts.sum() == pytest.approx(1.0)
+        assert parts[4] == pytest.approx(share)
+        np.testing.assert_allclose(task.system.state_weights, weights)
+    given_weights = (1.0, 0.0, 2.0, 0.0, 3.0)
+    task = build(state_weights=given_weights)
+    np.testing.assert_array_equal(task.reward.state_weights[:, 0], given_weights)
+
+
+# --- invariance ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["random_walk", "predict", "paper"])
+def test_a_run_does_not_depend_on_what_stands_beside_it(kind: str) -> None:
+    """Alone and in a batch whose other runs are reset in between, so that times differ."""
+    task = build(filter=kind, horizon=30, tokens="limited")
+    together, alone = EpisodeBatch(task, 3), EpisodeBatch(task, 1)
+    together.seed(np.arange(3), [5, 6, 7])
+    alone.seed(np.arange(1), [6])
+    together.reset()
+    alone.reset()
+    draw = np.random.default_rng(1)
+    for step in range(29):
+        if step in (4, 11):
+            together.reset(np.array([0 if step == 4 else 2]))
+        requests = draw.random((3, 3)) < 0.5
+        many, one = together.step(requests), alone.step(requests[:, 1:2])
+        np.testing.assert_allclose(many.reward[1], one.reward[0], rtol=1e-10)
+        np.testing.assert_allclose(together.observe()[1], alone.observe()[0], rtol=1e-6)
+        for mine, other in zip(
+            task.system.fused(together.delivered), task.system.fused(alone.delivered), strict=True
+        ):
+            np.testing.assert_allclose(mine[..., 1], other[..., 0], rtol=1e-10, atol=1e-14)
+
+
+def test_vector_environment_is_the_single_ones_across_autoresets() -> None:
+    options: dict[str, Any] = {"horizon": 12, "input_signal": "steps", "tokens": "limited"}
+    vector = UnknownInputVectorEnv(num_envs=3, autoreset_mode="SameStep", **options)
+    seen, _ = vector.reset(seed=11)
+    singles = [UnknownInputEnv(**options) for _ in range(3)]
+    actions = np.random.default_rng(0).integers(0, 2, (30, 3, 3), dtype=np.int8)
+    for number, env in enumerate(singles):
+        np.testing.assert_allclose(env.reset(seed=11 + number)[0], seen[number], rtol=1e-6)
+    for action in actions:
+        seen, reward, _, truncated, _ = vector.step(action)
+        for number, env in enumerate(singles):
+            observation, value, _, ended, _ = env.step(action[number])
+            if ended:
+                observation, _ = env.reset()
+            assert ended == truncated[number]
+            assert value == pytest.approx(reward[number], rel=1e-10)
+            np.testing.assert_allclose(observation, seen[number], rtol=1e-5, atol=1e-6)
