@@ -136,6 +136,17 @@ def main() -> None:
         "gym.make_vec, 1,024, Tobit filter": vector(tobit, 1024),
         "gym.make_vec, 4,096, Tobit filter": vector(tobit, 4096),
         "CorrelatedTracking, 1,024": vector({}, 1024, "fusion_gym/CorrelatedTracking-v0"),
+        "CorrelatedTracking, 1,024, ci": vector(
+            {"fusion": "ci"}, 1024, "fusion_gym/CorrelatedTracking-v0"
+        ),
+        "MarkovJumpTracking, 1,024": vector({}, 1024, "fusion_gym/MarkovJumpTracking-v0"),
+        "UnknownInput, 1,024": vector({}, 1024, "fusion_gym/UnknownInput-v0"),
+        "UnknownInput, 1,024, exact filter": vector(
+            {"filter": "predict"}, 1024, "fusion_gym/UnknownInput-v0"
+        ),
+        "UnknownInput, 1,024, paper's filter": vector(
+            {"filter": "paper"}, 1024, "fusion_gym/UnknownInput-v0"
+        ),
         "BiasedOscillator, 1,024": vector({}, 1024, "fusion_gym/BiasedOscillator-v0"),
         "BiasedOscillator, 1,024, adf": vector(adf, 1024, "fusion_gym/BiasedOscillator-v0"),
         "BiasedTracking, 1,024": vector({}, 1024, "fusion_gym/BiasedTracking-v0"),
