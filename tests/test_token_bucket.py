@@ -284,3 +284,19 @@ def test_the_least_capacity_is_accepted() -> None:
     assert TokenBucket.create(**(PAPER | {"capacity": 9.0, "initial": 9.0})).capacity == 9.0
     fixed = TokenBucket.create(**(PAPER | {"capacity": 3.0, "initial": 0.0, "sharing": "fixed"}))
     assert fixed.capacity == 3.0
+
+
+@pytest.mark.parametrize("sharing", ["equal", "fixed", "rotating"])
+def test_tokens_that_add_up_pay_for_a_transmission(sharing: str) -> None:
+    """Ten times 0.1 is a little less than 1 in floating point, and still enough."""
+    bucket = TokenBucket.create(
+        rate=0.1, capacity=2.0, initial=0.0, cost=1.0, sensors=1, sharing=sharing
+    )
+    tokens, step = bucket.start(1), np.zeros(1, dtype=np.int64)
+    for _ in range(10):
+        granted, spent, tokens = bucket.grant(tokens, np.zeros((1, 1), dtype=np.bool_), step)
+        assert not granted.any()
+        assert spent[0] == 0.0
+    granted, spent, tokens = bucket.grant(tokens, np.ones((1, 1), dtype=np.bool_), step)
+    assert granted.all()
+    assert tokens[0] >= 0.0

@@ -18,6 +18,7 @@ ENVIRONMENTS = {
     "fusion_gym/UnknownInput-v0": "fusion_gym.envs.unknown_input:UnknownInput",
     "fusion_gym/BiasedOscillator-v0": "fusion_gym.envs.biased:BiasedOscillator",
     "fusion_gym/BiasedTracking-v0": "fusion_gym.envs.biased:BiasedTracking",
+    "fusion_gym/RemoteEstimation-v0": "fusion_gym.envs.remote_estimation:RemoteEstimation",
 }
 
 

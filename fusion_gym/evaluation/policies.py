@@ -1,9 +1,15 @@
-"""Any policy by its text: an analytic trigger, or ``model:PATH`` for a saved agent."""
+"""Any policy by its text: an analytic trigger, a reference, or a saved agent."""
 
 from __future__ import annotations
 
-from fusion_gym.envs import Task
+import dataclasses
+from collections.abc import Callable
+
+from fusion_gym.envs import EpisodeBatch, Task
+from fusion_gym.envs.price import Price
 from fusion_gym.evaluation.lookahead import Lookahead
+from fusion_gym.evaluation.periodic_optimum import PeriodicOptimum
+from fusion_gym.solvers import OptimalPolicy
 from fusion_gym.triggers import Policy, make_trigger, parse_settings
 from fusion_gym.validation import ConfigurationError, keys
 
@@ -11,7 +17,8 @@ from fusion_gym.validation import ConfigurationError, keys
 def make_policy(spec: str, task: Task) -> Policy:
     """The policy that ``NAME``, ``NAME:key=value,…`` or ``model:PATH`` names.
 
-    A model takes ``deterministic=false``, and ``price=P`` where the task shows a price.
+    A model takes ``deterministic=false``, and ``price=P`` if it was trained to see the price. The
+    references ``lookahead``, ``periodic_optimum`` and ``optimal`` know the task's model.
 
     The signals that it looks at are checked against the task's information mode.
 
@@ -21,28 +28,42 @@ def make_policy(spec: str, task: Task) -> Policy:
             looks at signals which the task withholds.
     """
     name, _, text = spec.partition(":")
+    entries = text.split(",") if text else []
     if name == "model":
         from fusion_gym.evaluation.model_policy import load_model_policy
 
         path, *settings = text.split(",")
-        if path.startswith("path="):
-            path = path.removeprefix("path=")
         options = parse_settings("parameter of policy 'model'", settings)
         keys("parameter of policy 'model'", options, ["deterministic", "price"])
-        return load_model_policy(path, task, **options)
-    if name == "lookahead":
-        options = parse_settings("parameter of policy 'lookahead'", text.split(",") if text else [])
-        keys("parameter of policy 'lookahead'", options, ["price", "steps"])
-        return Lookahead(task, **options)
+        return load_model_policy(path.removeprefix("path="), task, **options)
+    if name in REFERENCES:
+        make, known = REFERENCES[name]
+        options = parse_settings(f"parameter of policy {name!r}", entries)
+        keys(f"parameter of policy {name!r}", options, known)
+        return make(task, **options)
     policy = make_trigger(spec, task.policy_defaults)
     _try_out(spec, policy, task)
     return policy
 
 
+def _optimum(task: Task, criterion: str = "finite", price: float | None = None) -> Policy:
+    """The solved optimum, at the task's own price of a token or at another."""
+    if price is not None:
+        reward = dataclasses.replace(task.reward, price=Price.create(price))
+        task = dataclasses.replace(task, reward=reward)
+    return OptimalPolicy(task, criterion)
+
+
+# Policies that need the task's model, each with the parameters that it takes.
+REFERENCES: dict[str, tuple[Callable[..., Policy], tuple[str, ...]]] = {
+    "lookahead": (Lookahead, ("price", "steps")),
+    "optimal": (_optimum, ("criterion", "price")),
+    "periodic_optimum": (PeriodicOptimum, ("cache", "packets", "period")),
+}
+
+
 def _try_out(spec: str, policy: Policy, task: Task) -> None:
     """One call on one run, so that a misfit is told before anything long begins."""
-    from fusion_gym.envs import EpisodeBatch
-
     batch = EpisodeBatch(task, 1)
     batch.reset()
     policy.reset(1)

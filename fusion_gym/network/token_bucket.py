@@ -12,6 +12,7 @@ from fusion_gym import validation
 from fusion_gym.validation import Array, ConfigurationError
 
 SHARING_RULES = ("equal", "fixed", "rotating")
+_ROUNDING = 1e-9  # tokens: ten times 0.1 pays for a transmission that costs 1
 
 
 class Grants(NamedTuple):
@@ -99,11 +100,12 @@ class TokenBucket:
         if self.unlimited:
             return Grants(requests.copy(), (requests * self.cost).sum(0), tokens)
         if self.sharing == "equal":
-            granted = requests & (self.cost * len(self.cost) <= tokens)
+            granted = requests & (self.cost * len(self.cost) <= tokens + _ROUNDING)
             spent = (granted * self.cost).sum(0)
         else:
             granted, spent = self._grant_in_order(tokens, requests, step)
-        return Grants(granted, spent, np.minimum(tokens + self.rate - spent, self.capacity))
+        left = np.maximum(tokens + self.rate - spent, 0.0)
+        return Grants(granted, spent, np.minimum(left, self.capacity))
 
     def _grant_in_order(
         self, tokens: Array, requests: NDArray[np.bool_], step: NDArray[np.int64]
@@ -116,7 +118,7 @@ class TokenBucket:
         for place in range(sensors):
             sensor = (first + place) % sensors
             cost = self.cost[sensor, 0]
-            answer = requests[sensor, lanes] & (spent + cost <= tokens)
+            answer = requests[sensor, lanes] & (spent + cost <= tokens + _ROUNDING)
             granted[sensor, lanes] = answer
             spent += answer * cost
         return granted, spent

@@ -8,6 +8,7 @@ from fusion_gym.systems.correlated_tracking import (
     CorrelatedTrackingSystem,
 )
 from fusion_gym.systems.markov_jump import MarkovJumpState, MarkovJumpSystem
+from fusion_gym.systems.remote_estimation import RemoteEstimationSystem
 from fusion_gym.systems.unknown_input import UnknownInputSystem
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "FeedbackCentre",
     "MarkovJumpState",
     "MarkovJumpSystem",
+    "RemoteEstimationSystem",
     "SequentialCentre",
     "Signal",
     "Signals",

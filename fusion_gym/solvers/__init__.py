@@ -1,0 +1,48 @@
+"""Solvers: the optimal cost of remote estimation by dynamic programming, and bounds on it."""
+
+from fusion_gym.solvers.ages import AgeSolution, solve_ages
+from fusion_gym.solvers.bounds import DualBound, lagrangian_bound
+from fusion_gym.solvers.grid import ErrorGrid
+from fusion_gym.solvers.joint import (
+    JointAverageSolution,
+    JointFiniteSolution,
+    JointProblem,
+    solve_joint_average,
+    solve_joint_finite,
+)
+from fusion_gym.solvers.policy import OptimalPolicy, Optimum, solve_task, source_problems
+from fusion_gym.solvers.single import (
+    AverageSolution,
+    DiscountedSolution,
+    FiniteSolution,
+    SourceProblem,
+    solve_average,
+    solve_discounted,
+    solve_finite,
+)
+from fusion_gym.solvers.tokens import TokenLevels
+
+__all__ = [
+    "AgeSolution",
+    "AverageSolution",
+    "DiscountedSolution",
+    "DualBound",
+    "ErrorGrid",
+    "FiniteSolution",
+    "JointAverageSolution",
+    "JointFiniteSolution",
+    "JointProblem",
+    "OptimalPolicy",
+    "Optimum",
+    "SourceProblem",
+    "TokenLevels",
+    "lagrangian_bound",
+    "solve_ages",
+    "solve_average",
+    "solve_discounted",
+    "solve_finite",
+    "solve_joint_average",
+    "solve_joint_finite",
+    "solve_task",
+    "source_problems",
+]

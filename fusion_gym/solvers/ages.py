@@ -1,0 +1,117 @@
+"""Several sources, scheduled by their ages alone: the best that ignores the errors can do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import validation
+from fusion_gym.solvers.single import SourceProblem
+from fusion_gym.validation import Array, ConfigurationError
+
+_LAZINESS = 0.3  # share of the old value that is kept: optimal schedules are periodic
+_MOST_STATES = 300_000
+
+
+@dataclass(frozen=True)
+class AgeSolution:
+    """The least average cost a step, between ``lower`` and ``upper``.
+
+    ``choice`` (A, ..., A) is the set of sources to transmit, as bits, by their ages 1 to A.
+    """
+
+    cost: float
+    lower: float
+    upper: float
+    choice: NDArray[np.int64]
+
+
+def silent_variances(problem: SourceProblem, longest: int) -> Array:
+    """Variance (longest,) of an error of age 1 to ``longest``: σ² (1 + a² + … + a^(2(age-1)))."""
+    with np.errstate(over="ignore"):
+        powers = problem.coefficient ** (2.0 * np.arange(longest))
+    return problem.deviation**2 * np.cumsum(powers)
+
+
+def solve_ages(
+    problems: tuple[SourceProblem, ...],
+    at_most: int | None = None,
+    longest: int | None = None,
+    tolerance: float = 1e-8,
+    iterations: int = 100_000,
+) -> AgeSolution:
+    """Least average cost of policies that know ages and losses only, by relative value iteration.
+
+    At most ``at_most`` sources transmit in a step (None: any number). The problems' token levels
+    are ignored. Ages beyond ``longest`` count as ``longest``; the default leaves room for four
+    times the best period.
+
+    Raises:
+        ConfigurationError: more than one channel state, more than 300,000 combinations of ages,
+            or no convergence.
+    """
+    count = len(problems)
+    limit = count if at_most is None else validation.integer("at_most", at_most, at_least=1)
+    if any(len(problem.drop) > 1 for problem in problems):
+        raise ConfigurationError(
+            "channel = 'gilbert_elliott' is not allowed for the best schedule by ages: the "
+            "channel must lose packets independently"
+        )
+    size = longest or max(_default_length(problem, count / limit) for problem in problems)
+    if size**count > _MOST_STATES:
+        raise ConfigurationError(
+            f"longest = {size} is not allowed with {count} sources: longest^sources must be at "
+            f"most {_MOST_STATES}"
+        )
+    sets = [s for s in range(2**count) if s.bit_count() <= limit]
+    costs = [_step_cost(problems, size, chosen) for chosen in sets]
+    value = np.zeros((size,) * count)
+    for _ in range(iterations):
+        options = np.stack(
+            [cost + _ahead(problems, value, s) for cost, s in zip(costs, sets, strict=True)]
+        )
+        change = options.min(0) - value
+        lower, upper = float(change.min()), float(change.max())
+        if upper - lower <= tolerance * max(abs(upper), 1e-300):
+            choice = np.array(sets)[options.argmin(0)]
+            return AgeSolution(0.5 * (lower + upper), lower, upper, choice)
+        value = value + (1.0 - _LAZINESS) * (change - change.flat[0])
+    raise ConfigurationError(
+        f"iterations = {iterations} are not enough: the average cost is only known to lie between "
+        f"{lower:.6g} and {upper:.6g}"
+    )
+
+
+def _default_length(problem: SourceProblem, sharing: float) -> int:
+    period = np.sqrt(2.0 * problem.price / problem.error_weight) / problem.deviation
+    drop = float(problem.drop[0])
+    losses = np.log(1e-6) / np.log(drop) if 0.0 < drop < 1.0 else 0.0
+    return int(np.ceil(4.0 * max(period, sharing) + losses * max(sharing, 1.0))) + 6
+
+
+def _step_cost(problems: tuple[SourceProblem, ...], size: int, chosen: int) -> Array:
+    """Expected cost of a step (A, ..., A) in which the sources ``chosen`` transmit."""
+    total = np.zeros((size,) * len(problems))
+    for i, problem in enumerate(problems):
+        cost = problem.error_weight * silent_variances(problem, size)
+        if chosen >> i & 1:
+            cost = problem.price + problem.drop[0] * cost
+        shape = [1] * len(problems)
+        shape[i] = size
+        total = total + cost.reshape(shape)
+    return total
+
+
+def _ahead(problems: tuple[SourceProblem, ...], value: Array, chosen: int) -> Array:
+    """Expected value of the ages that follow."""
+    for i, problem in enumerate(problems):
+        size = value.shape[i]
+        older = value.take(np.minimum(np.arange(size) + 1, size - 1), axis=i)
+        if chosen >> i & 1:
+            drop = problem.drop[0]
+            value = drop * older + (1.0 - drop) * value.take([0], axis=i)
+        else:
+            value = older
+    return value

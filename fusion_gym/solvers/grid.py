@@ -1,0 +1,86 @@
+"""The error of one source on a grid: its transition as a matrix."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtri
+
+from fusion_gym.validation import Array
+
+NEGLIGIBLE = 1e-10  # probability of what the default grid of one source leaves out
+_MOST_POINTS = 1500
+
+
+@dataclass(frozen=True)
+class ErrorGrid:
+    """Absolute errors 0, h, 2h, … and the matrix of E[V(a e + w)] for even functions V.
+
+    The Gaussian density is sampled at the grid's points. By Poisson's summation formula a row
+    then sums to 1, and has the mean and the variance of the Gaussian, to 2 exp(-2π² σ²/h²): no
+    error but that of V's kinks, of order h². What lies beyond the last point is added to it;
+    ``kernel`` is a stochastic matrix.
+
+    Shapes: ``points`` (M,), ``kernel`` (M, M) from the error after a delivery (row) to the next.
+    """
+
+    points: Array
+    kernel: Array
+
+    @classmethod
+    def create(cls, coefficient: float, deviation: float, reach: float, step: float) -> ErrorGrid:
+        """Errors up to ``reach`` in steps of ``step``, at least three and at most 1,500 points."""
+        count = min(max(int(np.ceil(reach / step)) + 1, 3), _MOST_POINTS)
+        points: Array = np.arange(count, dtype=np.float64) * float(step)
+        return cls(points, gaussian_rows(coefficient * points, deviation, points))
+
+
+def gaussian_rows(mean: Array, deviation: float, points: Array) -> Array:
+    """Weights (R, M) of the points of |X|, X ~ N(mean, deviation²), mean (R,); rows sum to 1."""
+    step = points[1]
+    scale = step / (deviation * np.sqrt(2.0 * np.pi))
+    rows = np.exp(-0.5 * ((points - mean[:, None]) / deviation) ** 2)
+    rows[:, 1:] += np.exp(-0.5 * ((points[1:] + mean[:, None]) / deviation) ** 2)
+    rows *= scale
+    rows[:, -1] += np.maximum(1.0 - rows.sum(1), 0.0)
+    return rows / rows.sum(1, keepdims=True)
+
+
+def silent_deviation(coefficient: float, deviation: float, steps: float) -> float:
+    """Deviation of the error after this many silent steps: σ √(1 + a² + … + a^(2(steps-1)))."""
+    square = coefficient**2
+    if abs(square - 1.0) < 1e-9:
+        return float(deviation * np.sqrt(steps))
+    with np.errstate(over="ignore"):
+        growth = np.expm1(steps * np.log(max(square, 1e-300))) / (square - 1.0)
+    return float(deviation * np.sqrt(growth))
+
+
+def default_reach(
+    coefficient: float,
+    deviation: float,
+    threshold: float,
+    transition: Array,
+    drop: Array,
+    wait: float,
+    horizon: int | None,
+    negligible: float = NEGLIGIBLE,
+) -> float:
+    """An error that is exceeded with a ``negligible`` probability.
+
+    From the threshold on, silence lasts as long as packets are lost; ``wait`` is the number of
+    steps between two packets that the tokens allow. Within a horizon, no error exceeds what
+    silence from the start would bring.
+    """
+    tails = -float(ndtri(0.5 * negligible))
+    persistence = float(np.abs(np.linalg.eigvals(transition * drop)).max())
+    losses = np.inf if persistence >= 1.0 else 0.0
+    if 0.0 < persistence < 1.0:
+        losses = np.log(negligible) / np.log(persistence)
+    steps = min((1.0 + losses) * wait + 1.0, np.inf if horizon is None else horizon, 4000.0)
+    reach = threshold + tails * silent_deviation(coefficient, deviation, steps)
+    if horizon is not None:
+        longest = tails * silent_deviation(coefficient, deviation, float(horizon))
+        reach = min(reach, longest)
+    return float(min(reach, 1e6 * deviation))

@@ -1,0 +1,205 @@
+"""Two sources that share the network: the optimum over both errors and the tokens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import validation
+from fusion_gym.network import TokenBucket
+from fusion_gym.solvers.grid import ErrorGrid, default_reach, gaussian_rows
+from fusion_gym.solvers.single import SourceProblem
+from fusion_gym.solvers.tokens import TokenLevels
+from fusion_gym.validation import Array, ConfigurationError
+
+_FINEST, _COARSEST = 20.0, 4.0  # points of the default grid a deviation of the noise
+_POINTS = 160  # that it has about, between these
+_POINTS_TOKENS = 110  # the same where tokens are limited
+_NEGLIGIBLE = 1e-5  # probability of what the default grid leaves out
+
+
+@dataclass(frozen=True)
+class JointProblem:
+    """Two sources whose channels lose packets independently, and what they share.
+
+    A source's own ``price`` is that of one of its transmissions, its own tokens are ignored.
+    ``tokens`` are the levels of the common bucket and ``at_most`` sources transmit in a step.
+    """
+
+    sources: tuple[SourceProblem, SourceProblem]
+    tokens: TokenLevels
+    at_most: int
+
+    @classmethod
+    def create(
+        cls,
+        sources: tuple[SourceProblem, ...],
+        bucket: TokenBucket | None = None,
+        at_most: int = 2,
+    ) -> JointProblem:
+        """Check the parts; without a bucket only ``at_most`` and the prices limit.
+
+        Raises:
+            ConfigurationError: not two sources, or more than one channel state.
+        """
+        if len(sources) != 2:
+            raise ConfigurationError(
+                f"sensors = {len(sources)} is not allowed for the joint optimum: it must be 2"
+            )
+        first, second = sources
+        if len(first.drop) > 1 or len(second.drop) > 1:
+            raise ConfigurationError(
+                "channel = 'gilbert_elliott' is not allowed for the joint optimum: the channel "
+                "must lose packets independently"
+            )
+        if bucket is None:
+            bucket = TokenBucket.create(1.0, 2.0, 2.0, 1.0, sensors=2, unlimited=True)
+        limit = validation.integer("at_most", at_most, at_least=1, at_most=2)
+        return cls((first, second), TokenLevels.create(bucket), limit)
+
+    @property
+    def allowed(self) -> NDArray[np.bool_]:
+        """Which of the four sets of sources may be asked for at each level, (K, 4)."""
+        small = np.array([chosen.bit_count() <= self.at_most for chosen in range(4)])
+        return self.tokens.affordable & small
+
+    def grids(
+        self, horizon: int | None = None, step: float | None = None
+    ) -> tuple[ErrorGrid, ErrorGrid]:
+        """A grid for each source's error, in steps of ``step`` deviations of the noise."""
+        tokens = self.tokens
+        wait = 2.0 / self.at_most
+        if len(tokens.level) > 1:
+            rate = float((tokens.level[tokens.following[:, 0]] - tokens.level).max())
+            wait = max(wait, float(tokens.spent[3]) / max(rate, 1e-12))
+        return self._grid(0, wait, horizon, step), self._grid(1, wait, horizon, step)
+
+    def _grid(self, which: int, wait: float, horizon: int | None, step: float | None) -> ErrorGrid:
+        source = self.sources[which]
+        deviation = source.deviation
+        threshold = max(source.scale, deviation * float(np.sqrt(wait)))
+        reach = default_reach(
+            source.coefficient,
+            deviation,
+            threshold,
+            source.transition,
+            source.drop,
+            wait,
+            horizon,
+            _NEGLIGIBLE,
+        )
+        points = _POINTS if len(self.tokens.level) == 1 else _POINTS_TOKENS
+        chosen = (
+            min(max(reach / points, deviation / _FINEST), deviation / _COARSEST)
+            if step is None
+            else step * deviation
+        )
+        return ErrorGrid.create(source.coefficient, deviation, reach, chosen)
+
+
+class JointBellman:
+    """One step backwards in time; functions have the shape (M1, M2, K)."""
+
+    def __init__(self, problem: JointProblem, grids: tuple[ErrorGrid, ErrorGrid]) -> None:
+        self.problem, self.grids = problem, grids
+        one, two = (
+            source.error_weight * grid.points**2
+            for source, grid in zip(problem.sources, grids, strict=True)
+        )
+        self.error_cost = (one[:, None] + two)[..., None]
+        self.shape = (len(one), len(two), len(problem.tokens.level))
+
+    def decide(self, value: Array) -> tuple[Array, NDArray[np.int8]]:
+        """The least cost (M1, M2, K) and the set of sources that brings it, as bits."""
+        first, second = self.grids
+        ahead = (first.kernel @ value.reshape(self.shape[0], -1)).reshape(self.shape)
+        remains = self.error_cost + np.matmul(second.kernel, ahead)
+        best = remains[..., self.problem.tokens.following[:, 0]]
+        choice = np.zeros(self.shape, dtype=np.int8)
+        for chosen in (1, 2, 3):
+            allowed = self.problem.allowed[:, chosen]
+            if not allowed.any():
+                continue
+            cost = remains[..., self.problem.tokens.following[:, chosen]]
+            for i, source in enumerate(self.problem.sources):
+                if chosen >> i & 1:
+                    drop = source.drop[0]
+                    cost = source.price + drop * cost + (1.0 - drop) * cost.take([0], axis=i)
+            better = (cost < best) & allowed
+            best = np.where(better, cost, best)
+            choice[better] = chosen
+        return best, choice
+
+
+@dataclass(frozen=True)
+class JointAverageSolution:
+    """The stationary optimum: ``cost`` a step, between ``lower`` and ``upper``.
+
+    ``choice`` (M1, M2, K) is the best set of sources, as bits, on the ``grids``.
+    """
+
+    cost: float
+    lower: float
+    upper: float
+    choice: NDArray[np.int8]
+    grids: tuple[ErrorGrid, ErrorGrid]
+
+
+def solve_joint_average(
+    problem: JointProblem,
+    grids: tuple[ErrorGrid, ErrorGrid] | None = None,
+    tolerance: float = 1e-6,
+    iterations: int = 20_000,
+) -> JointAverageSolution:
+    """Least average cost by relative value iteration, until its bounds are that close relatively.
+
+    Raises:
+        ConfigurationError: no convergence.
+    """
+    bellman = JointBellman(problem, grids or problem.grids())
+    value = np.zeros(bellman.shape)
+    for _ in range(iterations):
+        new, choice = bellman.decide(value)
+        change = new - value
+        lower, upper = float(change.min()), float(change.max())
+        value = new - new[0, 0, 0]
+        if upper - lower <= tolerance * max(abs(upper), 1e-300):
+            return JointAverageSolution(0.5 * (lower + upper), lower, upper, choice, bellman.grids)
+    raise ConfigurationError(
+        f"iterations = {iterations} are not enough: the average cost is only known to lie between "
+        f"{lower:.6g} and {upper:.6g}"
+    )
+
+
+@dataclass(frozen=True)
+class JointFiniteSolution:
+    """The optimum of an episode: ``cost`` is the expected sum over its steps.
+
+    ``choice`` (T, M1, M2, K) is the best set of sources, as bits, on the ``grids``.
+    """
+
+    cost: float
+    choice: NDArray[np.int8]
+    grids: tuple[ErrorGrid, ErrorGrid]
+
+
+def solve_joint_finite(
+    problem: JointProblem,
+    horizon: int,
+    initial_deviation: tuple[float, float] = (0.0, 0.0),
+    grids: tuple[ErrorGrid, ErrorGrid] | None = None,
+) -> JointFiniteSolution:
+    """Least expected cost of ``horizon`` steps by dynamic programming."""
+    steps = validation.integer("horizon", horizon, at_least=1)
+    bellman = JointBellman(problem, grids or problem.grids(steps))
+    value = np.zeros(bellman.shape)
+    choices = np.empty((steps, *bellman.shape), dtype=np.int8)
+    for step in reversed(range(steps)):
+        value, choices[step] = bellman.decide(value)
+    value = value[..., problem.tokens.initial]
+    for source, grid, spread in zip(problem.sources, bellman.grids, initial_deviation, strict=True):
+        deviation = float(np.hypot(source.coefficient * spread, source.deviation))
+        value = gaussian_rows(np.zeros(1), deviation, grid.points)[0] @ value
+    return JointFiniteSolution(float(value), choices, bellman.grids)

@@ -1,0 +1,338 @@
+"""One source: the optimal cost and its thresholds by value iteration.
+
+Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop channel with
+Markovian state", IEEE Trans. Automatic Control 65, 2020 (the dynamic programme and the order of
+events); token levels are added to the state here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_gym import validation
+from fusion_gym.network.token_bucket import TokenBucket
+from fusion_gym.solvers.grid import ErrorGrid, default_reach, gaussian_rows
+from fusion_gym.solvers.tokens import TokenLevels
+from fusion_gym.validation import Array, ConfigurationError
+
+_FINEST, _COARSEST = 40.0, 5.0  # points of the default grid a deviation of the noise
+_POINTS = 600  # that it has about, between these; half of them where tokens are limited
+
+
+@dataclass(frozen=True)
+class SourceProblem:
+    """When should one source transmit, so that w e² + price · transmissions is least?
+
+    One step, from the error e and the channel state s of the step before, both known: request or
+    not; the channel moves to s'; a packet is lost with probability ``drop[s']``; the error becomes
+    0 on a delivery and stays e otherwise; its square is paid; then e moves to a e + w.
+
+    ``coefficient`` a, ``deviation`` σ, ``price`` of a transmission, ``error_weight`` w; the
+    channel's ``transition`` (S, S) and ``drop`` (S,); ``tokens``, the levels of the bucket.
+    """
+
+    coefficient: float
+    deviation: float
+    price: float
+    error_weight: float
+    transition: Array
+    drop: Array
+    tokens: TokenLevels
+
+    @classmethod
+    def create(
+        cls,
+        coefficient: float = 1.0,
+        deviation: float = 1.0,
+        price: float = 1.0,
+        error_weight: float = 1.0,
+        drop: ArrayLike = 0.0,
+        transition: ArrayLike = ((1.0,),),
+        bucket: TokenBucket | None = None,
+    ) -> SourceProblem:
+        """Check the numbers; without a bucket transmissions are limited by their price alone.
+
+        Raises:
+            ConfigurationError: a value that is not allowed.
+        """
+        matrix = validation.array("transition", transition, (None, None))
+        if matrix.shape[0] != matrix.shape[1] or not np.allclose(matrix.sum(1), 1.0):
+            raise ConfigurationError(
+                f"transition = {matrix.tolist()} is not allowed: it must be a square matrix whose "
+                "rows sum to 1"
+            )
+        loss = validation.not_negative("drop", drop, matrix.shape[:1])
+        if np.any(loss > 1.0):
+            raise ConfigurationError(
+                f"drop = {loss.tolist()} is not allowed: it must be at most 1 everywhere"
+            )
+        if bucket is None:
+            bucket = TokenBucket.create(1.0, 1.0, 1.0, 1.0, sensors=1, unlimited=True)
+        return cls(
+            coefficient=validation.number("coefficient", coefficient),
+            deviation=validation.number("deviation", deviation, above=0.0),
+            price=validation.number("price", price, at_least=0.0),
+            error_weight=validation.number("error_weight", error_weight, above=0.0),
+            transition=matrix,
+            drop=loss,
+            tokens=TokenLevels.create(bucket),
+        )
+
+    @property
+    def scale(self) -> float:
+        """The threshold that is optimal in continuous time for a = 1: (6 price/w)^¼ σ^½."""
+        return float((6.0 * self.price / self.error_weight) ** 0.25 * self.deviation**0.5)
+
+    @property
+    def wait(self) -> float:
+        """Steps between two transmissions that the tokens can sustain, at least 1."""
+        tokens = self.tokens
+        if len(tokens.level) == 1:
+            return 1.0
+        rate = float((tokens.level[tokens.following[:, 0]] - tokens.level).max())
+        return max(1.0, float(tokens.spent[1]) / max(rate, 1e-12))
+
+    def grid(
+        self, horizon: int | None = None, reach: float | None = None, step: float | None = None
+    ) -> ErrorGrid:
+        """A grid of errors up to ``reach`` in steps of ``step``.
+
+        The default goes beyond what is reached with a probability of 1e-10, in about 600 points
+        (300 with limited tokens), but at most 40 and at least 5 a deviation of the noise.
+        """
+        if reach is None:
+            threshold = max(self.scale, self.deviation * float(np.sqrt(self.wait)))
+            reach = default_reach(
+                self.coefficient,
+                self.deviation,
+                threshold,
+                self.transition,
+                self.drop,
+                self.wait,
+                horizon,
+            )
+        if step is None:
+            finest, coarsest = self.deviation / _FINEST, self.deviation / _COARSEST
+            points = _POINTS if len(self.tokens.level) == 1 else _POINTS / 2
+            step = min(max(reach / points, finest), coarsest)
+        return ErrorGrid.create(self.coefficient, self.deviation, reach, step)
+
+
+class Bellman:
+    """One step backwards in time; functions have the shape (M, S, K).
+
+    The axes are the absolute error before the decision, the channel state that was fed back, and
+    the token level.
+    """
+
+    def __init__(self, problem: SourceProblem, grid: ErrorGrid, discount: float = 1.0) -> None:
+        self.problem, self.grid, self.discount = problem, grid, discount
+        self.error_cost = problem.error_weight * grid.points[:, None, None] ** 2
+        self.shape = (len(grid.points), len(problem.drop), len(problem.tokens.level))
+
+    def choices(self, value: Array, error_cost: Array | float, price: float) -> tuple[Array, Array]:
+        """Costs (M, S, K) of silence and of a request, with ``value`` from the next step on.
+
+        ``error_cost`` is paid for the error that remains and zero where it is zero, ``price`` for
+        the request; one that the network would not grant costs infinity.
+        """
+        problem = self.problem
+        silence, sending = problem.tokens.following.T
+        remains = self.grid.kernel @ value.reshape(self.shape[0], -1)
+        remains = error_cost + self.discount * remains.reshape(self.shape)
+        silent = _mix(problem.transition, remains[..., silence])
+        later = remains[..., sending]
+        request = _mix(problem.transition * problem.drop, later)
+        request = request + _mix(problem.transition * (1.0 - problem.drop), later[:1])
+        return silent, np.where(problem.tokens.affordable[:, 1], price + request, np.inf)
+
+    def decide(self, value: Array) -> tuple[Array, Array]:
+        """The least cost (M, S, K), and by how much a request is better than silence."""
+        silent, request = self.choices(value, self.error_cost, self.problem.price)
+        return np.minimum(silent, request), silent - request
+
+    def count(self, value: Array, threshold: Array) -> Array:
+        """Expected transmissions (M, S, K) under thresholds (S, K), ``value`` from the next step.
+
+        A point near the threshold counts as the share of its cell that lies above.
+        """
+        silent, request = self.choices(value, 0.0, 1.0)
+        points = self.grid.points[:, None, None]
+        share = np.clip((points - threshold) / self.grid.points[1] + 0.5, 0.0, 1.0)
+        gain = np.where(share > 0.0, request, silent) - silent
+        return silent + share * gain
+
+
+def _mix(weights: Array, value: Array) -> Array:
+    """Σ over s' of weights[s, s'] value[:, s', :]."""
+    rows = [sum(w * value[:, s] for s, w in enumerate(row)) for row in weights]
+    return np.stack(rows, axis=1)
+
+
+def thresholds(advantage: Array, points: Array) -> tuple[Array, bool]:
+    """Where the advantage (M, ...) of a request becomes positive, and whether it then stays so.
+
+    Interpolated between two points; infinite where it never does.
+    """
+    asks = advantage >= 0.0
+    first = np.argmax(asks, axis=0)
+    here = np.take_along_axis(advantage, first[None], 0)[0]
+    before = np.take_along_axis(advantage, np.maximum(first - 1, 0)[None], 0)[0]
+    with np.errstate(invalid="ignore"):
+        part = np.where(first > 0, here / np.where(here > before, here - before, 1.0), 0.0)
+    result = points[first] - part * points[1]
+    ordered = bool(np.all(np.diff(asks.astype(np.int8), axis=0) >= 0))
+    return np.where(asks.any(0), result, np.inf), ordered
+
+
+@dataclass(frozen=True)
+class AverageSolution:
+    """The stationary optimum: ``cost`` a step, between ``lower`` and ``upper``.
+
+    ``error`` is the mean squared error and ``rate`` the transmissions a step; ``threshold`` (S, K)
+    by channel state and token level; ``ordered`` says whether a request is best at every larger
+    error too.
+    """
+
+    cost: float
+    lower: float
+    upper: float
+    error: float
+    rate: float
+    threshold: Array
+    ordered: bool
+
+
+def solve_average(
+    problem: SourceProblem,
+    grid: ErrorGrid | None = None,
+    tolerance: float = 1e-7,
+    iterations: int = 200_000,
+) -> AverageSolution:
+    """Least average cost by relative value iteration, until its bounds are that close relatively.
+
+    Raises:
+        ConfigurationError: no convergence, for example of an unstable source whose packets are
+            lost too often.
+    """
+    bellman = Bellman(problem, grid or problem.grid())
+    value = np.zeros(bellman.shape)
+    lower = upper = 0.0
+    for _ in range(iterations):
+        new, advantage = bellman.decide(value)
+        change = new - value
+        lower, upper = float(change.min()), float(change.max())
+        value = new - new[0, 0, 0]
+        if upper - lower <= tolerance * max(abs(upper), 1e-300):
+            break
+    else:
+        raise ConfigurationError(
+            f"iterations = {iterations} are not enough: the average cost is only known to lie "
+            f"between {lower:.6g} and {upper:.6g}"
+        )
+    threshold, ordered = thresholds(advantage, bellman.grid.points)
+    cost = 0.5 * (lower + upper)
+    rate = _rate(bellman, threshold, tolerance, iterations)
+    error = (cost - problem.price * rate) / problem.error_weight
+    return AverageSolution(cost, lower, upper, error, rate, threshold, ordered)
+
+
+def _rate(bellman: Bellman, threshold: Array, tolerance: float, iterations: int) -> float:
+    """Transmissions a step under stationary thresholds."""
+    value, change = np.zeros(bellman.shape), np.zeros(bellman.shape)
+    for _ in range(iterations):
+        new = bellman.count(value, threshold)
+        change = new - value
+        value = new - new[0, 0, 0]
+        if np.ptp(change) <= tolerance:
+            break
+    return float(0.5 * (change.min() + change.max()))
+
+
+@dataclass(frozen=True)
+class DiscountedSolution:
+    """The discounted optimum, from a zero error on, with the initial tokens.
+
+    ``cost`` (S,) by the channel's state at time 0 is (1 - β) E Σ βᵗ cost(t), the cost of the first
+    step undiscounted; ``threshold`` (S, K) and ``ordered`` as in :class:`AverageSolution`.
+    """
+
+    cost: Array
+    threshold: Array
+    ordered: bool
+
+
+def solve_discounted(
+    problem: SourceProblem, discount: float, grid: ErrorGrid | None = None, tolerance: float = 1e-10
+) -> DiscountedSolution:
+    """Least discounted cost by value iteration.
+
+    Raises:
+        ConfigurationError: a discount outside (0, 1).
+    """
+    beta = validation.number("discount", discount, above=0.0, at_most=1.0 - 1e-6)
+    bellman = Bellman(problem, grid or problem.grid(), beta)
+    value = np.zeros(bellman.shape)
+    while True:
+        new, advantage = bellman.decide(value)
+        change = new - value
+        # The bounds of MacQueen: the limit lies between new + β/(1-β) min and max of the change.
+        value = new + beta / (1.0 - beta) * 0.5 * (change.min() + change.max())
+        if np.ptp(change) <= tolerance * max(float(np.abs(new[0]).max()), 1e-300):
+            break
+    first = bellman.grid.kernel[0] @ value[..., problem.tokens.initial]
+    return DiscountedSolution((1.0 - beta) * first, *thresholds(advantage, bellman.grid.points))
+
+
+@dataclass(frozen=True)
+class FiniteSolution:
+    """The exact optimum of an episode: ``cost`` is the expected sum over its ``horizon`` steps.
+
+    ``error`` and ``rate`` are expected means over the steps; ``threshold`` (T, S, K) by step,
+    channel state and token level; ``ordered`` as in :class:`AverageSolution`.
+    """
+
+    cost: float
+    error: float
+    rate: float
+    threshold: Array
+    ordered: bool
+
+
+def solve_finite(
+    problem: SourceProblem,
+    horizon: int,
+    initial_deviation: float = 0.0,
+    initial_channel: ArrayLike | None = None,
+    grid: ErrorGrid | None = None,
+) -> FiniteSolution:
+    """Least expected cost of ``horizon`` steps by dynamic programming.
+
+    x(0) has ``initial_deviation``; ``initial_channel`` (S,) is the distribution of the channel's
+    state at time 0, by default all on the first.
+
+    Raises:
+        ConfigurationError: a value that is not allowed.
+    """
+    steps = validation.integer("horizon", horizon, at_least=1)
+    spread = validation.number("initial_deviation", initial_deviation, at_least=0.0)
+    bellman = Bellman(problem, grid or problem.grid(steps))
+    value, sent = np.zeros(bellman.shape), np.zeros(bellman.shape)
+    states = bellman.shape[1]
+    found = np.empty((steps, *bellman.shape[1:]))
+    ordered = True
+    for step in reversed(range(steps)):
+        value, advantage = bellman.decide(value)
+        found[step], here = thresholds(advantage, bellman.grid.points)
+        sent = bellman.count(sent, found[step])
+        ordered = ordered and here
+    deviation = float(np.hypot(problem.coefficient * spread, problem.deviation))
+    first = gaussian_rows(np.zeros(1), deviation, bellman.grid.points)[0]
+    start = np.eye(states)[0] if initial_channel is None else np.asarray(initial_channel)
+    cost = float(first @ value[..., problem.tokens.initial] @ start)
+    rate = float(first @ sent[..., problem.tokens.initial] @ start) / steps
+    error = (cost / steps - problem.price * rate) / problem.error_weight
+    return FiniteSolution(cost, error, rate, found, ordered)

@@ -1,0 +1,78 @@
+"""The levels that a token bucket can reach, as states of a dynamic programme."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym.network import TokenBucket
+from fusion_gym.validation import Array, ConfigurationError
+
+_MOST_LEVELS = 500
+_DIGITS = 9
+
+
+@dataclass(frozen=True)
+class TokenLevels:
+    """Every level that can occur, and what each set of requests does to it.
+
+    A choice is a set of sensors, the bits of its number; choice 0 is silence. ``level`` (K,) in
+    ascending order, ``initial`` the index of the first; ``affordable`` (K, choices) bool, whether
+    the network grants every request of the choice; ``following`` (K, choices), the index of the
+    next level then; ``spent`` (choices,) tokens.
+    """
+
+    level: Array
+    initial: int
+    affordable: NDArray[np.bool_]
+    following: NDArray[np.int64]
+    spent: Array
+
+    @classmethod
+    def create(cls, bucket: TokenBucket) -> TokenLevels:
+        """Enumerate the levels; an unlimited bucket has one.
+
+        Raises:
+            ConfigurationError: more than 500 levels: rate, cost and capacity have no large common
+                divisor.
+        """
+        sensors = len(bucket.cost)
+        choices = np.arange(2**sensors)
+        sets = (choices >> np.arange(sensors)[:, None] & 1).astype(np.bool_)
+        spent = (sets * bucket.cost).sum(0)
+        start = float(bucket.start(1)[0])
+        if bucket.unlimited:
+            everything = np.ones((1, len(choices)), dtype=np.bool_)
+            return cls(np.array([start]), 0, everything, np.zeros((1, len(choices)), int), spent)
+        found, new = {round(start, _DIGITS)}, [round(start, _DIGITS)]
+        while new:
+            following = {
+                round(float(level), _DIGITS)
+                for source in new
+                for level in bucket.grant(np.full(len(choices), source), sets, choices * 0).tokens
+            }
+            new = sorted(following - found)
+            found |= following
+            if len(found) > _MOST_LEVELS:
+                raise ConfigurationError(
+                    f"token_rate = {bucket.rate}, token_capacity = {bucket.capacity} are not "
+                    f"allowed for the exact optimum: the bucket must have at most {_MOST_LEVELS} "
+                    "levels, so rate, cost and capacity need a common divisor"
+                )
+        level = np.array(sorted(found))
+        tokens = np.repeat(level, len(choices))
+        grants = bucket.grant(tokens, np.tile(sets, len(level)), np.zeros(len(tokens), int))
+        shape = (len(level), len(choices))
+        affordable = (grants.granted == np.tile(sets, len(level))).all(0).reshape(shape)
+        after = np.searchsorted(level, np.round(grants.tokens, _DIGITS) - 10.0**-_DIGITS)
+        initial = int(np.searchsorted(level, round(start, _DIGITS) - 10.0**-_DIGITS))
+        return cls(level, initial, affordable, after.reshape(shape), spent)
+
+    def index(self, tokens: Array) -> NDArray[np.int64]:
+        """The index of each level in ``tokens`` (N,)."""
+        if len(self.level) == 1:
+            return np.zeros(len(tokens), dtype=np.int64)
+        middle = 0.5 * (self.level[1:] + self.level[:-1])
+        return np.searchsorted(middle, tokens)

@@ -1,0 +1,371 @@
+"""The remote-estimation environment from the outside, and its policy against the solved optimum."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
+
+from fusion_gym.envs import EpisodeBatch
+from fusion_gym.envs.correlated_tracking import build as build_tracking
+from fusion_gym.envs.remote_estimation import (
+    RemoteEstimationEnv,
+    RemoteEstimationVectorEnv,
+    build,
+)
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.network.channel import Channel
+from fusion_gym.solvers import (
+    JointProblem,
+    OptimalPolicy,
+    SourceProblem,
+    solve_average,
+    solve_joint_average,
+    solve_task,
+    source_problems,
+)
+from fusion_gym.triggers import make_trigger
+from fusion_gym.validation import ConfigurationError
+
+Array = NDArray[np.float64]
+LOSSY: dict[str, Any] = {
+    "channel": "gilbert_elliott",
+    "channel_transition": ((0.6, 0.4), (0.2, 0.8)),
+    "drop_probability": (0.9, 0.1),
+}
+
+
+# --- the channel ---------------------------------------------------------------------------------
+
+
+def test_channel_follows_its_matrix_and_loses_by_its_state() -> None:
+    channel = Channel.gilbert_elliott(((0.7, 0.3), (0.1, 0.9)), (0.6, 0.2), sensors=2)
+    draw, runs = np.random.default_rng(0), 50_000
+    state = channel.start(draw.standard_normal((2, runs)))
+    assert state.mean() == pytest.approx(0.75, abs=0.01)  # 0.3/(0.3 + 0.1) of good
+    following = channel.advance(state, draw.standard_normal((2, runs)))
+    lost = channel.lost(following, draw.standard_normal((2, runs)))
+    for sensor in range(2):
+        before, after, gone = state[sensor], following[sensor], lost[sensor]
+        assert after[before == 0].mean() == pytest.approx(0.3, abs=0.02)
+        assert after[before == 1].mean() == pytest.approx(0.9, abs=0.01)
+        assert gone[after == 0].mean() == pytest.approx(0.6, abs=0.02)
+        assert gone[after == 1].mean() == pytest.approx(0.2, abs=0.01)
+    assert abs(np.corrcoef(state)[0, 1]) < 0.02
+
+
+def test_simple_channels_and_certain_starts() -> None:
+    normals = np.random.default_rng(1).standard_normal((2, 20_000))
+    nothing = np.zeros((2, 20_000), dtype=np.int64)
+    assert not Channel.perfect(2).lost(nothing, normals).any()
+    assert not Channel.perfect(2).loses
+    lost = Channel.independent((0.1, 1.0), 2).lost(nothing, normals)
+    assert lost[0].mean() == pytest.approx(0.1, abs=0.01)
+    assert lost[1].all()
+    for number, name in enumerate(("bad", "good")):
+        channel = Channel.gilbert_elliott(((0.5, 0.5), (0.5, 0.5)), 0.1, 2, name)
+        assert (channel.start(normals) == number).all()
+
+
+# --- the environment -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [{}, {"sensors": 2, **LOSSY}, {"action": "discrete"}])
+def test_gymnasiums_checker(options: dict[str, Any]) -> None:
+    check_env(RemoteEstimationEnv(**options), skip_render_check=True)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"coefficient": 0.9, "noise_deviation": 2.0},
+        {"sensors": 2, "coefficient": (1.0, -0.5), "initial_deviation": (0.0, 3.0), **LOSSY},
+        {"channel": "independent", "drop_probability": 0.4, "tokens": "limited"},
+    ],
+)
+def test_library_and_plain_loop_walk_the_same_trajectories(options: dict[str, Any]) -> None:
+    task = build(horizon=60, cost_weight=3.0, **options)
+    sensors, system = task.sensors, task.system
+    batch, runs = EpisodeBatch(task, 4), 4
+    batch.seed(np.arange(runs), [7, 8, 9, 10])
+    batch.reset()
+    ask = np.random.default_rng(3).random((60, sensors, runs)) < 0.3
+    a = np.broadcast_to(task.settings["coefficient"], sensors)
+    estimate, age = np.zeros((sensors, runs)), np.zeros((sensors, runs))
+    variance = np.broadcast_to(task.settings["initial_deviation"], sensors)[:, None] ** 2.0
+    variance = np.repeat(variance, runs, axis=1)
+    sigma = np.broadcast_to(task.settings["noise_deviation"], sensors)
+    for step in range(60):
+        signals, state = batch.signals(), batch.state
+        truth, tokens = system.truth(state), batch.tokens.copy()
+        outcome = batch.step(ask[step])
+        for run in range(runs):
+            paid = 0.0
+            for sensor in range(sensors):
+                predicted = a[sensor] * estimate[sensor, run]
+                error = truth[sensor, run] - predicted
+                variance[sensor, run] = a[sensor] ** 2 * variance[sensor, run] + sigma[sensor] ** 2
+                age[sensor, run] += 1
+                assert signals["innovation"][sensor, 0, run] == pytest.approx(error)
+                assert signals["age"][sensor, run] == age[sensor, run]
+                assert signals["innovation_deviation"][sensor, 0, run] == pytest.approx(
+                    math.sqrt(variance[sensor, run])
+                )
+                granted = ask[step, sensor, run] and (
+                    task.bucket.unlimited or tokens[run] >= 1.0 - 1e-12
+                )
+                assert outcome.granted[sensor, run] == granted
+                estimate[sensor, run] = predicted
+                paid += 3.0 * granted
+                if granted and not state.lost[sensor, run]:
+                    estimate[sensor, run] = truth[sensor, run]
+                    age[sensor, run], variance[sensor, run], error = 0, 0.0, 0.0
+                paid += error**2
+            assert outcome.reward[run] == pytest.approx(-paid)
+        mean, covariance = system.fused(batch.delivered)
+        np.testing.assert_allclose(mean, estimate, atol=1e-12)
+        np.testing.assert_allclose(np.diagonal(covariance).T, variance, atol=1e-9, rtol=1e-9)
+
+
+def test_sources_have_the_stated_law_whatever_is_sent() -> None:
+    task = build(coefficient=0.9, noise_deviation=2.0, initial_deviation=5.0, horizon=40)
+    truths = []
+    for policy in ("never", "always"):
+        batch, chosen = EpisodeBatch(task, 4000), make_trigger(policy)
+        batch.seed(np.arange(4000), list(range(4000)))
+        batch.reset()
+        path = [task.system.truth(batch.state)[0]]
+        for _ in range(30):
+            batch.step(chosen(batch.signals()))
+            path.append(task.system.truth(batch.state)[0])
+        truths.append(np.array(path))
+    np.testing.assert_array_equal(*truths)
+    path = truths[0]
+    assert path[0].std() == pytest.approx(math.hypot(4.5, 2.0), rel=0.05)
+    noise = path[1:] - 0.9 * path[:-1]
+    assert noise.std() == pytest.approx(2.0, rel=0.01)
+    assert abs((noise[1:] * noise[:-1]).mean()) < 0.1
+
+
+def test_knowledge_of_the_channel_is_one_step_late() -> None:
+    task = build(**LOSSY, initial_channel="bad", horizon=200)
+    batch = EpisodeBatch(task, 400)
+    batch.seed(np.arange(400), list(range(400)))
+    batch.reset()
+    names = list(batch.layout.names)
+    assert names == ["error[0]", "age[0]", "channel[0,bad]", "channel[0,good]", "tokens"]
+    assert (batch.signals()["channel_state"] == 0).all()
+    always, known, arrived = make_trigger("always"), [], []
+    for _ in range(100):
+        signals = batch.signals()
+        known.append(signals["channel_state"][0])
+        np.testing.assert_array_equal(batch.observe()[:, 3], signals["channel_state"][0])
+        outcome = batch.step(always(signals))
+        arrived.append(outcome.squared_error[0] == 0.0)
+    state, success = np.array(known), np.array(arrived)
+    # Arrivals follow the state that is fed back afterwards, with the losses of that state.
+    after = state[1:]
+    assert success[:-1][after == 0].mean() == pytest.approx(0.1, abs=0.02)
+    assert success[:-1][after == 1].mean() == pytest.approx(0.9, abs=0.02)
+    expected = 0.4 * 0.9 + 0.6 * 0.1  # from bad to good or bad
+    assert success[state == 0].mean() == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.parametrize("options", [{}, {"sensors": 3, **LOSSY, "tokens": "limited"}])
+def test_triggers_and_observations(options: dict[str, Any]) -> None:
+    for information in ("sensors", "centre"):
+        task = build(information=information, **options)
+        batch = EpisodeBatch(task, 8)
+        batch.reset()
+        shown = ["variance_threshold:threshold=2", "information_gain", "periodic", "random"]
+        if information == "sensors":
+            shown += ["innovation_threshold", "send_on_delta", "dynamic_event:threshold=0.5"]
+            shown += ["adaptive_innovation:threshold=1", "innovation_threshold:whitened=true"]
+        assert ("error[0]" in batch.layout.names) == (information == "sensors")
+        for name in shown:
+            spec = name + (",decay=0.1,divisor=5,initial=1" if "dynamic" in name else "")
+            policy, asked = make_trigger(spec), 0
+            policy.reset(8)
+            for _ in range(40):
+                found = policy(batch.signals())
+                asked += int(found.sum())
+                batch.step(found)
+                seen = batch.observe()
+                assert ((seen >= batch.layout.low) & (seen <= batch.layout.high)).all()
+            assert asked > 0, name
+        offered = batch.signals()
+        names = list(offered)
+        for signal in task.system.signals:
+            assert (signal.name in names) == (
+                information == "sensors" or signal.knowledge == "centre"
+            )
+            if signal.name in names:
+                axes = signal.axes.strip("()").split(",")
+                assert offered[signal.name].ndim == len([axis for axis in axes if axis])
+
+
+def test_observed_errors_do_not_saturate_where_the_decision_is_made() -> None:
+    for price, weight in ((0.5, 1.0), (5.0, 0.1), (500.0, 2.0)):
+        task = build(cost_weight=price, error_weight=weight)
+        threshold = float(solve_average(source_problems(task)[0]).threshold[0, 0])
+        assert 0.5 < threshold / task.system.error_scale[0] < 2.0
+
+
+def test_a_run_does_not_depend_on_its_neighbours() -> None:
+    options = {"sensors": 2, "tokens": "limited", **LOSSY}
+    many, one = RemoteEstimationVectorEnv(5, **options), RemoteEstimationEnv(**options)
+    seen, _ = many.reset(seed=20)
+    alone, _ = one.reset(seed=23)
+    draw = np.random.default_rng(1)
+    np.testing.assert_array_equal(seen[3], alone)
+    for _ in range(50):
+        action = draw.integers(0, 2, (5, 2), dtype=np.int8)
+        seen, reward, *_ = many.step(action)
+        alone, single, *_ = one.step(action[3])
+        np.testing.assert_allclose(seen[3], alone, rtol=1e-6)
+        assert reward[3] == pytest.approx(single, rel=1e-10)
+
+
+# --- the optimal policy --------------------------------------------------------------------------
+
+
+def simulate(task: Any, policy: Any, episodes: int = 1500) -> EpisodeResults:
+    return run_episodes(task, policy, episodes, 100)
+
+
+CASES: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "losses": {"channel": "independent", "drop_probability": 0.3, "initial_deviation": 2.0},
+    "states": {"channel": "gilbert_elliott", "cost_weight": 30.0, "initial_channel": "bad"},
+    "tokens": {"tokens": "limited", "cost_weight": 0.5},
+    "tokens and states": {"tokens": "limited", "cost_weight": 0.0, "token_cost": 2.0, **LOSSY},
+    "unstable": {"coefficient": 1.1, "cost_weight": 20.0},
+    "two": {"sensors": 2, "coefficient": (1.0, 0.8), "state_weights": (1.0, 0.5)},
+    "two at once": {"sensors": 2, "access": "single", "cost_weight": 0.0, "horizon": 100},
+    "two and tokens": {
+        "sensors": 2,
+        "noise_deviation": (1.0, 2.0),
+        "tokens": "limited",
+        "token_rate": 0.5,
+        "token_capacity": 3.0,
+        "cost_weight": 0.2,
+        "horizon": 50,
+    },
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_simulated_cost_of_the_optimal_policy_is_the_computed_one(case: str) -> None:
+    task = build(**CASES[case])
+    policy = OptimalPolicy(task)
+    found = simulate(task, policy)
+    room = 4.0 * found.returns.std() / math.sqrt(found.episodes)
+    assert abs(found.returns.mean() + policy.optimum.cost) < room
+    assert room < 0.06 * policy.optimum.cost
+    assert found.denied.sum() == 0.0
+    if math.isfinite(policy.optimum.rate):
+        assert found.rate.mean(0).sum() == pytest.approx(policy.optimum.rate, rel=0.03)
+
+
+def test_nothing_beats_the_optimal_policy_and_rules_on_age_cost_far_more() -> None:
+    task = build()
+    best = simulate(task, OptimalPolicy(task)).returns
+
+    def ratio(spec: str) -> float:
+        return float(simulate(task, make_trigger(spec)).returns.mean() / best.mean())
+
+    thresholds = {k: ratio(f"innovation_threshold:threshold={k}") for k in (1.4, 1.72, 2.1)}
+    assert min(thresholds.values()) == thresholds[1.72] > 0.999
+    assert thresholds[1.72] < 1.01
+    # The optimum is flat: a threshold that is 20 % off costs a few per cent.
+    assert 1.01 < thresholds[1.4] < 1.07
+    assert 1.01 < thresholds[2.1] < 1.07
+    periodic = min(ratio(f"periodic:period={period}") for period in (2, 3, 4))
+    assert periodic == pytest.approx(math.sqrt(3.0), rel=0.03)
+    assert ratio("always") > 3.0
+
+
+def test_stationary_policy_loses_nothing_in_long_episodes() -> None:
+    task = build(**CASES["states"])
+    finite, average = OptimalPolicy(task), OptimalPolicy(task, "average")
+    one, two = (simulate(task, policy, 3000).returns for policy in (finite, average))
+    gain = one - two
+    assert -3.0 * gain.std() / math.sqrt(3000) < gain.mean() < 0.01 * abs(one.mean())
+    assert average.optimum.cost * task.horizon == pytest.approx(finite.optimum.cost, rel=0.05)
+
+
+def test_optimum_of_several_sources_that_share_nothing_is_the_sum() -> None:
+    both = solve_task(build(**CASES["two"]))
+    parts = [
+        solve_task(build(coefficient=1.0)).cost,
+        solve_task(build(coefficient=0.8, state_weights=(0.5,))).cost,
+    ]
+    assert both.cost == pytest.approx(sum(parts))
+    task = build(sensors=2, access="single", cost_weight=0.0)
+    alone = SourceProblem.create(price=0.0)
+    joint = solve_joint_average(JointProblem.create((alone, alone), at_most=1))
+    assert solve_task(task, "average").cost == pytest.approx(joint.cost)
+
+
+# --- what is refused -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ({"sensors": 0}, "sensors"),
+        ({"coefficient": (1.0, 1.0)}, "coefficient"),
+        ({"coefficient": 100.0}, "coefficient"),
+        ({"noise_deviation": 0.0}, "noise_deviation"),
+        ({"initial_deviation": -1.0}, "initial_deviation"),
+        ({"channel": "fading"}, "channel"),
+        ({"drop_probability": 0.1}, "drop_probability"),
+        ({"channel": "independent", "drop_probability": 1.1}, "drop_probability"),
+        ({"channel": "independent", "channel_transition": np.eye(2)}, "channel_transition"),
+        ({"channel": "gilbert_elliott", "drop_probability": (0.1, 0.2, 0.3)}, "drop_probability"),
+        (
+            {"channel": "gilbert_elliott", "channel_transition": ((0.5, 0.4), (0, 1))},
+            "channel_transition",
+        ),
+        ({"channel": "gilbert_elliott", "channel_transition": np.eye(2)}, "initial_channel"),
+        ({"initial_channel": "unknown"}, "initial_channel"),
+        ({"error_scale": 0.0}, "error_scale"),
+        ({"drop": 0.1}, "drop"),
+        ({"horizon": 0}, "horizon"),
+    ],
+)
+def test_bad_options_are_refused(options: dict[str, Any], field: str) -> None:
+    with pytest.raises(ConfigurationError, match=field):
+        build(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ({"error": "trace"}, "error"),
+        ({"cost_weight": "random", "price_range": (1.0, 9.0)}, "cost_weight"),
+        ({"sensors": 3, "access": "single"}, "sensors"),
+        ({"sensors": 2, "access": "round_robin"}, "access"),
+        ({"sensors": 2, "access": "single", **LOSSY}, "channel"),
+    ],
+)
+def test_tasks_without_a_solved_optimum_are_refused(options: dict[str, Any], field: str) -> None:
+    task = build(**options)
+    with pytest.raises(ConfigurationError, match=field):
+        OptimalPolicy(task)
+
+
+def test_other_systems_and_unknown_criteria_are_refused() -> None:
+    with pytest.raises(ConfigurationError, match="system"):
+        OptimalPolicy(build_tracking())
+    with pytest.raises(ConfigurationError, match="criterion"):
+        OptimalPolicy(build(), "discounted")
+    policy = OptimalPolicy(build())
+    blind = EpisodeBatch(build(information="centre"), 2)
+    blind.reset()
+    with pytest.raises(LookupError, match="innovation"):
+        policy(blind.signals())

@@ -1,0 +1,417 @@
+"""The solved optimum of remote estimation: published costs, integral equations, closed forms."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from fusion_gym.network import TokenBucket
+from fusion_gym.solvers import (
+    AverageSolution,
+    ErrorGrid,
+    JointProblem,
+    SourceProblem,
+    TokenLevels,
+    lagrangian_bound,
+    solve_ages,
+    solve_average,
+    solve_discounted,
+    solve_finite,
+    solve_joint_average,
+    solve_joint_finite,
+)
+from fusion_gym.solvers.grid import gaussian_rows
+from fusion_gym.validation import ConfigurationError
+
+Array = NDArray[np.float64]
+
+# --- the published example -----------------------------------------------------------------------
+
+# (1 - β) times the discounted cost from zero error and a bad channel at time 0, of the paper's
+# example: a = 1, σ = 1, β = 0.9, price 100, losses 0.7 (bad) and 0.2 (good). By the probabilities
+# of going from bad to bad and from good to bad. From C_summary.tsv of the authors' repository
+# Jhelum-Ch/remote-estimation-with-Gilbert-Elliott-channel: thresholds found by stochastic
+# approximation, costs by Monte Carlo.
+PUBLISHED = {
+    (0.3, 0.1): 6.5286,
+    (0.3, 0.4): 6.9019,
+    (0.3, 0.8): 6.9346,
+    (0.3, 0.9): 6.9287,
+    (0.5, 0.1): 6.5687,
+    (0.5, 0.4): 7.0768,
+    (0.5, 0.8): 7.2771,
+    (0.5, 0.9): 7.2555,
+    (0.7, 0.1): 6.6911,
+    (0.7, 0.4): 7.3072,
+    (0.7, 0.8): 7.6557,
+    (0.7, 0.9): 7.6665,
+    (0.9, 0.1): 7.2214,
+    (0.9, 0.4): 7.8102,
+    (0.9, 0.8): 8.1102,
+    (0.9, 0.9): 8.1336,
+}
+
+
+def published_problem(stays: float, falls: float) -> SourceProblem:
+    transition = [[stays, 1.0 - stays], [falls, 1.0 - falls]]
+    return SourceProblem.create(price=100.0, drop=(0.7, 0.2), transition=transition)
+
+
+@pytest.mark.parametrize("chain", PUBLISHED)
+def test_published_costs(chain: tuple[float, float]) -> None:
+    solution = solve_discounted(published_problem(*chain), 0.9)
+    assert solution.cost[0] == pytest.approx(PUBLISHED[chain], rel=0.002)
+    assert solution.ordered
+
+
+def test_published_costs_tell_the_cases_apart() -> None:
+    """Neighbouring cases differ by more than the tolerance, so that the comparison can fail."""
+    found = [solve_discounted(published_problem(*chain), 0.9).cost[0] for chain in PUBLISHED]
+    printed = np.array(list(PUBLISHED.values()))
+    order = np.argsort(printed)
+    far = np.diff(printed[order]) > 0.004 * printed[order][1:]
+    assert far.sum() >= 9
+    assert (np.diff(np.array(found)[order])[far] > 0).all()
+
+
+def test_discounted_cost_of_its_thresholds_by_simulation() -> None:
+    """A loop written out for the order of events: error, decision, channel, loss, cost."""
+    problem = published_problem(0.7, 0.1)
+    solution = solve_discounted(problem, 0.9)
+    draw, runs = np.random.default_rng(0), 40_000
+    error, channel = np.zeros(runs), np.zeros(runs, dtype=int)
+    total = np.zeros(runs)
+    for step in range(120):
+        error = error + draw.standard_normal(runs)
+        asks = np.abs(error) >= solution.threshold[channel, 0]
+        channel = (draw.random(runs) >= problem.transition[channel, 0]).astype(int)
+        arrives = asks & (draw.random(runs) >= problem.drop[channel])
+        error = np.where(arrives, 0.0, error)
+        total += 0.1 * 0.9**step * (error**2 + 100.0 * asks)
+    room = 4.0 * total.std() / math.sqrt(runs)
+    assert abs(total.mean() - solution.cost[0]) < room
+    assert room < 0.02 * solution.cost[0]
+
+
+# --- a perfect channel: the integral equations of a renewal cycle --------------------------------
+
+
+def cycle(threshold: float, a: float, price: float, nodes: int = 120) -> tuple[float, float]:
+    """Average cost and rate of a threshold: Fredholm equations by Gauss-Legendre quadrature."""
+    place, weight = np.polynomial.legendre.leggauss(nodes)
+    place, weight = threshold * place, threshold * weight
+
+    def density(to: Array, start: Array | float) -> Array:
+        return np.exp(-0.5 * (to - a * start) ** 2) / math.sqrt(2.0 * math.pi)
+
+    stay = np.eye(nodes) - density(place[None], place[:, None]) * weight
+    paid = np.linalg.solve(stay, place**2)
+    lasts = np.linalg.solve(stay, np.ones(nodes))
+    first = density(place, 0.0) * weight
+    length = 1.0 + first @ lasts
+    return float((first @ paid + price) / length), float(1.0 / length)
+
+
+@pytest.mark.parametrize("a", [0.8, 1.0, 1.1])
+@pytest.mark.parametrize("price", [0.5, 5.0, 100.0])
+def test_perfect_channel_against_the_integral_equations(a: float, price: float) -> None:
+    solution = solve_average(SourceProblem.create(coefficient=a, price=price))
+    best = minimize_scalar(
+        lambda k: cycle(k, a, price)[0], bounds=(0.05, 10.0), options={"xatol": 1e-8}
+    )
+    assert solution.cost == pytest.approx(best.fun, rel=2e-4)
+    assert solution.threshold[0, 0] == pytest.approx(best.x, abs=2e-3)
+    assert solution.rate == pytest.approx(cycle(best.x, a, price)[1], rel=3e-3)
+    assert solution.lower <= solution.cost <= solution.upper
+    # A threshold that is 30 % off is told apart.
+    assert cycle(1.3 * best.x, a, price)[0] > solution.cost * 1.0005
+
+
+@settings(max_examples=15, deadline=None)
+@given(sigma=st.floats(0.1, 10.0), weight=st.floats(0.1, 10.0), price=st.floats(0.5, 20.0))
+def test_cost_scales_with_the_units(sigma: float, weight: float, price: float) -> None:
+    plain = solve_average(SourceProblem.create(price=price))
+    unit = weight * sigma**2
+    other = solve_average(
+        SourceProblem.create(deviation=sigma, price=price * unit, error_weight=weight)
+    )
+    assert other.cost == pytest.approx(plain.cost * unit, rel=1e-3)
+    assert other.threshold[0, 0] == pytest.approx(plain.threshold[0, 0] * sigma, rel=1e-3)
+
+
+def test_cost_is_concave_and_rises_with_price_and_losses() -> None:
+    prices = np.linspace(1.0, 25.0, 9)
+    found = [solve_average(SourceProblem.create(price=float(price))) for price in prices]
+    cost, rate = (np.array([getattr(s, name) for s in found]) for name in ("cost", "rate"))
+    assert (np.diff(cost) > 0).all()
+    assert (np.diff(cost, 2) < 0).all()
+    assert (np.diff(rate) < 0).all()
+    assert (np.diff([s.error for s in found]) > 0).all()
+    # The slope of the cost is the rate.
+    around = [solve_average(SourceProblem.create(price=price)).cost for price in (12.5, 13.5)]
+    assert around[1] - around[0] == pytest.approx(rate[4], rel=2e-3)
+    losing = [solve_average(SourceProblem.create(price=5.0, drop=p)).cost for p in (0, 0.3, 0.6)]
+    assert (np.diff(losing) > 0.05).all()
+
+
+def test_grid_hardly_matters() -> None:
+    problem = SourceProblem.create(price=10.0, drop=0.3)
+    plain = solve_average(problem).cost
+    reach = float(problem.grid().points[-1])
+    assert solve_average(problem, problem.grid(step=0.02)).cost == pytest.approx(plain, rel=2e-4)
+    wide = problem.grid(reach=1.5 * reach, step=0.05)
+    same = problem.grid(reach=reach, step=0.05)
+    assert solve_average(problem, wide).cost == pytest.approx(
+        solve_average(problem, same).cost, rel=1e-6
+    )
+    narrow = problem.grid(reach=3.0, step=0.05)
+    assert solve_average(problem, narrow).cost < 0.99 * plain
+
+
+@settings(max_examples=30, deadline=None)
+@given(mean=st.floats(0.0, 5.0), step=st.floats(0.02, 0.5))
+def test_grid_has_the_moments_of_the_gaussian(mean: float, step: float) -> None:
+    points = step * np.arange(int(14.0 / step))
+    row = gaussian_rows(np.array([mean]), 1.0, points)[0]
+    assert (row >= 0.0).all()
+    assert row.sum() == pytest.approx(1.0, abs=1e-14)
+    assert row @ points**2 == pytest.approx(mean**2 + 1.0, rel=1e-7)
+    assert row @ np.cos(points) == pytest.approx(math.exp(-0.5) * math.cos(mean), abs=1e-7)
+
+
+# --- rules on age --------------------------------------------------------------------------------
+
+
+def period_cost(period: int, a: float, price: float) -> float:
+    silent = sum((period - 1 - j) * a ** (2 * j) for j in range(period - 1))
+    return (price + silent) / period
+
+
+@pytest.mark.parametrize("a", [0.9, 1.0, 1.2])
+@pytest.mark.parametrize("price", [0.5, 6.0, 60.0])
+def test_best_age_rule_of_one_source_is_the_best_period(a: float, price: float) -> None:
+    best = min(period_cost(period, a, price) for period in range(1, 80))
+    if a < 1.0:
+        best = min(best, 1.0 / (1.0 - a * a))  # never
+    problem = SourceProblem.create(coefficient=a, price=price)
+    assert solve_ages((problem,)).cost == pytest.approx(best, rel=1e-4)
+
+
+def test_ages_cost_up_to_the_root_of_three_as_much() -> None:
+    """For a = 1 the ratio to the optimum tends to √3 as the price grows."""
+    ratios = []
+    for price in (10.0, 100.0, 1_000.0, 10_000.0):
+        problem = SourceProblem.create(price=price)
+        ages = min(period_cost(period, 1.0, price) for period in range(1, 400))
+        ratios.append(ages / solve_average(problem).cost)
+    assert all(ratio > 1.7 for ratio in ratios)
+    assert ratios[-1] == pytest.approx(math.sqrt(3.0), rel=0.001)
+    distance = np.abs(np.array(ratios) - math.sqrt(3.0))
+    assert (np.diff(distance) < 0).all()
+
+
+def test_round_robin_is_the_best_schedule_by_ages_of_equal_sources_only() -> None:
+    free = SourceProblem.create(price=0.0)
+    assert solve_ages((free,) * 3, at_most=1).cost == pytest.approx(3.0, rel=1e-6)  # 0 + 1 + 2
+    wild = SourceProblem.create(price=0.0, deviation=4.0)
+    uneven = solve_ages((wild, free), at_most=1).cost
+    # Round robin costs 16/2 + 1/2; the calm source waits for τ steps, the wild one once.
+    assert uneven == pytest.approx(
+        min((16.0 + t * (t - 1) / 2.0) / t for t in range(2, 20)), rel=1e-6
+    )
+    assert uneven < 8.5
+
+
+def test_losses_in_the_best_schedule_by_ages() -> None:
+    """Always transmitting is best at price zero: the age is then geometric."""
+    problem = SourceProblem.create(price=0.0, drop=0.4)
+    assert solve_ages((problem,)).cost == pytest.approx(0.4 / 0.6, rel=1e-5)
+
+
+# --- tokens --------------------------------------------------------------------------------------
+
+
+def test_levels_of_a_bucket() -> None:
+    bucket = TokenBucket.create(1.0, 6.0, 2.0, 3.0, sensors=1)
+    levels = TokenLevels.create(bucket)
+    assert levels.level.tolist() == [1, 2, 3, 4, 5, 6]
+    assert levels.level[levels.initial] == 2.0
+    assert levels.affordable[:, 1].tolist() == [False] * 2 + [True] * 4
+    assert levels.level[levels.following[:, 0]].tolist() == [2, 3, 4, 5, 6, 6]
+    assert levels.level[levels.following[2:, 1]].tolist() == [1, 2, 3, 4]
+    assert levels.index(np.array([1.0, 2.9999999, 6.0])).tolist() == [0, 2, 5]
+    awkward = TokenBucket.create(math.sqrt(0.5), 600.0, 0.0, 1.0, sensors=1)
+    with pytest.raises(ConfigurationError, match="levels"):
+        TokenLevels.create(awkward)
+
+
+@cache
+def limited(price: float = 0.0, capacity: float = 3.0) -> AverageSolution:
+    bucket = TokenBucket.create(0.25, capacity, 1.0, 1.0, sensors=1)
+    return solve_average(SourceProblem.create(price=price, bucket=bucket), tolerance=1e-5)
+
+
+def test_tokens_that_are_scarce_have_a_higher_threshold() -> None:
+    solution = limited()
+    threshold = solution.threshold[0]
+    assert solution.ordered
+    assert np.isinf(threshold[:3]).all()  # 0.25, 0.5, 0.75
+    assert (np.diff(threshold[3:]) < 0).all()
+    assert solution.rate <= 0.25 + 1e-6
+    assert (limited(5.0).threshold[0, 3:] > threshold[3:]).all()
+
+
+def test_limited_tokens_cost_more_than_the_dual_bound_and_less_than_a_period() -> None:
+    free = SourceProblem.create(price=0.0)
+    bound = lagrangian_bound((free,), (1.0,), 0.25)
+    assert bound.cost < limited().cost < 0.75 * 1.5  # every fourth step: (0 + 1 + 2 + 3)/4
+    # A larger bucket comes closer to the bound, which allows for any sequence of transmissions.
+    large = limited(capacity=8.0).cost
+    assert bound.cost < large < 1.15 * bound.cost
+    assert limited().cost > 1.15 * large
+    # At the best multiplier the source spends what there is.
+    dearer = solve_average(SourceProblem.create(price=bound.multiplier))
+    assert dearer.rate == pytest.approx(0.25, rel=0.01)
+    assert bound.cost == pytest.approx(dearer.error, rel=0.01)
+
+
+def test_tokens_in_plenty_do_not_bind() -> None:
+    bucket = TokenBucket.create(1.0, 2.0, 2.0, 1.0, sensors=1)
+    wide = solve_average(SourceProblem.create(price=5.0, bucket=bucket))
+    assert wide.cost == pytest.approx(solve_average(SourceProblem.create(price=5.0)).cost, rel=1e-4)
+
+
+# --- episodes ------------------------------------------------------------------------------------
+
+
+def test_short_episodes_by_hand() -> None:
+    """One step: E min(w², 1) of a standard normal w; the first of two steps looks one ahead."""
+    from scipy.integrate import quad
+
+    def density(w: float) -> float:
+        return math.exp(-0.5 * w * w) / math.sqrt(2.0 * math.pi)
+
+    problem = SourceProblem.create(price=1.0, coefficient=1.2)
+
+    def last(e: float) -> float:
+        inside = quad(lambda w: ((1.2 * e + w) ** 2 - 1.0) * density(w), *_ends(e), epsabs=1e-12)
+        return 1.0 + float(inside[0])
+
+    def _ends(e: float) -> tuple[float, float]:
+        return -1.0 - 1.2 * e, 1.0 - 1.2 * e
+
+    fine = problem.grid(2, step=0.02)
+    assert solve_finite(problem, 1, grid=fine).cost == pytest.approx(last(0.0), rel=2e-4)
+    both = quad(lambda w: min(w * w + last(w), 1.0 + last(0.0)) * density(w), -8, 8, limit=200)
+    solution = solve_finite(problem, 2, grid=fine)
+    assert solution.cost == pytest.approx(both[0], rel=2e-4)
+    assert solution.threshold[1, 0, 0] == pytest.approx(1.0, abs=1e-3)
+    assert solution.threshold[0, 0, 0] < 1.0
+
+
+def test_long_episodes_approach_the_average() -> None:
+    problem = SourceProblem.create(price=5.0)
+    average = solve_average(problem)
+    short, long = (solve_finite(problem, steps) for steps in (100, 200))
+    assert long.cost - short.cost == pytest.approx(100.0 * average.cost, rel=2e-4)
+    assert long.threshold[20, 0, 0] == pytest.approx(average.threshold[0, 0], abs=2e-3)
+    assert long.cost == pytest.approx(200.0 * (long.error + 5.0 * long.rate), rel=1e-9)
+    assert long.threshold.shape == (200, 1, 1)
+
+
+def test_unstable_source_needs_a_reliable_channel() -> None:
+    assert solve_average(SourceProblem.create(coefficient=1.2, price=5.0)).cost < 3.0
+    lossy = SourceProblem.create(coefficient=1.2, price=5.0, drop=0.9)
+    with pytest.raises(ConfigurationError, match="iterations"):
+        solve_average(lossy, lossy.grid(reach=20.0, step=0.2), iterations=20)
+
+
+# --- several sources -----------------------------------------------------------------------------
+
+
+def test_joint_optimum_of_sources_that_share_nothing_is_the_sum() -> None:
+    sources = (SourceProblem.create(price=3.0), SourceProblem.create(coefficient=0.8, price=6.0))
+    joint = solve_joint_average(JointProblem.create(sources))
+    assert joint.cost == pytest.approx(sum(solve_average(s).cost for s in sources), rel=2e-3)
+    episode = solve_joint_finite(JointProblem.create(sources), 50, (2.0, 0.0))
+    parts = solve_finite(sources[0], 50, 2.0).cost + solve_finite(sources[1], 50).cost
+    assert episode.cost == pytest.approx(parts, rel=2e-3)
+
+
+@pytest.mark.parametrize("drop", [0.0, 0.3])
+def test_joint_optimum_lies_between_the_dual_bound_and_the_best_schedule(drop: float) -> None:
+    """One transmission a step for two sources: bound <= optimum < best rule on ages."""
+    sources = (
+        SourceProblem.create(price=0.0, drop=drop),
+        SourceProblem.create(price=0.0, drop=drop, deviation=1.5),
+    )
+    bound = lagrangian_bound(sources, (1.0, 1.0), 1.0).cost
+    joint = solve_joint_average(JointProblem.create(sources, at_most=1))
+    ages = solve_ages(sources, at_most=1).cost
+    assert bound < joint.cost < ages
+    assert ages > 1.4 * joint.cost
+    # With one packet a step the larger error goes first where all else is equal.
+    same = (sources[0], sources[0])
+    choice = solve_joint_average(JointProblem.create(same, at_most=1)).choice[..., 0]
+    one, two = np.indices(choice.shape)
+    inner = np.maximum(one, two) < 20
+    assert (choice[inner & (one > two)] == 1).all()
+    assert (choice[inner & (two > one)] == 2).all()
+
+
+def test_dual_bound_of_an_episode() -> None:
+    bucket = TokenBucket.create(0.5, 4.0, 2.0, 1.0, sensors=2, sharing="rotating")
+    sources = (SourceProblem.create(price=0.5), SourceProblem.create(price=0.5, coefficient=0.8))
+    joint = solve_joint_finite(JointProblem.create(sources, bucket), 30)
+    bound = lagrangian_bound(sources, (1.0, 1.0), 0.5, horizon=30, initial_tokens=2.0)
+    assert 0.75 * joint.cost < bound.cost < joint.cost
+    assert bound.multiplier > 0.0
+    loose = lagrangian_bound(sources, (1.0, 1.0), 5.0, horizon=30)
+    assert loose.multiplier == 0.0
+    assert loose.cost == pytest.approx(sum(solve_finite(s, 30).cost for s in sources))
+
+
+# --- what is refused -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "field"),
+    [
+        ({"deviation": 0.0}, "deviation"),
+        ({"price": -1.0}, "price"),
+        ({"error_weight": 0.0}, "error_weight"),
+        ({"drop": 1.2}, "drop"),
+        ({"transition": [[0.5, 0.4], [0.1, 0.9]], "drop": 0.1}, "transition"),
+        ({"transition": [[0.5, 0.5]], "drop": 0.1}, "transition"),
+    ],
+)
+def test_bad_problems_are_refused(settings: dict[str, float], field: str) -> None:
+    with pytest.raises(ConfigurationError, match=field):
+        SourceProblem.create(**settings)  # type: ignore[arg-type]
+
+
+def test_what_the_solvers_refuse() -> None:
+    plain = SourceProblem.create()
+    states = published_problem(0.3, 0.1)
+    limited_source = SourceProblem.create(bucket=TokenBucket.create(0.5, 2.0, 0.0, 1.0, sensors=1))
+    with pytest.raises(ConfigurationError, match="discount"):
+        solve_discounted(plain, 1.0)
+    with pytest.raises(ConfigurationError, match="horizon"):
+        solve_finite(plain, 0)
+    with pytest.raises(ConfigurationError, match="sensors = 3"):
+        JointProblem.create((plain,) * 3)
+    for solver in (lambda: JointProblem.create((plain, states)), lambda: solve_ages((states,))):
+        with pytest.raises(ConfigurationError, match="independently"):
+            solver()
+    with pytest.raises(ConfigurationError, match="longest"):
+        solve_ages((plain,) * 4, longest=40)
+    with pytest.raises(ConfigurationError, match="tokens"):
+        lagrangian_bound((limited_source,), (1.0,), 0.5)
+    assert isinstance(plain.grid(), ErrorGrid)
