@@ -8,9 +8,10 @@ from typing import Any
 from tqdm import tqdm
 
 
-def progress_bar(total: int, description: str, initial: int = 0) -> tqdm[Any]:
-    """A bar over environment steps; where nobody watches, a line now and then."""
+def progress_bar(total: int, description: str, initial: int = 0, quiet: bool = False) -> tqdm[Any]:
+    """A bar over environment steps; where nobody watches, a line now and then; quiet, nothing."""
     return tqdm(
+        disable=quiet,
         total=total,
         initial=initial,
         desc=description,

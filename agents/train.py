@@ -237,8 +237,8 @@ def validation_task(experiment: Experiment, task: Task) -> Task:
     )
 
 
-def train(experiment: Experiment, *, resume: bool = False) -> dict[str, Any]:
-    """Run the training and return its summary.
+def train(experiment: Experiment, *, resume: bool = False, quiet: bool = False) -> dict[str, Any]:
+    """Run the training and return its summary; ``quiet`` shows neither bar nor summary.
 
     The summary has ``timesteps``, ``finished``, ``steps_per_second``, ``seconds`` by activity,
     and the best validation.
@@ -279,7 +279,7 @@ def train(experiment: Experiment, *, resume: bool = False) -> dict[str, Any]:
     with (
         Interrupt() as interrupt,
         progress_bar(
-            experiment.training.timesteps, f"training {experiment.algorithm.name}", begun
+            experiment.training.timesteps, f"training {experiment.algorithm.name}", begun, quiet
         ) as bar,
     ):
         progress = Progress(experiment, folder, validation_task(experiment, task), interrupt, bar)
@@ -308,7 +308,8 @@ def train(experiment: Experiment, *, resume: bool = False) -> dict[str, Any]:
         "best_validation": best,
     }
     (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
-    print(describe(summary, folder, elapsed))
+    if not quiet:
+        print(describe(summary, folder, elapsed))
     return summary
 
 

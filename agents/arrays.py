@@ -1,0 +1,34 @@
+"""Episode results on disk: what a verdict needs of a policy, beside the JSON that people read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from fusion_gym.evaluation import EpisodeResults
+
+FIELDS = tuple(EpisodeResults.__dataclass_fields__)
+
+
+def save_results(path: Path, results: Mapping[str, EpisodeResults]) -> None:
+    """All results in one compressed file, written in one move."""
+    arrays = {
+        f"{place}/{field}": getattr(found, field)
+        for place, found in enumerate(results.values())
+        for field in FIELDS
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.stem + ".part.npz")
+    np.savez_compressed(partial, names=np.array(list(results), dtype=np.str_), **arrays)
+    partial.replace(path)
+
+
+def load_results(path: Path) -> dict[str, EpisodeResults]:
+    """What :func:`save_results` wrote."""
+    with np.load(path, allow_pickle=False) as arrays:
+        return {
+            str(name): EpisodeResults(**{field: arrays[f"{place}/{field}"] for field in FIELDS})
+            for place, name in enumerate(arrays["names"])
+        }

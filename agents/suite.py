@@ -1,0 +1,154 @@
+"""The benchmark's config: settings, baselines with the ranges of their parameters, agents."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import pydantic
+
+from agents.config import (
+    A2CConfig,
+    DQNConfig,
+    EnvironmentConfig,
+    MaskablePPOConfig,
+    Positive,
+    PPOConfig,
+    Rate,
+    RecurrentPPOConfig,
+    parse,
+    read_yaml,
+)
+
+Mode = Literal["sensors", "centre", "local"]
+Knowledge = Literal["coordinator", "own", "centre", "clock"]
+# What a rule may know to be compared with an agent of this mode.
+COMPARABLE: dict[Mode, tuple[Knowledge, ...]] = {
+    "sensors": ("coordinator", "own", "centre", "clock"),
+    "centre": ("centre", "clock"),
+    "local": ("own", "clock"),
+}
+
+
+class _Strict(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+
+class Range(_Strict):
+    """A parameter between ``low`` and ``high``, in the logarithm, of one value or one a sensor."""
+
+    low: Rate
+    high: Rate
+    whole: bool = False
+    per_sensor: bool = False
+
+    @pydantic.model_validator(mode="after")
+    def _ordered(self) -> Range:
+        if self.low >= self.high:
+            raise ValueError(f"low = {self.low} must be below high = {self.high}")
+        return self
+
+
+class Choices(_Strict):
+    """A parameter with few values."""
+
+    values: tuple[Any, ...] = pydantic.Field(min_length=1)
+
+
+class Family(_Strict):
+    """A rule with parameters to tune; ``knows`` says with which agents it is compared.
+
+    ``own``: a sensor's own signals. ``centre``: what the centre knows beforehand. ``clock``:
+    nothing but time. ``coordinator``: all sensors' new signals at once.
+    """
+
+    label: str
+    policy: str
+    knows: Knowledge
+    parameters: dict[str, Range | Choices]
+
+
+class Tuning(_Strict):
+    """One budget of trials for every rule, on seeds that no test uses."""
+
+    trials: Positive = 40
+    episodes: Positive = 200
+    seed: int = pydantic.Field(default=600_000_000, ge=0)
+    kept: Positive = 14
+
+
+class Genie(_Strict):
+    """A system that always receives, with these options changed: a lower bound of the error."""
+
+    options: dict[str, Any]
+    assumes: str
+
+
+class Setting(_Strict):
+    """One environment in one setting; ``families`` are labels, all of them by default.
+
+    ``longer`` multiplies the length of its trainings.
+    """
+
+    name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
+    title: str
+    environment: EnvironmentConfig
+    price_range: tuple[Rate, Rate]
+    families: tuple[str, ...] | None = None
+    points: tuple[str, ...] = ("always", "never")
+    lookahead: tuple[str, ...] = ()
+    references: tuple[str, ...] = ()
+    longer: float = pydantic.Field(default=1.0, gt=0)
+    genie: Genie | None = None
+
+
+class Suite(_Strict):
+    """The whole benchmark."""
+
+    episodes: Positive = 1000
+    seed: int = pydantic.Field(default=0, ge=0)
+    training_seeds: Positive = 5
+    timesteps: Positive = 4_000_000
+    num_envs: Positive = 256
+    prices: Positive = 7
+    modes: tuple[Mode, ...] = ("sensors", "centre", "local")
+    tuning: Tuning = Tuning()
+    algorithm: PPOConfig | MaskablePPOConfig | RecurrentPPOConfig | A2CConfig | DQNConfig = (
+        pydantic.Field(discriminator="name")
+    )
+    families: tuple[Family, ...]
+    settings: tuple[Setting, ...]
+
+    def families_of(self, setting: Setting) -> list[Family]:
+        """The setting's baselines."""
+        names = setting.families
+        return [f for f in self.families if names is None or f.label in names]
+
+    @pydantic.model_validator(mode="after")
+    def _named(self) -> Suite:
+        labels = [family.label for family in self.families]
+        for setting in self.settings:
+            for name in setting.families or ():
+                if name not in labels:
+                    raise ValueError(f"families of {setting.name}: {name!r} is none of {labels}")
+        return self
+
+
+# What --quick changes: the same work, less of it.
+QUICK: dict[str, Any] = {
+    "episodes": 200,
+    "training_seeds": 1,
+    "timesteps": 600_000,
+    "prices": 5,
+    "tuning": {"trials": 10, "episodes": 60, "kept": 8},
+}
+
+
+def load_suite(path: str | Path, quick: bool = False) -> Suite:
+    """The benchmark's config, or its quick version.
+
+    Raises:
+        ConfigurationError: unreadable, an unknown key, or a value that is not allowed.
+    """
+    plain = read_yaml(path)
+    return parse(Suite, plain | QUICK if quick else plain, str(path))

@@ -1,0 +1,69 @@
+"""Baselines at full strength: Optuna searches a rule's parameters for its whole trade-off."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import optuna
+
+from agents.suite import Choices, Family, Range, Tuning
+from fusion_gym.envs import Task
+from fusion_gym.evaluation import make_policy, run_episodes
+from fusion_gym.validation import ConfigurationError
+
+optuna.logging.set_verbosity(optuna.logging.WARNING)
+
+
+def suggest(trial: optuna.Trial, family: Family, sensors: int) -> str:
+    """The policy's text for a trial."""
+    parts = []
+    for name, space in family.parameters.items():
+        if isinstance(space, Choices):
+            value = trial.suggest_categorical(name, list(space.values))
+            parts.append(f"{name}={_text(value)}")
+            continue
+        count = sensors if space.per_sensor else 1
+        values = [
+            _number(trial, f"{name}_{place}" if count > 1 else name, space)
+            for place in range(count)
+        ]
+        parts.append(f"{name}={'/'.join(_text(value) for value in values)}")
+    return f"{family.policy}:{','.join(parts)}" if parts else family.policy
+
+
+def _number(trial: optuna.Trial, name: str, space: Range) -> float:
+    if space.whole:
+        return trial.suggest_int(name, int(space.low), int(space.high), log=True)
+    return trial.suggest_float(name, space.low, space.high, log=True)
+
+
+def _text(value: Any) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value).lower()
+
+
+def tune(task: Task, family: Family, tuning: Tuning, seed: int = 0) -> list[str]:
+    """The rule's Pareto-optimal policies in rate and error, by rising rate; at most ``kept``.
+
+    Two objectives at once, so that the search looks for the curve and not for one point of it;
+    the budget of trials is the same for every rule.
+
+    Raises:
+        ConfigurationError: none of the trials was a policy that fits the task.
+    """
+    sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=max(tuning.trials // 3, 4))
+    study = optuna.create_study(directions=["minimize", "minimize"], sampler=sampler)
+
+    def objective(trial: optuna.Trial) -> tuple[float, float]:
+        policy = suggest(trial, family, task.sensors)
+        trial.set_user_attr("policy", policy)
+        results = run_episodes(task, make_policy(policy, task), tuning.episodes, tuning.seed)
+        mse = float(results.mse.mean())
+        return float(results.rate.mean()), mse if np.isfinite(mse) else 1e300
+
+    study.optimize(objective, n_trials=tuning.trials)
+    best = sorted(study.best_trials, key=lambda trial: trial.values[0])
+    if not best:
+        raise ConfigurationError(f"family = {family.label!r} is not allowed: no trial succeeded")
+    places = np.unique(np.linspace(0, len(best) - 1, min(tuning.kept, len(best))).round())
+    return list(dict.fromkeys(best[int(place)].user_attrs["policy"] for place in places))
