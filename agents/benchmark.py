@@ -251,7 +251,7 @@ def execute(suite: Suite, work: list[Job], folders: Folders, workers: int) -> No
             joblib.delayed(run)(job, suite, folders) for job in work
         )
         for weight in finished:
-            bar.update(weight)
+            bar.update(min(weight, bar.total - bar.n))
     print(f"{len(work)} pieces of work in {time.perf_counter() - began:.0f} s")
 
 

@@ -101,6 +101,48 @@ def _draw(
     )  # fmt: skip
 
 
+def fronts(
+    path: Path,
+    title: str,
+    curves: Mapping[str, Sequence[tuple[float, float]]],
+    lookahead: Sequence[tuple[float, float]],
+    agents: Mapping[str, Sequence[tuple[float, float]]],
+    genie: Mapping[str, Mapping[str, float]] | None,
+) -> None:
+    """Learned fronts beside tuned baselines and the lookahead, as points (rate, MSE).
+
+    The errors' axis ends at six times the least of them: what lies above is of no interest.
+    """
+    figure, axes = plt.subplots(figsize=(8.6, 5.6))
+    colours = plt.get_cmap("tab20")
+    for place, (label, points) in enumerate(curves.items()):
+        rate, mse = zip(*sorted(points), strict=True)
+        line = "" if len(points) == 1 else "-"
+        axes.plot(rate, mse, line, marker="o", ms=3, lw=0.9, color=colours(place % 20), label=label)
+    if lookahead:
+        rate, mse = zip(*lookahead, strict=True)
+        axes.plot(rate, mse, ":", marker="x", ms=4, color=_INK, label="lookahead with the model")
+    for (mode, points), style in zip(agents.items(), ("-", "--", "-."), strict=False):
+        rate, mse = zip(*sorted(points), strict=True)
+        axes.plot(
+            rate, mse, style, marker="*", ms=9, color=_AGENT, zorder=3, label=f"agent, {mode}"
+        )
+    least = min(mse for points in agents.values() for _, mse in points)
+    if genie is not None:
+        axes.axhline(genie["mse"]["mean"], color=_INK, lw=0.8, label="genie")
+        least = min(least, genie["mse"]["mean"])
+    axes.set_yscale("log")
+    axes.set_ylim(0.9 * least, 6 * least)
+    reach = max(rate for points in agents.values() for rate, _ in points)
+    ends = [rate for points in curves.values() for rate, _ in points]
+    axes.set_xlim(-0.005, min(max(1.15 * reach, 0.05), max(ends) * 1.05))
+    axes.set_xlabel("transmissions per sensor and step")
+    axes.set_ylabel("mean squared error of the fused estimate")
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.legend(fontsize=7.5, ncols=2)
+    _save(figure, path)
+
+
 def episode(path: Path, title: str, trajectory: Trajectory, capacity: float) -> None:
     """One episode: tokens with requests and grants above, states and estimates below."""
     steps = np.arange(1, len(trajectory.truth) + 1)

@@ -16,6 +16,7 @@ import json
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -71,9 +72,16 @@ class Progress(BaseCallback):
     """Validation, best model, checkpoints, the progress bar and the split of the wall time."""
 
     def __init__(
-        self, experiment: Experiment, folder: Path, task: Task, interrupt: Interrupt, bar: tqdm[Any]
+        self,
+        experiment: Experiment,
+        folder: Path,
+        task: Task,
+        interrupt: Interrupt,
+        bar: tqdm[Any],
+        watch: Callable[[dict[str, Any]], bool] | None = None,
     ) -> None:
         super().__init__()
+        self.watch, self.stopped = watch, False
         self.experiment, self.folder, self.task = experiment, folder, task
         self.interrupt, self.bar = interrupt, bar
         self.records = read_records(folder)
@@ -94,7 +102,7 @@ class Progress(BaseCallback):
         self._mark, self._env_mark = now, self._environment().seconds
 
     def _on_step(self) -> bool:
-        return not self.interrupt.raised
+        return not (self.interrupt.raised or self.stopped)
 
     def _on_rollout_end(self) -> None:
         environment = self._environment().seconds - self._env_mark
@@ -137,6 +145,8 @@ class Progress(BaseCallback):
         if score(record, self.target) > self.best:
             self.best = score(record, self.target)
             save(self.model, self.folder / "best_model.zip")
+        if self.watch is not None:
+            self.stopped = self.watch(record)
 
     def save(self) -> None:
         """Write the checkpoint, with the replay buffer where there is one."""
@@ -237,8 +247,16 @@ def validation_task(experiment: Experiment, task: Task) -> Task:
     )
 
 
-def train(experiment: Experiment, *, resume: bool = False, quiet: bool = False) -> dict[str, Any]:
+def train(
+    experiment: Experiment,
+    *,
+    resume: bool = False,
+    quiet: bool = False,
+    watch: Callable[[dict[str, Any]], bool] | None = None,
+) -> dict[str, Any]:
     """Run the training and return its summary; ``quiet`` shows neither bar nor summary.
+
+    ``watch`` is handed each validation's record and may end the training by returning true.
 
     The summary has ``timesteps``, ``finished``, ``steps_per_second``, ``seconds`` by activity,
     and the best validation.
@@ -282,7 +300,8 @@ def train(experiment: Experiment, *, resume: bool = False, quiet: bool = False) 
             experiment.training.timesteps, f"training {experiment.algorithm.name}", begun, quiet
         ) as bar,
     ):
-        progress = Progress(experiment, folder, validation_task(experiment, task), interrupt, bar)
+        scored = validation_task(experiment, task)
+        progress = Progress(experiment, folder, scored, interrupt, bar, watch)
         callbacks: list[BaseCallback] = [progress]
         if experiment.training.target_rate is not None:
             price = task.reward.price.fixed
@@ -292,7 +311,7 @@ def train(experiment: Experiment, *, resume: bool = False, quiet: bool = False) 
             model.learn(remaining, callback=CallbackList(callbacks), reset_num_timesteps=False)
             progress.num_timesteps = model.num_timesteps
             bar.update(model.num_timesteps - bar.n)
-            if not interrupt.raised:
+            if not (interrupt.raised or progress.stopped):
                 progress.validate()
             progress.save()
     elapsed = time.perf_counter() - began

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
+from fusion_gym import zoo
 from fusion_gym.envs import EpisodeBatch, Task
 from fusion_gym.envs.price import Price
 from fusion_gym.evaluation.lookahead import Lookahead
@@ -15,7 +16,7 @@ from fusion_gym.validation import ConfigurationError, keys
 
 
 def make_policy(spec: str, task: Task) -> Policy:
-    """The policy that ``NAME``, ``NAME:key=value,…`` or ``model:PATH`` names.
+    """The policy that ``NAME``, ``NAME:key=value,…``, ``model:PATH`` or ``zoo:NAME`` names.
 
     A model takes ``deterministic=false``, and ``price=P`` if it was trained to see the price. The
     references ``lookahead``, ``periodic_optimum`` and ``optimal`` know the task's model.
@@ -29,13 +30,14 @@ def make_policy(spec: str, task: Task) -> Policy:
     """
     name, _, text = spec.partition(":")
     entries = text.split(",") if text else []
-    if name == "model":
+    if name in ("model", "zoo"):
         from fusion_gym.evaluation.model_policy import load_model_policy
 
-        path, *settings = text.split(",")
-        options = parse_settings("parameter of policy 'model'", settings)
-        keys("parameter of policy 'model'", options, ["deterministic", "price"])
-        return load_model_policy(path.removeprefix("path="), task, **options)
+        chosen, *settings = text.split(",")
+        options = parse_settings(f"parameter of policy {name!r}", settings)
+        keys(f"parameter of policy {name!r}", options, ["deterministic", "price"])
+        path = zoo.model_path(chosen) if name == "zoo" else chosen.removeprefix("path=")
+        return load_model_policy(path, task, **options)
     if name in REFERENCES:
         make, known = REFERENCES[name]
         options = parse_settings(f"parameter of policy {name!r}", entries)

@@ -1,0 +1,305 @@
+"""The benchmark of policies: tuning, verdict, report, zoo, resuming, and hyper-parameters."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+import pytest
+import yaml
+
+import fusion_gym
+from agents import benchmark, report, tune, zoo
+from agents.arrays import load_results, save_results
+from agents.suite import Choices, Family, Range, Tuning, load_suite
+from agents.tuning import tune as tune_family
+from agents.verdict import judge
+from fusion_gym.evaluation import EpisodeResults, make_policy, run_episodes
+from fusion_gym.validation import ConfigurationError
+
+ROOT = Path(__file__).parent.parent
+ENV = "fusion_gym/TobitOscillator-v0"
+SMALL: dict[str, Any] = {
+    "episodes": 12,
+    "training_seeds": 2,
+    "timesteps": 256,
+    "num_envs": 4,
+    "prices": 3,
+    "tuning": {"trials": 4, "episodes": 4, "kept": 3},
+    "algorithm": {"name": "ppo", "n_steps": 8, "batch_size": 32, "n_epochs": 1},
+    "families": [
+        {
+            "label": "innovation",
+            "policy": "innovation_threshold",
+            "knows": "own",
+            "parameters": {"threshold": {"low": 0.2, "high": 3, "per_sensor": True}},
+        },
+        {
+            "label": "gain",
+            "policy": "information_gain",
+            "knows": "centre",
+            "parameters": {
+                "threshold": {"low": 0.001, "high": 0.3},
+                "at_most": {"values": [None, 1]},
+            },
+        },
+    ],
+    "settings": [
+        {
+            "name": "small",
+            "title": "a small setting",
+            "environment": {"id": ENV, "options": {"filter": "tobit", "horizon": 10}},
+            "price_range": [0.001, 0.1],
+            "lookahead": ["lookahead:steps=1,price=0.01", "lookahead:steps=1,price=1e9"],
+            "genie": {"options": {"tokens": "unlimited"}, "assumes": "everything arrives"},
+        }
+    ],
+}
+
+
+def small_suite(folder: Path, **changes: Any) -> Path:
+    path = folder / "suite.yaml"
+    path.write_text(yaml.safe_dump(SMALL | changes))
+    return path
+
+
+def run_main(monkeypatch: pytest.MonkeyPatch, module: Any, *arguments: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["program", *arguments])
+    module.main()
+
+
+def test_from_tuning_to_report_and_zoo(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results, work = tmp_path / "results", tmp_path / "work"
+    arguments = [
+        "--config", str(small_suite(tmp_path)), "--results", str(results), "--work", str(work),
+        "--workers", "1",
+    ]  # fmt: skip
+    run_main(monkeypatch, benchmark, *arguments, "--seeds", "1", "--modes", "sensors")
+    folder = results / "small"
+    first = json.loads((folder / "verdict.json").read_text())
+    assert first["modes"]["sensors"]["seeds"] == 1
+    stamp = (folder / "agent_sensors_0.json").stat().st_mtime_ns
+    with pytest.raises(SystemExit, match="--resume"):
+        run_main(monkeypatch, benchmark, *arguments)
+    run_main(monkeypatch, benchmark, *arguments, "--resume")
+    assert (folder / "agent_sensors_0.json").stat().st_mtime_ns == stamp
+    verdict = json.loads((folder / "verdict.json").read_text())
+    assert {mode: front["seeds"] for mode, front in verdict["modes"].items()} == {
+        "sensors": 2, "centre": 2, "local": 2,
+    }  # fmt: skip
+    baselines = json.loads((folder / "baselines.json").read_text())
+    assert baselines["curves"]["gain"]["knows"] == "centre"
+    assert baselines["genie"]["assumes"] == "everything arrives"
+    in_local = {point["name"] for point in verdict["modes"]["local"]["envelope"]}
+    assert not any(name.startswith("information_gain") for name in in_local)
+    agent = json.loads((folder / "agent_local_1.json").read_text())
+    assert agent["training"]["environment"]["local"]
+    assert len(agent["points"]) == 3
+    # The written numbers are those that the saved model reaches on the test seeds.
+    task = fusion_gym.make_task(ENV, filter="tobit", horizon=10)
+    model = f"model:{work / 'small' / 'local_1' / 'best_model.zip'},price={agent['prices'][1]!r}"
+    again = run_episodes(task, make_policy(model, task), 12, seed=0)
+    assert agent["points"][1]["mse"]["mean"] == pytest.approx(again.mse.mean())
+
+    run_main(monkeypatch, report, "--results", str(results))
+    text = (results / "README.md").read_text()
+    assert "| [small](#small) | local | 2 |" in text
+    page = (results / "report.html").read_text()
+    assert "data:image/png;base64," in page
+    assert 'src="small' not in page
+
+    run_main(
+        monkeypatch, zoo, "--results", str(results), "--work", str(work), "--zoo",
+        str(tmp_path / "zoo"),
+    )  # fmt: skip
+    card = json.loads((tmp_path / "zoo" / "small_sensors.json").read_text())
+    assert card["env"] == ENV
+    assert (tmp_path / "zoo" / "small_sensors.zip").stat().st_size < 300_000
+    assert "zoo:small_local" in capsys.readouterr().out
+
+
+def test_the_committed_suite_fits_its_environments() -> None:
+    for quick in (False, True):
+        suite = load_suite(ROOT / "configs" / "benchmark.yaml", quick)
+        for setting in suite.settings:
+            task = benchmark._task(setting)
+            for name in (*setting.points, *setting.lookahead, *setting.references):
+                make_policy(name, task)
+            for family in suite.families_of(setting):
+                trial = optuna.create_study().ask()
+                make_policy(benchmark_text(trial, family, task.sensors), task)
+            if setting.genie is not None:
+                fusion_gym.make_task(
+                    setting.environment.id, **(setting.environment.options | setting.genie.options)
+                )
+
+
+def benchmark_text(trial: optuna.Trial, family: Family, sensors: int) -> str:
+    from agents.tuning import suggest
+
+    return suggest(trial, family, sensors)
+
+
+def test_tuned_policies_are_a_curve() -> None:
+    task = fusion_gym.make_task(ENV, filter="tobit", horizon=20)
+    family = Family(
+        label="x", policy="innovation_threshold", knows="own",
+        parameters={"threshold": Range(low=0.1, high=5), "whitened": Choices(values=(True, False))},
+    )  # fmt: skip
+    policies = tune_family(task, family, Tuning(trials=12, episodes=30, kept=5))
+    assert 2 <= len(policies) <= 5
+    found = [run_episodes(task, make_policy(p, task), 30, 600_000_000) for p in policies]
+    rates = [r.rate.mean() for r in found]
+    errors = [r.mse.mean() for r in found]
+    assert rates == sorted(rates)
+    assert errors == sorted(errors, reverse=True)
+    assert tune_family(task, family, Tuning(trials=12, episodes=30, kept=5)) == policies
+
+
+def made_up(rate: float, mse: Any) -> EpisodeResults:
+    mse = np.asarray(mse, dtype=np.float64)
+    zero = np.zeros_like(mse)
+    return EpisodeResults(
+        mse=mse, bound_trace=zero, nees=zero, rate=np.full((len(mse), 2), rate),
+        requests=np.full((len(mse), 2), rate), tokens=zero, denied=zero, returns=zero,
+        diverged=zero, squared_error=np.zeros((3, 2)),
+    )  # fmt: skip
+
+
+def test_the_verdict_is_the_arithmetic_that_it_says() -> None:
+    generator = np.random.default_rng(0)
+    noise = generator.uniform(0.5, 1.5, 400)
+    baselines = {"never": made_up(0.0, 2 * noise), "always": made_up(1.0, noise)}
+    references = {"never": made_up(0.0, 2 * noise), "ahead": made_up(0.25, 0.5 * noise)}
+    # At rate 0.3 the envelope is 1.7, at 0.8 it is 1.2 (outside the middle).
+    agents = [
+        [made_up(0.3, 0.7 * 1.7 * noise), made_up(0.8, noise)],
+        [made_up(0.3, 0.8 * 1.7 * noise), made_up(0.8, noise)],
+    ]
+    verdict = judge(agents, [0.1, 0.01], baselines, references, always=1.0)
+    point = verdict["points"][0]
+    assert point["envelope"] == pytest.approx(1.7 * noise.mean())
+    assert verdict["middle"]["mean"] == pytest.approx(-0.25)
+    assert verdict["middle"]["low"] == pytest.approx(-0.3)
+    assert verdict["middle"]["high"] == pytest.approx(-0.2)
+    room = 1.7 - 0.5
+    assert verdict["room"] == pytest.approx(room / 1.7)
+    assert verdict["closed"] == pytest.approx((1.7 - 0.75 * 1.7) / room)
+    assert verdict["points"][1]["difference"]["mean"] == pytest.approx(1 / 1.2 - 1)
+
+
+def test_the_interval_covers_the_difference_between_episodes() -> None:
+    """Unpaired noise of known deviation: the interval is that of the ratio of two means."""
+    generator = np.random.default_rng(1)
+    baselines = {"never": made_up(0.0, generator.normal(1.0, 0.2, 2000))}
+    agents = [[made_up(0.1, generator.normal(0.9, 0.2, 2000))] for _ in range(1)]
+    found = judge(agents, [1.0], baselines, {}, always=1.0)["middle"]
+    deviation = 0.2 * np.sqrt((1 + 0.9**2) / 2000)
+    width = (found["high"] - found["low"]) / (2 * 1.96)
+    assert width == pytest.approx(deviation, rel=0.1)
+
+
+def test_results_survive_the_disk(tmp_path: Path) -> None:
+    task = fusion_gym.make_task(ENV, filter="tobit", horizon=5)
+    found = {p: run_episodes(task, make_policy(p, task), 3, 0) for p in ("always", "never")}
+    save_results(tmp_path / "x.npz", found)
+    again = load_results(tmp_path / "x.npz")
+    assert list(again) == ["always", "never"]
+    for name, results in found.items():
+        for field in EpisodeResults.__dataclass_fields__:
+            np.testing.assert_array_equal(getattr(again[name], field), getattr(results, field))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"famlies": []}, "famlies"),
+        ({"prices": 0}, "prices = 0"),
+        ({"settings": [SMALL["settings"][0] | {"families": ["none"]}]}, "'none' is none of"),
+        (
+            {"families": [SMALL["families"][0] | {"parameters": {"a": {"low": 2, "high": 1}}}]},
+            "low = 2.0 must be below high = 1.0",
+        ),
+    ],
+)
+def test_a_suite_that_is_not_allowed(tmp_path: Path, changes: Any, message: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        load_suite(small_suite(tmp_path, **changes))
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--envs", "smal"], "did you mean 'small'"),
+        (["--modes", "sensor"], "did you mean 'sensors'"),
+        (["--seeds", "0"], "training_seeds"),
+    ],
+)
+def test_the_benchmark_refuses_with_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
+) -> None:
+    config = ["--config", str(small_suite(tmp_path)), "--results", str(tmp_path / "none")]
+    with pytest.raises(SystemExit) as caught:
+        run_main(monkeypatch, benchmark, *config, *arguments)
+    assert message in str(caught.value)
+
+
+def test_the_zoo_answers_by_name() -> None:
+    task = fusion_gym.make_task(ENV)
+    with pytest.raises(ConfigurationError, match="zoo = 'nobody' is not allowed"):
+        make_policy("zoo:nobody", task)
+
+
+@pytest.mark.parametrize("name", fusion_gym.zoo.names())
+def test_agents_of_the_zoo_reach_their_numbers(name: str) -> None:
+    """The card's first 60 episodes at its middle price, to what their mean allows."""
+    card = fusion_gym.zoo.card(name)
+    task = fusion_gym.make_task(card["env"], **card["options"])
+    if card["mode"] == "centre":
+        task = fusion_gym.make_task(card["env"], information="centre", **card["options"])
+    place = len(card["test"]["prices"]) // 2
+    policy = make_policy(f"zoo:{name},price={card['test']['prices'][place]!r}", task)
+    found = run_episodes(task, policy, 60, card["test"]["seed"])
+    told = card["test"]["points"][place]
+    deviation = found.mse.std() / np.sqrt(60)
+    assert found.mse.mean() == pytest.approx(told["mse"]["mean"], abs=4.5 * deviation)
+    assert np.mean(told["rate"]) == pytest.approx(found.rate.mean(), abs=0.03)
+
+
+def test_tuning_goes_on_with_its_study(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "config.yaml"
+    config.write_text(
+        yaml.safe_dump(
+            {
+                "environment": {"id": ENV, "options": {"filter": "tobit", "horizon": 10}},
+                "algorithm": {"name": "ppo", "batch_size": 64},
+                "training": {"timesteps": 1024, "num_envs": 8},
+                "validation": {"every": 512, "episodes": 4},
+                "output": "runs/x",
+            }
+        )
+    )
+    folder = tmp_path / "study"
+    for trials in (1, 2, 2):
+        run_main(
+            monkeypatch, tune, "--config", str(config), "--trials", str(trials), "--output",
+            str(folder),
+        )  # fmt: skip
+    study = optuna.load_study(study_name="tune", storage=f"sqlite:///{folder / 'study.db'}")
+    assert len(study.trials) == 2
+    best = (folder / "best.yaml").read_text()
+    assert best.startswith("# Found by python -m agents.tune --config")
+    algorithm = yaml.safe_load(best)["algorithm"]
+    assert algorithm["learning_rate"] == study.best_params["learning_rate"]
+    with pytest.raises(SystemExit, match="trials = 0"):
+        run_main(monkeypatch, tune, "--config", str(config), "--trials", "0", "--output", "x")
+    capsys.readouterr()
