@@ -17,7 +17,7 @@ import yaml
 from stable_baselines3 import PPO
 
 import fusion_gym
-from agents import demo, evaluate, reproduce, train
+from agents import demo, evaluate, monitor, reproduce, train
 from agents.config import load_comparison, load_experiment, load_sweep
 from agents.constraint import score
 from fusion_gym.evaluation import make_policy
@@ -27,7 +27,7 @@ from fusion_gym.validation import ConfigurationError
 ROOT = Path(__file__).parent.parent
 CONFIGS = ROOT / "configs"
 ENV = "fusion_gym/TobitOscillator-v0"
-EXPERIMENTS = [f for f in sorted(CONFIGS.glob("*.yaml")) if "algorithm" in f.read_text()]
+EXPERIMENTS = [f for f in sorted(CONFIGS.glob("*.yaml")) if "\ntraining:" in f.read_text()]
 SMALL: dict[str, dict[str, Any]] = {
     "ppo": {"name": "ppo", "n_steps": 16, "batch_size": 128, "n_epochs": 1},
     "maskable_ppo": {"name": "maskable_ppo", "n_steps": 16, "batch_size": 128, "n_epochs": 1},
@@ -127,7 +127,7 @@ def test_training_writes_its_results_and_resumes(tmp_path: Path, algorithm: str)
     assert summary["timesteps"] >= 1024
     assert json.loads((folder / "summary.json").read_text()) == summary
     assert list((folder / "tensorboard").glob("events*"))
-    records = train.read_records(folder)
+    records = monitor.read_records(folder)
     assert max(r["return"] for r in records) == summary["best_validation"]["return"]
     with pytest.raises(ConfigurationError, match="--resume"):
         train.train(experiment)
@@ -136,7 +136,7 @@ def test_training_writes_its_results_and_resumes(tmp_path: Path, algorithm: str)
     )
     again = train.train(longer, resume=True)
     assert again["timesteps"] >= 2048
-    assert len(train.read_records(folder)) > len(records)
+    assert len(monitor.read_records(folder)) > len(records)
     other = longer.model_copy(
         update={"validation": longer.validation.model_copy(update={"episodes": 5})}
     )
@@ -206,13 +206,13 @@ def test_an_interrupted_training_loses_nothing(tmp_path: Path, number: signal.Si
     assert b"go on with --resume" in output
     summary = json.loads((folder / "summary.json").read_text())
     assert not summary["finished"]
-    records = len(train.read_records(folder))
+    records = len(monitor.read_records(folder))
     resumed = [*command, "--resume", "--timesteps", str(summary["timesteps"] + 1500)]
     subprocess.run(resumed, cwd=ROOT, check=True, capture_output=True, timeout=120)
     later = json.loads((folder / "summary.json").read_text())
     assert later["finished"]
     assert later["timesteps"] >= summary["timesteps"] + 1500
-    assert len(train.read_records(folder)) > records
+    assert len(monitor.read_records(folder)) > records
 
 
 def run_evaluation(*arguments: str) -> dict[str, Any]:
@@ -305,7 +305,7 @@ def test_demo_from_baselines_to_figures(tmp_path: Path, monkeypatch: pytest.Monk
         assert json.loads((folder / "agent" / "summary.json").read_text())["finished"]
     began = (output / "paper" / "agent" / "final_model.zip").stat().st_mtime
     demo.main()
-    records = train.read_records(output / "paper" / "agent")
+    records = monitor.read_records(output / "paper" / "agent")
     assert len(records) == 1, "a finished training is not repeated"
     assert (output / "paper" / "agent" / "final_model.zip").stat().st_mtime >= began
 
