@@ -7,8 +7,6 @@ Traces depend on no noise and are held to the printed digits.
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -163,33 +161,6 @@ def test_claimed_trace_over_whole_episodes(kind: str) -> None:
 
 
 # --- headroom ------------------------------------------------------------------------------------
-
-
-def schedule_traces(packets: NDArray[np.bool_]) -> Array:
-    """Mean fused trace over a period, settled, of schedules (6, sensors, N): (N,)."""
-    system, runs = build().system, packets.shape[-1]
-    assert isinstance(system, MarkovJumpSystem)
-    recursion = system.recursion
-    lags, means = recursion.start(runs), np.zeros((3, 2, runs))
-    total = np.zeros(runs)
-    for time in range(72):
-        place = recursion.filters.at(np.full(runs, time))
-        sent = packets[time % 6]
-        if time >= 66:
-            offer = recursion.offer(lags, place)
-            total += linalg.trace(system.fusion.fuse(means, offer.joint(sent))[1])
-        lags = recursion.predict(lags, sent, place)
-    return total / 6
-
-
-@pytest.mark.parametrize(("packets", "best"), [(2, 2.333), (4, 1.727)])
-def test_best_periodic_schedules(packets: int, best: float) -> None:
-    places = list(itertools.combinations(range(18), packets))
-    schedules = np.zeros((18, len(places)), dtype=bool)
-    for number, chosen in enumerate(places):
-        schedules[list(chosen), number] = True
-    traces = schedule_traces(schedules.reshape(6, 3, -1))
-    assert traces.min() == pytest.approx(best, abs=1e-3)
 
 
 def test_centre_variance_at_seven_packets_beats_the_papers_trigger_at_nine() -> None:

@@ -387,15 +387,18 @@ LOOKS_AT = {
     "stochastic_event": "innovation",
     "adaptive_threshold": "measurement",
 }
+# Signals that this system does not have at all.
+LACKS = {"centre_variance": "greedy_variance", "local_variance": "local_variance"}
 
 
 @pytest.mark.parametrize("name", sorted(TRIGGERS))
 def test_what_the_centre_cannot_know_is_refused(name: str) -> None:
     task = make_task(ENV_ID, information="centre")
-    if name not in LOOKS_AT:
+    if name not in LOOKS_AT | LACKS:
         assert isinstance(make_policy(name, task), TRIGGERS[name])
         return
     with pytest.raises(ConfigurationError) as caught:
         make_policy(name, task)
-    for part in (f"policy '{name}'", f"'{LOOKS_AT[name]}'", "information='centre'"):
+    reason = "unknown signal" if name in LACKS else "information='centre'"
+    for part in (f"policy '{name}'", f"'{(LOOKS_AT | LACKS)[name]}'", reason):
         assert part in str(caught.value)

@@ -1,0 +1,222 @@
+"""The exhaustive periodic schedule: known optima, the recursion by itself, its cache, refusals."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from reference_markov_jump import PAPER, Dense, best_weights
+
+import fusion_gym
+from fusion_gym import linalg
+from fusion_gym.envs import EpisodeBatch, Task
+from fusion_gym.evaluation import make_policy, periodic_optimum, run_episodes
+from fusion_gym.evaluation.periodic_optimum import PeriodicOptimum, steady_traces
+from fusion_gym.systems.markov_jump import MarkovJumpSystem
+from fusion_gym.triggers.random import Random
+from fusion_gym.validation import ConfigurationError
+
+Array = NDArray[np.float64]
+ENV_ID = "fusion_gym/MarkovJumpTracking-v0"
+
+
+def markov(**options: Any) -> Task:
+    return fusion_gym.make_task(ENV_ID, **options)
+
+
+@pytest.fixture(autouse=True)
+def _forgetful(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(periodic_optimum, "_found", {})
+
+
+def recursion_traces(schedules: NDArray[np.bool_], steps: int, last: int) -> Array:
+    """Mean fused trace over the last times, from the covariances' recursion alone."""
+    system, runs = markov().system, schedules.shape[-1]
+    assert isinstance(system, MarkovJumpSystem)
+    recursion = system.recursion
+    lags, means = recursion.start(runs), np.zeros((3, 2, runs))
+    sent, total = np.ones((3, runs), dtype=bool), np.zeros(runs)
+    for time in range(1, steps + 1):
+        place = recursion.filters.at(np.full(runs, time))
+        lags = recursion.predict(lags, sent, recursion.filters.at(np.full(runs, time - 1)))
+        sent = schedules[(time - 1) % len(schedules)]
+        if time > steps - last:
+            offer = recursion.offer(lags, place)
+            total += linalg.trace(system.fusion.fuse(means, offer.joint(sent))[1])
+    return total / last
+
+
+@pytest.mark.parametrize(("packets", "best"), [(2, 2.333), (4, 1.727)])
+def test_known_optima(packets: int, best: float) -> None:
+    policy = make_policy(f"periodic_optimum:packets={packets},period=6", markov())
+    assert isinstance(policy, PeriodicOptimum)
+    assert policy.trace == pytest.approx(best, abs=5e-4)
+    assert policy.schedule.shape == (6, 3)
+    assert policy.schedule.sum() == packets
+
+
+@pytest.mark.parametrize("period", [4, 6])
+def test_traces_are_those_of_the_recursion_alone(period: int) -> None:
+    """With a period of 4 and sampling that repeats after 6 steps the traces repeat after 12."""
+    schedules = np.random.default_rng(0).random((period, 3, 40)) < 0.3
+    found = steady_traces(markov().system, schedules)
+    np.testing.assert_allclose(found, recursion_traces(schedules, 144, 12), rtol=1e-6)
+
+
+def test_the_trace_is_that_of_dense_matrices() -> None:
+    policy = PeriodicOptimum(markov(), 3, 6)
+    dense, traces = Dense(PAPER), []
+    dense.send(np.ones(3, dtype=bool))
+    for step in range(96):
+        sent = policy.schedule[step % 6]
+        traces.append(np.trace(best_weights(dense.copies(sent), 2)[1]))
+        dense.send(sent)
+    assert np.mean(traces[-6:]) == pytest.approx(policy.trace, rel=1e-5)
+
+
+@pytest.mark.parametrize("options", [{}, {"filter": "centralised"}, {"fusion": "ci"}])
+def test_the_policy_reaches_its_trace_and_no_schedule_a_lower_one(options: Any) -> None:
+    task = markov(horizon=120, information="centre", **options)
+    policy = PeriodicOptimum(task, 2, 3)
+    batch, traces, sent = EpisodeBatch(task, 2), [], np.zeros((3, 2))
+    batch.reset()
+    for _ in range(120):
+        outcome = batch.step(policy(batch.signals()))
+        sent += outcome.granted
+        traces.append(linalg.trace(task.system.fused(batch.delivered)[1]))
+    assert sent.sum() == 2 * 2 * 120 / 3
+    np.testing.assert_allclose(np.mean(traces[-6:], axis=0), policy.trace, rtol=1e-6)
+    others = np.zeros((9, 36), dtype=bool)
+    for number, chosen in enumerate(itertools.combinations(range(9), 2)):
+        others[list(chosen), number] = True
+    found = steady_traces(task.system, others.reshape(3, 3, -1))
+    assert policy.trace == pytest.approx(found.min(), rel=1e-9)
+    assert found.max() > 1.2 * found.min()
+
+
+def test_it_beats_random_requests_and_knows_its_error() -> None:
+    task = markov()
+    best = run_episodes(task, PeriodicOptimum(task), 1500, 0)
+    rate = tuple(best.rate.mean(0))
+    other = run_episodes(task, Random(rate), 1500, 0)
+    assert best.mse.mean() < 0.9 * other.mse.mean()
+    gap = best.mse - best.bound_trace
+    assert abs(gap.mean()) <= 4 * gap.std() / np.sqrt(1500)
+
+
+def test_runs_in_other_steps_stand_side_by_side() -> None:
+    policy = PeriodicOptimum(markov(), 3, 6)
+    requests = policy({"step": np.array([0, 4, 6, 13])})  # type: ignore[arg-type]
+    np.testing.assert_array_equal(requests.T, policy.schedule[[0, 4, 0, 1]])
+
+
+# --- cache ---------------------------------------------------------------------------------------
+
+
+def test_a_search_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = PeriodicOptimum(markov(), 2, 3)
+    monkeypatch.setattr(periodic_optimum, "_search", None)  # a second search would fail
+    again = PeriodicOptimum(markov(), 2, 3)
+    np.testing.assert_array_equal(again.schedule, first.schedule)
+    with pytest.raises(TypeError):
+        PeriodicOptimum(markov(), 1, 3)
+    with pytest.raises(TypeError):
+        PeriodicOptimum(markov(noise_coupling=0.1), 2, 3)
+    with pytest.raises(TypeError):
+        PeriodicOptimum(markov(fusion="ci"), 2, 3)
+
+
+def test_a_file_holds_what_was_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "new" / "schedules.json"
+    text = f"periodic_optimum:packets=2,period=3,cache={path}"
+    first: Any = make_policy(text, markov())
+    assert [entry.name for entry in path.parent.iterdir()] == ["schedules.json"]
+    PeriodicOptimum(markov(), 1, 3, str(path))  # beside the first
+    monkeypatch.setattr(periodic_optimum, "_found", {})
+    monkeypatch.setattr(periodic_optimum, "_search", None)
+    before = path.read_bytes()
+    again: Any = make_policy(text, markov())
+    np.testing.assert_array_equal(again.schedule, first.schedule)
+    assert again.schedule.dtype == np.bool_
+    assert again.trace == first.trace
+    assert path.read_bytes() == before
+    assert len(json.loads(before)["periodic_optimum"]) == 2
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "3", '{"other": 1}', '{"periodic_optimum": [1]}', "\x00\xff"]
+)
+def test_a_broken_or_foreign_file_is_replaced(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "schedules.json"
+    path.write_text(text, encoding="latin-1")
+    PeriodicOptimum(markov(), 1, 2, str(path))
+    (entry,) = json.loads(path.read_text())["periodic_optimum"].values()
+    assert np.sum(entry["requests"]) == 1
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        None,
+        7,
+        {},
+        {"requests": [[1, 0, 0]], "trace": 1.0},
+        {"requests": [[1, 0, 0], [0, 1, 0]], "trace": 1.0},
+        {"requests": [[1, 0, 0], [0, 0]], "trace": 1.0},
+        {"requests": [[0.5, 0.5, 0], [0, 0, 0]], "trace": 1.0},
+        {"requests": [[1, 0, 0], [0, 0, 0]], "trace": "low"},
+        {"requests": [["1", 0, 0], [0, 0, 0]], "trace": 1.0},
+        {"requests": [[1, 0, 0], [0, 0, 0]], "trace": -1.0},
+    ],
+)
+def test_an_entry_that_cannot_be_true_is_found_anew(
+    tmp_path: Path, entry: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "schedules.json"
+    right = PeriodicOptimum(markov(), 1, 2, str(path))
+    saved = json.loads(path.read_text())
+    (key,) = saved["periodic_optimum"]
+    path.write_text(json.dumps({"periodic_optimum": {key: entry, "another": 1}}))
+    monkeypatch.setattr(periodic_optimum, "_found", {})
+    found = PeriodicOptimum(markov(), 1, 2, str(path))
+    np.testing.assert_array_equal(found.schedule, right.schedule)
+    assert found.trace == right.trace
+    after = json.loads(path.read_text())["periodic_optimum"]
+    assert after == saved["periodic_optimum"] | {"another": 1}
+
+
+# --- refusals ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("spec", "options", "message"),
+    [
+        ("packets=0", {}, "packets = 0"),
+        ("packets=19", {}, "packets = 19 .* <= 18"),
+        ("packets=2.5", {}, "packets = 2.5"),
+        ("period=0", {}, "period = 0"),
+        ("period=none", {}, "period = None"),
+        ("packets=12,period=8", {}, "packets = 12 .* 2704156 schedules"),
+        ("cache=3", {}, "cache = 3 .* path"),
+        ("cache=/dev/null/schedules.json,packets=1,period=1", {}, "cache = .* written"),
+        ("phase=3", {}, "unknown parameter of policy 'periodic_optimum' 'phase'"),
+        ("", {"access": "single"}, "access = 'single' .* 'any'"),
+        ("", {"filter": "imm"}, "MarkovJumpCentralSystem.* not depend on the data"),
+    ],
+)
+def test_what_is_not_allowed(spec: str, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        make_policy(f"periodic_optimum:{spec}" if spec else "periodic_optimum", markov(**options))
+
+
+def test_systems_whose_covariances_depend_on_the_data_are_refused() -> None:
+    task = fusion_gym.make_task("fusion_gym/TobitOscillator-v0")
+    with pytest.raises(ConfigurationError, match=r"CensoredSystem.* not depend on the data"):
+        make_policy("periodic_optimum", task)
+    with pytest.raises(ConfigurationError, match="CensoredSystem"):
+        steady_traces(task.system, np.zeros((1, 3, 1), dtype=bool))
