@@ -3,6 +3,8 @@
 from fusion_gym.filters.assumed_density import AssumedDensityFilter
 from fusion_gym.filters.base import Expectation, NodeFilter, Plan
 from fusion_gym.filters.bound import BoundConstants, BoundTobitFilter, EventError
+from fusion_gym.filters.centralised_linear import CentralisedLinearFilter
+from fusion_gym.filters.interacting_models import InteractingModels
 from fusion_gym.filters.kalman import KalmanFilter
 from fusion_gym.filters.linear_minimum_variance import AugmentedModel, LocalFilters
 from fusion_gym.filters.markov_jump_errors import LagRecursion
@@ -15,8 +17,10 @@ __all__ = [
     "AugmentedModel",
     "BoundConstants",
     "BoundTobitFilter",
+    "CentralisedLinearFilter",
     "EventError",
     "Expectation",
+    "InteractingModels",
     "JointErrorCovariance",
     "KalmanFilter",
     "LagRecursion",

@@ -8,6 +8,7 @@ from fusion_gym.systems.correlated_tracking import (
     CorrelatedTrackingSystem,
 )
 from fusion_gym.systems.markov_jump import MarkovJumpState, MarkovJumpSystem
+from fusion_gym.systems.markov_jump_central import MarkovJumpCentralSystem
 from fusion_gym.systems.remote_estimation import RemoteEstimationSystem
 from fusion_gym.systems.unknown_input import UnknownInputSystem
 
@@ -18,6 +19,7 @@ __all__ = [
     "CorrelatedTrackingSystem",
     "Feature",
     "FeedbackCentre",
+    "MarkovJumpCentralSystem",
     "MarkovJumpState",
     "MarkovJumpSystem",
     "RemoteEstimationSystem",
