@@ -181,7 +181,7 @@ def experiment_of(suite: Suite, setting: Setting, mode: Mode, seed: int, work: P
         environment=EnvironmentConfig(
             id=setting.environment.id, options=options, local=mode == "local"
         ),
-        algorithm=suite.algorithm,
+        algorithm=suite.algorithm_of(setting),
         training=TrainingConfig(timesteps=timesteps, num_envs=suite.num_envs, seed=seed),
         validation=ValidationConfig(every=max(timesteps // 8, 1), episodes=512),
         output=str(work / setting.name / f"{mode}_{seed}"),

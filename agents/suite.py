@@ -87,7 +87,7 @@ class Genie(_Strict):
 class Setting(_Strict):
     """One environment in one setting; ``families`` are labels, all of them by default.
 
-    ``longer`` multiplies the length of its trainings.
+    ``longer`` multiplies the length of its trainings, ``algorithm`` replaces hyper-parameters.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
@@ -99,6 +99,7 @@ class Setting(_Strict):
     lookahead: tuple[str, ...] = ()
     references: tuple[str, ...] = ()
     longer: float = pydantic.Field(default=1.0, gt=0)
+    algorithm: dict[str, Any] = {}
     genie: Genie | None = None
 
 
@@ -119,6 +120,14 @@ class Suite(_Strict):
     families: tuple[Family, ...]
     settings: tuple[Setting, ...]
 
+    def algorithm_of(self, setting: Setting) -> Any:
+        """The setting's algorithm, checked again.
+
+        Raises:
+            pydantic.ValidationError: a hyper-parameter that is unknown or not allowed.
+        """
+        return type(self.algorithm).model_validate(self.algorithm.model_dump() | setting.algorithm)
+
     def families_of(self, setting: Setting) -> list[Family]:
         """The setting's baselines."""
         names = setting.families
@@ -128,6 +137,7 @@ class Suite(_Strict):
     def _named(self) -> Suite:
         labels = [family.label for family in self.families]
         for setting in self.settings:
+            self.algorithm_of(setting)
             for name in setting.families or ():
                 if name not in labels:
                     raise ValueError(f"families of {setting.name}: {name!r} is none of {labels}")
