@@ -92,6 +92,7 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         "seed": arguments.seed,
         "horizon": task.horizon,
         "settings": task.settings,
+        "states": list(task.system.state_names),
         "policies": {},
         "quantiles": {},
     }
@@ -129,6 +130,7 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     tables.console().print(
         tables.evaluation_table(title, report["policies"], report["quantiles"], differences)
     )
+    tables.console().print(tables.state_table(task.system.state_names, report["policies"]))
     return report
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich import box
@@ -59,6 +59,20 @@ def evaluation_table(
         if differences:
             row.append(difference(differences[name]) if name in differences else "reference")
         table.add_row(*row)
+    return table
+
+
+def state_table(states: Sequence[str], policies: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Root mean square error of each state (and input, where there is one), a row a policy."""
+    table = Table(
+        title="root of the mean squared error over episodes, averaged over time",
+        box=box.SIMPLE_HEAD,
+    )
+    table.add_column("policy", overflow="fold")
+    for state in states:
+        table.add_column(state, justify="right")
+    for name, found in policies.items():
+        table.add_row(name, *(f"{error:.4g}" for error in found["armse"]))
     return table
 
 

@@ -229,12 +229,14 @@ def test_evaluation_writes_the_promised_json(tmp_path: Path) -> None:
     written = json.loads(file.read_text())
     assert written == json.loads(json.dumps(report))
     assert list(written) == [
-        *("env", "episodes", "seed", "horizon", "settings", "policies", "quantiles", "reference"),
+        *("env", "episodes", "seed", "horizon", "settings", "states", "policies", "quantiles"),
+        "reference",
     ]
     assert (written["env"], written["episodes"], written["horizon"]) == (ENV, 30, 20)
     assert written["settings"]["filter"] == "tobit"
     always = written["policies"]["always"]
     assert always["rate"] == [1.0, 1.0, 1.0]
+    assert len(written["states"]) == len(always["armse"]) == 2
     assert set(always) == {
         *("mse", "armse", "bound_trace", "nees", "rate", "requests", "tokens", "denied", "return"),
     }
