@@ -10,7 +10,7 @@ from fusion_gym.envs import EpisodeBatch, Task
 from fusion_gym.envs.price import Price
 from fusion_gym.evaluation.lookahead import Lookahead
 from fusion_gym.evaluation.periodic_optimum import PeriodicOptimum
-from fusion_gym.solvers import OptimalPolicy
+from fusion_gym.solvers import OptimalPolicy, WhittleIndex
 from fusion_gym.triggers import Policy, make_trigger, parse_settings
 from fusion_gym.validation import ConfigurationError, keys
 
@@ -19,7 +19,7 @@ def make_policy(spec: str, task: Task) -> Policy:
     """The policy that ``NAME``, ``NAME:key=value,…``, ``model:PATH`` or ``zoo:NAME`` names.
 
     A model takes ``deterministic=false``, and ``price=P`` if it was trained to see the price. The
-    references ``lookahead``, ``periodic_optimum`` and ``optimal`` know the task's model.
+    references ``lookahead``, ``periodic_optimum``, ``optimal`` and ``whittle`` know the model.
 
     The signals that it looks at are checked against the task's information mode.
 
@@ -61,6 +61,7 @@ REFERENCES: dict[str, tuple[Callable[..., Policy], tuple[str, ...]]] = {
     "lookahead": (Lookahead, ("price", "steps")),
     "optimal": (_optimum, ("criterion", "price")),
     "periodic_optimum": (PeriodicOptimum, ("cache", "packets", "period")),
+    "whittle": (WhittleIndex, ("at_most", "price")),
 }
 
 

@@ -21,6 +21,7 @@ from fusion_gym.solvers.single import (
     solve_finite,
 )
 from fusion_gym.solvers.tokens import TokenLevels
+from fusion_gym.solvers.whittle import WhittleIndex
 
 __all__ = [
     "AgeSolution",
@@ -36,6 +37,7 @@ __all__ = [
     "Optimum",
     "SourceProblem",
     "TokenLevels",
+    "WhittleIndex",
     "lagrangian_bound",
     "solve_ages",
     "solve_average",
