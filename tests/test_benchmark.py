@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 import fusion_gym
-from agents import benchmark, report, tune, zoo
+from agents import benchmark, report, solved, tune, zoo
 from agents.arrays import load_results, save_results
 from agents.suite import Choices, Family, Range, Tuning, load_suite
 from agents.tuning import tune as tune_family
@@ -271,6 +271,33 @@ def test_agents_of_the_zoo_reach_their_numbers(name: str) -> None:
     deviation = found.mse.std() / np.sqrt(60)
     assert found.mse.mean() == pytest.approx(told["mse"]["mean"], abs=4.5 * deviation)
     assert np.mean(told["rate"]) == pytest.approx(found.rate.mean(), abs=0.03)
+
+
+def test_the_solved_case_is_trained_once_and_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "config.yaml"
+    options = {"error_weight": 0.1, "cost_weight": 0.5, "horizon": 20}
+    config.write_text(
+        yaml.safe_dump(
+            {
+                "environment": {"id": "fusion_gym/RemoteEstimation-v0", "options": options},
+                "algorithm": {"name": "ppo", "batch_size": 64},
+                "training": {"timesteps": 512, "num_envs": 8},
+                "output": "runs/x",
+            }
+        )
+    )
+    arguments = ["--config", str(config), "--episodes", "50", "--output", str(tmp_path / "s")]
+    run_main(monkeypatch, solved, *arguments, "--seeds", "0")
+    stamp = (tmp_path / "s" / "ppo_0" / "final_model.zip").stat().st_mtime_ns
+    run_main(monkeypatch, solved, *arguments, "--seeds", "0", "1")
+    assert (tmp_path / "s" / "ppo_0" / "final_model.zip").stat().st_mtime_ns == stamp
+    found = json.loads((tmp_path / "s" / "ppo.json").read_text())["agents"]
+    assert set(found) == {"0", "1"}
+    # Hardly trained, an agent costs more than the optimum.
+    assert found["0"]["mean"] > 0.0
+    assert "above the optimum" in capsys.readouterr().out
 
 
 def test_tuning_goes_on_with_its_study(
