@@ -7,7 +7,7 @@ cyber-physical systems with unknown inputs under adaptive event-triggered mechan
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from fusion_gym import linalg
 from fusion_gym.filters.input_state_nodes import Estimates, Nodes, Outlook
 from fusion_gym.plants.input_signals import InputSignal
 from fusion_gym.plants.unknown_input import UnknownInputPlant
-from fusion_gym.systems.base import Feature, Knowledge, Signal, SignalArray
+from fusion_gym.systems.base import Feature, Signal, SignalArray, feature_block
 from fusion_gym.validation import Array
 
 _RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
@@ -121,12 +121,12 @@ class UnknownInputSystem:
         local_states = [(node, f"{node},{name}") for node in nodes for name in self.state_names]
         fused = [(None, name) for name in self.state_names]
         return (
-            _block("whitened_innovation", components, "sensor", _RANGE),
-            _block("held_difference", components, "sensor", _RANGE),
-            _block("age", [(node, f"{node}") for node in nodes], "centre"),
-            _block("local_log_deviation", local_states, "centre", _RANGE),
-            _block("log_deviation", fused, "centre", _RANGE),
-            _block("estimate", fused, "centre", _RANGE),
+            feature_block("whitened_innovation", components, "sensor", _RANGE),
+            feature_block("held_difference", components, "sensor", _RANGE),
+            feature_block("age", [(node, f"{node}") for node in nodes], "centre"),
+            feature_block("local_log_deviation", local_states, "centre", _RANGE),
+            feature_block("log_deviation", fused, "centre", _RANGE),
+            feature_block("estimate", fused, "centre", _RANGE),
         )
 
     def start(self, noise: Array) -> UnknownInputState:
@@ -254,19 +254,6 @@ class UnknownInputSystem:
         n = self.plant.size
         before = self.nodes.fused_covariance(state.estimates, state.time - 1.0)
         return self.nodes.model.predict_covariance(before)[:n, :n]
-
-
-def _block(
-    kind: str,
-    places: Iterable[tuple[int | None, str]],
-    knowledge: Knowledge,
-    limit: float | None = None,
-) -> tuple[Feature, ...]:
-    """Entries of the nodes that know them, between -limit and limit, or from 0 to 1."""
-    low, high = (0.0, 1.0) if limit is None else (-limit, limit)
-    return tuple(
-        Feature(f"{kind}[{place}]", knowledge, low, high, sensor=node) for node, place in places
-    )
 
 
 def _log_deviation(covariance: Array, reference: Array) -> Array:
