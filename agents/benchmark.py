@@ -79,7 +79,10 @@ class Folders:
 def jobs(suite: Suite, settings: list[Setting], modes: list[Mode]) -> Iterator[Job]:
     """All work, what everything else needs first."""
     for setting in settings:
-        yield Job(setting, "baselines", weight=60.0)
+        yield Job(setting, "baselines", weight=120.0)
+    for setting in settings:
+        if setting.references:
+            yield Job(setting, "references", weight=30.0)
     for seed in range(suite.training_seeds):
         for mode in modes:
             for setting in settings:
@@ -92,6 +95,8 @@ def run(job: Job, suite: Suite, folders: Folders) -> float:
     torch.set_num_threads(1)
     if job.kind == "baselines":
         _run_baselines(job, suite, folders)
+    elif job.kind == "references":
+        _run_references(job, suite, folders)
     else:
         _run_agent(job, suite, folders)
     return job.weight
@@ -110,7 +115,7 @@ def _test(task: Task, policies: list[str], suite: Suite) -> dict[str, EpisodeRes
 
 
 def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
-    """Tune every family, then test its curve, the single policies and the references."""
+    """Tune every family, then test its curve, the single policies and the lookahead."""
     setting, task = job.setting, _task(job.setting)
     curves: dict[str, dict[str, Any]] = {}
     found: dict[str, EpisodeResults] = {}
@@ -118,11 +123,7 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
         policies = tune(task, family, suite.tuning)
         found |= _test(task, policies, suite)
         curves[family.label] = {"knows": family.knows, "policies": policies}
-    for points, kind in (
-        (setting.points, "clock"),
-        (setting.lookahead, "lookahead"),
-        (setting.references, "reference"),
-    ):
+    for points, kind in ((setting.points, "clock"), (setting.lookahead, "lookahead")):
         for name in points:
             curves[name] = {"knows": kind, "policies": [name]}
         found |= _test(task, list(points), suite)
@@ -138,6 +139,15 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
         report["genie"] = _summary(results) | {"assumes": setting.genie.assumes}
     save_results(folders.episodes(job), found)
     write(folders.report(job), report)
+
+
+def _run_references(job: Job, suite: Suite, folders: Folders) -> None:
+    """Test policies that were computed, and that know no more than the centre."""
+    setting, task = job.setting, _task(job.setting)
+    found = _test(task, list(setting.references), suite)
+    save_results(folders.episodes(job), found)
+    policies = {name: _summary(results) for name, results in found.items()}
+    write(folders.report(job), {**_header(job, suite, task), "policies": policies})
 
 
 def _run_agent(job: Job, suite: Suite, folders: Folders) -> None:
@@ -216,9 +226,12 @@ def conclude(suite: Suite, setting: Setting, folders: Folders) -> dict[str, Any]
     ahead = {
         name: every[name]
         for curve in report["curves"].values()
-        if curve["knows"] in ("lookahead", "reference")
+        if curve["knows"] == "lookahead"
         for name in curve["policies"]
     }
+    second = Job(setting, "references")
+    known = load_results(folders.episodes(second)) if folders.report(second).exists() else {}
+    references = {"sensors": ahead | known, "centre": known, "local": {}}
     always = float(every["always"].rate.mean())
     verdict: dict[str, Any] = {"setting": setting.name, "title": setting.title, "modes": {}}
     for mode in suite.modes:
@@ -234,8 +247,7 @@ def conclude(suite: Suite, setting: Setting, folders: Folders) -> dict[str, Any]
         }
         agents = [list(load_results(folders.episodes(job)).values()) for job in done]
         prices = json.loads(folders.report(done[0]).read_text())["prices"]
-        references = ahead if mode == "sensors" else {}
-        verdict["modes"][mode] = judge(agents, prices, comparable, references, always) | {
+        verdict["modes"][mode] = judge(agents, prices, comparable, references[mode], always) | {
             "envelope": [point._asdict() for point in lower_envelope(comparable)]
         }
     write(folders.results / setting.name / "verdict.json", verdict)

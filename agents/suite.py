@@ -87,7 +87,9 @@ class Genie(_Strict):
 class Setting(_Strict):
     """One environment in one setting; ``families`` are labels, all of them by default.
 
-    ``longer`` multiplies the length of its trainings, ``algorithm`` replaces hyper-parameters.
+    ``lookahead`` are policies that know the model and all new signals, ``references`` computed
+    ones that know no more than the centre. ``longer`` multiplies the length of its trainings,
+    ``algorithm`` replaces hyper-parameters.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")

@@ -55,6 +55,7 @@ SMALL: dict[str, Any] = {
             "environment": {"id": ENV, "options": {"filter": "tobit", "horizon": 10}},
             "price_range": [0.001, 0.1],
             "lookahead": ["lookahead:steps=1,price=0.01", "lookahead:steps=1,price=1e9"],
+            "references": ["periodic:period=7"],
             "genie": {"options": {"tokens": "unlimited"}, "assumes": "everything arrives"},
         }
     ],
@@ -96,6 +97,7 @@ def test_from_tuning_to_report_and_zoo(
     baselines = json.loads((folder / "baselines.json").read_text())
     assert baselines["curves"]["gain"]["knows"] == "centre"
     assert baselines["genie"]["assumes"] == "everything arrives"
+    assert (folder / "references.json").exists()
     in_local = {point["name"] for point in verdict["modes"]["local"]["envelope"]}
     assert not any(name.startswith("information_gain") for name in in_local)
     agent = json.loads((folder / "agent_local_1.json").read_text())
