@@ -10,6 +10,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+import matplotlib.ticker
 import numpy as np
 
 from fusion_gym.evaluation import (
@@ -111,7 +112,7 @@ def fronts(
 ) -> None:
     """Learned fronts beside tuned baselines and the lookahead, as points (rate, MSE).
 
-    The errors' axis ends at six times the least of them: what lies above is of no interest.
+    The errors' axis ends at 4.5 times the least of them: what lies above is of no interest.
     """
     figure, axes = plt.subplots(figsize=(8.6, 5.6))
     colours = plt.get_cmap("tab20")
@@ -127,12 +128,15 @@ def fronts(
         axes.plot(
             rate, mse, style, marker="*", ms=9, color=_AGENT, zorder=3, label=f"agent, {mode}"
         )
-    least = min(mse for points in agents.values() for _, mse in points)
+    everything = [mse for points in (*agents.values(), lookahead) for _, mse in points]
+    bottom = 0.88 * min(everything)
     if genie is not None:
-        axes.axhline(genie["mse"]["mean"], color=_INK, lw=0.8, label="genie")
-        least = min(least, genie["mse"]["mean"])
+        level = genie["mse"]["mean"]
+        label = f"genie ({level:.3g}{', below' if level < bottom else ''})"
+        axes.axhline(max(level, bottom), color=_INK, lw=0.8, label=label)
     axes.set_yscale("log")
-    axes.set_ylim(0.9 * least, 6 * least)
+    axes.set_ylim(bottom, 4.5 * bottom)
+    axes.yaxis.set_minor_formatter(matplotlib.ticker.LogFormatter(labelOnlyBase=False))
     reach = max(rate for points in agents.values() for rate, _ in points)
     ends = [rate for points in curves.values() for rate, _ in points]
     axes.set_xlim(-0.005, min(max(1.15 * reach, 0.05), max(ends) * 1.05))
