@@ -168,7 +168,7 @@ def _run_agent(job: Job, suite: Suite, folders: Folders) -> None:
         **_header(job, suite, task),
         "mode": mode,
         "training_seed": job.seed,
-        "training": experiment.model_dump(mode="json"),
+        "training": experiment.model_dump(mode="json", exclude={"output"}),
         "seconds": summary["seconds"],
         "best_validation": summary["best_validation"],
         "prices": prices,
