@@ -7,7 +7,7 @@ that episode's noise, so that nobody can know it in advance.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -160,75 +160,18 @@ def _terms(*values: ArrayLike) -> int:
 
 
 @dataclass(frozen=True)
-class Steps:
-    """Each input keeps its level and jumps to a new one with the probability 1/``period``.
+class _Stationary:
+    """What signals share whose memory is their value, drawn from a stationary distribution.
 
-    ``amplitude`` (q, 1) is the standard deviation of the zero-mean levels in the input's unit,
-    ``period`` (q, 1) the mean number of sampling instants between jumps, at least 1.
+    ``amplitude`` (q, 1) is its standard deviation in the input's unit, its mean is zero; ``period``
+    (q, 1) is in sampling instants, at least 1.
     """
 
     amplitude: Array
     period: Array
 
     @classmethod
-    def create(cls, size: int, amplitude: ArrayLike, period: ArrayLike) -> Steps:
-        """Check the numbers: one for all inputs, or (size,).
-
-        Raises:
-            ConfigurationError: a wrong shape, an amplitude <= 0 or a period < 1.
-        """
-        return cls(*_scale_and_period(size, amplitude, period))
-
-    @property
-    def size(self) -> int:
-        """Number of inputs q."""
-        return len(self.amplitude)
-
-    @property
-    def start_channels(self) -> int:
-        """The first levels."""
-        return self.size
-
-    @property
-    def noise_channels(self) -> int:
-        """Whether to jump, and where to."""
-        return 2 * self.size
-
-    def start(self, noise: Array) -> Array:
-        """The levels (q, N)."""
-        return self.amplitude * noise
-
-    def value(self, memory: Array, time: Array) -> Array:
-        """The levels (q, N)."""
-        return memory
-
-    def advance(self, memory: Array, noise: Array) -> Array:
-        """The levels one instant later."""
-        jump = ndtr(noise[: self.size]) * self.period < 1.0
-        return np.where(jump, self.amplitude * noise[self.size :], memory)
-
-    def mean(self, horizon: int) -> Array:
-        """Zero, (horizon, q)."""
-        return np.zeros((horizon, self.size))
-
-    def covariance(self, horizon: int) -> Array:
-        """(horizon, q, q): a² (1 - 1/period)^lag on the diagonal."""
-        return _geometric(self.amplitude, 1.0 - 1.0 / self.period, horizon)
-
-
-@dataclass(frozen=True)
-class MeanRevertingWalk:
-    """d(k + 1) = r d(k) + a √(1 - r²) η with r = exp(-1/period): a random walk held back.
-
-    Its variance stays at a². ``amplitude`` a (q, 1) in the input's unit; ``period`` (q, 1) is the
-    correlation time in sampling instants, at least 1.
-    """
-
-    amplitude: Array
-    period: Array
-
-    @classmethod
-    def create(cls, size: int, amplitude: ArrayLike, period: ArrayLike) -> MeanRevertingWalk:
+    def create(cls, size: int, amplitude: ArrayLike, period: ArrayLike) -> Self:
         """Check the numbers: one for all inputs, or (size,).
 
         Raises:
@@ -246,11 +189,6 @@ class MeanRevertingWalk:
         """The first values."""
         return self.size
 
-    @property
-    def noise_channels(self) -> int:
-        """The steps of the walk."""
-        return self.size
-
     def start(self, noise: Array) -> Array:
         """Values (q, N) drawn from the stationary distribution."""
         return self.amplitude * noise
@@ -259,14 +197,46 @@ class MeanRevertingWalk:
         """The values (q, N)."""
         return memory
 
-    def advance(self, memory: Array, noise: Array) -> Array:
-        """The values one instant later."""
-        kept = np.exp(-1.0 / self.period)
-        return kept * memory + self.amplitude * np.sqrt(1.0 - kept * kept) * noise
-
     def mean(self, horizon: int) -> Array:
         """Zero, (horizon, q)."""
         return np.zeros((horizon, self.size))
+
+
+@dataclass(frozen=True)
+class Steps(_Stationary):
+    """Each input keeps its level and jumps to a new one with the probability 1/``period``."""
+
+    @property
+    def noise_channels(self) -> int:
+        """Whether to jump, and where to."""
+        return 2 * self.size
+
+    def advance(self, memory: Array, noise: Array) -> Array:
+        """The levels (q, N) one instant later."""
+        jump = ndtr(noise[: self.size]) * self.period < 1.0
+        return np.where(jump, self.amplitude * noise[self.size :], memory)
+
+    def covariance(self, horizon: int) -> Array:
+        """(horizon, q, q): a² (1 - 1/period)^lag on the diagonal."""
+        return _geometric(self.amplitude, 1.0 - 1.0 / self.period, horizon)
+
+
+@dataclass(frozen=True)
+class MeanRevertingWalk(_Stationary):
+    """d(k + 1) = r d(k) + a √(1 - r²) η with r = exp(-1/period): a random walk held back.
+
+    Its variance stays at a², ``period`` is the correlation time.
+    """
+
+    @property
+    def noise_channels(self) -> int:
+        """The steps of the walk."""
+        return self.size
+
+    def advance(self, memory: Array, noise: Array) -> Array:
+        """The values (q, N) one instant later."""
+        kept = np.exp(-1.0 / self.period)
+        return kept * memory + self.amplitude * np.sqrt(1.0 - kept * kept) * noise
 
     def covariance(self, horizon: int) -> Array:
         """(horizon, q, q): a² exp(-lag/period) on the diagonal."""
