@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import shlex
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -187,12 +188,21 @@ def experiment_of(suite: Suite, setting: Setting, mode: Mode, seed: int, work: P
     if mode == "centre":
         options["information"] = "centre"
     timesteps = round(suite.timesteps * setting.longer)
+    algorithm, runs = suite.algorithm_of(setting), suite.num_envs
+    if mode == "local":
+        # As many rows side by side as a coordinator has runs, and as many batches an update.
+        sensors = _task(setting).sensors
+        runs = max(suite.num_envs // sensors, 1)
+        size = getattr(algorithm, "batch_size", None)
+        if size is not None:
+            batch = max(size * runs * sensors // suite.num_envs, 1)
+            algorithm = algorithm.model_copy(update={"batch_size": batch})
     return Experiment(
         environment=EnvironmentConfig(
             id=setting.environment.id, options=options, local=mode == "local"
         ),
-        algorithm=suite.algorithm_of(setting),
-        training=TrainingConfig(timesteps=timesteps, num_envs=suite.num_envs, seed=seed),
+        algorithm=algorithm,
+        training=TrainingConfig(timesteps=timesteps, num_envs=runs, seed=seed),
         validation=ValidationConfig(every=max(timesteps // 8, 1), episodes=512),
         output=str(work / setting.name / f"{mode}_{seed}"),
     )
@@ -290,6 +300,8 @@ def parser() -> argparse.ArgumentParser:
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     given = parser().parse_args()
+    # Ended from outside like by Ctrl-C: the workers stop too.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     kind = "quick" if given.quick else "full"
     folders = Folders(
         given.results or Path("results/quick" if given.quick else "results"),

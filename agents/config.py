@@ -14,6 +14,10 @@ Model = TypeVar("Model", bound=pydantic.BaseModel)
 Positive = Annotated[int, pydantic.Field(gt=0)]
 Rate = Annotated[float, pydantic.Field(gt=0)]
 Share = Annotated[float, pydantic.Field(ge=0, le=1)]
+# Share of the steps in which the untrained policy lets every sensor request; by default one half.
+# Where that is far more than the tokens pay for, asking for less changes nothing (another sensor's
+# request is granted instead), and a training can stay there for long.
+InitialRate = Annotated[float | None, pydantic.Field(gt=0, lt=1)]
 
 
 class _Strict(pydantic.BaseModel):
@@ -61,6 +65,7 @@ class PPOConfig(_Algorithm):
     ent_coef: float = 0.0
     vf_coef: float = 0.5
     max_grad_norm: Rate = 0.5
+    initial_rate: InitialRate = None
 
 
 class MaskablePPOConfig(PPOConfig):
@@ -85,6 +90,7 @@ class A2CConfig(_Algorithm):
     ent_coef: float = 0.0
     vf_coef: float = 0.5
     max_grad_norm: Rate = 0.5
+    initial_rate: InitialRate = None
 
 
 class DQNConfig(_Algorithm):

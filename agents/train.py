@@ -21,49 +21,25 @@ from typing import Any
 
 import torch
 import yaml
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.utils import LinearSchedule
 
 from agents.config import Experiment, load_experiment, parse
 from agents.constraint import TargetRate, score
+from agents.models import make_model
 from agents.monitor import Interrupt, Progress, save
 from agents.progress import progress_bar
 from fusion_gym.envs import Task
 from fusion_gym.envs.price import Price
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.evaluation.model_policy import ALGORITHMS, tag_model
+from fusion_gym.evaluation.model_policy import ALGORITHMS
 from fusion_gym.validation import ConfigurationError
 
 # Training seeds lie far from the validation's and from the small numbers that tests use.
 TRAINING_SEEDS = 1_000_000_000
 # Algorithms that know no MultiBinary actions (the recurrent one fails on them while it trains).
 DISCRETE_ONLY = ("dqn", "recurrent_ppo")
-
-
-def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
-    """A new model of the config's algorithm."""
-    settings = experiment.algorithm.model_dump()
-    name, network = settings.pop("name"), settings.pop("network")
-    end, memory = settings.pop("learning_rate_end"), settings.pop("memory", None)
-    if end is not None:
-        settings["learning_rate"] = LinearSchedule(settings["learning_rate"], end, 1.0)
-    activation = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[network["activation"]]
-    shape = {"net_arch": list(network["hidden"]), "activation_fn": activation}
-    if memory is not None:
-        shape["lstm_hidden_size"] = memory
-    model = ALGORITHMS[name](
-        "MlpPolicy" if memory is None else "MlpLstmPolicy",
-        env,
-        seed=experiment.training.seed,
-        device="cpu",
-        policy_kwargs=shape,
-        **settings,
-    )
-    tag_model(model, env.task, local=experiment.environment.local)
-    return model
 
 
 def prepare(experiment: Experiment, folder: Path, resume: bool) -> None:

@@ -164,6 +164,35 @@ def test_tuned_policies_are_a_curve() -> None:
     assert tune_family(task, family, Tuning(trials=12, episodes=30, kept=5)) == policies
 
 
+def test_tuning_begins_with_values_that_all_sensors_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    task = fusion_gym.make_task(ENV, filter="tobit", horizon=5)
+    space = Range(low=0.1, high=10, per_sensor=True)
+    family = Family(
+        label="x", policy="innovation_threshold", knows="own",
+        parameters={"threshold": space, "whitened": Choices(values=(True, False))},
+    )  # fmt: skip
+    asked: list[str] = []
+
+    def spy(text: str, task: Any) -> Any:
+        asked.append(text)
+        return make_policy(text, task)
+
+    monkeypatch.setattr("agents.tuning.make_policy", spy)
+    tune_family(task, family, Tuning(trials=24, episodes=2, kept=5))
+    assert len(asked) == 24
+    shared = [text for text in asked[:8] if len(set(thresholds(text))) == 1]
+    assert len(shared) == 8
+    for kind in ("true", "false"):
+        values = [thresholds(t)[0] for t in shared if t.endswith(f"whitened={kind}")]
+        assert len(values) == 4
+        assert np.diff(np.log(values)) == pytest.approx(np.log(100) / 4, rel=1e-3)
+    assert any(len(set(thresholds(text))) > 1 for text in asked[8:])
+
+
+def thresholds(text: str) -> list[float]:
+    return [float(value) for value in text.split(":threshold=")[1].split(",")[0].split("/")]
+
+
 def made_up(rate: float, mse: Any) -> EpisodeResults:
     mse = np.asarray(mse, dtype=np.float64)
     zero = np.zeros_like(mse)

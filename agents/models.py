@@ -1,0 +1,80 @@
+"""New models of a config's algorithm, and with which policy they begin."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from gymnasium.spaces import Discrete, MultiBinary
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import LinearSchedule
+
+from agents.config import Experiment
+from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.evaluation.model_policy import ALGORITHMS, tag_model
+from fusion_gym.validation import Array, ConfigurationError
+
+
+def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
+    """A new model of the config's algorithm.
+
+    Raises:
+        ConfigurationError: an ``initial_rate`` that the action space does not allow.
+    """
+    settings = experiment.algorithm.model_dump()
+    name, network = settings.pop("name"), settings.pop("network")
+    end, memory = settings.pop("learning_rate_end"), settings.pop("memory", None)
+    rate = settings.pop("initial_rate", None)
+    if end is not None:
+        settings["learning_rate"] = LinearSchedule(settings["learning_rate"], end, 1.0)
+    activation = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[network["activation"]]
+    shape = {"net_arch": list(network["hidden"]), "activation_fn": activation}
+    if memory is not None:
+        shape["lstm_hidden_size"] = memory
+    model = ALGORITHMS[name](
+        "MlpPolicy" if memory is None else "MlpLstmPolicy",
+        env,
+        seed=experiment.training.seed,
+        device="cpu",
+        policy_kwargs=shape,
+        **settings,
+    )
+    if rate is not None:
+        _begin_at(model, env, rate)
+    tag_model(model, env.task, local=experiment.environment.local)
+    return model
+
+
+def initial_logits(env: FusionSB3VecEnv, rate: float) -> Array:
+    """Logits of the choices with which every sensor requests in a share ``rate`` of the steps.
+
+    Shape (sensors,) for ``MultiBinary``, else one a number of ``Discrete``.
+
+    Raises:
+        ConfigurationError: one sensor a step, and the sensors' rates exceed 1 together.
+    """
+    odds, space, sensors = np.log(rate / (1.0 - rate)), env.action_space, env.task.sensors
+    if isinstance(space, MultiBinary):
+        return np.full(sensors, odds)
+    assert isinstance(space, Discrete)
+    if env.view is not None:
+        return np.array([0.0, odds])
+    if env.task.access == "single":
+        if sensors * rate >= 1.0:
+            raise ConfigurationError(
+                f"initial_rate = {rate} is not allowed: it must be < 1/{sensors}, for one of "
+                f"{sensors} sensors transmits in a step"
+            )
+        return np.log([1.0 - sensors * rate, *[rate] * sensors])
+    bits = np.arange(2**sensors)[:, None] >> np.arange(sensors) & 1
+    return np.asarray(bits.sum(1) * odds)
+
+
+def _begin_at(model: BaseAlgorithm, env: FusionSB3VecEnv, rate: float) -> None:
+    """Shift the last layer's offsets so that the untrained policy requests at this rate."""
+    logits = initial_logits(env, rate)
+    head = model.policy.action_net
+    assert isinstance(head, torch.nn.Linear)
+    if head.out_features == 2 * logits.size:  # two choices a sensor, as MaskablePPO has them
+        logits = np.stack((np.zeros_like(logits), logits), axis=1).ravel()
+    with torch.no_grad():
+        head.bias.add_(torch.as_tensor(logits, dtype=head.bias.dtype))
