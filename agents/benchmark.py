@@ -116,7 +116,7 @@ def _test(task: Task, policies: list[str], suite: Suite) -> dict[str, EpisodeRes
 
 
 def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
-    """Tune every family, then test its curve, the single policies and the lookahead."""
+    """Tune every family, then test its curve, the single policies and the informed references."""
     setting, task = job.setting, _task(job.setting)
     curves: dict[str, dict[str, Any]] = {}
     found: dict[str, EpisodeResults] = {}
@@ -124,7 +124,7 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
         policies = tune(task, family, suite.tuning)
         found |= _test(task, policies, suite)
         curves[family.label] = {"knows": family.knows, "policies": policies}
-    for points, kind in ((setting.points, "clock"), (setting.lookahead, "lookahead")):
+    for points, kind in ((setting.points, "clock"), (setting.informed, "informed")):
         for name in points:
             curves[name] = {"knows": kind, "policies": [name]}
         found |= _test(task, list(points), suite)
@@ -202,7 +202,9 @@ def experiment_of(suite: Suite, setting: Setting, mode: Mode, seed: int, work: P
             id=setting.environment.id, options=options, local=mode == "local"
         ),
         algorithm=algorithm,
-        training=TrainingConfig(timesteps=timesteps, num_envs=runs, seed=seed),
+        training=TrainingConfig(
+            timesteps=timesteps, num_envs=runs, seed=seed, price_exponent=suite.price_exponent
+        ),
         validation=ValidationConfig(every=max(timesteps // 8, 1), episodes=512),
         output=str(work / setting.name / f"{mode}_{seed}"),
     )
@@ -236,7 +238,7 @@ def conclude(suite: Suite, setting: Setting, folders: Folders) -> dict[str, Any]
     ahead = {
         name: every[name]
         for curve in report["curves"].values()
-        if curve["knows"] == "lookahead"
+        if curve["knows"] == "informed"
         for name in curve["policies"]
     }
     second = Job(setting, "references")

@@ -112,7 +112,9 @@ class TrainingConfig(_Strict):
     """How long, with how many runs side by side, from which seed, on how many threads.
 
     ``target_rate`` trains to an average rate of transmissions per sensor and step: the price of a
-    token starts at the environment's ``cost_weight`` and is adapted.
+    token starts at the environment's ``cost_weight`` and is adapted. ``price_exponent`` is for a
+    price that is drawn: episodes count by (middle of the range / price)^exponent, in training and
+    in validation, so that an agent does not neglect the low prices.
     """
 
     timesteps: Positive
@@ -120,6 +122,7 @@ class TrainingConfig(_Strict):
     seed: int = pydantic.Field(default=0, ge=0)
     threads: Positive = 1
     target_rate: float | None = pydantic.Field(default=None, gt=0, le=1)
+    price_exponent: Share = 0.0
 
 
 class ValidationConfig(_Strict):

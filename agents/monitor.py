@@ -17,10 +17,11 @@ from tqdm import tqdm
 
 from agents.config import Experiment
 from agents.constraint import score
-from fusion_gym.envs import Task
+from fusion_gym.envs import EpisodeBatch, Task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.evaluation.model_policy import ModelPolicy
+from fusion_gym.validation import Array
 
 
 class Interrupt:
@@ -105,7 +106,7 @@ class Progress(BaseCallback):
         found = run_episodes(self.task, policy, settings.episodes, settings.seed)
         record = {
             "timesteps": self.num_timesteps,
-            "return": float(found.returns.mean()),
+            "return": float((found.returns * self._weights()).mean()),
             "mse": float(found.mse.mean()),
             "rate": float(found.rate.mean()),
         }
@@ -123,6 +124,17 @@ class Progress(BaseCallback):
             save(self.model, self.folder / "best_model.zip")
         if self.watch is not None:
             self.stopped = self.watch(record)
+
+    def _weights(self) -> Array:
+        """What each validation episode's return counts, by its price."""
+        exponent = self.experiment.training.price_exponent
+        if exponent == 0.0:
+            return np.ones(1)
+        episodes, first = self.experiment.validation.episodes, self.experiment.validation.seed
+        batch = EpisodeBatch(self.task, episodes)
+        batch.seed(np.arange(episodes), [first + place for place in range(episodes)])
+        batch.reset()
+        return self.task.reward.price.scale(batch.price, exponent)
 
     def save(self) -> None:
         """Write the checkpoint, with the replay buffer where there is one."""

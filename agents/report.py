@@ -128,12 +128,12 @@ def draw(results: Path, name: str, parts: dict[str, Any]) -> None:
             for policy in curve["policies"]
         ]
         for label, curve in parts["baselines"]["curves"].items()
-        if curve["knows"] != "lookahead"
+        if curve["knows"] != "informed"
     }
     ahead = sorted(
         (_rate(policies[policy]), policies[policy]["mse"]["mean"])
         for curve in parts["baselines"]["curves"].values()
-        if curve["knows"] == "lookahead"
+        if curve["knows"] == "informed"
         for policy in curve["policies"]
     )
     fronts = {

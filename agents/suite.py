@@ -16,6 +16,7 @@ from agents.config import (
     PPOConfig,
     Rate,
     RecurrentPPOConfig,
+    Share,
     parse,
     read_yaml,
 )
@@ -87,7 +88,7 @@ class Genie(_Strict):
 class Setting(_Strict):
     """One environment in one setting; ``families`` are labels, all of them by default.
 
-    ``lookahead`` are policies that know the model and all new signals, ``references`` computed
+    ``informed`` are policies that know the model and all new signals, ``references`` computed
     ones that know no more than the centre. ``longer`` multiplies the length of its trainings,
     ``algorithm`` replaces hyper-parameters.
     """
@@ -98,7 +99,7 @@ class Setting(_Strict):
     price_range: tuple[Rate, Rate]
     families: tuple[str, ...] | None = None
     points: tuple[str, ...] = ("always", "never")
-    lookahead: tuple[str, ...] = ()
+    informed: tuple[str, ...] = ()
     references: tuple[str, ...] = ()
     longer: float = pydantic.Field(default=1.0, gt=0)
     algorithm: dict[str, Any] = {}
@@ -114,6 +115,7 @@ class Suite(_Strict):
     timesteps: Positive = 4_000_000
     num_envs: Positive = 256
     prices: Positive = 7
+    price_exponent: Share = 0.5
     modes: tuple[Mode, ...] = ("sensors", "centre", "local")
     tuning: Tuning = Tuning()
     algorithm: PPOConfig | MaskablePPOConfig | RecurrentPPOConfig | A2CConfig | DQNConfig = (

@@ -124,7 +124,13 @@ def train(
     folder = Path(experiment.output)
     prepare(experiment, folder, resume)
     torch.set_num_threads(experiment.training.threads)
-    env = FusionSB3VecEnv(task, experiment.training.num_envs, stagger=True, local=local)
+    env = FusionSB3VecEnv(
+        task,
+        experiment.training.num_envs,
+        stagger=True,
+        local=local,
+        price_exponent=experiment.training.price_exponent,
+    )
     checkpoint = folder / "latest.zip"
     if resume and checkpoint.exists():
         model = ALGORITHMS[experiment.algorithm.name].load(checkpoint, env=env, device="cpu")

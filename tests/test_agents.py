@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from stable_baselines3 import PPO
@@ -20,7 +21,8 @@ import fusion_gym
 from agents import demo, evaluate, monitor, reproduce, train
 from agents.config import load_comparison, load_experiment, load_sweep
 from agents.constraint import score
-from fusion_gym.evaluation import make_policy
+from fusion_gym.envs import EpisodeBatch
+from fusion_gym.evaluation import make_policy, run_episodes
 from fusion_gym.evaluation.metrics import summarise
 from fusion_gym.validation import ConfigurationError
 
@@ -169,6 +171,26 @@ def test_training_to_a_target_rate_moves_the_price(tmp_path: Path) -> None:
     assert prices[1.0] < 0.01 < prices[0.001]
     # 16 rollouts of 128 steps; each raises the logarithm by at most 0.05.
     assert prices[0.001] == pytest.approx(0.01 * math.exp(16 * 0.05), rel=1e-6)
+
+
+def test_validation_counts_episodes_by_their_price(tmp_path: Path) -> None:
+    """The record's return is the weighted one: cheap and dear episodes count alike."""
+    path = small_config(tmp_path)
+    content = yaml.safe_load(path.read_text())
+    content["environment"]["options"] |= {"cost_weight": "random", "price_range": [0.01, 1.0]}
+    content["training"]["price_exponent"] = 1.0
+    path.write_text(yaml.safe_dump(content))
+    train.train(load_experiment(path), quiet=True)
+    record = monitor.read_records(tmp_path / "run")[-1]
+    task = fusion_gym.make_task(ENV, **content["environment"]["options"])
+    batch = EpisodeBatch(task, 4)
+    batch.seed(np.arange(4), [500_000_000 + place for place in range(4)])
+    batch.reset()
+    price = batch.price.copy()
+    final = make_policy(f"model:{tmp_path / 'run' / 'final_model.zip'}", task)
+    found = run_episodes(task, final, 4, 500_000_000)
+    assert record["return"] == pytest.approx(float((found.returns * 0.1 / price).mean()))
+    assert record["return"] != pytest.approx(float(found.returns.mean()), rel=0.01)
 
 
 def test_the_best_model_under_a_target_keeps_its_rate() -> None:

@@ -54,7 +54,7 @@ SMALL: dict[str, Any] = {
             "title": "a small setting",
             "environment": {"id": ENV, "options": {"filter": "tobit", "horizon": 10}},
             "price_range": [0.001, 0.1],
-            "lookahead": ["lookahead:steps=1,price=0.01", "lookahead:steps=1,price=1e9"],
+            "informed": ["lookahead:steps=1,price=0.01", "lookahead:steps=1,price=1e9"],
             "references": ["periodic:period=7"],
             "genie": {"options": {"tokens": "unlimited"}, "assumes": "everything arrives"},
         }
@@ -131,7 +131,7 @@ def test_the_committed_suite_fits_its_environments() -> None:
         suite = load_suite(ROOT / "configs" / "benchmark.yaml", quick)
         for setting in suite.settings:
             task = benchmark._task(setting)
-            for name in (*setting.points, *setting.lookahead, *setting.references):
+            for name in (*setting.points, *setting.informed, *setting.references):
                 make_policy(name, task)
             for family in suite.families_of(setting):
                 trial = optuna.create_study().ask()

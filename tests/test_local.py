@@ -53,6 +53,8 @@ def test_a_row_has_what_the_sensor_knows_and_nothing_else(env_id: str) -> None:
             entry = batch.layout.names.index(source)
             np.testing.assert_array_equal(rows[:, sensor, place], observation[:, entry])
     kinds = {name.partition("[")[0] for name in view.names}
+    measured = {f.name.partition("[")[0] for f in batch.layout.entries if f.knowledge == "sensor"}
+    assert measured & kinds, "a sensor must see what it measures"
     assert {"tokens", "price", "sensor"} <= kinds
     assert not kinds & GLOBAL.get(env_id, set())
 

@@ -100,6 +100,39 @@ def test_an_agent_is_asked_at_any_price(tmp_path: Any) -> None:
         ModelPolicy(plain, unseen, price=0.05)
 
 
+@pytest.mark.parametrize("local", [False, True])
+def test_rewards_of_a_training_over_prices_are_scaled_and_returns_are_not(local: bool) -> None:
+    from fusion_gym.envs.sb3 import FusionSB3VecEnv
+
+    task = fusion_gym.make_task(
+        ENV_ID, filter="tobit", cost_weight="random", price_range=SPAN, horizon=6
+    )
+    plain = FusionSB3VecEnv(task, 5, local=local)
+    scaled = FusionSB3VecEnv(task, 5, local=local, price_exponent=0.5)
+    for env in (plain, scaled):
+        env.seed(7)
+        env.reset()
+    rows = plain.num_envs // 5
+    action = np.ones(plain.num_envs, dtype=int) if local else np.ones((5, task.sensors), dtype=int)
+    for _ in range(13):  # two episodes and a step: new prices are drawn on the way
+        price = plain.batch.price.repeat(rows)
+        _, reward, _, infos = plain.step(action)
+        _, other, _, others = scaled.step(action)
+        factor = np.sqrt(np.sqrt(SPAN[0] * SPAN[1]) / price)
+        np.testing.assert_allclose(other, reward * factor, rtol=1e-5)
+        assert [i.get("episode", {}).get("r") for i in infos] == [
+            i.get("episode", {}).get("r") for i in others
+        ]
+    for value in (-0.1, 1.5, float("nan")):
+        with pytest.raises(ConfigurationError, match="price_exponent"):
+            FusionSB3VecEnv(task, 5, price_exponent=value)
+
+
+def test_one_price_has_no_scale() -> None:
+    price = fusion_gym.make_task(ENV_ID, cost_weight=0.2).reward.price
+    np.testing.assert_array_equal(price.scale(np.full(3, 0.2), 0.5), 1.0)
+
+
 @pytest.mark.parametrize(
     ("options", "parts"),
     [

@@ -66,6 +66,17 @@ class Price:
         low, high = self.span
         return np.log(price / low) / math.log(high / low)
 
+    def scale(self, price: Array, exponent: float) -> Array:
+        """(geometric mean of the range / price)^exponent, same shape; 1 without a range.
+
+        Multiplying an episode's rewards by it changes no policy that is best for its price, and
+        brings what a decision is worth at low and at high prices closer together: at a price p the
+        decisions that are hard to make are worth about p.
+        """
+        if self.span is None:
+            return np.ones(price.shape)
+        return np.asarray((math.sqrt(self.span[0] * self.span[1]) / price) ** exponent)
+
 
 def _span(value: Any) -> tuple[float, float]:
     pair = validation.positive("price_range", validation.array("price_range", value, (2,)), (2,))

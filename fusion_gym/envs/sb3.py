@@ -18,6 +18,7 @@ from fusion_gym.envs.batch import EpisodeBatch
 from fusion_gym.envs.local import LocalView
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.task import Task
+from fusion_gym.validation import Array
 
 
 class FusionSB3VecEnv(VecEnv):
@@ -35,6 +36,9 @@ class FusionSB3VecEnv(VecEnv):
     :class:`~fusion_gym.envs.local.LocalView` and the action space ``Discrete(2)``: one shared
     policy learns what each sensor can run by itself. All rows of a run get the run's reward.
 
+    ``price_exponent``, from 0 to 1, is for training over a range of prices: an episode's rewards
+    are multiplied by :meth:`~fusion_gym.envs.price.Price.scale`. Returns in infos are not.
+
     Attributes:
         task: the task.
         view: the local view, if there is one.
@@ -44,7 +48,13 @@ class FusionSB3VecEnv(VecEnv):
     """
 
     def __init__(
-        self, task: Task, num_envs: int, *, stagger: bool = False, local: bool = False
+        self,
+        task: Task,
+        num_envs: int,
+        *,
+        stagger: bool = False,
+        local: bool = False,
+        price_exponent: float = 0.0,
     ) -> None:
         self.runs = validation.integer("num_envs", num_envs, at_least=1)
         self.task = task
@@ -53,6 +63,9 @@ class FusionSB3VecEnv(VecEnv):
         self._rows = 1 if self.view is None else task.sensors  # of each run
         self.observation_names = (self.view or self.batch.layout).names
         self.stagger = validation.boolean("stagger", stagger)
+        self.price_exponent = validation.number(
+            "price_exponent", price_exponent, at_least=0.0, at_most=1.0
+        )
         self.seconds = 0.0
         self.totals = (0.0, 0)
         self.render_mode = None
@@ -110,7 +123,7 @@ class FusionSB3VecEnv(VecEnv):
             requests = spaces.requests(self.task, self._actions, self.runs)
         else:
             requests = self.view.requests(self._actions)
-        lengths = self.batch.steps
+        lengths, scale = self.batch.steps, self._scale()
         outcome = self.batch.step(requests)
         self._returns += outcome.reward
         self._spent += outcome.cost
@@ -119,7 +132,7 @@ class FusionSB3VecEnv(VecEnv):
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done.any():
             self._finish(np.flatnonzero(done), lengths, infos)
-        reward = outcome.reward.astype(np.float32)
+        reward = (outcome.reward * scale).astype(np.float32)
         result = (
             self._observe(),
             reward.repeat(self._rows),
@@ -151,6 +164,12 @@ class FusionSB3VecEnv(VecEnv):
         self._returns[runs] = 0.0
         self._spent[runs] = 0.0
         self.batch.reset(runs)
+
+    def _scale(self) -> Array | float:
+        """What the rewards of the coming step are multiplied by, (N,)."""
+        if self.price_exponent == 0.0:
+            return 1.0
+        return self.task.reward.price.scale(self.batch.price, self.price_exponent)
 
     def _observe(self) -> NDArray[np.float32]:
         observation = self.batch.observe()

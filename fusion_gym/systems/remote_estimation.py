@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.network.channel import STATES, Channel
-from fusion_gym.systems.base import Feature, Signal, SignalArray
+from fusion_gym.systems.base import Feature, Signal, SignalArray, feature_block
 from fusion_gym.validation import Array
 
 _RANGE = 5.0  # scaled errors are clipped here
@@ -114,11 +114,11 @@ class RemoteEstimationSystem:
     def features(self) -> tuple[tuple[Feature, ...], ...]:
         """Blocks of the observation; see docs/remote_estimation.md."""
         sensors = range(self.sensor_count)
-        error = tuple(Feature(f"error[{i}]", "sensor", -_RANGE, _RANGE) for i in sensors)
-        age = tuple(Feature(f"age[{i}]", "centre", 0.0, 1.0) for i in sensors)
-        channel = tuple(
-            Feature(f"channel[{i},{name}]", "centre", 0.0, 1.0) for i in sensors for name in STATES
-        )
+        own = [(i, f"{i}") for i in sensors]
+        error = feature_block("error", own, "sensor", _RANGE)
+        age = feature_block("age", own, "centre")
+        states = [(i, f"{i},{name}") for i in sensors for name in STATES]
+        channel = feature_block("channel", states, "centre")
         return (error, age, channel) if self.channel.states > 1 else (error, age)
 
     def start(self, noise: Array) -> RemoteEstimationState:
