@@ -106,11 +106,11 @@ def fronts(
     path: Path,
     title: str,
     curves: Mapping[str, Sequence[tuple[float, float]]],
-    lookahead: Sequence[tuple[float, float]],
+    informed: Sequence[tuple[float, float]],
     agents: Mapping[str, Sequence[tuple[float, float]]],
     genie: Mapping[str, Mapping[str, float]] | None,
 ) -> None:
-    """Learned fronts beside tuned baselines and the lookahead, as points (rate, MSE).
+    """Learned fronts beside tuned baselines and informed references, as points (rate, MSE).
 
     The errors' axis ends at 4.5 times the least of them: what lies above is of no interest.
     """
@@ -120,15 +120,15 @@ def fronts(
         rate, mse = zip(*sorted(points), strict=True)
         line = "" if len(points) == 1 else "-"
         axes.plot(rate, mse, line, marker="o", ms=3, lw=0.9, color=colours(place % 20), label=label)
-    if lookahead:
-        rate, mse = zip(*lookahead, strict=True)
-        axes.plot(rate, mse, ":", marker="x", ms=4, color=_INK, label="lookahead with the model")
+    if informed:
+        rate, mse = zip(*informed, strict=True)
+        axes.plot(rate, mse, ":", marker="x", ms=4, color=_INK, label="reference with the model")
     for (mode, points), style in zip(agents.items(), ("-", "--", "-."), strict=False):
         rate, mse = zip(*sorted(points), strict=True)
         axes.plot(
             rate, mse, style, marker="*", ms=9, color=_AGENT, zorder=3, label=f"agent, {mode}"
         )
-    everything = [mse for points in (*agents.values(), lookahead) for _, mse in points]
+    everything = [mse for points in (*agents.values(), informed) for _, mse in points]
     bottom = 0.88 * min(everything)
     if genie is not None:
         level = genie["mse"]["mean"]
