@@ -53,19 +53,24 @@ class _Algorithm(_Strict):
     network: NetworkConfig = NetworkConfig()
 
 
-class PPOConfig(_Algorithm):
+class _OnPolicy(_Algorithm):
+    """What PPO and A2C have in common."""
+
+    gae_lambda: Share = 0.9
+    ent_coef: float = 0.0
+    vf_coef: float = 0.5
+    max_grad_norm: Rate = 0.5
+    initial_rate: InitialRate = None
+
+
+class PPOConfig(_OnPolicy):
     """Stable-Baselines3's PPO; the names are its own."""
 
     name: Literal["ppo"]
     n_steps: Positive = 64
     batch_size: Positive = 4096
     n_epochs: Positive = 4
-    gae_lambda: Share = 0.9
     clip_range: Rate = 0.2
-    ent_coef: float = 0.0
-    vf_coef: float = 0.5
-    max_grad_norm: Rate = 0.5
-    initial_rate: InitialRate = None
 
 
 class MaskablePPOConfig(PPOConfig):
@@ -81,16 +86,11 @@ class RecurrentPPOConfig(PPOConfig):
     memory: Positive = 64
 
 
-class A2CConfig(_Algorithm):
+class A2CConfig(_OnPolicy):
     """Stable-Baselines3's A2C; the names are its own."""
 
     name: Literal["a2c"]
     n_steps: Positive = 8
-    gae_lambda: Share = 0.9
-    ent_coef: float = 0.0
-    vf_coef: float = 0.5
-    max_grad_norm: Rate = 0.5
-    initial_rate: InitialRate = None
 
 
 class DQNConfig(_Algorithm):

@@ -85,12 +85,19 @@ class Genie(_Strict):
     assumes: str
 
 
+class Hindsight(_Strict):
+    """What a clairvoyant would do at some prices; ``width`` is that of its beam search."""
+
+    prices: tuple[Rate, ...] = pydantic.Field(min_length=1)
+    width: Positive = 32
+
+
 class Setting(_Strict):
     """One environment in one setting; ``families`` are labels, all of them by default.
 
     ``informed`` are policies that know the model and all new signals, ``references`` computed
     ones that know no more than the centre. ``longer`` multiplies the length of its trainings,
-    ``algorithm`` replaces hyper-parameters.
+    ``price_exponent`` and ``algorithm`` replace the suite's.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
@@ -102,8 +109,10 @@ class Setting(_Strict):
     informed: tuple[str, ...] = ()
     references: tuple[str, ...] = ()
     longer: float = pydantic.Field(default=1.0, gt=0)
+    price_exponent: Share | None = None
     algorithm: dict[str, Any] = {}
     genie: Genie | None = None
+    hindsight: Hindsight | None = None
 
 
 class Suite(_Strict):
@@ -116,6 +125,7 @@ class Suite(_Strict):
     num_envs: Positive = 256
     prices: Positive = 7
     price_exponent: Share = 0.5
+    hindsight_episodes: Positive = 100
     modes: tuple[Mode, ...] = ("sensors", "centre", "local")
     tuning: Tuning = Tuning()
     algorithm: PPOConfig | MaskablePPOConfig | RecurrentPPOConfig | A2CConfig | DQNConfig = (
@@ -154,6 +164,7 @@ QUICK: dict[str, Any] = {
     "training_seeds": 1,
     "timesteps": 600_000,
     "prices": 5,
+    "hindsight_episodes": 10,
     "tuning": {"trials": 10, "episodes": 60, "kept": 8},
 }
 

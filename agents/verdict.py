@@ -42,6 +42,7 @@ def judge(
     baselines: Mapping[str, EpisodeResults],
     references: Mapping[str, EpisodeResults],
     always: float,
+    clairvoyant: Mapping[str, EpisodeResults] | None = None,
 ) -> dict[str, Any]:
     """Points and verdict of one front.
 
@@ -50,7 +51,9 @@ def judge(
     difference of the MSE to the baselines' envelope: interquartile mean over seeds with a 95 %
     interval, bootstrapped over seeds and (paired) episodes at once. The verdict does the same over
     all points in the middle of the front, stratified by price, where the rate is between 5 % and
-    50 % of ``always``, the rate that always transmitting gets.
+    50 % of ``always``, the rate that always transmitting gets. ``clairvoyant`` has results of
+    schedules made in hindsight, on the first of the episodes: points have their MSE at the same
+    rate, as a share of the baselines' envelope on the same episodes times that on all.
     """
     points, inside = [], []
     for place, price in enumerate(prices):
@@ -70,6 +73,10 @@ def judge(
             sound = [found.mean() for found in known if found is not None]
             if sound and len(sound) == len(rates):
                 point["reference"] = float(np.mean(sound))
+            ahead = envelope_mse(clairvoyant, rate) if clairvoyant else None
+            if ahead is not None:
+                share = ahead.mean() / envelope[:, : len(ahead)].mean()
+                point["hindsight"] = float(share * envelope.mean())
         points.append(point)
     verdict: dict[str, Any] = {"points": points, "seeds": len(agents)}
     if inside:
@@ -79,6 +86,10 @@ def judge(
     if room > 0.0:
         verdict["room"] = room / sum(p["envelope"] for p in gaps)
         verdict["closed"] = sum(p["envelope"] - p["mse"] for p in gaps) / room
+    loose = [p for p in points if "hindsight" in p and _in_middle(p, always)]
+    if loose:
+        part = sum(p["hindsight"] for p in loose) / sum(p["envelope"] for p in loose)
+        verdict["hindsight_room"] = 1.0 - part
     return verdict
 
 

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 import fusion_gym
-from agents import benchmark, report, solved, tune, zoo
+from agents import benchmark, jobs, report, solved, tune, zoo
 from agents.arrays import load_results, save_results
 from agents.suite import Choices, Family, Range, Tuning, load_suite
 from agents.tuning import tune as tune_family
@@ -57,8 +57,10 @@ SMALL: dict[str, Any] = {
             "informed": ["lookahead:steps=1,price=0.01", "lookahead:steps=1,price=1e9"],
             "references": ["periodic:period=7"],
             "genie": {"options": {"tokens": "unlimited"}, "assumes": "everything arrives"},
+            "hindsight": {"prices": [0.001, 0.1], "width": 4},
         }
     ],
+    "hindsight_episodes": 5,
 }
 
 
@@ -98,6 +100,10 @@ def test_from_tuning_to_report_and_zoo(
     assert baselines["curves"]["gain"]["knows"] == "centre"
     assert baselines["genie"]["assumes"] == "everything arrives"
     assert (folder / "references.json").exists()
+    hindsight = json.loads((folder / "hindsight.json").read_text())
+    assert (hindsight["episodes"], hindsight["width"]) == (5, 4)
+    dear = hindsight["policies"]["hindsight at price 0.1"]["tokens"]["mean"]
+    assert dear < hindsight["policies"]["hindsight at price 0.001"]["tokens"]["mean"]
     in_local = {point["name"] for point in verdict["modes"]["local"]["envelope"]}
     assert not any(name.startswith("information_gain") for name in in_local)
     agent = json.loads((folder / "agent_local_1.json").read_text())
@@ -130,7 +136,7 @@ def test_the_committed_suite_fits_its_environments() -> None:
     for quick in (False, True):
         suite = load_suite(ROOT / "configs" / "benchmark.yaml", quick)
         for setting in suite.settings:
-            task = benchmark._task(setting)
+            task = jobs.setting_task(setting)
             for name in (*setting.points, *setting.informed, *setting.references):
                 make_policy(name, task)
             for family in suite.families_of(setting):
@@ -213,8 +219,14 @@ def test_the_verdict_is_the_arithmetic_that_it_says() -> None:
         [made_up(0.3, 0.7 * 1.7 * noise), made_up(0.8, noise)],
         [made_up(0.3, 0.8 * 1.7 * noise), made_up(0.8, noise)],
     ]
-    verdict = judge(agents, [0.1, 0.01], baselines, references, always=1.0)
+    ahead = {
+        "dear": made_up(0.1, 0.6 * noise[:50]),
+        "cheap": made_up(0.5, 0.2 * noise[:50]),
+    }
+    verdict = judge(agents, [0.1, 0.01], baselines, references, always=1.0, clairvoyant=ahead)
     point = verdict["points"][0]
+    assert point["hindsight"] == pytest.approx(0.4 * noise.mean())
+    assert verdict["hindsight_room"] == pytest.approx(1.0 - 0.4 / 1.7)
     assert point["envelope"] == pytest.approx(1.7 * noise.mean())
     assert verdict["middle"]["mean"] == pytest.approx(-0.25)
     assert verdict["middle"]["low"] == pytest.approx(-0.3)

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import fusion_gym
+from agents import report
 from fusion_gym.envs import EpisodeBatch
 from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.triggers import TRIGGERS
@@ -48,6 +49,14 @@ def test_files_and_configs_that_the_readme_names_exist() -> None:
 def test_every_policy_is_in_the_readme() -> None:
     missing = [name for name in TRIGGERS if f"`{name}`" not in README]
     assert not missing
+
+
+def test_the_committed_report_says_what_the_results_say() -> None:
+    found = report.read(ROOT / "results")
+    written = (ROOT / "results" / "README.md").read_text()
+    assert written == report.text_of(found, "python -m agents.benchmark")
+    missing = [line for line in report.headline_table(found) if line not in README]
+    assert missing == []
 
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)

@@ -100,7 +100,7 @@ class EpisodeBatch:
             self.price = _merge(self.price, self.task.reward.price.draw(drawn), runs)
         self._draw(runs)
         fresh = system.start(np.ascontiguousarray(noise.T))
-        row = self._noise()
+        row = self.noise()
         fresh = system.sense(fresh, row if everyone else row[:, runs])
         self.state = fresh if everyone else _merge(self.state, fresh, runs)
         self.tokens = _merge(self.tokens, self.task.bucket.start(len(runs)), runs)
@@ -142,7 +142,7 @@ class EpisodeBatch:
         if used_up.any():
             self._draw(np.flatnonzero(used_up))
         self.delivered = state
-        self.state = system.sense(state, self._noise())
+        self.state = system.sense(state, self.noise())
         self.finished = truncated.copy()
         return Outcome(
             reward=reward_error + reward_cost,
@@ -175,8 +175,8 @@ class EpisodeBatch:
             result[sensor] = self.task.bucket.grant(self.tokens, alone, self.steps).granted[sensor]
         return result
 
-    def _noise(self) -> Array:
-        """The system's noise (channels, N) at the cursor."""
+    def noise(self) -> Array:
+        """The normals (channels, N) of the last sensing, a view that later steps overwrite."""
         return self._ring[self._cursor % self._block, : self.task.system.noise_channels]
 
     def signals(self) -> Signals:
@@ -241,6 +241,22 @@ class EpisodeBatch:
         rows = (self._cursor + np.arange(self._block)) % self._block
         self._ring[rows[:, None], :, runs[None, :]] = noise.transpose(1, 0, 2)
         self._block_start[runs] = self._cursor
+
+
+def take_runs(state: Any, runs: NDArray[np.int64]) -> Any:
+    """The given runs of a state, in this order and possibly again and again.
+
+    Through dataclasses and named tuples, whose arrays have the batch as last axis.
+    """
+    if isinstance(state, np.ndarray):
+        return state.take(runs, axis=-1)
+    if state is None:
+        return None
+    if isinstance(state, tuple):
+        return type(state)(*(take_runs(part, runs) for part in state))
+    return type(state)(
+        *(take_runs(getattr(state, field.name), runs) for field in dataclasses.fields(state))
+    )
 
 
 def _merge(old: Any, new: Any, runs: NDArray[np.int64]) -> Any:

@@ -2,6 +2,7 @@
 
 from fusion_gym.evaluation.envelope import EnvelopePoint, compare_with_envelope, lower_envelope
 from fusion_gym.evaluation.episodes import EpisodeResults, Trajectory, record_episode, run_episodes
+from fusion_gym.evaluation.hindsight import Schedules, find_schedules, run_hindsight
 from fusion_gym.evaluation.intervals import Interval, mean_interval
 from fusion_gym.evaluation.metrics import paired_difference, robust_summary, summarise
 from fusion_gym.evaluation.policies import make_policy
@@ -10,8 +11,10 @@ __all__ = [
     "EnvelopePoint",
     "EpisodeResults",
     "Interval",
+    "Schedules",
     "Trajectory",
     "compare_with_envelope",
+    "find_schedules",
     "lower_envelope",
     "make_policy",
     "mean_interval",
@@ -19,5 +22,6 @@ __all__ = [
     "record_episode",
     "robust_summary",
     "run_episodes",
+    "run_hindsight",
     "summarise",
 ]
