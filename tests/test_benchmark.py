@@ -19,6 +19,7 @@ from agents.suite import Choices, Family, Range, Tuning, load_suite
 from agents.tuning import tune as tune_family
 from agents.verdict import judge
 from fusion_gym.evaluation import EpisodeResults, make_policy, run_episodes
+from fusion_gym.evaluation.periodic_optimum import Schedule
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
@@ -132,7 +133,12 @@ def test_from_tuning_to_report_and_zoo(
     assert "zoo:small_local" in capsys.readouterr().out
 
 
-def test_the_committed_suite_fits_its_environments() -> None:
+def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unsearched(system: Any, packets: int, period: int, *_: Any) -> Schedule:
+        return Schedule(np.ones((period, system.sensor_count), dtype=np.bool_), float(packets))
+
+    # The policies are made, but the schedules' searches would take minutes.
+    monkeypatch.setattr("fusion_gym.evaluation.periodic_optimum.optimum", unsearched)
     for quick in (False, True):
         suite = load_suite(ROOT / "configs" / "benchmark.yaml", quick)
         for setting in suite.settings:

@@ -9,6 +9,7 @@ import json
 import math
 import os
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ import fusion_gym
 from fusion_gym import linalg, validation
 from fusion_gym.envs import Task
 from fusion_gym.systems import Signals, System
+from fusion_gym.systems.base import ConservativeSystem
 from fusion_gym.triggers import Requests
 from fusion_gym.validation import Array, ConfigurationError
 
@@ -28,7 +30,8 @@ _MOST = 200_000  # schedules that one search may compare
 _TOGETHER = 4096  # schedules side by side
 _LONGEST = 1000  # steps after which traces that have not settled are taken as they are
 _SETTLED = 1e-9  # relative change from one cycle to the next below which they have
-_FORMAT = 1  # of the cache
+_FORMAT = 2  # of the cache
+AVERAGES = ("steady", "episode")
 
 _found: dict[str, Schedule] = {}
 
@@ -36,7 +39,7 @@ _found: dict[str, Schedule] = {}
 class Schedule(NamedTuple):
     """Requests (period, sensors) bool, row 0 for the first step of an episode, and their trace.
 
-    ``trace`` is the plain trace of the fused covariance in the steady state, averaged over time.
+    ``trace`` is the plain trace of the fused error's covariance, averaged over time.
     """
 
     requests: Patterns
@@ -47,9 +50,23 @@ class PeriodicOptimum:
     """Repeats the schedule of ``packets`` requests in ``period`` steps with the smallest trace.
 
     All schedules are compared by the system's own recursion, whatever it costs: the phase against
-    the sensors' sampling matters, so none is left out. The trace is the plain one of the fused
-    covariance in the steady state. It looks at no signal but the clock, and supposes that every
-    request is granted; under a token limit the network may deny some.
+    the sensors' sampling and the start matters, so none is left out. It looks at no signal but the
+    clock, and supposes that every request is granted; under a token limit the network may deny
+    some.
+
+    The trace is the plain one of the fused error's covariance:
+
+    - the actual covariance, thus the mean squared error, if the system claims only a bound but
+      can tell (CorrelatedTracking-v0; where the noise scale is drawn, the mean over scales);
+    - else the claimed one. It is the mean squared error in MarkovJumpTracking-v0 with matrix
+      weights or at a centre, and of uncensored Kalman filters with federated fusion. Under
+      covariance intersection it is a bound, and in UnknownInput-v0 a claim under the filter's
+      model of the input, so the best schedule by the claim need not have the smallest error.
+
+    ``average="steady"`` takes its mean over the steady state and supposes that an episode is long
+    against the transient from the start. ``"episode"`` takes the mean over the task's horizon from
+    the start, transient included: what an evaluation measures, and the right choice where the
+    plant or a node never settles.
 
     The result of a search is kept while the process lives, and with ``cache``, a path, in a file.
 
@@ -60,10 +77,16 @@ class PeriodicOptimum:
     """
 
     def __init__(
-        self, task: Task, packets: int = 4, period: int = 6, cache: str | None = None
+        self,
+        task: Task,
+        packets: int = 4,
+        period: int = 6,
+        cache: str | None = None,
+        average: str = "steady",
     ) -> None:
         validation.integer("period", period, at_least=1)
         validation.integer("packets", packets, at_least=1, at_most=period * task.sensors)
+        validation.choice("average", average, AVERAGES)
         if cache is not None and not isinstance(cache, str):
             raise ConfigurationError(f"cache = {cache!r} is not allowed: it must be a path")
         if task.access != "any":
@@ -79,7 +102,8 @@ class PeriodicOptimum:
                 f"allowed: of {count} schedules at most {_MOST} can be compared, so period must "
                 "be smaller"
             )
-        self.schedule, self.trace = optimum(task.system, packets, period, cache)
+        steps = task.horizon if average == "episode" else None
+        self.schedule, self.trace = optimum(task.system, packets, period, cache, steps)
 
     def reset(self, num_envs: int, seed: int = 0) -> None:
         """Nothing to forget."""
@@ -90,29 +114,38 @@ class PeriodicOptimum:
         return np.ascontiguousarray(self.schedule[place].T)
 
 
-def optimum(system: System[Any], packets: int, period: int, cache: str | None = None) -> Schedule:
-    """The schedule with the smallest steady trace, from memory or ``cache`` if it is known.
+def optimum(
+    system: System[Any],
+    packets: int,
+    period: int,
+    cache: str | None = None,
+    steps: int | None = None,
+) -> Schedule:
+    """The schedule with the smallest trace, from memory or ``cache`` if it is known.
 
-    Of equal traces (to a relative 1e-9) the first in the order of its steps and sensors wins.
+    The trace is averaged over the first ``steps`` steps from the start; ``None`` stands for the
+    steady state. Of equal traces (to a relative 1e-9) the first in the order of its steps and
+    sensors wins.
 
     Raises:
         ConfigurationError: the system's covariances depend on the data.
     """
-    key = _key(system, packets, period)
+    key = _key(system, packets, period, steps)
     if key not in _found:
         stored = _load(cache, key, packets, (period, system.sensor_count))
-        _found[key] = _search(system, packets, period) if stored is None else stored
+        _found[key] = _search(system, packets, period, steps) if stored is None else stored
     if cache is not None:
         _store(cache, key, _found[key])
     return _found[key]
 
 
 def steady_traces(system: System[Any], schedules: Patterns) -> Array:
-    """Plain traces (N,) of the fused covariance, settled and averaged, of periodic schedules.
+    """Plain traces (N,) of the fused error's covariance, settled, of periodic schedules.
 
     The system runs without noise, one run a schedule: its covariances do not depend on the data.
     The average is over the common period of schedules and sampling, the first one that differs
-    by less than 1e-9 from the one before in all runs.
+    by less than 1e-9 from the one before in all runs, or the one in which step 1,000 lies. That
+    is no steady state where the plant or a node never settles.
 
     Args:
         system: declares a ``covariance_cycle``.
@@ -121,16 +154,11 @@ def steady_traces(system: System[Any], schedules: Patterns) -> Array:
     Raises:
         ConfigurationError: the system's covariances depend on the data.
     """
-    period, _, runs = schedules.shape
-    length = math.lcm(period, _cycle(system))
-    still = np.zeros((system.noise_channels, runs))
-    state = system.start(np.zeros((system.start_channels, runs)))
-    before = np.full(runs, np.inf)
-    for first in range(0, _LONGEST, length):
-        total = np.zeros(runs)
-        for step in range(first, first + length):
-            state = system.deliver(system.sense(state, still), schedules[step % period])
-            total += linalg.trace(system.fused(state)[1])
+    length = math.lcm(len(schedules), _cycle(system))
+    run = _Still(system, schedules)
+    before = np.full(schedules.shape[-1], np.inf)
+    for _ in range(0, _LONGEST, length):
+        total = run.total(length)
         settled = np.abs(total - before) <= _SETTLED * total
         before = total
         if settled.all():
@@ -138,7 +166,42 @@ def steady_traces(system: System[Any], schedules: Patterns) -> Array:
     return np.asarray(before / length)
 
 
-def _search(system: System[Any], packets: int, period: int) -> Schedule:
+def episode_traces(system: System[Any], schedules: Patterns, steps: int) -> Array:
+    """Plain traces (N,) as in :func:`steady_traces`, averaged over ``steps`` steps from the start.
+
+    Raises:
+        ConfigurationError: the system's covariances depend on the data.
+    """
+    _cycle(system)
+    return _Still(system, schedules).total(steps) / steps
+
+
+class _Still:
+    """Runs without noise from the start, one a schedule (period, sensors, N)."""
+
+    def __init__(self, system: System[Any], schedules: Patterns) -> None:
+        self._covariance: Callable[[Any], Array] = lambda state: system.fused(state)[1]
+        self._system, self._schedules, self._step = system, schedules, 0
+        if isinstance(system, ConservativeSystem):
+            self._system = actual = system.with_actual_covariance()
+            self._covariance = actual.error_covariance
+        runs = schedules.shape[-1]
+        self._still = np.zeros((system.noise_channels, runs))
+        self._state = self._system.start(np.zeros((system.start_channels, runs)))
+
+    def total(self, steps: int) -> Array:
+        """Sum (N,) of the traces over the next ``steps`` steps."""
+        total = np.zeros(self._schedules.shape[-1])
+        for step in range(self._step, self._step + steps):
+            delivered = self._schedules[step % len(self._schedules)]
+            sensed = self._system.sense(self._state, self._still)
+            self._state = self._system.deliver(sensed, delivered)
+            total += linalg.trace(self._covariance(self._state))
+        self._step += steps
+        return total
+
+
+def _search(system: System[Any], packets: int, period: int, steps: int | None) -> Schedule:
     sensors = system.sensor_count
     places = period * sensors
     every = itertools.combinations(range(places), packets)
@@ -147,7 +210,11 @@ def _search(system: System[Any], packets: int, period: int) -> Schedule:
         schedules = np.zeros((places, len(part)), dtype=np.bool_)
         for number, chosen in enumerate(part):
             schedules[list(chosen), number] = True
-        traces = steady_traces(system, schedules.reshape(period, sensors, -1))
+        shaped = schedules.reshape(period, sensors, -1)
+        if steps is None:
+            traces = steady_traces(system, shaped)
+        else:
+            traces = episode_traces(system, shaped, steps)
         first = int(np.flatnonzero(traces <= traces.min() * (1.0 + 1e-9))[0])
         if traces[first] < trace * (1.0 - 1e-9):
             best, trace = schedules[:, first].reshape(period, sensors), float(traces[first])
@@ -159,8 +226,9 @@ def _cycle(system: System[Any]) -> int:
     if cycle is None:
         raise ConfigurationError(
             f"policy 'periodic_optimum' is not allowed with {type(system).__name__}: it must be a "
-            "system whose covariances do not depend on the data, such as MarkovJumpTracking-v0 "
-            "with filter='local' or 'centralised'"
+            "system whose covariances do not depend on the data but on what is delivered, such as "
+            "MarkovJumpTracking-v0 with filter='local' or 'centralised', CorrelatedTracking-v0, "
+            "or UnknownInput-v0 with filter='random_walk' or 'predict'"
         )
     return int(cycle)
 
@@ -168,10 +236,10 @@ def _cycle(system: System[Any]) -> int:
 # --- cache ---------------------------------------------------------------------------------------
 
 
-def _key(system: System[Any], packets: int, period: int) -> str:
+def _key(system: System[Any], packets: int, period: int, steps: int | None) -> str:
     """Hash of the system's type and all its numbers, and of what is asked for."""
     digest = hashlib.sha256()
-    asked = (_FORMAT, fusion_gym.__version__, packets, period)
+    asked = (_FORMAT, fusion_gym.__version__, packets, period, steps)
     digest.update(repr(asked).encode())
     _feed(digest, system)
     return digest.hexdigest()

@@ -60,7 +60,7 @@ def _optimum(task: Task, criterion: str = "finite", price: float | None = None) 
 REFERENCES: dict[str, tuple[Callable[..., Policy], tuple[str, ...]]] = {
     "lookahead": (Lookahead, ("price", "steps")),
     "optimal": (_optimum, ("criterion", "price")),
-    "periodic_optimum": (PeriodicOptimum, ("cache", "packets", "period")),
+    "periodic_optimum": (PeriodicOptimum, ("average", "cache", "packets", "period")),
     "whittle": (WhittleIndex, ("at_most", "price")),
 }
 

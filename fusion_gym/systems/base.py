@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,4 +175,40 @@ class System(Protocol[StateT]):
 
     def open_loop(self, horizon: int) -> Array:
         """Mean error variance (n,) over t = 1..horizon of a centre that never receives."""
+        ...
+
+
+@runtime_checkable
+class PredictableSystem(System[StateT], Protocol[StateT]):
+    """A system that says whether its covariances follow from what is delivered alone.
+
+    Optional: a system without ``covariance_cycle`` counts as one whose covariances need the data.
+    """
+
+    @property
+    def covariance_cycle(self) -> int | None:
+        """Steps after which the covariances' recursion repeats itself (1 if it is always the same).
+
+        None where the data enter the covariances, or where deliveries do not.
+        """
+        ...
+
+
+@runtime_checkable
+class ConservativeSystem(PredictableSystem[StateT], Protocol[StateT]):
+    """A predictable system that claims a bound and can tell the actual covariance beside it.
+
+    Optional, as above.
+    """
+
+    def with_actual_covariance(self) -> ConservativeSystem[StateT]:
+        """The same system, its states carrying what :meth:`error_covariance` needs."""
+        ...
+
+    def error_covariance(self, state: StateT) -> Array:
+        """Actual covariance (n, n, N) of the fused error after :meth:`deliver`.
+
+        After a start with zeros for noise it is the mean over all episodes. Deliveries must not
+        depend on the noise.
+        """
         ...

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg
+from fusion_gym.filters import KalmanFilter
 from fusion_gym.plants import LinearPlant
 from fusion_gym.systems.base import Feature, Knowledge, Signal, SignalArray
-from fusion_gym.systems.centre import Centre, Outlook
+from fusion_gym.systems.centre import Centre, FeedbackCentre, Outlook
 from fusion_gym.validation import Array
 
 _WHITE = 5.0  # whitened quantities are clipped at this many standard deviations
@@ -103,6 +104,17 @@ class CensoredSystem:
     def start_channels(self) -> int:
         """Normals of a start: its direction, its deviation, the noise of the first measurement."""
         return 2 * self.plant.size + self.centre.sensors.noise_channels
+
+    @property
+    def covariance_cycle(self) -> int | None:
+        """1 where covariances follow from the deliveries: Kalman filters, and nothing censored.
+
+        With federated fusion they are then the actual ones, if ``model`` is the plant; with
+        covariance intersection they are bounds.
+        """
+        sensors, centre = self.centre.sensors, self.centre
+        linear = isinstance(centre, FeedbackCentre) and isinstance(centre.filter, KalmanFilter)
+        return 1 if linear and sensors.uncensored.all() and not sensors.two_sided else None
 
     @property
     def signals(self) -> tuple[Signal, ...]:

@@ -107,6 +107,11 @@ class CorrelatedTrackingSystem:
         return self.plant.initial_factor.shape[1] + 1
 
     @property
+    def covariance_cycle(self) -> int:
+        """1: all covariances follow from the deliveries, by a recursion that never changes."""
+        return 1
+
+    @property
     def signals(self) -> tuple[Signal, ...]:
         """The signals that :meth:`read` offers."""
         return SIGNALS
@@ -268,6 +273,22 @@ class CorrelatedTrackingSystem:
                 "track_actual = False is not allowed here: it must be True for actual covariances"
             )
         return state.joint
+
+    def with_actual_covariance(self) -> CorrelatedTrackingSystem:
+        """The same system with its actual covariances tracked."""
+        joint = JointErrorCovariance.create(self.plant, self.filter.sensors)
+        return replace(self, joint=joint)
+
+    def error_covariance(self, state: CorrelatedTrackingState) -> Array:
+        """Actual covariance (n, n, N) of the fused error.
+
+        Gains and fusion weights come from the bounds, so it is proportional to the noise scale,
+        and the mean over drawn scales is its value at the mean scale: that of a start with zeros.
+
+        Raises:
+            ConfigurationError: it is not tracked.
+        """
+        return self.actual_covariance(state)[0, 0]
 
     def open_loop(self, horizon: int) -> Array:
         """Mean error variance (n,) over t = 1..horizon of a centre that only predicts (bound)."""

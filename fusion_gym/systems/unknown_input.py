@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg
-from fusion_gym.filters.input_state_nodes import Estimates, Nodes, Outlook
+from fusion_gym.filters.input_state_nodes import Estimates, Nodes, Outlook, RunNodes
 from fusion_gym.plants.input_signals import InputSignal
 from fusion_gym.plants.unknown_input import UnknownInputPlant
 from fusion_gym.systems.base import Feature, Signal, SignalArray, feature_block
@@ -106,6 +106,17 @@ class UnknownInputSystem:
         """Normals of a start: the initial state, the first measurements' noise, the signal."""
         own = self.plant.start_channels + self.nodes.sensors.noise_channels
         return own + self.signal.start_channels
+
+    @property
+    def covariance_cycle(self) -> int | None:
+        """1 where covariances follow from the deliveries: nodes that predict while nothing arrives.
+
+        None with the paper's filter and with a hold variance, whose covariances do not show how
+        old the held measurement is. The covariances are claims under the filter's model of the
+        input, not the actual ones.
+        """
+        nodes = self.nodes
+        return 1 if isinstance(nodes, RunNodes) and nodes.hold_variance is None else None
 
     @property
     def signals(self) -> tuple[Signal, ...]:
