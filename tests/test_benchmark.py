@@ -15,6 +15,7 @@ import yaml
 import fusion_gym
 from agents import benchmark, jobs, report, solved, tune, zoo
 from agents.arrays import load_results, save_results
+from agents.config import PPOConfig
 from agents.suite import Choices, Family, Range, Tuning, load_suite
 from agents.tuning import tune as tune_family
 from agents.verdict import judge
@@ -152,6 +153,30 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
                 fusion_gym.make_task(
                     setting.environment.id, **(setting.environment.options | setting.genie.options)
                 )
+
+
+def test_trainings_of_the_committed_suite(tmp_path: Path) -> None:
+    """Local agents train on as many rows as a coordinator, in whole batches; settings override."""
+    suite = load_suite(ROOT / "configs" / "benchmark.yaml")
+    for setting in suite.settings:
+        sensors = jobs.setting_task(setting).sensors
+        whole, own = (
+            jobs.experiment_of(suite, setting, mode, 3, tmp_path) for mode in ("sensors", "local")
+        )
+        assert whole.training.num_envs == suite.num_envs
+        rows = own.training.num_envs * sensors
+        assert suite.num_envs - sensors < rows <= suite.num_envs
+        for experiment, together in ((whole, suite.num_envs), (own, rows)):
+            algorithm = experiment.algorithm
+            assert isinstance(algorithm, PPOConfig)
+            assert algorithm.n_steps * together % algorithm.batch_size == 0
+            assert experiment.training.seed == 3
+            wanted = setting.price_exponent
+            given = experiment.training.price_exponent
+            assert given == (suite.price_exponent if wanted is None else wanted)
+            for key, value in setting.algorithm.items():
+                if key != "batch_size":
+                    assert getattr(algorithm, key) == value
 
 
 def benchmark_text(trial: optuna.Trial, family: Family, sensors: int) -> str:
