@@ -22,12 +22,13 @@ import joblib
 from tqdm import tqdm
 
 from agents.arrays import load_results
+from agents.config import parse
 from agents.evaluate import write
 from agents.jobs import Folders, Job, jobs, run, setting_task
 from agents.suite import COMPARABLE, Setting, Suite, load_suite
 from agents.verdict import judge
 from fusion_gym.evaluation import EpisodeResults, lower_envelope
-from fusion_gym.validation import ConfigurationError, choice
+from fusion_gym.validation import ConfigurationError, choice, integer
 
 
 def conclude(suite: Suite, setting: Setting, folders: Folders) -> dict[str, Any] | None:
@@ -109,18 +110,19 @@ def parser() -> argparse.ArgumentParser:
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     given = parser().parse_args()
-    # Ended from outside like by Ctrl-C: the workers stop too.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     kind = "quick" if given.quick else "full"
     folders = Folders(
         given.results or Path("results/quick" if given.quick else "results"),
         given.work or Path("runs/benchmark") / kind,
     )
+    # Ended from outside like by Ctrl-C: the workers stop too.
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         suite = load_suite(given.config, given.quick)
         changed = {"training_seeds": given.seeds, "timesteps": given.timesteps}
         changed = {key: value for key, value in changed.items() if value is not None}
-        suite = Suite.model_validate(suite.model_dump() | changed)
+        suite = parse(Suite, suite.model_dump() | changed, "command line")
+        integer("workers", given.workers, at_least=1)
         by_name = {setting.name: setting for setting in suite.settings}
         for name in given.envs or []:
             choice("envs", name, by_name)
@@ -144,12 +146,13 @@ def main() -> None:
         print(f"results in {folders.results}: python -m agents.report --results {folders.results}")
     except ConfigurationError as error:
         sys.exit(f"error: {error}")
-    except ValueError as error:
-        sys.exit(f"error: {error}")
     except KeyboardInterrupt:
-        command = shlex.join(["python", "-m", "agents.benchmark", *sys.argv[1:]])
-        print(f"interrupted; go on with: {command} --resume", file=sys.stderr)
+        words = [word for word in sys.argv[1:] if word != "--resume"]
+        command = shlex.join(["python", "-m", "agents.benchmark", *words, "--resume"])
+        print(f"interrupted; go on with: {command}", file=sys.stderr)
         sys.exit(130)
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 if __name__ == "__main__":
