@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from reference_markov_jump import PAPER, Dense, best_weights
-from scipy.optimize import minimize_scalar
 
 import fusion_gym
 from fusion_gym import linalg
@@ -19,12 +18,9 @@ from fusion_gym.envs import EpisodeBatch, Task
 from fusion_gym.evaluation import make_policy, periodic_optimum, run_episodes
 from fusion_gym.evaluation.periodic_optimum import (
     PeriodicOptimum,
-    episode_traces,
     steady_traces,
 )
-from fusion_gym.systems.correlated_tracking import CorrelatedTrackingSystem
 from fusion_gym.systems.markov_jump import MarkovJumpSystem
-from fusion_gym.systems.unknown_input import UnknownInputSystem
 from fusion_gym.triggers.random import Random
 from fusion_gym.validation import ConfigurationError
 
@@ -120,218 +116,6 @@ def test_runs_in_other_steps_stand_side_by_side() -> None:
     policy = PeriodicOptimum(markov(), 3, 6)
     requests = policy({"step": np.array([0, 4, 6, 13])})  # type: ignore[arg-type]
     np.testing.assert_array_equal(requests.T, policy.schedule[[0, 4, 0, 1]])
-
-
-# --- other systems -------------------------------------------------------------------------------
-
-
-def correlated(**options: Any) -> Task:
-    return fusion_gym.make_task("fusion_gym/CorrelatedTracking-v0", **options)
-
-
-def unknown(**options: Any) -> Task:
-    return fusion_gym.make_task("fusion_gym/UnknownInput-v0", **options)
-
-
-def biased(name: str = "Tracking", **options: Any) -> Task:
-    """Nothing is censored, unless the options say so."""
-    free = {
-        "filter": "kalman",
-        "access": "any",
-        "censoring_threshold": -np.inf,
-        "censoring_upper": np.inf,
-    }
-    return fusion_gym.make_task(f"fusion_gym/Biased{name}-v0", **free | options)
-
-
-def all_schedules(packets: int, period: int, sensors: int) -> NDArray[np.bool_]:
-    chosen = list(itertools.combinations(range(period * sensors), packets))
-    result = np.zeros((period * sensors, len(chosen)), dtype=bool)
-    for number, places in enumerate(chosen):
-        result[list(places), number] = True
-    return result.reshape(period, sensors, -1)
-
-
-def squared_by_impulses(system: Any, schedule: NDArray[np.bool_], steps: int) -> float:
-    """Exact MSE over the first steps of a system whose error is linear in its normals.
-
-    One run for each normal, which alone is 1: the squares of what the errors gain by it add up.
-    """
-    first, each = system.start_channels, system.noise_channels
-    every = np.eye(first + each * steps, 1 + first + each * steps, k=1)
-    state, total = system.start(every[:first]), 0.0
-    for step in range(steps):
-        noise = every[first + each * step : first + each * (step + 1)]
-        sent = np.repeat(schedule[step % len(schedule)][:, None], every.shape[1], axis=1)
-        state = system.deliver(system.sense(state, noise), sent)
-        error = system.truth(state) - system.fused(state)[0]
-        total += float(((error[:, 1:] - error[:, :1]) ** 2).sum())
-    return total / steps
-
-
-def assert_searched(
-    task: Task, packets: int, period: int, traces: list[float], rtol: float
-) -> None:
-    """The policy has the schedule and the episode's trace of an independent brute force."""
-    policy = PeriodicOptimum(task, packets, period, average="episode")
-    best = int(np.argmin(traces))
-    schedules = all_schedules(packets, period, task.sensors)
-    assert policy.trace == pytest.approx(traces[best], rel=rtol)
-    np.testing.assert_array_equal(policy.schedule, schedules[..., best])
-    found = episode_traces(task.system, schedules, task.horizon)
-    np.testing.assert_allclose(found, traces, rtol=rtol)
-
-
-@pytest.mark.parametrize("options", [{}, {"fusion": "sci"}, {"fusion": "ci", "noise_scale": 0.5}])
-def test_brute_force_by_impulses(options: Any) -> None:
-    task = correlated(horizon=7, **options)
-    schedules = all_schedules(2, 2, 3)
-    exact = [squared_by_impulses(task.system, schedules[..., i], 7) for i in range(15)]
-    assert_searched(task, 2, 2, exact, 1e-9)
-
-
-def test_a_bound_is_not_what_is_minimised() -> None:
-    task, schedules = correlated(horizon=60), all_schedules(3, 3, 3)
-    actual = PeriodicOptimum(task, 3, 3, average="episode")
-    system, claims = task.system, np.zeros(84)
-    still = np.zeros((system.noise_channels, 84))
-    state = system.start(np.zeros((system.start_channels, 84)))
-    for step in range(60):
-        state = system.deliver(system.sense(state, still), schedules[step % 3])
-        claims += linalg.trace(system.fused(state)[1]) / 60
-    safest = schedules[..., claims.argmin()]
-    assert actual.trace < 0.98 * squared_by_impulses(system, safest, 60)
-    assert squared_by_impulses(system, actual.schedule, 60) == pytest.approx(actual.trace)
-
-
-def test_the_mean_over_drawn_noise_scales() -> None:
-    """2,000 episodes: the MSE is the trace to 4 standard errors, which are below 3 % of it."""
-    task = correlated(noise_scale="random", horizon=60)
-    policy = PeriodicOptimum(task, 3, 4, average="episode")
-    found = run_episodes(task, policy, 2000, 0).mse
-    error = found.std() / np.sqrt(2000)
-    assert error < 0.03 * policy.trace
-    assert abs(found.mean() - policy.trace) <= 4 * error
-    fixed = PeriodicOptimum(correlated(horizon=60), 3, 4, average="episode")
-    np.testing.assert_array_equal(policy.schedule, fixed.schedule)
-    assert policy.trace == pytest.approx(0.7 * fixed.trace, rel=1e-9)
-
-
-def test_a_system_that_tracks_already_has_the_same_optimum() -> None:
-    tracked = PeriodicOptimum(correlated(track_actual=True, horizon=20), 2, 3, average="episode")
-    other = PeriodicOptimum(correlated(horizon=20), 2, 3, average="episode")
-    np.testing.assert_array_equal(tracked.schedule, other.schedule)
-    assert tracked.trace == other.trace
-
-
-def test_an_input_as_the_filter_believes_it_makes_the_claim_true() -> None:
-    """One sensor, so that nothing is fused; 2,000 episodes, 4 standard errors of 0.5 %."""
-    kept = np.exp(-1.0 / 5.0)
-    task = unknown(
-        horizon=240,
-        measurement_matrices=[[[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]],
-        measurement_covariance=[[0.01, 0.02]],
-        input_signal="random_walk",
-        input_amplitude=0.5,
-        input_period=5.0,
-        input_memory=kept,
-        input_change=0.5 * np.sqrt(1.0 - kept**2),
-        input_deviation=0.5,
-    )
-    for average, transient in (("episode", 0), ("steady", 40)):
-        policy = PeriodicOptimum(task, 2, 4, average=average)
-        results = run_episodes(task, policy, 2000, 0)
-        found = results.squared_error[transient:].sum(1).mean()
-        error = results.mse.std() / np.sqrt(2000 * (1.0 - transient / 240))
-        assert error < 0.005 * policy.trace
-        assert abs(found - policy.trace) <= 4 * error
-
-
-def intersected(a: Array, b: Array) -> Array:
-    """Covariance intersection of the smallest trace by a general-purpose search."""
-
-    def join(share: float) -> Array:
-        return np.linalg.inv(share * np.linalg.inv(a) + (1.0 - share) * np.linalg.inv(b))
-
-    found = minimize_scalar(
-        lambda share: np.trace(join(share)),
-        bounds=(0, 1),
-        method="bounded",
-        options={"xatol": 1e-9},
-    )
-    return min((join(found.x), a, b), key=np.trace)
-
-
-def test_brute_force_of_fused_input_nodes() -> None:
-    task = unknown(fusion="sci", horizon=6)
-    system = task.system
-    assert isinstance(system, UnknownInputSystem)
-    model, sensors = system.nodes.model, system.nodes.sensors
-    memory = np.diag(model.memory[:, 0])
-    forward = np.vstack((model.state_rows[..., 0], np.hstack((np.zeros((1, 4)), memory))))
-    schedules, traces = all_schedules(2, 2, 3), []
-    for number in range(schedules.shape[-1]):
-        nodes, total = [model.initial_covariance[..., 0]] * 3, 0.0
-        for step in range(6):
-            for node in range(3):
-                prior = forward @ nodes[node] @ forward.T + model.change[..., 0]
-                if schedules[step % 2, node, number]:
-                    matrix = np.hstack((sensors.matrix[node, ..., 0], np.zeros((2, 1))))
-                    noise = sensors.covariance[node, ..., 0]
-                    information = matrix.T @ np.linalg.inv(noise) @ matrix
-                    prior = np.linalg.inv(np.linalg.inv(prior) + information)
-                nodes[node] = prior
-            for block in (slice(0, 4), slice(4, 5)):
-                first, second, third = (node[block, block] for node in nodes)
-                total += float(np.trace(intersected(intersected(first, second), third)))
-        traces.append(total / 6)
-    assert_searched(task, 2, 2, traces, 1e-5)
-
-
-@pytest.mark.parametrize("name", ["Tracking", "Oscillator"])
-def test_brute_force_of_uncensored_nodes(name: str) -> None:
-    """Federated Kalman filters with feedback are one Kalman filter; its MSE is its trace."""
-    task = biased(name, horizon=30)
-    plant, sensors = task.system.plant, task.system.centre.sensors  # type: ignore[attr-defined]
-    forward, process = plant.transition[..., 0], plant.process_covariance[..., 0]
-    schedules, traces = all_schedules(2, 3, 2), []
-    for number in range(schedules.shape[-1]):
-        covariance, total = plant.initial_covariance[..., 0], 0.0
-        for step in range(30):
-            covariance = forward @ covariance @ forward.T + process
-            for sensor in np.flatnonzero(schedules[step % 3, :, number]):
-                row = sensors.measurement_matrix[sensor, ..., 0]
-                spread = row @ covariance @ row.T + sensors.variance[sensor]
-                gain = covariance @ row.T / spread
-                covariance = covariance - gain @ row @ covariance
-            total += float(np.trace(covariance))
-        traces.append(total / 30)
-    assert_searched(task, 2, 3, traces, 1e-9)
-    best = all_schedules(2, 3, 2)[..., int(np.argmin(traces))]
-    assert squared_by_impulses(task.system, best, 30) == pytest.approx(min(traces), rel=1e-9)
-
-
-def test_a_transient_is_part_of_an_episode() -> None:
-    """What is best in the end is not what is best over ten steps from the start."""
-    task = correlated(horizon=10)
-    steady, episode = PeriodicOptimum(task, 2, 2), PeriodicOptimum(task, 2, 2, average="episode")
-    both = np.stack((steady.schedule, episode.schedule), axis=-1)
-    mean, late = episode_traces(task.system, both, 10), steady_traces(task.system, both)
-    assert mean[1] == pytest.approx(episode.trace, rel=1e-9)
-    assert mean[1] < 0.95 * mean[0]
-    assert late[0] == pytest.approx(steady.trace, rel=1e-9)
-    assert late[0] < 0.5 * late[1]
-
-
-def test_actual_covariances_are_not_there_unless_tracked() -> None:
-    system = correlated().system
-    assert isinstance(system, CorrelatedTrackingSystem)
-    state = system.start(np.zeros((system.start_channels, 2)))
-    with pytest.raises(ConfigurationError, match="track_actual"):
-        system.error_covariance(state)
-    tracking = system.with_actual_covariance()
-    state = tracking.start(np.zeros((system.start_channels, 2)))
-    assert linalg.trace(tracking.error_covariance(state)) == pytest.approx([3.0, 3.0])
 
 
 # --- cache ---------------------------------------------------------------------------------------
@@ -439,30 +223,6 @@ def test_what_is_not_allowed(spec: str, options: dict[str, Any], message: str) -
 def test_averages_that_do_not_exist(average: Any) -> None:
     with pytest.raises(ConfigurationError, match=r"average = .* 'steady', 'episode'"):
         PeriodicOptimum(markov(), 1, 1, average=average)
-
-
-@pytest.mark.parametrize(
-    "task",
-    [
-        unknown(filter="paper"),
-        unknown(hold_variance=0.05),
-        biased(filter="paper"),
-        biased(filter="adf"),
-        biased(censoring_upper=1000.0),
-        biased(censoring_threshold=[[-1000.0], [-np.inf]]),
-        fusion_gym.make_task("fusion_gym/RemoteEstimation-v0"),
-    ],
-    ids=["paper", "hold", "tobit", "adf", "upper", "lower", "remote"],
-)
-def test_other_filters_of_the_same_systems_are_refused(task: Task) -> None:
-    with pytest.raises(ConfigurationError, match=r"System.* not depend on the data"):
-        PeriodicOptimum(task, 1, 1)
-
-
-@pytest.mark.parametrize("options", [{"filter": "predict"}, {"fusion": "exact_ci"}])
-def test_filters_that_predict_while_nothing_arrives_are_searched(options: Any) -> None:
-    policy = PeriodicOptimum(unknown(horizon=20, **options), 1, 2, average="episode")
-    assert policy.schedule.sum() == 1
 
 
 def test_systems_whose_covariances_depend_on_the_data_are_refused() -> None:
