@@ -38,12 +38,7 @@ def conclude(suite: Suite, setting: Setting, folders: Folders) -> dict[str, Any]
         return None
     report = json.loads(folders.report(first).read_text())
     every = load_results(folders.episodes(first))
-    ahead = {
-        name: every[name]
-        for curve in report["curves"].values()
-        if curve["knows"] == "informed"
-        for name in curve["policies"]
-    }
+    ahead = _finished(Job(setting, "informed"), folders)
     known = _finished(Job(setting, "references"), folders)
     clairvoyant = _finished(Job(setting, "hindsight"), folders)
     references = {"sensors": ahead | known, "centre": known, "local": {}}

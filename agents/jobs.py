@@ -63,10 +63,11 @@ class Folders:
 def jobs(suite: Suite, settings: list[Setting], modes: list[Mode]) -> Iterator[Job]:
     """All work, what everything else needs first."""
     for setting in settings:
-        yield Job(setting, "baselines", weight=120.0)
+        yield Job(setting, "baselines", weight=200.0)
     for setting in settings:
-        if setting.references:
-            yield Job(setting, "references", weight=30.0)
+        for kind in ("informed", "references"):
+            if computed(setting, kind):
+                yield Job(setting, kind, weight=60.0)
         if setting.hindsight:
             yield Job(setting, "hindsight", weight=0.6 * suite.hindsight_episodes)
     for seed in range(suite.training_seeds):
@@ -76,12 +77,17 @@ def jobs(suite: Suite, settings: list[Setting], modes: list[Mode]) -> Iterator[J
                 yield Job(setting, "agent", mode, seed, weight=30.0 + length / 40_000)
 
 
+def computed(setting: Setting, kind: str) -> tuple[str, ...]:
+    """The setting's references of a kind: "informed" or "references"."""
+    return setting.informed if kind == "informed" else setting.references
+
+
 def run(job: Job, suite: Suite, folders: Folders) -> float:
     """Do a job and write its results; returns its weight."""
     torch.set_num_threads(1)
     if job.kind == "baselines":
         _run_baselines(job, suite, folders)
-    elif job.kind == "references":
+    elif job.kind in ("informed", "references"):
         _run_references(job, suite, folders)
     elif job.kind == "hindsight":
         _run_hindsight(job, suite, folders)
@@ -104,7 +110,7 @@ def _test(task: Task, policies: list[str], suite: Suite) -> dict[str, EpisodeRes
 
 
 def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
-    """Tune every family, then test its curve, the single policies and the informed references."""
+    """Tune every family, then test its curve, the single policies and the genie."""
     setting, task = job.setting, setting_task(job.setting)
     curves: dict[str, dict[str, Any]] = {}
     found: dict[str, EpisodeResults] = {}
@@ -112,10 +118,9 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
         policies = tune(task, family, suite.tuning)
         found |= _test(task, policies, suite)
         curves[family.label] = {"knows": family.knows, "policies": policies}
-    for points, kind in ((setting.points, "clock"), (setting.informed, "informed")):
-        for name in points:
-            curves[name] = {"knows": kind, "policies": [name]}
-        found |= _test(task, list(points), suite)
+    for name in setting.points:
+        curves[name] = {"knows": "clock", "policies": [name]}
+    found |= _test(task, list(setting.points), suite)
     report: dict[str, Any] = {
         **_header(job, suite, task),
         "curves": curves,
@@ -131,9 +136,9 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
 
 
 def _run_references(job: Job, suite: Suite, folders: Folders) -> None:
-    """Test policies that were computed, and that know no more than the centre."""
-    setting, task = job.setting, setting_task(job.setting)
-    found = _test(task, list(setting.references), suite)
+    """Test policies that were computed."""
+    task = setting_task(job.setting)
+    found = _test(task, list(computed(job.setting, job.kind)), suite)
     save_results(folders.episodes(job), found)
     policies = {name: _summary(results) for name, results in found.items()}
     write(folders.report(job), {**_header(job, suite, task), "policies": policies})

@@ -29,7 +29,7 @@ MODES = {
 
 
 def read(results: Path) -> dict[str, dict[str, Any]]:
-    """Baselines and verdict of every setting that has both, by name.
+    """Verdict, baselines and informed references of every setting that is judged, by name.
 
     Raises:
         ConfigurationError: there are none.
@@ -38,6 +38,7 @@ def read(results: Path) -> dict[str, dict[str, Any]]:
         path.parent.name: {
             "verdict": json.loads(path.read_text()),
             "baselines": json.loads((path.parent / "baselines.json").read_text()),
+            "informed": _policies(path.parent / "informed.json"),
         }
         for path in sorted(results.glob("*/verdict.json"))
     }
@@ -46,6 +47,11 @@ def read(results: Path) -> dict[str, dict[str, Any]]:
             f"results = {str(results)!r} is not allowed: it must hold results of agents.benchmark"
         )
     return found
+
+
+def _policies(path: Path) -> dict[str, Any]:
+    """The policies of a report, none if there is no such report."""
+    return dict(json.loads(path.read_text())["policies"]) if path.exists() else {}
 
 
 def share(interval: dict[str, float] | None) -> str:
@@ -149,14 +155,8 @@ def draw(results: Path, name: str, parts: dict[str, Any]) -> None:
             for policy in curve["policies"]
         ]
         for label, curve in parts["baselines"]["curves"].items()
-        if curve["knows"] != "informed"
     }
-    ahead = sorted(
-        (_rate(policies[policy]), policies[policy]["mse"]["mean"])
-        for curve in parts["baselines"]["curves"].values()
-        if curve["knows"] == "informed"
-        for policy in curve["policies"]
-    )
+    ahead = sorted((_rate(policy), policy["mse"]["mean"]) for policy in parts["informed"].values())
     fronts = {
         mode: [(point["rate"], point["mse"]) for point in front["points"]]
         for mode, front in parts["verdict"]["modes"].items()
