@@ -22,6 +22,7 @@ from fusion_gym.evaluation import (
 
 _INK = "#30343b"
 _AGENT = "#c8102e"
+_TALLEST = 7.0  # of the least error, where the errors' axis of the fronts ends
 plt.rcParams.update(
     {
         "figure.dpi": 130,
@@ -112,7 +113,7 @@ def fronts(
 ) -> None:
     """Learned fronts beside tuned baselines and informed references, as points (rate, MSE).
 
-    The errors' axis ends at 4.5 times the least of them: what lies above is of no interest.
+    The errors' axis ends at seven times the least of them: what lies above is of no interest.
     """
     figure, axes = plt.subplots(figsize=(8.6, 5.6))
     colours = plt.get_cmap("tab20")
@@ -135,8 +136,10 @@ def fronts(
         label = f"genie ({level:.3g}{', below' if level < bottom else ''})"
         axes.axhline(max(level, bottom), color=_INK, lw=0.8, label=label)
     axes.set_yscale("log")
-    axes.set_ylim(bottom, 4.5 * bottom)
-    axes.yaxis.set_minor_formatter(matplotlib.ticker.LogFormatter(labelOnlyBase=False))
+    axes.set_ylim(bottom, _TALLEST * bottom)
+    plain = matplotlib.ticker.FuncFormatter(lambda value, _: f"{value:g}")
+    axes.yaxis.set_major_formatter(plain)
+    axes.yaxis.set_minor_formatter(plain)
     reach = max(rate for points in agents.values() for rate, _ in points)
     ends = [rate for points in curves.values() for rate, _ in points]
     axes.set_xlim(-0.005, min(max(1.15 * reach, 0.05), max(ends) * 1.05))

@@ -74,18 +74,23 @@ def summary_table(found: dict[str, dict[str, Any]]) -> list[str]:
             worth = front.get("room", 0.0) >= LEAST_ROOM
             closed = f"{front['closed']:.0%}" if worth else "–"
             ahead = f"{-front['hindsight_room']:+.1%}" if "hindsight_room" in front else "–"
-            compared = [p["difference"] for p in front["points"] if "difference" in p]
-            above = sum(difference["low"] > 0.0 for difference in compared)
+            worse, asked = above(front)
             lines.append(
                 f"| [{name}](#{name.replace('_', '-')}) | {mode} | {front['seeds']} | "
-                f"{share(front.get('middle'))} | {above} of {len(compared)} | {room} | {closed} | "
+                f"{share(front.get('middle'))} | {worse} of {asked} | {room} | {closed} | "
                 f"{ahead} |"
             )
     return lines
 
 
+def above(front: dict[str, Any]) -> tuple[int, int]:
+    """At how many prices an agent's whole interval lies above the envelope, and of how many."""
+    compared = [point["difference"] for point in front["points"] if "difference" in point]
+    return sum(difference["low"] > 0.0 for difference in compared), len(compared)
+
+
 def headline_table(found: dict[str, dict[str, Any]]) -> list[str]:
-    """One row a setting, one column a mode: the table of the project's front page."""
+    """One row a setting, one column a mode, and a line below: the front page's table."""
     lines = [
         "| setting | " + " | ".join(MODES) + " | reference for `sensors` |",
         "|---|" + "---|" * (len(MODES) + 1),
@@ -96,7 +101,9 @@ def headline_table(found: dict[str, dict[str, Any]]) -> list[str]:
         room = fronts.get("sensors", {}).get("room")
         cells.append("–" if room is None else f"{-room:+.1%}")
         lines.append(f"| {parts['verdict']['title'].split(',')[0]} | {' | '.join(cells)} |")
-    return lines
+    counts = [above(f) for parts in found.values() for f in parts["verdict"]["modes"].values()]
+    worse, asked = (sum(column) for column in zip(*counts, strict=True))
+    return [*lines, f"{worse} of the {asked} points of all fronts lie above the envelope with"]
 
 
 def setting_section(name: str, parts: dict[str, Any]) -> list[str]:
