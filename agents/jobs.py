@@ -121,27 +121,20 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
     for name in setting.points:
         curves[name] = {"knows": "clock", "policies": [name]}
     found |= _test(task, list(setting.points), suite)
-    report: dict[str, Any] = {
-        **_header(job, suite, task),
-        "curves": curves,
-        "policies": {name: _summary(results) for name, results in found.items()},
-    }
+    report: dict[str, Any] = {**_header(job, suite, task), "curves": curves}
     if setting.genie is not None:
         options = setting.environment.options | setting.genie.options
         free = make_task(setting.environment.id, **options)
         results = run_episodes(free, make_policy("always", free), suite.episodes, suite.seed)
         report["genie"] = _summary(results) | {"assumes": setting.genie.assumes}
-    save_results(folders.episodes(job), found)
-    write(folders.report(job), report)
+    _keep(job, folders, found, report)
 
 
 def _run_references(job: Job, suite: Suite, folders: Folders) -> None:
     """Test policies that were computed."""
     task = setting_task(job.setting)
     found = _test(task, list(computed(job.setting, job.kind)), suite)
-    save_results(folders.episodes(job), found)
-    policies = {name: _summary(results) for name, results in found.items()}
-    write(folders.report(job), {**_header(job, suite, task), "policies": policies})
+    _keep(job, folders, found, _header(job, suite, task))
 
 
 def _run_hindsight(job: Job, suite: Suite, folders: Folders) -> None:
@@ -155,10 +148,8 @@ def _run_hindsight(job: Job, suite: Suite, folders: Folders) -> None:
         )
         for price in chosen.prices
     }
-    save_results(folders.episodes(job), found)
-    policies = {name: _summary(results) for name, results in found.items()}
     header = _header(job, suite, task) | {"episodes": episodes, "width": chosen.width}
-    write(folders.report(job), {**header, "policies": policies})
+    _keep(job, folders, found, header)
 
 
 def _run_agent(job: Job, suite: Suite, folders: Folders) -> None:
@@ -220,6 +211,15 @@ def experiment_of(suite: Suite, setting: Setting, mode: Mode, seed: int, work: P
         validation=ValidationConfig(every=max(timesteps // 8, 1), episodes=512),
         output=str(work / setting.name / f"{mode}_{seed}"),
     )
+
+
+def _keep(
+    job: Job, folders: Folders, found: dict[str, EpisodeResults], report: dict[str, Any]
+) -> None:
+    """Write the episodes, then the report with a summary of every policy."""
+    save_results(folders.episodes(job), found)
+    policies = {name: _summary(results) for name, results in found.items()}
+    write(folders.report(job), report | {"policies": policies})
 
 
 def _header(job: Job, suite: Suite, task: Task) -> dict[str, Any]:

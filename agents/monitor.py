@@ -17,9 +17,9 @@ from tqdm import tqdm
 
 from agents.config import Experiment
 from agents.constraint import score
-from fusion_gym.envs import EpisodeBatch, Task
+from fusion_gym.envs import Task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.evaluation import run_episodes
+from fusion_gym.evaluation.episodes import begin, run_episodes
 from fusion_gym.evaluation.model_policy import ModelPolicy
 from fusion_gym.validation import Array
 
@@ -131,10 +131,7 @@ class Progress(BaseCallback):
         if exponent == 0.0:
             return np.ones(1)
         episodes, first = self.experiment.validation.episodes, self.experiment.validation.seed
-        batch = EpisodeBatch(self.task, episodes)
-        batch.seed(np.arange(episodes), [first + place for place in range(episodes)])
-        batch.reset()
-        return self.task.reward.price.scale(batch.price, exponent)
+        return self.task.reward.price.scale(begin(self.task, episodes, first).price, exponent)
 
     def save(self) -> None:
         """Write the checkpoint, with the replay buffer where there is one."""

@@ -90,7 +90,7 @@ def above(front: dict[str, Any]) -> tuple[int, int]:
 
 
 def headline_table(found: dict[str, dict[str, Any]]) -> list[str]:
-    """One row a setting, one column a mode, and a line below: the front page's table."""
+    """One row a setting, one column a mode: the front page's table."""
     lines = [
         "| setting | " + " | ".join(MODES) + " | reference for `sensors` |",
         "|---|" + "---|" * (len(MODES) + 1),
@@ -101,9 +101,14 @@ def headline_table(found: dict[str, dict[str, Any]]) -> list[str]:
         room = fronts.get("sensors", {}).get("room")
         cells.append("–" if room is None else f"{-room:+.1%}")
         lines.append(f"| {parts['verdict']['title'].split(',')[0]} | {' | '.join(cells)} |")
+    return lines
+
+
+def headline_count(found: dict[str, dict[str, Any]]) -> str:
+    """How many points of all fronts lie above the envelope: the front page's sentence on it."""
     counts = [above(f) for parts in found.values() for f in parts["verdict"]["modes"].values()]
     worse, asked = (sum(column) for column in zip(*counts, strict=True))
-    return [*lines, f"{worse} of the {asked} points of all fronts lie above the envelope with"]
+    return f"{worse} of the {asked} points of all fronts lie above the envelope"
 
 
 def setting_section(name: str, parts: dict[str, Any]) -> list[str]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from batches import assert_a_run_is_the_same_beside_others
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 from reference_markov_jump import options, random_model
@@ -32,27 +33,7 @@ each_filter = pytest.mark.parametrize("where", FILTERS)
 
 @each_filter
 def test_a_run_does_not_depend_on_its_neighbours_nor_on_their_times(where: str) -> None:
-    task = build(filter=where, horizon=30)
-    alone, together = EpisodeBatch(task, 1), EpisodeBatch(task, 5)
-    alone.seed(np.arange(1), [3])
-    alone.reset()
-    together.seed(np.arange(5), [9, 8, 7, 6, 5])
-    together.reset()
-    draw = np.random.default_rng(0)
-    for _ in range(11):
-        together.step(draw.random((3, 5)) < 0.3)
-    together.seed(np.array([2]), [3])
-    together.reset(np.array([2]))
-    for _ in range(30):
-        requests = draw.random((3, 5)) < 0.3
-        np.testing.assert_allclose(together.observe()[2], alone.observe()[0], rtol=1e-6, atol=1e-7)
-        one, many = alone.step(requests[:, 2:3]), together.step(requests)
-        assert many.reward[2] == pytest.approx(one.reward[0], rel=1e-10)
-        for name in ("mean", "covariance"):
-            single = getattr(alone.delivered, name)[..., 0]
-            beside = getattr(together.delivered, name)[..., 2]
-            np.testing.assert_allclose(beside, single, rtol=1e-10, atol=1e-13)
-        together.finished[:] = False
+    assert_a_run_is_the_same_beside_others(build(filter=where, horizon=30), ("mean", "covariance"))
 
 
 @each_filter

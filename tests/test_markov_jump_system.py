@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from batches import assert_a_run_is_the_same_beside_others
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 from reference_markov_jump import PAPER, Run, options, random_model
@@ -62,23 +63,7 @@ def test_runs_agree_with_plain_loops(seed: int | None) -> None:
 
 
 def test_a_run_does_not_depend_on_its_neighbours_nor_on_their_times() -> None:
-    task = build(horizon=30)
-    alone, together = EpisodeBatch(task, 1), EpisodeBatch(task, 5)
-    alone.seed(np.arange(1), [3])
-    alone.reset()
-    together.seed(np.arange(5), [9, 8, 7, 6, 5])
-    together.reset()
-    draw = np.random.default_rng(0)
-    for _ in range(11):
-        together.step(draw.random((3, 5)) < 0.3)
-    together.seed(np.array([2]), [3])
-    together.reset(np.array([2]))
-    for _ in range(30):
-        requests = draw.random((3, 5)) < 0.3
-        np.testing.assert_allclose(together.observe()[2], alone.observe()[0], rtol=1e-6, atol=1e-7)
-        one, many = alone.step(requests[:, 2:3]), together.step(requests)
-        assert many.reward[2] == pytest.approx(one.reward[0], rel=1e-10)
-        together.finished[:] = False
+    assert_a_run_is_the_same_beside_others(build(horizon=30))
 
 
 def test_copies_are_predicted_and_replaced() -> None:

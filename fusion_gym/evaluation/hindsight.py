@@ -5,10 +5,8 @@ The search is a beam search: of every kept candidate all sets of transmissions a
 step with what it led to: the system's state, the tokens left and the cost so far.
 
 Candidates that agree in their last few transmissions and in their tokens have all but the same
-future. Where not all can be kept, the cheapest of each such group comes before the second of any.
-On the benchmark that was worth up to a doubling of the width at low prices, and nothing at high
-ones. Ranking by the cost that silence would lead to, with its noise known, was worth less than the
-width that its time buys: one step ahead a little less, four and more mostly did harm.
+future. Where not all can be kept, the cheapest of each such group comes before the second of any,
+so that the beam does not fill up with near copies of one schedule.
 """
 
 from __future__ import annotations
