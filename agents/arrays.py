@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fusion_gym.evaluation import EpisodeResults
+from fusion_gym.evaluation.episodes import EpisodeResults
 
 FIELDS = tuple(EpisodeResults.__dataclass_fields__)
 

@@ -27,7 +27,8 @@ from agents.evaluate import write
 from agents.jobs import Folders, Job, jobs, run, setting_task
 from agents.suite import COMPARABLE, Setting, Suite, load_suite
 from agents.verdict import judge
-from fusion_gym.evaluation import EpisodeResults, lower_envelope
+from fusion_gym.evaluation.envelope import lower_envelope
+from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.validation import ConfigurationError, choice, integer
 
 

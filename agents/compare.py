@@ -23,18 +23,12 @@ from agents import figures, tables
 from agents.config import Sweep, load_experiment, load_sweep
 from agents.evaluate import write
 from agents.progress import progress_bar
-from fusion_gym.envs import Task
+from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation import (
-    EpisodeResults,
-    compare_with_envelope,
-    lower_envelope,
-    make_policy,
-    robust_summary,
-    run_episodes,
-    summarise,
-)
-from fusion_gym.evaluation.envelope import Comparison
+from fusion_gym.evaluation.envelope import Comparison, compare_with_envelope, lower_envelope
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.metrics import robust_summary, summarise
+from fusion_gym.policies.make import make_policy
 from fusion_gym.validation import ConfigurationError
 
 

@@ -21,7 +21,8 @@ from agents.compare import compare, run_all
 from agents.config import Experiment, Sweep, load_experiment, load_sweep
 from agents.train import train
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation import make_policy, record_episode
+from fusion_gym.evaluation.episodes import record_episode
+from fusion_gym.policies.make import make_policy
 from fusion_gym.validation import ConfigurationError
 
 

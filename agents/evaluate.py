@@ -19,15 +19,10 @@ import fusion_gym
 from agents import tables
 from agents.config import load_experiment
 from agents.progress import progress_bar
-from fusion_gym.evaluation import (
-    EpisodeResults,
-    make_policy,
-    paired_difference,
-    robust_summary,
-    run_episodes,
-    summarise,
-)
-from fusion_gym.triggers import parse_settings
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.metrics import paired_difference, robust_summary, summarise
+from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.registry import parse_settings
 from fusion_gym.validation import ConfigurationError
 
 

@@ -13,12 +13,9 @@ import matplotlib.pyplot as plt
 import matplotlib.ticker
 import numpy as np
 
-from fusion_gym.evaluation import (
-    EnvelopePoint,
-    EpisodeResults,
-    Trajectory,
-    mean_interval,
-)
+from fusion_gym.evaluation.envelope import EnvelopePoint
+from fusion_gym.evaluation.episodes import EpisodeResults, Trajectory
+from fusion_gym.evaluation.intervals import mean_interval
 
 _INK = "#30343b"
 _AGENT = "#c8102e"

@@ -16,16 +16,12 @@ from agents.evaluate import write
 from agents.suite import Mode, Setting, Suite
 from agents.train import train
 from agents.tuning import tune
-from fusion_gym.envs import Task
+from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation import (
-    EpisodeResults,
-    make_policy,
-    robust_summary,
-    run_episodes,
-    run_hindsight,
-    summarise,
-)
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.metrics import robust_summary, summarise
+from fusion_gym.policies.hindsight import run_hindsight
+from fusion_gym.policies.make import make_policy
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 
 from agents.config import Experiment
+from fusion_gym.arrays import Array
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.evaluation.model_policy import ALGORITHMS, tag_model
-from fusion_gym.validation import Array, ConfigurationError
+from fusion_gym.policies.model import ALGORITHMS, tag_model
+from fusion_gym.validation import ConfigurationError
 
 
 def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:

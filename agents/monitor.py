@@ -17,11 +17,11 @@ from tqdm import tqdm
 
 from agents.config import Experiment
 from agents.constraint import score
-from fusion_gym.envs import Task
+from fusion_gym.arrays import Array
+from fusion_gym.core.task import Task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.evaluation.episodes import begin, run_episodes
-from fusion_gym.evaluation.model_policy import ModelPolicy
-from fusion_gym.validation import Array
+from fusion_gym.policies.model import ModelPolicy
 
 
 class Interrupt:

@@ -18,7 +18,9 @@ from agents import tables
 from agents.config import Comparison, load_comparison
 from agents.progress import progress_bar
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation import EpisodeResults, make_policy, mean_interval, run_episodes
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.intervals import mean_interval
+from fusion_gym.policies.make import make_policy
 from fusion_gym.validation import ConfigurationError
 
 COLUMNS = ("setting", "requests", "rate", "MSE", "median", "ARMSE", "trace P", "NEES")

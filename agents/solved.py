@@ -22,7 +22,9 @@ from agents.config import Experiment, load_experiment
 from agents.evaluate import write
 from agents.train import train
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation import EpisodeResults, make_policy, mean_interval, run_episodes
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.intervals import mean_interval
+from fusion_gym.policies.make import make_policy
 from fusion_gym.validation import ConfigurationError
 
 

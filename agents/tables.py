@@ -9,7 +9,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from fusion_gym.evaluation import Interval
+from fusion_gym.evaluation.intervals import Interval
 
 
 def console() -> Console:

@@ -29,11 +29,11 @@ from agents.constraint import TargetRate, score
 from agents.models import make_model
 from agents.monitor import Interrupt, Progress, save
 from agents.progress import progress_bar
-from fusion_gym.envs import Task
-from fusion_gym.envs.price import Price
+from fusion_gym.core.reward import Price
+from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.evaluation.model_policy import ALGORITHMS
+from fusion_gym.policies.model import ALGORITHMS
 from fusion_gym.validation import ConfigurationError
 
 # Training seeds lie far from the validation's and from the small numbers that tests use.

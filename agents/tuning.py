@@ -9,8 +9,9 @@ import numpy as np
 import optuna
 
 from agents.suite import Choices, Family, Range, Tuning
-from fusion_gym.envs import Task
-from fusion_gym.evaluation import make_policy, run_episodes
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.make import make_policy
 from fusion_gym.validation import ConfigurationError
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from fusion_gym.evaluation import EpisodeResults, lower_envelope
-from fusion_gym.evaluation.envelope import EnvelopePoint
-from fusion_gym.validation import Array
+from fusion_gym.arrays import Array
+from fusion_gym.evaluation.envelope import EnvelopePoint, lower_envelope
+from fusion_gym.evaluation.episodes import EpisodeResults
 
 RESAMPLES = 2000
 MIDDLE = (0.05, 0.5)  # of the rate that transmitting always gets: the middle of the front

@@ -24,7 +24,7 @@ from rich.table import Table
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import fusion_gym
-from fusion_gym.envs.tobit_oscillator import TobitOscillatorOptions
+from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
 
 ENV = "fusion_gym/TobitOscillator-v0"
 TURNS = 5

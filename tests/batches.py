@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusion_gym.envs import EpisodeBatch, Task
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
 
 
 def assert_a_run_is_the_same_beside_others(task: Task, delivered: tuple[str, ...] = ()) -> None:

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_gym.filters import BoundConstants, BoundTobitFilter, EventError, NodeFilter
-from fusion_gym.sensors import CensoredSensors
+from fusion_gym.systems.tobit.bound_filter import BoundConstants, BoundTobitFilter, EventError
+from fusion_gym.systems.tobit.filters import NodeFilter
+from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 Array = NDArray[np.float64]
 PAPER_EPSILON = (0.05,) * 5 + (0.7,) * 8 + (1.0,)

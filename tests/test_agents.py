@@ -21,9 +21,10 @@ import fusion_gym
 from agents import demo, evaluate, monitor, reproduce, train
 from agents.config import load_comparison, load_experiment, load_sweep
 from agents.constraint import score
-from fusion_gym.envs import EpisodeBatch
-from fusion_gym.evaluation import make_policy, run_episodes
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.metrics import summarise
+from fusion_gym.policies.make import make_policy
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent

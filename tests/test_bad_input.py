@@ -12,8 +12,9 @@ from gymnasium.error import ResetNeeded
 
 import fusion_gym
 from fusion_gym import ConfigurationError, make_sb3_vec_env, make_task
-from fusion_gym.evaluation import make_policy, run_episodes
-from fusion_gym.triggers import make_trigger
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.registry import make_trigger
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
 

@@ -19,8 +19,9 @@ from agents.config import PPOConfig
 from agents.suite import Choices, Family, Range, Tuning, load_suite
 from agents.tuning import tune as tune_family
 from agents.verdict import judge
-from fusion_gym.evaluation import EpisodeResults, make_policy, run_episodes
-from fusion_gym.evaluation.periodic_optimum import Schedule
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.periodic_optimum import Schedule
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
@@ -139,7 +140,7 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
         return Schedule(np.ones((period, system.sensor_count), dtype=np.bool_), float(packets))
 
     # The policies are made, but the schedules' searches would take minutes.
-    monkeypatch.setattr("fusion_gym.evaluation.periodic_optimum.optimum", unsearched)
+    monkeypatch.setattr("fusion_gym.policies.periodic_optimum.optimum", unsearched)
     for quick in (False, True):
         suite = load_suite(ROOT / "configs" / "benchmark.yaml", quick)
         for setting in suite.settings:

@@ -13,11 +13,13 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 
 import fusion_gym
-from fusion_gym.envs import EpisodeBatch, Task
-from fusion_gym.evaluation import EpisodeResults, make_policy, run_episodes
-from fusion_gym.filters import AssumedDensityFilter
-from fusion_gym.network import access_mask, first_request
-from fusion_gym.sensors import CensoredSensors
+from fusion_gym.core.access import access_mask, first_request
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.policies.make import make_policy
+from fusion_gym.systems.tobit.assumed_density import AssumedDensityFilter
+from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.validation import ConfigurationError
 
 OSCILLATOR = "fusion_gym/BiasedOscillator-v0"

@@ -29,11 +29,8 @@ from reference_tobit import (
 from scipy import stats
 
 from fusion_gym import ConfigurationError
-from fusion_gym.filters import (
-    BoundConstants,
-    EventError,
-)
-from fusion_gym.sensors import CensoredSensors
+from fusion_gym.systems.tobit.bound_filter import BoundConstants, EventError
+from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 OTHER_EPSILON = tuple(np.linspace(0.1, 1.4, 14).tolist())
 NEVER_CENSORED = -math.inf

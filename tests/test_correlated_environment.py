@@ -14,17 +14,17 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from fusion_gym import linalg
-from fusion_gym.envs import EpisodeBatch
-from fusion_gym.envs.correlated_tracking import (
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.system import Signals
+from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
+from fusion_gym.policies.rules.random import Random
+from fusion_gym.systems.correlated.environment import (
     CorrelatedTrackingEnv,
     CorrelatedTrackingOptions,
     CorrelatedTrackingVectorEnv,
     build,
 )
-from fusion_gym.systems import Signals
-from fusion_gym.triggers import make_trigger
-from fusion_gym.triggers.adaptive_innovation import AdaptiveInnovation
-from fusion_gym.triggers.random import Random
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]

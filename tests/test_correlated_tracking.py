@@ -18,14 +18,12 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from fusion_gym import linalg
-from fusion_gym.envs import EpisodeBatch
-from fusion_gym.envs.correlated_tracking import (
-    build,
-)
-from fusion_gym.systems import Signals
-from fusion_gym.triggers import make_trigger
-from fusion_gym.triggers.adaptive_innovation import AdaptiveInnovation
-from fusion_gym.triggers.base import Policy
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.system import Signals
+from fusion_gym.policies.base import Policy
+from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
+from fusion_gym.systems.correlated.environment import build
 
 Array = NDArray[np.float64]
 RATES = (0.581, 0.463, 0.635)

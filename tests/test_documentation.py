@@ -12,9 +12,9 @@ import pytest
 
 import fusion_gym
 from agents import report
-from fusion_gym.envs import EpisodeBatch
+from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import ENVIRONMENTS
-from fusion_gym.triggers import TRIGGERS
+from fusion_gym.policies.registry import TRIGGERS
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()

@@ -17,19 +17,14 @@ from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fusion_gym import ConfigurationError, make_sb3_vec_env, make_task
-from fusion_gym.envs import EpisodeBatch, Task
-from fusion_gym.evaluation import (
-    EpisodeResults,
-    compare_with_envelope,
-    lower_envelope,
-    make_policy,
-    mean_interval,
-    paired_difference,
-    record_episode,
-    run_episodes,
-    summarise,
-)
-from fusion_gym.evaluation.model_policy import tag_model
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.envelope import compare_with_envelope, lower_envelope
+from fusion_gym.evaluation.episodes import EpisodeResults, record_episode, run_episodes
+from fusion_gym.evaluation.intervals import mean_interval
+from fusion_gym.evaluation.metrics import paired_difference, summarise
+from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.model import tag_model
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
 OPTIONS: dict[str, Any] = {"horizon": 12, "token_cost": (3.0, 2.0, 1.0), "token_rate": 2.0}

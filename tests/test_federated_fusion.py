@@ -10,11 +10,13 @@ from filterpy.kalman import KalmanFilter as FilterPyFilter
 from numpy.typing import NDArray
 
 from fusion_gym import ConfigurationError
-from fusion_gym.filters import KalmanFilter, NodeFilter, TobitKalmanFilter
-from fusion_gym.fusion import FederatedFusion
-from fusion_gym.plants import LinearPlant
-from fusion_gym.sensors import CensoredSensors
-from fusion_gym.systems import CensoredSystem, FeedbackCentre
+from fusion_gym.fusion.federated import FederatedFusion
+from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.tobit.centre import FeedbackCentre
+from fusion_gym.systems.tobit.filters import KalmanFilter, NodeFilter
+from fusion_gym.systems.tobit.sensors import CensoredSensors
+from fusion_gym.systems.tobit.system import CensoredSystem
+from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 Array = NDArray[np.float64]
 EQUAL = (1 / 3, 1 / 3, 1 / 3)

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 import fusion_gym
-from fusion_gym.envs import EpisodeBatch, Task
-from fusion_gym.envs.price import Price
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.reward import Price
+from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import ENVIRONMENTS
-from fusion_gym.evaluation import find_schedules, make_policy, run_episodes, run_hindsight
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.hindsight import find_schedules, run_hindsight
+from fusion_gym.policies.make import make_policy
 from fusion_gym.validation import ConfigurationError
 
 REMOTE = "fusion_gym/RemoteEstimation-v0"

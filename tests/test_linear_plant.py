@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from fusion_gym import ConfigurationError
-from fusion_gym.plants import LinearPlant
-from fusion_gym.plants.linear import covariance_factor
+from fusion_gym.systems.linear_plant import LinearPlant, covariance_factor
 
 TURN = np.array([[0.8, 0.5], [-0.5, 0.8]])
 GAIN = np.array([0.16, 0.18])

@@ -12,12 +12,13 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env.util import obs_space_info
 
 import fusion_gym
-from fusion_gym.envs import EpisodeBatch
-from fusion_gym.envs.local import LocalView
+from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.evaluation import make_policy, run_episodes
-from fusion_gym.evaluation.model_policy import tag_model
+from fusion_gym.envs.views import LocalView
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.model import tag_model
 from fusion_gym.validation import ConfigurationError
 
 TOBIT = "fusion_gym/TobitOscillator-v0"

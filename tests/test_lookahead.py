@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 import fusion_gym
-from fusion_gym.envs import EpisodeBatch, Task
-from fusion_gym.evaluation import make_policy, run_episodes
-from fusion_gym.evaluation.lookahead import Lookahead
-from fusion_gym.systems import Signals
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.system import Signals
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.lookahead import Lookahead
+from fusion_gym.policies.make import make_policy
 from fusion_gym.validation import ConfigurationError
 
 TOBIT = "fusion_gym/TobitOscillator-v0"

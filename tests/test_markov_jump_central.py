@@ -16,12 +16,12 @@ from reference_markov_jump import PAPER, Dense, options, random_model
 from scipy.stats import multivariate_normal
 
 from fusion_gym import linalg
-from fusion_gym.envs import EpisodeBatch
-from fusion_gym.envs.markov_jump import build
-from fusion_gym.evaluation import run_episodes
-from fusion_gym.systems import Signals
-from fusion_gym.triggers.constant import Always
-from fusion_gym.triggers.random import Random
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.system import Signals
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.rules.constant import Always
+from fusion_gym.policies.rules.random import Random
+from fusion_gym.systems.markov_jump.environment import build
 
 Array = NDArray[np.float64]
 FILTERS = ("centralised", "imm")

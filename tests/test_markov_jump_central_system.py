@@ -13,13 +13,14 @@ from reference_markov_jump import options, random_model
 
 import fusion_gym
 from fusion_gym import linalg
-from fusion_gym.envs import EpisodeBatch
-from fusion_gym.envs.local import LocalView
-from fusion_gym.envs.markov_jump import MarkovJumpTrackingEnv, build
-from fusion_gym.evaluation import make_policy, run_episodes
-from fusion_gym.systems import Signals
-from fusion_gym.triggers import make_trigger
-from fusion_gym.triggers.random import Random
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.system import Signals
+from fusion_gym.envs.views import LocalView
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.rules.random import Random
+from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingEnv, build
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from reference_markov_jump import options, random_model
 
 from fusion_gym import linalg
-from fusion_gym.envs import EpisodeBatch
-from fusion_gym.envs.markov_jump import build
+from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.systems.markov_jump import MarkovJumpSystem
-from fusion_gym.triggers import Policy
-from fusion_gym.triggers.centre_variance import CentreVariance
-from fusion_gym.triggers.constant import Always
-from fusion_gym.triggers.local_variance import LocalVariance
-from fusion_gym.triggers.random import Random
+from fusion_gym.policies.base import Policy
+from fusion_gym.policies.rules.centre_variance import CentreVariance
+from fusion_gym.policies.rules.constant import Always
+from fusion_gym.policies.rules.local_variance import LocalVariance
+from fusion_gym.policies.rules.random import Random
+from fusion_gym.systems.markov_jump.environment import build
+from fusion_gym.systems.markov_jump.system import MarkovJumpSystem
 
 Array = NDArray[np.float64]
 RMSE = 0.022  # relative: four standard errors

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from reference_markov_jump import PAPER, Dense, best_weights, random_model
 
-from fusion_gym.filters.linear_minimum_variance import AugmentedModel, LocalFilters
-from fusion_gym.filters.markov_jump_errors import LagRecursion
 from fusion_gym.fusion.matrix_weighted import IntersectionOfCopies, MatrixWeightedFusion
 from fusion_gym.fusion.sequential import SequentialFusion
-from fusion_gym.plants.markov_jump import MarkovJumpPlant
-from fusion_gym.sensors.fading import FadingSensors
+from fusion_gym.systems.markov_jump.lag_errors import LagRecursion
+from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
+from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
+from fusion_gym.systems.markov_jump.sensors import FadingSensors
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]

@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 from reference_markov_jump import PAPER, Run, options, random_model
 
 from fusion_gym import linalg
-from fusion_gym.envs import EpisodeBatch
-from fusion_gym.envs.markov_jump import (
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.system import Signals
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.rules.centre_variance import CentreVariance
+from fusion_gym.policies.rules.local_variance import LocalVariance
+from fusion_gym.policies.rules.random import Random
+from fusion_gym.systems.markov_jump.environment import (
     MarkovJumpTrackingEnv,
     MarkovJumpTrackingVectorEnv,
     build,
 )
-from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.systems import Signals
-from fusion_gym.triggers import make_trigger
-from fusion_gym.triggers.centre_variance import CentreVariance
-from fusion_gym.triggers.local_variance import LocalVariance
-from fusion_gym.triggers.random import Random
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]

@@ -11,10 +11,12 @@ from sb3_contrib import MaskablePPO, RecurrentPPO
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 
 import fusion_gym
-from fusion_gym.envs import EpisodeBatch, spaces
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.envs import spaces
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.evaluation import make_policy, run_episodes
-from fusion_gym.evaluation.model_policy import ModelPolicy, tag_model
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.model import ModelPolicy, tag_model
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
 BIASED = "fusion_gym/BiasedOscillator-v0"

@@ -18,13 +18,10 @@ from filter_problems import (
 )
 from filterpy.kalman import KalmanFilter as FilterPyFilter
 
-from fusion_gym.filters import (
-    BoundConstants,
-    KalmanFilter,
-    NodeFilter,
-    TobitKalmanFilter,
-)
-from fusion_gym.sensors import CensoredSensors
+from fusion_gym.systems.tobit.bound_filter import BoundConstants
+from fusion_gym.systems.tobit.filters import KalmanFilter, NodeFilter
+from fusion_gym.systems.tobit.sensors import CensoredSensors
+from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 NEVER_CENSORED = -math.inf
 

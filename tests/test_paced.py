@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from fusion_gym import ConfigurationError, make_task
-from fusion_gym.evaluation import make_policy, run_episodes
-from fusion_gym.triggers import make_trigger
-from fusion_gym.triggers.paced import Paced
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.rules.paced import Paced
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
 LENGTH = 400

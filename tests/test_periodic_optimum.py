@@ -14,14 +14,14 @@ from reference_markov_jump import PAPER, Dense, best_weights
 
 import fusion_gym
 from fusion_gym import linalg
-from fusion_gym.envs import EpisodeBatch, Task
-from fusion_gym.evaluation import make_policy, periodic_optimum, run_episodes
-from fusion_gym.evaluation.periodic_optimum import (
-    PeriodicOptimum,
-    steady_traces,
-)
-from fusion_gym.systems.markov_jump import MarkovJumpSystem
-from fusion_gym.triggers.random import Random
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies import periodic_optimum
+from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.periodic_optimum import PeriodicOptimum, steady_traces
+from fusion_gym.policies.rules.random import Random
+from fusion_gym.systems.markov_jump.system import MarkovJumpSystem
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]

@@ -12,15 +12,12 @@ from scipy.optimize import minimize_scalar
 
 import fusion_gym
 from fusion_gym import linalg
-from fusion_gym.envs import Task
-from fusion_gym.evaluation import periodic_optimum, run_episodes
-from fusion_gym.evaluation.periodic_optimum import (
-    PeriodicOptimum,
-    episode_traces,
-    steady_traces,
-)
-from fusion_gym.systems.correlated_tracking import CorrelatedTrackingSystem
-from fusion_gym.systems.unknown_input import UnknownInputSystem
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies import periodic_optimum
+from fusion_gym.policies.periodic_optimum import PeriodicOptimum, episode_traces, steady_traces
+from fusion_gym.systems.correlated.system import CorrelatedTrackingSystem
+from fusion_gym.systems.unknown_input.system import UnknownInputSystem
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]

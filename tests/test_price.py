@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import fusion_gym
-from fusion_gym.envs import EpisodeBatch
-from fusion_gym.evaluation import make_policy, run_episodes
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.make import make_policy
 from fusion_gym.validation import ConfigurationError
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
@@ -69,7 +70,7 @@ def test_an_agent_is_asked_at_any_price(tmp_path: Any) -> None:
     from stable_baselines3 import PPO
 
     from fusion_gym.envs.sb3 import FusionSB3VecEnv
-    from fusion_gym.evaluation.model_policy import ModelPolicy, tag_model
+    from fusion_gym.policies.model import ModelPolicy, tag_model
 
     options = {"filter": "tobit", "cost_weight": "random", "price_range": SPAN}
     task = fusion_gym.make_task(ENV_ID, **options)

@@ -20,12 +20,15 @@ from numpy.typing import NDArray
 from reference_tobit import Example, Run, simulate
 
 import fusion_gym
-from fusion_gym.envs import EpisodeBatch, Task
-from fusion_gym.evaluation import EpisodeResults, make_policy, run_episodes
-from fusion_gym.filters import Expectation, Plan, TobitKalmanFilter
-from fusion_gym.sensors import CensoredSensors
-from fusion_gym.systems import Signals
-from fusion_gym.triggers import Policy
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.system import Signals
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.policies.base import Policy
+from fusion_gym.policies.make import make_policy
+from fusion_gym.systems.tobit.filters import Expectation, Plan
+from fusion_gym.systems.tobit.sensors import CensoredSensors
+from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 Array = NDArray[np.float64]
 ENV_ID = "fusion_gym/TobitOscillator-v0"

@@ -10,25 +10,20 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
-from fusion_gym.envs import EpisodeBatch
-from fusion_gym.envs.correlated_tracking import build as build_tracking
-from fusion_gym.envs.remote_estimation import (
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.channel import Channel
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.policies.optimal import OptimalPolicy
+from fusion_gym.policies.registry import make_trigger
+from fusion_gym.solvers.joint import JointProblem, solve_joint_average
+from fusion_gym.solvers.single import SourceProblem, solve_average
+from fusion_gym.solvers.task import solve_task, source_problems
+from fusion_gym.systems.correlated.environment import build as build_tracking
+from fusion_gym.systems.remote.environment import (
     RemoteEstimationEnv,
     RemoteEstimationVectorEnv,
     build,
 )
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.network.channel import Channel
-from fusion_gym.solvers import (
-    JointProblem,
-    OptimalPolicy,
-    SourceProblem,
-    solve_average,
-    solve_joint_average,
-    solve_task,
-    source_problems,
-)
-from fusion_gym.triggers import make_trigger
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]

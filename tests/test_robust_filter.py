@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusion_gym.filters import JointErrorCovariance, RobustKalmanFilter
-from fusion_gym.plants import LinearPlant
-from fusion_gym.sensors import CorrelatedSensors
+from fusion_gym.systems.correlated.filters import JointErrorCovariance, RobustKalmanFilter
+from fusion_gym.systems.correlated.sensors import CorrelatedSensors
+from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]

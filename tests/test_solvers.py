@@ -12,22 +12,19 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from fusion_gym.network import TokenBucket
-from fusion_gym.solvers import (
+from fusion_gym.core.token_bucket import TokenBucket
+from fusion_gym.solvers.ages import solve_ages
+from fusion_gym.solvers.bounds import lagrangian_bound
+from fusion_gym.solvers.grid import ErrorGrid, gaussian_rows
+from fusion_gym.solvers.joint import JointProblem, solve_joint_average, solve_joint_finite
+from fusion_gym.solvers.single import (
     AverageSolution,
-    ErrorGrid,
-    JointProblem,
     SourceProblem,
-    TokenLevels,
-    lagrangian_bound,
-    solve_ages,
     solve_average,
     solve_discounted,
     solve_finite,
-    solve_joint_average,
-    solve_joint_finite,
 )
-from fusion_gym.solvers.grid import gaussian_rows
+from fusion_gym.solvers.tokens import TokenLevels
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]

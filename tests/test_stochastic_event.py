@@ -13,12 +13,14 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from fusion_gym import ConfigurationError, make_task
-from fusion_gym.envs import EpisodeBatch, Task
-from fusion_gym.evaluation import EpisodeResults, make_policy, run_episodes
-from fusion_gym.filters import KalmanFilter, StochasticEventFilter
-from fusion_gym.sensors import CensoredSensors
-from fusion_gym.triggers import make_trigger
-from fusion_gym.triggers.stochastic_event import StochasticEvent
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.rules.stochastic_event import StochasticEvent
+from fusion_gym.systems.tobit.filters import KalmanFilter, StochasticEventFilter
+from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 OSCILLATOR = "fusion_gym/TobitOscillator-v0"
 TRACKING = "fusion_gym/BiasedTracking-v0"

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fusion_gym import ConfigurationError
-from fusion_gym.network import SHARING_RULES, TokenBucket
+from fusion_gym.core.token_bucket import SHARING_RULES, TokenBucket
 
 PAPER = {"rate": 5.0, "capacity": 30.0, "initial": 10.0, "cost": 3.0, "sensors": 3}
 

@@ -14,9 +14,9 @@ import pytest
 from numpy.typing import NDArray
 
 from fusion_gym import ConfigurationError, make_task
-from fusion_gym.envs import EpisodeBatch
-from fusion_gym.evaluation import make_policy
-from fusion_gym.triggers import TRIGGERS, make_trigger, parse_settings, parse_value
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.registry import TRIGGERS, make_trigger, parse_settings, parse_value
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
 SENSORS = 3

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusion_gym.envs import EpisodeBatch
-from fusion_gym.envs.unknown_input import build
-from fusion_gym.triggers.adaptive_threshold import AdaptiveThreshold
-from fusion_gym.triggers.base import Policy
-from fusion_gym.triggers.constant import Always, Never
-from fusion_gym.triggers.random import Random
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.policies.base import Policy
+from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
+from fusion_gym.policies.rules.constant import Always, Never
+from fusion_gym.policies.rules.random import Random
+from fusion_gym.systems.unknown_input.environment import build
 
 Array = NDArray[np.float64]
 

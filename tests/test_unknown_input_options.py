@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from fusion_gym import linalg
-from fusion_gym.envs import EpisodeBatch
-from fusion_gym.envs.unknown_input import UnknownInputOptions, build
-from fusion_gym.triggers import make_trigger
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.policies.registry import make_trigger
+from fusion_gym.systems.unknown_input.environment import UnknownInputOptions, build
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parents[1]

@@ -16,14 +16,17 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 
 from fusion_gym import linalg
-from fusion_gym.filters.input_state import InputModel, InputSensors, JointGain
-from fusion_gym.filters.input_state_bound import BoundTables
-from fusion_gym.filters.input_state_fusion import NodeFusion, tracked_intersection
-from fusion_gym.filters.random_walk_input import RandomWalkInputFilter
-from fusion_gym.fusion.covariance_intersection import covariance_intersection_many
-from fusion_gym.plants.unknown_input import UnknownInputPlant
-from fusion_gym.systems import Signals
-from fusion_gym.triggers.adaptive_threshold import AdaptiveThreshold
+from fusion_gym.core.system import Signals
+from fusion_gym.fusion.covariance_intersection import (
+    covariance_intersection_many,
+)
+from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
+from fusion_gym.systems.unknown_input.bound_filter import BoundTables
+from fusion_gym.systems.unknown_input.filters import RandomWalkInputFilter
+from fusion_gym.systems.unknown_input.fusion import NodeFusion, tracked_intersection
+from fusion_gym.systems.unknown_input.input_state import InputModel, JointGain
+from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
+from fusion_gym.systems.unknown_input.sensors import InputSensors
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]

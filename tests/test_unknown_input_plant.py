@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from fusion_gym import linalg
-from fusion_gym.plants.input_signals import (
+from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
+from fusion_gym.systems.unknown_input.signals import (
     GivenInput,
     InputSignal,
     MeanRevertingWalk,
     Sinusoids,
     Steps,
 )
-from fusion_gym.plants.unknown_input import UnknownInputPlant
 
 Array = NDArray[np.float64]
 

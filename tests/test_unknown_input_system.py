@@ -12,19 +12,21 @@ from scipy.linalg import null_space
 from scipy.special import ndtr
 
 from fusion_gym import linalg
-from fusion_gym.envs import EpisodeBatch
-from fusion_gym.envs.unknown_input import (
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.fusion.covariance_intersection import (
+    covariance_intersection_many,
+)
+from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
+from fusion_gym.policies.rules.constant import Always, Never
+from fusion_gym.policies.rules.random import Random
+from fusion_gym.systems.unknown_input.environment import (
     UnknownInputEnv,
     UnknownInputVectorEnv,
     build,
 )
-from fusion_gym.envs.unknown_input_examples import EXAMPLES, two_carts
-from fusion_gym.evaluation import run_episodes
-from fusion_gym.fusion.covariance_intersection import covariance_intersection_many
-from fusion_gym.triggers import make_trigger
-from fusion_gym.triggers.adaptive_threshold import AdaptiveThreshold
-from fusion_gym.triggers.constant import Always, Never
-from fusion_gym.triggers.random import Random
+from fusion_gym.systems.unknown_input.examples import EXAMPLES, two_carts
 
 Array = NDArray[np.float64]
 ROOT = Path(__file__).parents[1]

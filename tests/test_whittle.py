@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 import fusion_gym
-from fusion_gym.evaluation import make_policy, run_episodes
-from fusion_gym.solvers import SourceProblem, WhittleIndex, solve_average
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.whittle import WhittleIndex
+from fusion_gym.solvers.single import SourceProblem, solve_average
 from fusion_gym.validation import ConfigurationError
 
 ENV = "fusion_gym/RemoteEstimation-v0"

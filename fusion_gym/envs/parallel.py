@@ -11,10 +11,10 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from fusion_gym.envs.batch import EpisodeBatch
-from fusion_gym.envs.local import LocalView
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
-from fusion_gym.envs.task import Task
+from fusion_gym.envs.views import LocalView
 
 Dict = dict[str, Any]
 
@@ -22,7 +22,7 @@ Dict = dict[str, Any]
 class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
     """One run, in which each sensor decides by itself whether to request (1) or not (0).
 
-    An agent observes what its sensor sees by itself (:class:`~fusion_gym.envs.local.LocalView`),
+    An agent observes what its sensor sees by itself (:class:`~fusion_gym.envs.views.LocalView`),
     all get the run's reward. Episodes end by truncation for all agents at once.
 
     Attributes:
@@ -100,7 +100,7 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         return dict(zip(self.agents, rows, strict=True))
 
     def render(self) -> None:
-        """Nothing to see; figures are made by ``fusion_gym.evaluation.record_episode``."""
+        """Nothing to see; figures are made by ``fusion_gym.evaluation.episodes.record_episode``."""
 
 
 def parallel_env(env_id: str, **options: Any) -> FusionParallelEnv:

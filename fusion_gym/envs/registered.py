@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 from gymnasium.vector import AutoresetMode
 
+from fusion_gym.core.task import Task
 from fusion_gym.envs.single import FusionEnv
-from fusion_gym.envs.task import Task
 from fusion_gym.envs.vector import FusionVectorEnv
 
 

@@ -7,18 +7,18 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import load_env_creator
 
-from fusion_gym.envs.task import Task
+from fusion_gym.core.task import Task
 from fusion_gym.envs.vector import FusionVectorEnv
 from fusion_gym.validation import ConfigurationError, keys
 
 ENVIRONMENTS = {
-    "fusion_gym/TobitOscillator-v0": "fusion_gym.envs.tobit_oscillator:TobitOscillator",
-    "fusion_gym/CorrelatedTracking-v0": "fusion_gym.envs.correlated_tracking:CorrelatedTracking",
-    "fusion_gym/MarkovJumpTracking-v0": "fusion_gym.envs.markov_jump:MarkovJumpTracking",
-    "fusion_gym/UnknownInput-v0": "fusion_gym.envs.unknown_input:UnknownInput",
-    "fusion_gym/BiasedOscillator-v0": "fusion_gym.envs.biased:BiasedOscillator",
-    "fusion_gym/BiasedTracking-v0": "fusion_gym.envs.biased:BiasedTracking",
-    "fusion_gym/RemoteEstimation-v0": "fusion_gym.envs.remote_estimation:RemoteEstimation",
+    "fusion_gym/TobitOscillator-v0": "fusion_gym.systems.tobit.oscillator:TobitOscillator",
+    "fusion_gym/CorrelatedTracking-v0": "fusion_gym.systems.correlated.environment:CorrelatedTracking",
+    "fusion_gym/MarkovJumpTracking-v0": "fusion_gym.systems.markov_jump.environment:MarkovJumpTracking",
+    "fusion_gym/UnknownInput-v0": "fusion_gym.systems.unknown_input.environment:UnknownInput",
+    "fusion_gym/BiasedOscillator-v0": "fusion_gym.systems.tobit.biased:BiasedOscillator",
+    "fusion_gym/BiasedTracking-v0": "fusion_gym.systems.tobit.biased:BiasedTracking",
+    "fusion_gym/RemoteEstimation-v0": "fusion_gym.systems.remote.environment:RemoteEstimation",
 }
 
 

@@ -13,12 +13,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
 from fusion_gym.envs import spaces
-from fusion_gym.envs.batch import EpisodeBatch
-from fusion_gym.envs.local import LocalView
 from fusion_gym.envs.registration import make_task
-from fusion_gym.envs.task import Task
-from fusion_gym.validation import Array
+from fusion_gym.envs.views import LocalView
 
 
 class FusionSB3VecEnv(VecEnv):
@@ -33,11 +33,11 @@ class FusionSB3VecEnv(VecEnv):
     value of each truncated run, so episodes that all end together would stall it.
 
     With ``local`` every sensor of every run is a row of its own, with the observation of
-    :class:`~fusion_gym.envs.local.LocalView` and the action space ``Discrete(2)``: one shared
+    :class:`~fusion_gym.envs.views.LocalView` and the action space ``Discrete(2)``: one shared
     policy learns what each sensor can run by itself. All rows of a run get the run's reward.
 
     ``price_exponent``, from 0 to 1, is for training over a range of prices: an episode's rewards
-    are multiplied by :meth:`~fusion_gym.envs.price.Price.scale`. Returns in infos are not.
+    are multiplied by :meth:`~fusion_gym.core.reward.Price.scale`. Returns in infos are not.
 
     Attributes:
         task: the task.

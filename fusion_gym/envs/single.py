@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import validation
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
 from fusion_gym.envs import spaces
-from fusion_gym.envs.batch import EpisodeBatch
-from fusion_gym.envs.task import Task
 from fusion_gym.envs.vector import Infos, refuse_rendering, reset_infos, step_infos
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from fusion_gym.envs.task import ObservationLayout, Task
+from fusion_gym.core.observation import ObservationLayout
+from fusion_gym.core.task import Task
 
 
 def observation_space(layout: ObservationLayout) -> spaces.Box:

@@ -12,9 +12,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from fusion_gym import validation
+from fusion_gym.core.batch import EpisodeBatch, Outcome
+from fusion_gym.core.task import Task
 from fusion_gym.envs import spaces
-from fusion_gym.envs.batch import EpisodeBatch, Outcome
-from fusion_gym.envs.task import Task
 
 Infos = dict[str, Any]
 

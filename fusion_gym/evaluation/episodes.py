@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg, validation
-from fusion_gym.envs import EpisodeBatch, Task
-from fusion_gym.triggers import Policy
-from fusion_gym.validation import Array
+from fusion_gym.arrays import Array
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.policies.base import Policy
 
 _BATCH = 1024  # episodes side by side; fixed, so that results do not depend on the machine
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from fusion_gym.validation import Array
+from fusion_gym.arrays import Array
 
 LEVEL = 0.95
 RESAMPLES = 2000

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fusion_gym import linalg
+from fusion_gym.arrays import Array
 from fusion_gym.fusion.diagonal import DiagonalPair, best_weight, diagonalise
 from fusion_gym.fusion.several import covariance_intersection_many
-from fusion_gym.validation import Array
 
 __all__ = [
     "Fused",

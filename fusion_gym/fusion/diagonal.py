@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fusion_gym import linalg
-from fusion_gym.validation import Array
+from fusion_gym.arrays import Array
 
 _ORTHOGONAL = 1e-13  # cosine below which two rows count as orthogonal
 _SWEEPS = 30  # cap of the rotations; sizes up to 6 need fewer than 10 sweeps

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
 from fusion_gym.fusion.information import InformationFusion
-from fusion_gym.validation import Array, ConfigurationError
+from fusion_gym.validation import ConfigurationError
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class FederatedFusion:
         return InformationFusion().fuse(mean, covariance)
 
     def fuse_alone(self, silent: Array, delivered: Array) -> tuple[Array, Array]:
-        """See :class:`fusion_gym.fusion.FeedbackFusion`: informations are sums."""
+        """See :class:`fusion_gym.fusion.feedback.FeedbackFusion`: informations are sums."""
         information = linalg.inverse(silent)
         total = information.sum(0)
         gained = linalg.inverse(delivered) - information

@@ -8,12 +8,13 @@ from typing import Protocol
 import numpy as np
 
 from fusion_gym import validation
+from fusion_gym.arrays import Array
 from fusion_gym.fusion.covariance_intersection import (
     covariance_intersection_many,
     inverse_covariance_intersection,
 )
 from fusion_gym.fusion.sequential import SequentialFusion
-from fusion_gym.validation import Array, ConfigurationError
+from fusion_gym.validation import ConfigurationError
 
 INTERSECTION_RULES = ("ci", "ici", "sci", "sici")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fusion_gym import linalg
-from fusion_gym.validation import Array
+from fusion_gym.arrays import Array
 
 
 @dataclass(frozen=True)

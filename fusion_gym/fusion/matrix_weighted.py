@@ -11,9 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion_gym import linalg
-from fusion_gym.fusion.covariance_intersection import covariance_intersection_many
+from fusion_gym.arrays import Array
+from fusion_gym.fusion.covariance_intersection import (
+    covariance_intersection_many,
+)
 from fusion_gym.fusion.sequential import SequentialFusion
-from fusion_gym.validation import Array
 
 # Relative. Above the rounding of Σ, so that weights stay below 1e6 and their covariance honest to
 # 1e-4 in the worst case (1e-9 in the usual one); below any difference of estimates that matters.

@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg
-from fusion_gym.fusion.covariance_intersection import covariance_intersection_many
+from fusion_gym.arrays import Array
+from fusion_gym.fusion.covariance_intersection import (
+    covariance_intersection_many,
+)
 from fusion_gym.fusion.sequential import SequentialResult
-from fusion_gym.validation import Array
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
 from fusion_gym.fusion.covariance_intersection import (
     covariance_intersection,
     inverse_covariance_intersection,
 )
-from fusion_gym.validation import Array, ConfigurationError
+from fusion_gym.validation import ConfigurationError
 
 _RULES = {"ci": covariance_intersection, "ici": inverse_covariance_intersection}
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg
+from fusion_gym.arrays import Array
 from fusion_gym.fusion.diagonal import best_weight, diagonalise
-from fusion_gym.validation import Array
 
 _GAP = 1e-6  # relative optimality gap at which the search ends
 _STEPS = 100  # cap of its steps; most lanes need four, ill-conditioned ones up to about thirty

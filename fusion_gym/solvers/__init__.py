@@ -10,7 +10,6 @@ from fusion_gym.solvers.joint import (
     solve_joint_average,
     solve_joint_finite,
 )
-from fusion_gym.solvers.policy import OptimalPolicy, Optimum, solve_task, source_problems
 from fusion_gym.solvers.single import (
     AverageSolution,
     DiscountedSolution,
@@ -20,8 +19,8 @@ from fusion_gym.solvers.single import (
     solve_discounted,
     solve_finite,
 )
+from fusion_gym.solvers.task import Optimum, solve_task, source_problems
 from fusion_gym.solvers.tokens import TokenLevels
-from fusion_gym.solvers.whittle import WhittleIndex
 
 __all__ = [
     "AgeSolution",
@@ -33,11 +32,9 @@ __all__ = [
     "JointAverageSolution",
     "JointFiniteSolution",
     "JointProblem",
-    "OptimalPolicy",
     "Optimum",
     "SourceProblem",
     "TokenLevels",
-    "WhittleIndex",
     "lagrangian_bound",
     "solve_ages",
     "solve_average",

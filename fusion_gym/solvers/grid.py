@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtri
 
-from fusion_gym.validation import Array
+from fusion_gym.arrays import Array
 
 NEGLIGIBLE = 1e-10  # probability of what the default grid of one source leaves out
 _MOST_POINTS = 1500

@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import validation
-from fusion_gym.network import TokenBucket
+from fusion_gym.arrays import Array
+from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.solvers.grid import ErrorGrid, default_reach, gaussian_rows
 from fusion_gym.solvers.single import SourceProblem
 from fusion_gym.solvers.tokens import TokenLevels
-from fusion_gym.validation import Array, ConfigurationError
+from fusion_gym.validation import ConfigurationError
 
 _FINEST, _COARSEST = 20.0, 4.0  # points of the default grid a deviation of the noise
 _POINTS = 160  # that it has about, between these

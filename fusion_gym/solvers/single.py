@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.network.token_bucket import TokenBucket
+from fusion_gym.arrays import Array
+from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.solvers.grid import ErrorGrid, default_reach, gaussian_rows
 from fusion_gym.solvers.tokens import TokenLevels
-from fusion_gym.validation import Array, ConfigurationError
+from fusion_gym.validation import ConfigurationError
 
 _FINEST, _COARSEST = 40.0, 5.0  # points of the default grid a deviation of the noise
 _POINTS = 600  # that it has about, between these; half of them where tokens are limited

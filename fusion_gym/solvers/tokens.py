@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_gym.network import TokenBucket
-from fusion_gym.validation import Array, ConfigurationError
+from fusion_gym.arrays import Array
+from fusion_gym.core.token_bucket import TokenBucket
+from fusion_gym.validation import ConfigurationError
 
 _MOST_LEVELS = 500
 _DIGITS = 9

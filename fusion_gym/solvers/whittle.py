@@ -1,82 +1,24 @@
-"""Whittle's index of remote estimation: what a transmission of each source is worth by itself."""
+"""Whittle's index of a source: the thresholds on its error at many prices."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_gym import validation
-from fusion_gym.envs.task import Task
-from fusion_gym.solvers.policy import source_problems
+from fusion_gym.arrays import Array
 from fusion_gym.solvers.single import SourceProblem, solve_average
-from fusion_gym.systems import Signals
-from fusion_gym.triggers.base import Requests, check_at_most, strongest
-from fusion_gym.validation import Array, ConfigurationError
+from fusion_gym.validation import ConfigurationError
 
 _PRICES = np.geomspace(0.02, 5000.0, 32)  # in units of w σ², at which the optimum is solved
 
 
-class WhittleIndex:
-    """Requests the sources whose index reaches the price of a transmission, highest first.
-
-    The index of a source with error e and channel state s is the price λ at which its own optimum
-    does not care whether it transmits. With thresholds that grow with the price it is the inverse
-    of λ ↦ k(s; λ); the thresholds are solved at 32 prices and interpolated. For one source and a
-    fixed price the rule is the stationary optimum; for many sources that share a network it is
-    Whittle's heuristic, which is asymptotically optimal in similar problems and not in general.
-
-    ``at_most`` sources are requested in a step (None: one with ``access="single"``, else all);
-    ``price`` of a token stands for the task's own. With a price of zero it asks for whoever has
-    the highest index.
+def index_table(number: int, problem: SourceProblem) -> tuple[Array, Array]:
+    """Prices (P,) and the thresholds (P, S) there, of source ``number``.
 
     Raises:
-        ConfigurationError: another system than remote estimation, an unstable source, or
-            thresholds that do not grow with the price.
-
-    Source: P. Whittle, "Restless bandits: activity allocation in a changing world", Journal of
-    Applied Probability 25A, 1988.
+        ConfigurationError: an unstable source, or thresholds that do not grow with the price.
     """
-
-    def __init__(self, task: Task, price: float | None = None, at_most: int | None = None) -> None:
-        check_at_most(at_most)
-        problems = source_problems(task)
-        self._at_most = 1 if at_most is None and task.access == "single" else at_most
-        fixed = task.reward.price.fixed if price is None else price
-        self._price = validation.number("price", fixed, at_least=0.0)
-        self._cost = task.bucket.cost
-        self._tables = [_table(number, problem) for number, problem in enumerate(problems)]
-
-    def reset(self, num_envs: int, seed: int = 0) -> None:
-        """Nothing to forget."""
-
-    def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
-        index = self.index(signals["innovation"][:, 0], signals["channel_state"]) / self._cost
-        return strongest(index, index >= self._price, self._at_most, signals["age"])
-
-    def index(self, error: Array, channel: NDArray[np.int64]) -> Array:
-        """Price of a transmission (sensors, N) at which each source is indifferent.
-
-        From errors (sensors, N) and channel states (sensors, N).
-        """
-        result = np.empty(error.shape)
-        for source, (prices, thresholds) in enumerate(self._tables):
-            size = np.abs(error[source])
-            for state, reached in enumerate(thresholds.T):
-                here = channel[source] == state
-                inside = np.interp(size[here], reached, prices)
-                # Beyond the table the index grows as the square of the error, which it does for
-                # small errors exactly.
-                scale = np.clip(size[here], None, reached[0]) / reached[0]
-                beyond = np.maximum(size[here] / reached[-1], 1.0)
-                result[source, here] = inside * scale**2 * beyond**2
-        return result
-
-
-def _table(number: int, problem: SourceProblem) -> tuple[Array, Array]:
-    """Prices (P,) and the thresholds (P, S) there."""
     if abs(problem.coefficient) > 1.0:
         raise ConfigurationError(
             f"coefficient = {problem.coefficient:g} of source {number} is not allowed for the "

@@ -1,0 +1,250 @@
+"""Fingerprints of fusion-gym's figures, to show that a change of the code moves none of them.
+
+    python -m benchmarks.figures --output before.json [--only zoo reproduce …] [--workers 2]
+    python -m benchmarks.figures --compare before.json after.json
+
+The first line runs the commands of the checkout in the current directory and writes a SHA-256 of
+what each piece of work gave: the zoo's agents, the best rules of the stored results, the
+documentation's tables, short trainings of every training config, and the quick benchmark of one
+setting. The second line prints the pieces that differ, and exits with status 1 if any do.
+
+Finished pieces are in the file at once, and a second run skips them. Only the command lines and
+the stored JSON and YAML files are used, so the same script serves both sides of a change. Floating
+point is compared bit by bit: both sides belong on one machine with the same packages.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import io
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+TIMESTEPS = 100_000
+VALIDATION = {"every": 60_000, "episodes": 64}  # once on the way, and once at the end
+BENCHMARK = "tobit_oscillator"
+# Takes a temporary folder and returns what is to be hashed.
+Work = Callable[[Path], bytes]
+
+
+def command(module: str, *words: str) -> str:
+    """Run ``python -m module`` in the current directory and return its standard output.
+
+    Raises:
+        RuntimeError: it failed; the message ends with what it said.
+    """
+    done = subprocess.run(
+        [sys.executable, "-m", module, *words],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode != 0:
+        raise RuntimeError(f"{module} ended with {done.returncode}: {done.stderr.strip()[-1000:]}")
+    return done.stdout
+
+
+def read(path: Path) -> Any:
+    """The content of a JSON file."""
+    return json.loads(path.read_text())
+
+
+def evaluate(
+    env: str, options: dict[str, Any], policies: list[str], episodes: int, folder: Path
+) -> bytes:
+    """Summaries and quantiles that ``agents.evaluate`` writes for these policies."""
+    found = folder / "evaluation.json"
+    texts = [f"{key}={value}" for key, value in options.items()]  # lists as Python writes them
+    command(
+        "agents.evaluate",
+        *("--env", env, *(["--set", *texts] if texts else []), "--policies", *policies),
+        *("--episodes", str(episodes), "--seed", "0", "--json", str(found)),
+    )
+    report = read(found)
+    chosen = {key: report[key] for key in ("policies", "quantiles")}
+    return json.dumps(chosen, sort_keys=True).encode()
+
+
+def reproduce(config: Path, episodes: int, folder: Path) -> bytes:
+    """The table that ``agents.reproduce`` prints."""
+    words = ("--config", str(config), "--episodes", str(episodes), "--markdown")
+    return command("agents.reproduce", *words).encode()
+
+
+def train(plain: dict[str, Any], folder: Path) -> bytes:
+    """Validations and final weights of a short training with this config."""
+    config, output = folder / "config.yaml", folder / "training"
+    plain = plain | {"validation": plain.get("validation", {}) | VALIDATION}
+    config.write_text(yaml.safe_dump(plain, sort_keys=False))
+    words = ("--config", str(config), "--timesteps", str(TIMESTEPS), "--output", str(output))
+    command("agents.train", *words)
+    with zipfile.ZipFile(output / "final_model.zip") as model:
+        weights = torch.load(io.BytesIO(model.read("policy.pth")), "cpu", weights_only=True)
+    tensors = [weights[key].contiguous().numpy().tobytes() for key in sorted(weights)]
+    return b"".join([*tensors, (output / "validation.jsonl").read_bytes()])
+
+
+def numbers(content: Any) -> Iterator[float]:
+    """All numbers of a JSON document but the wall times, by sorted keys."""
+    if isinstance(content, dict):
+        for key in sorted(content):
+            if key != "seconds":
+                yield from numbers(content[key])
+    elif isinstance(content, list):
+        for entry in content:
+            yield from numbers(entry)
+    elif isinstance(content, (int, float)) and not isinstance(content, bool):
+        yield content
+
+
+def benchmark(setting: str, folder: Path) -> bytes:
+    """The numbers in every file that the quick benchmark of a setting writes."""
+    results = folder / "results"
+    command(
+        "agents.benchmark",
+        *("--quick", "--envs", setting, "--workers", "1"),
+        *("--results", str(results), "--work", str(folder / "work")),
+    )
+    files = sorted(results.glob(f"{setting}/*.json"))
+    return json.dumps({file.name: list(numbers(read(file))) for file in files}).encode()
+
+
+def zoo_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
+    """Every agent of the zoo at its prices, in its environment."""
+    for path in sorted(Path("fusion_gym/zoo").glob("*.json")):
+        card = read(path)
+        centre = {"information": "centre"} if card["mode"] == "centre" else {}
+        low, high = card["training"]["environment"]["options"]["price_range"]
+        prices = [min(max(price, low), high) for price in card["test"]["prices"]]
+        policies = [f"zoo:{path.stem},price={price!r}" for price in prices]
+        work = partial(evaluate, card["env"], card["options"] | centre, policies, episodes)
+        yield f"zoo {path.stem}, {episodes} episodes", work
+
+
+def envelope_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
+    """Every setting's rules that no other rule beats, in the stored results."""
+    for path in sorted(Path("results").glob("*/verdict.json")):
+        stored = read(path.with_name("baselines.json"))
+        modes = read(path)["modes"].values()
+        names = dict.fromkeys(point["name"] for mode in modes for point in mode["envelope"])
+        work = partial(evaluate, stored["env"], stored["options"], list(names), episodes)
+        yield f"envelopes {path.parent.name}, {episodes} episodes", work
+
+
+def reproduce_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
+    """Every table of the documentation."""
+    for path in sorted(Path("configs").glob("*_reproduce.yaml")):
+        yield f"reproduce {path.stem}, {episodes} episodes", partial(reproduce, path, episodes)
+
+
+def training_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
+    """Every config of a training; its episodes are ``VALIDATION``'s."""
+    for path in sorted(Path("configs").glob("*.yaml")):
+        plain = yaml.safe_load(path.read_text())
+        if "training" in plain:
+            yield f"trainings {path.stem}", partial(train, plain)
+
+
+def benchmark_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
+    """The quick benchmark of one setting; its episodes are those of ``--quick``."""
+    yield f"benchmark {BENCHMARK}", partial(benchmark, BENCHMARK)
+
+
+KINDS: dict[str, Callable[[int], Iterator[tuple[str, Work]]]] = {
+    "zoo": zoo_pieces,
+    "envelopes": envelope_pieces,
+    "reproduce": reproduce_pieces,
+    "trainings": training_pieces,
+    "benchmark": benchmark_pieces,
+}
+
+
+def fingerprint(work: Work) -> tuple[str, float]:
+    """The SHA-256 of what the work gave, and the seconds that it took."""
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        found = hashlib.sha256(work(Path(folder))).hexdigest()
+    return found, time.perf_counter() - began
+
+
+def run(output: Path, kinds: list[str], episodes: int, workers: int) -> int:
+    """Fill the file with the pieces that it lacks; returns how many of them failed."""
+    found: dict[str, str] = read(output) if output.exists() else {}
+    pieces = {name: work for kind in kinds for name, work in KINDS[kind](episodes)}
+    left = {name: work for name, work in pieces.items() if name not in found}
+    print(f"{len(pieces)} pieces, {len(pieces) - len(left)} of them are finished", flush=True)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    unfinished, failed = output.with_name(output.name + ".part"), 0
+    with ThreadPoolExecutor(workers) as pool:
+        futures: dict[Future[tuple[str, float]], str] = {
+            pool.submit(fingerprint, work): name for name, work in left.items()
+        }
+        try:
+            for future in as_completed(futures):
+                name = futures[future]
+                if (error := future.exception()) is not None:
+                    failed += 1
+                    print(f"{name} failed: {error!r}", file=sys.stderr, flush=True)
+                    continue
+                found[name], seconds = future.result()
+                unfinished.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n")
+                unfinished.replace(output)
+                print(f"{name}: {found[name][:12]}, {seconds:.0f} s", flush=True)
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return failed
+
+
+def compare(before: Path, after: Path) -> int:
+    """Print the pieces that differ or that one of the files lacks; returns how many."""
+    first, second = read(before), read(after)
+    names = sorted(first.keys() | second.keys())
+    differing = [name for name in names if first.get(name) != second.get(name)]
+    for name in differing:
+        lacking = [
+            str(path) for path, side in ((before, first), (after, second)) if name not in side
+        ]
+        print(f"{name}: {'not in ' + lacking[0] if lacking else 'differs'}")
+    print(f"{len(differing)} of {len(names)} pieces differ")
+    return len(differing)
+
+
+def main() -> None:
+    """Entry point; exit status 1 if a piece failed or differs, 130 after an interrupt."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.figures",
+        description="Fingerprints of the figures, to show that a change moves none.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    task = parser.add_mutually_exclusive_group(required=True)
+    task.add_argument("--output", type=Path, help="run what this JSON lacks, and add it")
+    task.add_argument("--compare", type=Path, nargs=2, metavar=("BEFORE", "AFTER"))
+    parser.add_argument("--only", nargs="+", choices=KINDS, default=list(KINDS))
+    parser.add_argument("--episodes", type=int, default=200, help="of evaluations and tables")
+    parser.add_argument("--workers", type=int, default=2, help="commands side by side")
+    given = parser.parse_args()
+    try:
+        if given.compare:
+            sys.exit(compare(*given.compare) > 0)
+        sys.exit(run(given.output, given.only, given.episodes, given.workers) > 0)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

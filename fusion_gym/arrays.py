@@ -1,0 +1,45 @@
+"""Arrays of runs: quantities of shape (…, N), and records of them, with the batch axis last."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def take_runs(state: Any, runs: NDArray[np.int64]) -> Any:
+    """The given runs of a state, in this order and possibly again and again.
+
+    Through dataclasses and named tuples, whose arrays have the batch as last axis.
+    """
+    if isinstance(state, np.ndarray):
+        return state.take(runs, axis=-1)
+    if state is None:
+        return None
+    if isinstance(state, tuple):
+        return type(state)(*(take_runs(part, runs) for part in state))
+    return type(state)(
+        *(take_runs(getattr(state, field.name), runs) for field in dataclasses.fields(state))
+    )
+
+
+def merge_runs(old: Any, new: Any, runs: NDArray[np.int64]) -> Any:
+    """``old`` with the given runs replaced by ``new``, through dataclasses and named tuples."""
+    if isinstance(old, np.ndarray):
+        result = old.copy()
+        result[..., runs] = new
+        return result
+    if old is None:
+        return None
+    if isinstance(old, tuple):
+        return type(old)(*(merge_runs(a, b, runs) for a, b in zip(old, new, strict=True)))
+    return type(old)(
+        *(
+            merge_runs(getattr(old, field.name), getattr(new, field.name), runs)
+            for field in dataclasses.fields(old)
+        )
+    )

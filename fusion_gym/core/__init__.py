@@ -1,0 +1,1 @@
+"""The contract between systems, policies and environments, and the episodes that keep it."""

@@ -1,0 +1,39 @@
+"""Medium access: which sensors may use the network in a step, before tokens are asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from fusion_gym.arrays import Array
+
+ACCESS_RULES = ("any", "single", "round_robin", "random")
+
+
+def access_mask(
+    rule: str, sensors: int, step: NDArray[np.int64], noise: Array | None
+) -> NDArray[np.bool_]:
+    """Which sensors (sensors, N) the network admits at ``step`` (N,), the steps taken so far.
+
+    - ``"any"``: all of them.
+    - ``"single"``: all of them, but only one request a step gets through (:func:`first_request`).
+    - ``"round_robin"``: one after another, sensor 0 first (round_robin_tobit, equation (4)).
+    - ``"random"``: one, drawn from the standard normals ``noise`` (N,).
+    """
+    if rule == "round_robin":
+        turn = step % sensors
+    elif rule == "random":
+        assert noise is not None, "random access needs noise"
+        turn = np.minimum((ndtr(noise) * sensors).astype(np.int64), sensors - 1)
+    else:
+        return np.ones((sensors, len(step)), dtype=np.bool_)
+    return np.arange(sensors)[:, None] == turn
+
+
+def first_request(requests: NDArray[np.bool_], step: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """At most one of the requests (sensors, N): the first, in an order that rotates by ``step``."""
+    sensors = len(requests)
+    place = (np.arange(sensors)[:, None] - step) % sensors
+    first = np.argmin(np.where(requests, place, sensors), axis=0)
+    return requests & (np.arange(sensors)[:, None] == first)

@@ -1,0 +1,243 @@
+"""The batched core: N episodes of one task side by side, with their noise, tokens and rewards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.utils import seeding
+from numpy.typing import NDArray
+
+from fusion_gym.arrays import Array, merge_runs
+from fusion_gym.core.access import access_mask, first_request
+from fusion_gym.core.observation import ObservationLayout
+from fusion_gym.core.system import Signals
+from fusion_gym.core.task import Task
+
+_LONGEST_BLOCK = 256  # steps of noise that are drawn and kept at a time
+
+
+class Outcome(NamedTuple):
+    """What one step brought, batch axis last.
+
+    ``reward`` (N,) is ``reward_error`` + ``reward_cost``; ``cost`` (N,) the tokens spent;
+    ``requested``, ``granted`` (sensors, N) bool; ``squared_error`` (n, N) of the fused estimate;
+    ``diverged`` (N,) bool, whether some state's squared error is not finite or above the task's
+    ``divergence_level``; ``truncated`` (N,) bool.
+    """
+
+    reward: Array
+    reward_error: Array
+    reward_cost: Array
+    cost: Array
+    requested: NDArray[np.bool_]
+    granted: NDArray[np.bool_]
+    squared_error: Array
+    diverged: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+
+
+class EpisodeBatch:
+    """N runs of a :class:`~fusion_gym.core.task.Task`, advanced together.
+
+    Each run draws all its noise from its own generator, in blocks and whatever the actions: a
+    seed fixes an episode's noise (common random numbers), and a run does not depend on what
+    stands beside it (batch invariance).
+
+    ``state`` is the system's after sensing, ``delivered`` its state after the last delivery,
+    for metrics and figures.
+    """
+
+    def __init__(self, task: Task, num_envs: int) -> None:
+        self.task = task
+        self.num_envs = num_envs
+        self.layout = ObservationLayout(task)
+        self.generators: list[np.random.Generator | None] = [None] * num_envs
+        self._episode_starts: list[Any] = [None] * num_envs
+        self.state: Any = None
+        self.delivered: Any = None
+        self.tokens = task.bucket.start(num_envs)
+        self.price = task.reward.price.draw(np.zeros(num_envs))
+        self.steps = np.zeros(num_envs, dtype=np.int64)
+        self.finished = np.ones(num_envs, dtype=np.bool_)
+        self._limit = np.full(num_envs, task.horizon, dtype=np.int64)
+        # Row (cursor mod block) of the ring holds the noise of the next sensing; a run's block
+        # starts wherever the cursor stood at its reset, so that a row is one contiguous read.
+        self._block = min(task.horizon + 1, _LONGEST_BLOCK)
+        self._channels = task.system.noise_channels + (task.access == "random")
+        self._ring = np.zeros((self._block, self._channels, num_envs))
+        self._cursor = 0
+        self._block_start = np.zeros(num_envs, dtype=np.int64)
+
+    def seed(self, runs: NDArray[np.int64], seeds: Sequence[int | None]) -> None:
+        """Give these runs new generators; ``None`` keeps a run's generator if it has one."""
+        for run, seed in zip(runs.tolist(), seeds, strict=True):
+            if seed is not None or self.generators[run] is None:
+                self.use_generator(run, seeding.np_random(seed)[0])
+
+    def use_generator(self, run: int, generator: np.random.Generator) -> None:
+        """Draw this run's noise from ``generator``, from its present state on (if it is new)."""
+        if generator is not self.generators[run]:
+            self.generators[run] = generator
+            self._episode_starts[run] = None
+
+    def reset(self, runs: NDArray[np.int64] | None = None, *, stagger: bool = False) -> None:
+        """Begin new episodes in the given runs (all by default) and sense for the first time.
+
+        ``stagger`` spreads the lengths of these first episodes evenly from 1 to the horizon, so
+        that later ones do not all end in the same step.
+        """
+        everyone = runs is None
+        runs = np.arange(self.num_envs) if runs is None else runs
+        system = self.task.system
+        noise = np.empty((len(runs), system.start_channels))
+        for place, run in enumerate(runs.tolist()):
+            self._next_episode(run).standard_normal(out=noise[place])
+        if self.task.reward.price.fixed is None:
+            drawn = np.array([self._far_uniform(run) for run in runs.tolist()])
+            self.price = merge_runs(self.price, self.task.reward.price.draw(drawn), runs)
+        self._draw(runs)
+        fresh = system.start(np.ascontiguousarray(noise.T))
+        row = self.noise()
+        fresh = system.sense(fresh, row if everyone else row[:, runs])
+        self.state = fresh if everyone else merge_runs(self.state, fresh, runs)
+        self.tokens = merge_runs(self.tokens, self.task.bucket.start(len(runs)), runs)
+        self.steps[runs] = 0
+        self.finished[runs] = False
+        horizon = self.task.horizon
+        self._limit[runs] = horizon
+        if stagger:
+            self._limit[runs] = horizon - (np.arange(len(runs)) * horizon) // len(runs)
+
+    def step(self, requests: NDArray[np.bool_]) -> Outcome:
+        """Answer the requests (sensors, N), update, fuse, reward; then move and sense.
+
+        Runs that are ``finished`` are carried along without meaning until they are reset.
+
+        Raises:
+            ResetNeeded: before the first reset.
+        """
+        if self.state is None:
+            raise ResetNeeded("call reset before the first step")
+        task, system = self.task, self.task.system
+        if task.access == "any":
+            admitted = requests
+        elif task.access == "single":
+            admitted = first_request(requests, self.steps)
+        else:
+            admitted = requests & self.admitted()
+        granted, spent, tokens = task.bucket.grant(self.tokens, admitted, self.steps)
+        state = system.deliver(self.state, granted)
+        mean, covariance = system.fused(state)
+        error = system.truth(state) - mean
+        squared_error = error * error
+        reward_error, reward_cost = task.reward.terms(squared_error, covariance, spent, self.price)
+        self.tokens = tokens
+        self.steps = self.steps + 1
+        truncated = self.steps >= self._limit
+        self._cursor += 1
+        used_up = ~self.finished & (self._cursor - self._block_start >= self._block)
+        if used_up.any():
+            self._draw(np.flatnonzero(used_up))
+        self.delivered = state
+        self.state = system.sense(state, self.noise())
+        self.finished = truncated.copy()
+        return Outcome(
+            reward=reward_error + reward_cost,
+            reward_error=reward_error,
+            reward_cost=reward_cost,
+            cost=spent,
+            requested=requests,
+            granted=granted,
+            squared_error=squared_error,
+            diverged=np.asarray(~(squared_error <= task.divergence_level).all(0)),
+            truncated=truncated,
+        )
+
+    def observe(self) -> NDArray[np.float32]:
+        """Observations (N, entries) of all runs, a fresh array."""
+        return self.layout.encode(self.state, self.tokens, self.admitted, self.price)
+
+    def admitted(self) -> NDArray[np.bool_]:
+        """The sensors (sensors, N) that the network's access rule admits in the coming step."""
+        noise = self._ring[self._cursor % self._block, -1] if self.task.access == "random" else None
+        return access_mask(self.task.access, self.task.sensors, self.steps, noise)
+
+    def grantable(self) -> NDArray[np.bool_]:
+        """The sensors (sensors, N) whose request alone the network would grant now."""
+        admitted = self.admitted()
+        result = np.zeros_like(admitted)
+        for sensor in range(self.task.sensors):
+            alone = np.zeros_like(admitted)
+            alone[sensor] = admitted[sensor]
+            result[sensor] = self.task.bucket.grant(self.tokens, alone, self.steps).granted[sensor]
+        return result
+
+    def noise(self) -> Array:
+        """The normals (channels, N) of the last sensing, a view that later steps overwrite."""
+        return self._ring[self._cursor % self._block, : self.task.system.noise_channels]
+
+    def signals(self) -> Signals:
+        """The signals of all runs, without what the information mode withholds.
+
+        To the system's own it adds ``tokens`` (N,), ``token_cost`` (sensors, 1), ``price`` (N,) of
+        a token, ``step`` (N,),
+        the steps taken in the episode, ``start`` (N,) bool, ``admitted`` and
+        ``grantable`` (sensors, N) bool, ``observation`` (N, entries), and the system's ``state``,
+        which only a policy that plans with the system's own methods has a use for.
+        """
+        values = dict(self.task.system.read(self.state))
+        values |= {
+            "tokens": self.tokens,
+            "token_cost": self.task.bucket.cost,
+            "price": self.price,
+            "step": self.steps,
+            "start": self.steps == 0,
+            "admitted": self.admitted,
+            "grantable": self.grantable,
+            "observation": self.observe,
+            "state": self.state,
+        }
+        return Signals(values, self.task.hidden_signals)
+
+    def _next_episode(self, run: int) -> np.random.Generator:
+        """The run's generator at the start of its next episode.
+
+        Episodes begin 2⁶⁴ draws apart, so that the noise of one does not depend on how long the
+        one before it was.
+        """
+        if self.generators[run] is None:
+            self.use_generator(run, seeding.np_random(None)[0])
+        generator = self._generator(run)
+        bits = generator.bit_generator
+        if self._episode_starts[run] is not None:
+            bits.state = self._episode_starts[run]
+            bits.advance(2**64)  # type: ignore[attr-defined]
+        self._episode_starts[run] = bits.state
+        return generator
+
+    def _far_uniform(self, run: int) -> float:
+        """A uniform number of the episode from beyond all its noise, which it does not shift."""
+        generator = self._generator(run)
+        bits = generator.bit_generator
+        here = bits.state
+        bits.advance(2**63)  # type: ignore[attr-defined]
+        drawn = generator.random()
+        bits.state = here
+        return drawn
+
+    def _generator(self, run: int) -> np.random.Generator:
+        generator = self.generators[run]
+        assert generator is not None, "reset gives every run a generator"
+        return generator
+
+    def _draw(self, runs: NDArray[np.int64]) -> None:
+        """Draw the next block of noise for these runs, to begin at the cursor."""
+        noise = np.empty((len(runs), self._block, self._channels))
+        for place, run in enumerate(runs.tolist()):
+            self._generator(run).standard_normal(out=noise[place])
+        rows = (self._cursor + np.arange(self._block)) % self._block
+        self._ring[rows[:, None], :, runs[None, :]] = noise.transpose(1, 0, 2)
+        self._block_start[runs] = self._cursor

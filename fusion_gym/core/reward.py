@@ -1,0 +1,146 @@
+"""What the answer is worth: the error, and the price of a token."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
+from fusion_gym.validation import ConfigurationError
+
+ERROR_KINDS = ("squared", "trace")
+
+
+@dataclass(frozen=True)
+class Reward:
+    """reward = -(error_weight · Σᵢ wᵢ error_i + price · tokens spent).
+
+    ``error="squared"`` takes the squared error of the fused estimate, ``"trace"`` the diagonal of
+    its covariance as the filter claims it (which a policy can game, see the documentation).
+    ``state_weights`` w has shape (n, 1).
+    """
+
+    error: str
+    error_weight: float
+    price: Price
+    state_weights: Array
+
+    @classmethod
+    def create(
+        cls,
+        error: str,
+        error_weight: float,
+        price: Price,
+        state_weights: ArrayLike | None,
+        open_loop: Array,
+    ) -> Reward:
+        """Check the weights; ``None`` weighs all states alike so that open loop costs 1.
+
+        ``open_loop`` (n,) is the mean error variance of each state without any transmission.
+
+        Raises:
+            ConfigurationError: an unknown kind, a negative weight, or a wrong shape.
+        """
+        weights = (
+            np.full(open_loop.shape, 1.0 / open_loop.sum())
+            if state_weights is None
+            else validation.not_negative("state_weights", state_weights, open_loop.shape)
+        )
+        return cls(
+            error=validation.choice("error", error, ERROR_KINDS),
+            error_weight=validation.number("error_weight", error_weight, at_least=0.0),
+            price=price,
+            state_weights=weights[:, None],
+        )
+
+    def terms(
+        self, squared_error: Array, covariance: Array, spent: Array, price: Array
+    ) -> tuple[Array, Array]:
+        """The two terms of the reward (N,), both <= 0: error and cost.
+
+        From squared errors (n, N), the fused covariance (n, n, N), tokens spent (N,) and the
+        price of a token (N,).
+        """
+        error = squared_error if self.error == "squared" else linalg.diagonal(covariance)
+        return -self.error_weight * (self.state_weights * error).sum(0), -price * spent
+
+
+@dataclass(frozen=True)
+class Price:
+    """What a token costs in the reward.
+
+    ``fixed`` is the price, or ``None`` where each episode draws its own, evenly in the logarithm,
+    from ``span`` (low, high). With a span the observation shows the price, so that one agent can
+    learn the whole trade-off between error and transmissions.
+    """
+
+    fixed: float | None
+    span: tuple[float, float] | None = None
+
+    @classmethod
+    def create(cls, cost_weight: Any, price_range: Any = None) -> Price:
+        """The options ``cost_weight`` (a number >= 0 or "random") and ``price_range``.
+
+        Raises:
+            ConfigurationError: a negative price, a range that is not 0 < low < high, a random
+                price without a range, or a fixed one outside its range.
+        """
+        span = None if price_range is None else _span(price_range)
+        if isinstance(cost_weight, str):
+            validation.choice("cost_weight", cost_weight, ("random",))
+            if span is None:
+                raise ConfigurationError(
+                    "price_range = None is not allowed with cost_weight='random': it must be a "
+                    "pair (low, high) with 0 < low < high"
+                )
+            return cls(None, span)
+        price = validation.number("cost_weight", cost_weight, at_least=0.0)
+        if span is not None and not span[0] <= price <= span[1]:
+            raise ConfigurationError(
+                f"cost_weight = {price} is not allowed: it must lie in price_range = {list(span)}"
+            )
+        return cls(price, span)
+
+    def draw(self, uniform: Array) -> Array:
+        """Prices (N,) from uniform numbers in [0, 1); fixed ones do not depend on them."""
+        if self.fixed is not None or self.span is None:
+            return np.full(uniform.shape, self.fixed)
+        low, high = self.span
+        return low * (high / low) ** uniform
+
+    def encode(self, price: Array) -> Array:
+        """Position of the price in the range, 0 to 1 in the logarithm; same shape.
+
+        Raises:
+            ConfigurationError: there is no range.
+        """
+        if self.span is None:
+            raise ConfigurationError("price_range = None is not allowed here: no price is observed")
+        low, high = self.span
+        return np.log(price / low) / math.log(high / low)
+
+    def scale(self, price: Array, exponent: float) -> Array:
+        """(geometric mean of the range / price)^exponent, same shape; 1 without a range.
+
+        Multiplying an episode's rewards by it changes no policy that is best for its price, and
+        brings what a decision is worth at low and at high prices closer together: at a price p the
+        decisions that are hard to make are worth about p.
+        """
+        if self.span is None:
+            return np.ones(price.shape)
+        return np.asarray((math.sqrt(self.span[0] * self.span[1]) / price) ** exponent)
+
+
+def _span(value: Any) -> tuple[float, float]:
+    pair = validation.positive("price_range", validation.array("price_range", value, (2,)), (2,))
+    low, high = pair.tolist()
+    if low >= high:
+        raise ConfigurationError(
+            f"price_range = {[low, high]} is not allowed: it must be a pair with 0 < low < high"
+        )
+    return low, high

@@ -1,0 +1,85 @@
+"""A task: a system, its network, what a policy may know, and what the answer is worth."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, field
+from typing import Any
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.access import ACCESS_RULES
+from fusion_gym.core.reward import Reward
+from fusion_gym.core.system import System
+from fusion_gym.core.token_bucket import TokenBucket
+
+INFORMATION_MODES = ("sensors", "centre")
+ACTION_KINDS = ("binary", "discrete")
+
+
+@dataclass(frozen=True)
+class Task:
+    """Everything that an environment needs to know, independent of the number of runs.
+
+    ``information`` is ``"sensors"`` (a coordinator that sees every sensor's new measurement) or
+    ``"centre"`` (only what the fusion centre knows before anything is sent). ``action`` is
+    ``"binary"`` (one bit a sensor) or ``"discrete"`` (the bits as one number, sensor 0 the lowest).
+    ``access`` is a rule of :mod:`fusion_gym.core.access`; with ``"single"`` the action is
+    0 for nobody or the number of the sensor, counted from 1.
+    ``settings`` is what a user chose, for reports; ``policy_defaults`` the scenario's own
+    parameters of named policies.
+
+    Raises:
+        ConfigurationError: an unknown mode, a horizon below 1, or parts that do not fit together.
+    """
+
+    system: System[Any]
+    bucket: TokenBucket
+    reward: Reward
+    horizon: int
+    information: str = "sensors"
+    action: str = "binary"
+    access: str = "any"
+    settings: dict[str, Any] = field(default_factory=dict)
+    policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        validation.integer("horizon", self.horizon, at_least=1)
+        if self.information == "local":
+            raise validation.ConfigurationError(
+                "information = 'local' is not allowed here: it must be one of "
+                f"{', '.join(map(repr, INFORMATION_MODES))}; sensors that decide by themselves are "
+                "fusion_gym.parallel_env(id) and make_sb3_vec_env(id, n, local=True)"
+            )
+        validation.choice("information", self.information, INFORMATION_MODES)
+        validation.choice("action", self.action, ACTION_KINDS)
+        validation.choice("access", self.access, ACCESS_RULES)
+        if len(self.bucket.cost) != self.system.sensor_count:
+            raise validation.ConfigurationError(
+                f"token_cost for {len(self.bucket.cost)} sensors is not allowed: the system has "
+                f"{self.system.sensor_count}"
+            )
+        states = len(self.system.state_names)
+        if self.reward.state_weights.shape != (states, 1):
+            raise validation.ConfigurationError(
+                f"state_weights of shape {self.reward.state_weights.shape} are not allowed: the "
+                f"system has {states} states, so it must be ({states}, 1)"
+            )
+
+    @property
+    def sensors(self) -> int:
+        """Number of sensors."""
+        return self.system.sensor_count
+
+    @functools.cached_property
+    def divergence_level(self) -> Array:
+        """Squared errors (n, 1) beyond which a run counts as diverged: 100 times open loop."""
+        return 100.0 * self.system.open_loop(self.horizon)[:, None]
+
+    @property
+    def hidden_signals(self) -> tuple[str, ...]:
+        """Names of the system's signals that the information mode withholds."""
+        if self.information == "sensors":
+            return ()
+        hidden = (s.name for s in self.system.signals if s.knowledge == "sensor")
+        return ("state", *hidden)

@@ -1,0 +1,125 @@
+"""Token bucket: the network's hard limit on transmissions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.validation import ConfigurationError
+
+SHARING_RULES = ("equal", "fixed", "rotating")
+_ROUNDING = 1e-9  # tokens: ten times 0.1 pays for a transmission that costs 1
+
+
+class Grants(NamedTuple):
+    """What the network answered: ``granted`` (sensors, N) bool, ``spent`` and ``tokens`` (N,)."""
+
+    granted: NDArray[np.bool_]
+    spent: Array
+    tokens: Array
+
+
+@dataclass(frozen=True)
+class TokenBucket:
+    """Tokens are generated at ``rate`` a step up to ``capacity``; a grant to sensor m costs c_m.
+
+    ``sharing`` says how simultaneous requests share the bucket:
+
+    - ``"equal"``: each of the l sensors owns an l-th of the tokens, and a request is granted if
+      ξ/l >= c_m (tobit_token_bucket, equations (16) and (18)). With equal costs that is all or
+      nothing. It looks at the tokens before this step's spending.
+    - ``"fixed"``: requests are granted in the order of the sensors while tokens last.
+    - ``"rotating"``: the same, the first in the order moving on by one sensor each step.
+
+    ``unlimited`` grants everything; tokens spent are still counted, the level stays full.
+
+    Shapes: ``cost`` (sensors, 1), in tokens; ``rate``, ``capacity`` and ``initial`` in tokens.
+    """
+
+    rate: float
+    capacity: float
+    initial: float
+    cost: Array
+    sharing: str = "equal"
+    unlimited: bool = False
+
+    @classmethod
+    def create(
+        cls,
+        rate: float,
+        capacity: float,
+        initial: float,
+        cost: ArrayLike,
+        sensors: int,
+        sharing: str = "equal",
+        unlimited: bool = False,
+    ) -> TokenBucket:
+        """Check the numbers; ``cost`` is one number or one for each sensor.
+
+        Raises:
+            ConfigurationError: a negative rate, a cost <= 0, an initial level outside
+                [0, capacity], an unknown sharing rule, or a capacity with which some sensor
+                could never transmit.
+        """
+        costs = validation.positive("token_cost", cost, (sensors,))[:, None]
+        limit = validation.number("token_capacity", capacity, above=0.0)
+        rule = validation.choice("sharing", sharing, SHARING_RULES)
+        needed = float(costs.max()) * (sensors if rule == "equal" else 1)
+        if limit < needed * (1.0 - 1e-12) and not unlimited:
+            reason = (
+                f"at least {needed:g}: under sharing='equal' each of the {sensors} sensors owns "
+                f"1/{sensors} of the bucket and a transmission costs up to {costs.max():g}"
+                if rule == "equal"
+                else f"at least the cost of a transmission, {needed:g}"
+            )
+            raise ConfigurationError(
+                f"token_capacity = {limit:g} is not allowed: it must be {reason}"
+            )
+        return cls(
+            rate=validation.number("token_rate", rate, at_least=0.0),
+            capacity=limit,
+            initial=validation.number("initial_tokens", initial, at_least=0.0, at_most=limit),
+            cost=costs,
+            sharing=rule,
+            unlimited=validation.boolean("unlimited", unlimited),
+        )
+
+    def start(self, num_envs: int) -> Array:
+        """Tokens at the start of an episode, shape (num_envs,)."""
+        return np.full(num_envs, self.capacity if self.unlimited else self.initial)
+
+    def grant(self, tokens: Array, requests: NDArray[np.bool_], step: NDArray[np.int64]) -> Grants:
+        """Answer the requests (sensors, N) with the tokens (N,); ``step`` (N,) turns the order.
+
+        Source: tobit_token_bucket, equations (16)-(18).
+        """
+        if self.unlimited:
+            return Grants(requests.copy(), (requests * self.cost).sum(0), tokens)
+        if self.sharing == "equal":
+            granted = requests & (self.cost * len(self.cost) <= tokens + _ROUNDING)
+            spent = (granted * self.cost).sum(0)
+        else:
+            granted, spent = self._grant_in_order(tokens, requests, step)
+        left = np.maximum(tokens + self.rate - spent, 0.0)
+        return Grants(granted, spent, np.minimum(left, self.capacity))
+
+    def _grant_in_order(
+        self, tokens: Array, requests: NDArray[np.bool_], step: NDArray[np.int64]
+    ) -> tuple[NDArray[np.bool_], Array]:
+        sensors, runs = requests.shape
+        granted = np.zeros_like(requests)
+        spent = np.zeros(runs)
+        lanes = np.arange(runs)
+        first = step % sensors if self.sharing == "rotating" else np.zeros(runs, dtype=np.int64)
+        for place in range(sensors):
+            sensor = (first + place) % sensors
+            cost = self.cost[sensor, 0]
+            answer = requests[sensor, lanes] & (spent + cost <= tokens + _ROUNDING)
+            granted[sensor, lanes] = answer
+            spent += answer * cost
+        return granted, spent

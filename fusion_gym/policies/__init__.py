@@ -1,0 +1,1 @@
+"""Every policy: rules, references that know the model, saved agents."""

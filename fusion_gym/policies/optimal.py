@@ -1,0 +1,48 @@
+"""The policy that attains the solved optimum of a remote-estimation task."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fusion_gym.core.system import Signals
+from fusion_gym.core.task import Task
+from fusion_gym.policies.base import Requests
+from fusion_gym.solvers.task import solve_task
+
+
+class OptimalPolicy:
+    """Requests as the solved optimum of a task does; it looks at errors, channels and tokens.
+
+    ``criterion`` as in :func:`solve_task`: the exact optimum of an episode knows the steps that
+    are left, the stationary one does not. ``optimum`` holds the cost that it attains.
+
+    Raises:
+        ConfigurationError: a task that is not solved here.
+    """
+
+    def __init__(self, task: Task, criterion: str = "finite") -> None:
+        self.optimum = solve_task(task, criterion)
+
+    def reset(self, num_envs: int, seed: int = 0) -> None:
+        """Nothing to forget."""
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Requests (sensors, N)."""
+        optimum = self.optimum
+        error = np.abs(signals["innovation"][:, 0])
+        level = optimum.tokens.index(signals["tokens"])
+        if optimum.threshold is not None:
+            threshold = optimum.threshold
+            step = np.minimum(signals["step"], len(threshold) - 1)
+            sensor = np.arange(len(error))[:, None]
+            request: Requests = error >= threshold[step, sensor, signals["channel_state"], level]
+            return request
+        assert optimum.choice is not None
+        assert optimum.grids is not None
+        step = np.minimum(signals["step"], len(optimum.choice) - 1)
+        one, two = (
+            np.minimum(np.rint(e / grid.points[1]), len(grid.points) - 1).astype(np.int64)
+            for e, grid in zip(error, optimum.grids, strict=True)
+        )
+        chosen = optimum.choice[step, one, two, level]
+        return (chosen >> np.arange(2)[:, None] & 1).astype(np.bool_)

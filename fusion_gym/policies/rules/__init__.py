@@ -1,0 +1,1 @@
+"""Analytic policies, from signals to requests, one rule or pair of rules a file."""

@@ -1,0 +1,95 @@
+"""The adaptive threshold trigger of the unknown-input paper."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg, validation
+from fusion_gym.core.system import Signals
+from fusion_gym.policies.base import (
+    PerSensor,
+    Requests,
+    Trigger,
+    check_not_negative,
+    column,
+    shape_of,
+)
+from fusion_gym.validation import ConfigurationError
+
+
+@dataclass
+class AdaptiveThreshold(Trigger):
+    """Request when |σ|² > ρ, with σ the measurement minus the last delivered one.
+
+    The threshold follows ρ' = ρ̄ + |σ|²/(λ + |σ|²) (ρ - ρ̄) in every step, with σ before the
+    transmission: it only rises, from ``rho_initial`` ρ₀ at an episode's start to ``rho_bar`` ρ̄.
+    ``rho_bar``, ``rho_initial`` and ``adaptation`` λ are in squared units of the measurement;
+    ``scale`` multiplies ρ̄ and ρ₀, for sweeps.
+
+    While every request is granted, |σ|² <= ρ̄ wherever nothing was sent. σ is taken against the
+    last delivery and not the last request, so that this also holds again after a denied request
+    is repeated. The measurement at time 0 counts as delivered.
+
+    Raises:
+        ConfigurationError: not 0 <= ρ₀ <= ρ̄ <= 1, or λ <= 0, or a negative scale.
+
+    Source: unknown_input, equations (5)-(7), defaults of Section 4.
+    """
+
+    rho_bar: PerSensor = 0.05
+    rho_initial: PerSensor = 0.01
+    adaptation: PerSensor = 0.01
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_thresholds(self.rho_bar, self.rho_initial, self.adaptation)
+        validation.number("scale", self.scale, at_least=0.0)
+        self.reset(0)
+
+    def reset(self, num_envs: int, seed: int = 0) -> None:
+        """Forget the thresholds."""
+        self._rho: NDArray[np.float64] | None = None
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Requests (sensors, N)."""
+        sensors, runs = shape_of(signals)
+        limit = self.scale * column("rho_bar", self.rho_bar, sensors)
+        initial = self.scale * column("rho_initial", self.rho_initial, sensors)
+        start = signals["start"]
+        if self._rho is None:
+            self._rho, start = np.empty((sensors, runs)), np.ones(runs, dtype=np.bool_)
+        rho = np.where(start, initial, self._rho)
+        difference = signals["measurement"] - signals["held"]
+        squared = linalg.dot(difference, difference)
+        request: Requests = squared > rho
+        share = squared / (column("adaptation", self.adaptation, sensors) + squared)
+        self._rho = limit + share * (rho - limit)
+        return request
+
+
+def check_thresholds(rho_bar: PerSensor, rho_initial: PerSensor, adaptation: PerSensor) -> None:
+    """0 <= ρ₀ <= ρ̄ <= 1 and λ > 0, each one number or one a sensor.
+
+    Raises:
+        ConfigurationError: anything else.
+    """
+    for name, value in (("rho_bar", rho_bar), ("rho_initial", rho_initial)):
+        check_not_negative(name, value)
+    if np.any(np.asarray(rho_bar) > 1.0):
+        raise ConfigurationError(f"rho_bar = {rho_bar!r} is not allowed: it must be >= 0 and <= 1")
+    try:
+        reversed_ = np.any(np.asarray(rho_initial) > np.asarray(rho_bar))
+    except ValueError:
+        raise ConfigurationError(
+            f"rho_initial = {rho_initial!r} is not allowed: it must be a number, or as many as "
+            f"rho_bar = {rho_bar!r} has"
+        ) from None
+    if reversed_:
+        raise ConfigurationError(
+            f"rho_initial = {rho_initial!r} is not allowed: it must be <= rho_bar = {rho_bar!r}"
+        )
+    given = np.asarray(adaptation)
+    validation.positive("adaptation", adaptation, given.shape if given.ndim == 1 else ())

@@ -1,0 +1,38 @@
+"""Transmit until the centre's own predicted uncertainty is small enough."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fusion_gym import validation
+from fusion_gym.core.system import Signals
+from fusion_gym.policies.base import Requests, Trigger, check_at_most, strongest
+
+
+@dataclass
+class CentreVariance(Trigger):
+    """Request the fewest sensors, chosen greedily, that bring the centre's trace below a threshold.
+
+    The trace is that of the fused covariance after the step, in squared units of the state. If it
+    is at least ``threshold`` without any packet, the sensor that lowers it most is requested; if
+    it still is, the one that lowers it most in addition; and so on, ``at_most`` of them (None:
+    all). It looks at no measurement, so without a token limit it is a schedule.
+
+    Unlike the rule ``variance_threshold`` it takes the plain
+    trace, and it knows what several packets bring together.
+
+    Source: the threshold is that of S. Trimpe and R. D'Andrea, "Event-based state estimation with
+    variance-based triggering", IEEE Trans. Automatic Control 59, 2014; the choice is ours.
+    """
+
+    threshold: float = 1.6
+    at_most: int | None = None
+
+    def __post_init__(self) -> None:
+        validation.number("threshold", self.threshold, at_least=0.0)
+        check_at_most(self.at_most)
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Requests (sensors, N)."""
+        before = signals["greedy_variance"]
+        return strongest(before, before >= self.threshold, self.at_most, signals["age"])

@@ -1,0 +1,32 @@
+"""Greedy choice by predicted reduction of variance per token."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fusion_gym import validation
+from fusion_gym.core.system import Signals
+from fusion_gym.policies.base import Requests, Trigger, check_at_most, strongest
+
+
+@dataclass
+class InformationGain(Trigger):
+    """Request where the relative reduction of the fused trace per token is >= ``threshold``.
+
+    The reduction is that of a delivery from this sensor alone, relative to the trace without any
+    delivery; it does not depend on the measurement. Greedily, the ``at_most`` sensors that gain
+    most per token are taken (None: all that reach the threshold).
+    """
+
+    threshold: float = 0.05
+    at_most: int | None = 1
+
+    def __post_init__(self) -> None:
+        validation.number("threshold", self.threshold, at_least=0.0)
+        check_at_most(self.at_most)
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Requests (sensors, N)."""
+        relative = signals["variance_reduction"] / signals["silent_variance"]
+        gain = relative / signals["token_cost"]
+        return strongest(gain, gain >= self.threshold, self.at_most, signals["age"])

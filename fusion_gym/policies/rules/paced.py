@@ -1,0 +1,45 @@
+"""Requests at an even pace, at any rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fusion_gym import validation
+from fusion_gym.core.system import Signals
+from fusion_gym.policies.base import PerSensor, Requests, Trigger, column, shape_of
+
+# A pace that comes up at a step may be computed a rounding below it: 49 · (1/49) < 1.
+_ROUNDING = 1e-9
+
+
+@dataclass
+class Paced(Trigger):
+    """Each sensor requests at ``rate``, its requests spread as evenly as possible.
+
+    A sensor requests at step t, counted from 0, where ⌊(t + 1) r + φ⌋ > ⌊t r + φ⌋ with its rate r
+    in [0, 1], any real number. In every window of n steps it makes less than one request more or
+    fewer than n r. The phases φ are i/sensors for sensor i if ``staggered``, which spreads sensors
+    of one rate evenly among each other too, and 0 otherwise.
+
+    For r = 1/period this is ``periodic`` but for the phase. It is what an event trigger of the same
+    rate has to beat.
+    """
+
+    rate: PerSensor = 0.2
+    staggered: bool = True
+
+    def __post_init__(self) -> None:
+        for rate in np.atleast_1d(np.asarray(self.rate, dtype=object)):
+            validation.number("rate", rate, at_least=0.0, at_most=1.0)
+        validation.boolean("staggered", self.staggered)
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Requests (sensors, N)."""
+        sensors, _ = shape_of(signals)
+        rate, step = column("rate", self.rate, sensors), signals["step"]
+        phase = np.full((sensors, 1), _ROUNDING)
+        if self.staggered:
+            phase += np.arange(sensors)[:, None] / sensors
+        return np.floor((step + 1) * rate + phase) > np.floor(step * rate + phase)

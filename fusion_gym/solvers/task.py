@@ -1,0 +1,154 @@
+"""The solved optimum of a remote-estimation task."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.task import Task
+from fusion_gym.solvers.grid import ErrorGrid
+from fusion_gym.solvers.joint import JointProblem, solve_joint_average, solve_joint_finite
+from fusion_gym.solvers.single import (
+    AverageSolution,
+    FiniteSolution,
+    SourceProblem,
+    solve_average,
+    solve_finite,
+)
+from fusion_gym.solvers.tokens import TokenLevels
+from fusion_gym.systems.remote.system import RemoteEstimationSystem
+from fusion_gym.validation import ConfigurationError
+
+CRITERIA = ("finite", "average")
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The least expected cost, and requests by thresholds or by a table.
+
+    ``cost`` is that of an episode, the negative expected return, with ``criterion="finite"``, and
+    that of a step in the long run with ``"average"``. ``error`` (w e² a step) and ``rate``
+    (transmissions a step) are sums over the sources; they are nan for a table.
+
+    ``threshold`` (T, n, S, K) by step, source, channel state and token level (T = 1 for
+    ``"average"``), or ``choice`` (T, M1, M2, K), the best set of two sources as bits, on ``grids``.
+    """
+
+    cost: float
+    error: float
+    rate: float
+    tokens: TokenLevels
+    threshold: Array | None = None
+    choice: NDArray[np.int8] | None = None
+    grids: tuple[ErrorGrid, ErrorGrid] | None = None
+
+
+def source_problems(task: Task) -> tuple[SourceProblem, ...]:
+    """The task's sources, each limited by its price alone.
+
+    Raises:
+        ConfigurationError: another system, a price that is drawn, or a reward that does not look
+            at the squared error.
+    """
+    system, reward = _system(task), task.reward
+    if reward.error != "squared":
+        raise ConfigurationError(
+            f"error = {reward.error!r} is not allowed for the optimum: it must be 'squared'"
+        )
+    if reward.price.fixed is None:
+        raise ConfigurationError(
+            "cost_weight = 'random' is not allowed for the optimum: it must be a number"
+        )
+    weights = reward.error_weight * reward.state_weights[:, 0]
+    return tuple(
+        SourceProblem.create(
+            coefficient=float(system.coefficient[i]),
+            deviation=float(system.deviation[i]),
+            price=reward.price.fixed * float(task.bucket.cost[i, 0]),
+            error_weight=float(weights[i]),
+            drop=system.channel.drop[:, i],
+            transition=system.channel.transition,
+        )
+        for i in range(system.sensor_count)
+    )
+
+
+def _system(task: Task) -> RemoteEstimationSystem:
+    if not isinstance(task.system, RemoteEstimationSystem):
+        raise ConfigurationError(
+            f"system = {type(task.system).__name__} is not allowed: only remote estimation is "
+            "solved"
+        )
+    return task.system
+
+
+def solve_task(task: Task, criterion: str = "finite") -> Optimum:
+    """The optimum of one source, of several that share nothing, or of two that share the network.
+
+    ``criterion="finite"`` is the exact optimum of the task's episodes, ``"average"`` that of an
+    endless one.
+
+    Raises:
+        ConfigurationError: a task that is not solved here, for example three sources that share
+            tokens (:func:`fusion_gym.solvers.bounds.lagrangian_bound` bounds its cost from below).
+    """
+    validation.choice("criterion", criterion, CRITERIA)
+    problems, bucket = source_problems(task), task.bucket
+    alone = len(problems) == 1
+    if not alone and not (task.access == "any" and bucket.unlimited):
+        return _solve_pair(task, problems, criterion)
+    tokens = TokenLevels.create(bucket)
+    costs, errors, rates, found = [], [], [], []
+    for i, priced in enumerate(problems):
+        problem = replace(priced, tokens=tokens) if alone else priced
+        solution: AverageSolution | FiniteSolution
+        if criterion == "average":
+            solution = solve_average(problem)
+        else:
+            system = _system(task)
+            spread = float(system.initial_deviation[i])
+            solution = solve_finite(problem, task.horizon, spread, system.channel.initial)
+        if not solution.ordered:
+            raise ConfigurationError(
+                "the optimum of this task asks for no thresholds on the error: it is not solved "
+                "here"
+            )
+        costs.append(solution.cost)
+        errors.append(problem.error_weight * solution.error)
+        rates.append(solution.rate)
+        found.append(solution.threshold.reshape(-1, *solution.threshold.shape[-2:]))
+    return Optimum(
+        cost=sum(costs),
+        error=sum(errors),
+        rate=sum(rates),
+        tokens=tokens,
+        threshold=np.stack(found, axis=1),
+    )
+
+
+def _solve_pair(task: Task, problems: tuple[SourceProblem, ...], criterion: str) -> Optimum:
+    if len(problems) != 2:
+        raise ConfigurationError(
+            f"sensors = {len(problems)} is not allowed for the optimum under limited tokens or "
+            "access: it must be 1 or 2"
+        )
+    if task.access not in ("any", "single"):
+        raise ConfigurationError(
+            f"access = {task.access!r} is not allowed for the optimum of two sources: it must be "
+            "'any' or 'single'"
+        )
+    at_most = 1 if task.access == "single" else 2
+    problem = JointProblem.create(problems, task.bucket, at_most)
+    if criterion == "average":
+        stationary = solve_joint_average(problem)
+        cost, choice, grids = stationary.cost, stationary.choice[None], stationary.grids
+    else:
+        one, two = _system(task).initial_deviation.tolist()
+        episode = solve_joint_finite(problem, task.horizon, (one, two))
+        cost, choice, grids = episode.cost, episode.choice, episode.grids
+    return Optimum(cost, math.nan, math.nan, problem.tokens, choice=choice, grids=grids)

@@ -1,0 +1,1 @@
+"""Correlated noises known by bounds, robust filters: adaptive_innovation."""

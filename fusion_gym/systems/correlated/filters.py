@@ -1,0 +1,158 @@
+"""Kalman filters for sensors that share a noise with the plant, run on bounds of the variances.
+
+Source: adaptive_innovation (K. Xu, X. Li, J. Wang and Y. Gao, "Robust sequential fusion estimation
+based on adaptive innovation event-triggered mechanism for uncertain networked systems", 2022).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.systems.correlated.sensors import CorrelatedSensors
+from fusion_gym.systems.linear_plant import LinearPlant
+
+
+class RobustPlan(NamedTuple):
+    """What a delivery would do at every node; none of it depends on the measurement.
+
+    ``gain`` K (sensors, n, m, N); ``innovation_covariance`` (sensors, m, m, N);
+    ``delivered_covariance`` (sensors, n, n, N).
+    """
+
+    gain: Array
+    innovation_covariance: Array
+    delivered_covariance: Array
+
+
+@dataclass(frozen=True)
+class RobustKalmanFilter:
+    """The minimum-variance filter of each node for noises at the bounds of their variances.
+
+    It knows that its measurement noise is correlated with the noise that moved the plant. Without
+    a delivery the posterior is the prior. For smaller actual variances its covariance is an upper
+    bound of the actual one (Theorem 1), whatever is delivered, as long as what is delivered does
+    not depend on the noise.
+
+    Source: adaptive_innovation, equation (12), with R_ii and S_i of :class:`CorrelatedSensors`.
+    """
+
+    sensors: CorrelatedSensors
+
+    def expect(self, mean: Array) -> Array:
+        """Expected measurements H x̂ (sensors, m, N) from prior means (sensors, n, N)."""
+        return linalg.matvec(self.sensors.measurement_matrix, mean)
+
+    def innovation_covariance(self, covariance: Array) -> Array:
+        """H P Hᵀ + H S + (H S)ᵀ + R (sensors, m, m, N), P (sensors, n, n, N) or (n, n, N).
+
+        It holds for any estimate whose prior error contains Γ w, the fused one too.
+        """
+        sensors = self.sensors
+        matrix = sensors.measurement_matrix
+        own = np.arange(sensors.count)
+        crossed = linalg.matmul(matrix, sensors.cross_covariance)
+        noise = sensors.covariance[own, own] + crossed + linalg.transpose(crossed)
+        return linalg.congruence(matrix, covariance) + noise
+
+    def plan(self, covariance: Array) -> RobustPlan:
+        """Gains and posterior covariances from prior covariances (sensors, n, n, N).
+
+        Source: adaptive_innovation, equation (12).
+        """
+        sensors = self.sensors
+        cross = linalg.matmul(covariance, linalg.transpose(sensors.measurement_matrix))
+        cross += sensors.cross_covariance
+        innovation = self.innovation_covariance(covariance)
+        if sensors.size == 1:
+            gain = cross / innovation
+        else:
+            gain = linalg.transpose(linalg.solve(innovation, linalg.transpose(cross)))
+        reduction = linalg.matmul(gain, linalg.transpose(cross))
+        return RobustPlan(gain, innovation, linalg.symmetrise(covariance - reduction))
+
+
+@dataclass(frozen=True)
+class JointErrorCovariance:
+    """Actual covariances of the errors of all estimates together, cross-covariances included.
+
+    Estimate 0 is the fused one, estimates 1..l are the nodes'. The joint covariance is an array
+    (l + 1, l + 1, n, n, N) of blocks. It is exact for every pattern of deliveries that does not
+    depend on the noise; it contains (23) and (28), and, by applying the fusion's weights to it,
+    (43) and (55) together with the cross-covariances of the fused prediction that these need.
+
+    Shapes: ``transition`` (n, n, 1), ``process_covariance`` (n, n, 1), ``initial_covariance``
+    (n, n, 1); ``measurement_matrix`` (l + 1, m, n, 1), ``cross_covariance`` (l + 1, n, m, 1) and
+    ``covariance`` (l + 1, l + 1, m, m, 1) as in :class:`CorrelatedSensors`, with zeros for the
+    fused estimate, which measures nothing. All are bounds; ``scale`` (N,) makes them actual.
+
+    Source: adaptive_innovation, equations (16), (17), (23), (28), (43), (55).
+    """
+
+    transition: Array
+    process_covariance: Array
+    initial_covariance: Array
+    measurement_matrix: Array
+    cross_covariance: Array
+    covariance: Array
+
+    @classmethod
+    def create(cls, plant: LinearPlant, sensors: CorrelatedSensors) -> JointErrorCovariance:
+        """From the plant and its sensors."""
+        ahead = [(1, 0), (0, 0), (0, 0), (0, 0)]
+        return cls(
+            transition=plant.transition,
+            process_covariance=plant.process_covariance,
+            initial_covariance=plant.initial_covariance,
+            measurement_matrix=np.pad(sensors.measurement_matrix, ahead),
+            cross_covariance=np.pad(sensors.cross_covariance, ahead),
+            covariance=np.pad(sensors.covariance, [(1, 0), *ahead]),
+        )
+
+    def start(self, scale: Array) -> Array:
+        """At time 0 every estimate is the initial mean: all blocks equal, (l+1, l+1, n, n, N)."""
+        count = len(self.measurement_matrix)
+        actual = scale * self.initial_covariance
+        return np.broadcast_to(actual, (count, count, *actual.shape)).copy()
+
+    def predict(self, joint: Array, scale: Array) -> Array:
+        """Φ J Φᵀ + scale · Q in every block."""
+        moved = linalg.matmul(self.transition, joint)
+        moved = linalg.matmul(moved, linalg.transpose(self.transition))
+        return moved + scale * self.process_covariance
+
+    def update(self, joint: Array, gain: Array, granted: NDArray[np.bool_], scale: Array) -> Array:
+        """The nodes with ``granted`` (l, N) update with their gains (l, n, m, N)."""
+        used = np.zeros((len(joint), *gain.shape[1:]))
+        used[1:] = np.where(granted[:, None, None], gain, 0.0)
+        kept = linalg.identity(joint.shape[-2]) - linalg.matmul(used, self.measurement_matrix)
+        result = linalg.matmul(kept[:, None], joint)
+        result = linalg.matmul(result, linalg.transpose(kept)[None])
+        crossed = linalg.matmul(kept[:, None], (scale * self.cross_covariance)[None])
+        crossed = linalg.matmul(crossed, linalg.transpose(used)[None])
+        noise = linalg.matmul(used[:, None], scale * self.covariance)
+        noise = linalg.matmul(noise, linalg.transpose(used)[None])
+        return _symmetric(result - crossed - _transposed(crossed) + noise)
+
+    def fuse(self, joint: Array, weights: Array) -> Array:
+        """Estimate 0 becomes Σ_j weights_j · estimate j, weights (l + 1, n, n, N) with sum I."""
+        row = linalg.matmul(weights[:, None], joint).sum(0)
+        fused = linalg.matmul(row, linalg.transpose(weights)).sum(0)
+        result = joint.copy()
+        result[0] = row
+        result[:, 0] = linalg.transpose(row)
+        result[0, 0] = linalg.symmetrise(fused)
+        return result
+
+
+def _transposed(joint: Array) -> Array:
+    return joint.swapaxes(0, 1).swapaxes(2, 3)
+
+
+def _symmetric(joint: Array) -> Array:
+    return (joint + _transposed(joint)) * 0.5

@@ -1,0 +1,116 @@
+"""Sensors whose noise contains the very noise that has just moved the plant.
+
+Source: adaptive_innovation (K. Xu, X. Li, J. Wang and Y. Gao, "Robust sequential fusion estimation
+based on adaptive innovation event-triggered mechanism for uncertain networked systems", 2022).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
+from fusion_gym.systems.linear_plant import LinearPlant
+
+
+@dataclass(frozen=True)
+class CorrelatedSensors:
+    """y_i = H_i x + η_i + β_i w, where w is the very noise that has just moved the plant.
+
+    Shapes: ``measurement_matrix`` H (sensors, m, n, 1); ``deviation`` (sensors, m, 1), the bound
+    of the standard deviation of η; ``coupling`` β Q^½ (sensors, m, r, 1), for w written as Q^½
+    times r standard normals. From them follow the bounds ``covariance`` R_ij (sensors, sensors,
+    m, m, 1) between the measurement noises of two sensors and ``cross_covariance`` S_i
+    (sensors, n, m, 1) between Γ w and a measurement noise. Build one with :meth:`create`.
+
+    Source: adaptive_innovation, equations (2), (3), (5), (6).
+    """
+
+    measurement_matrix: Array
+    deviation: Array
+    coupling: Array
+    covariance: Array
+    cross_covariance: Array
+
+    @classmethod
+    def create(
+        cls,
+        measurement_matrices: ArrayLike,
+        measurement_variance: ArrayLike,
+        noise_coupling: ArrayLike,
+        process_deviation: Array,
+        plant: LinearPlant,
+    ) -> CorrelatedSensors:
+        """Check plain arrays: H (sensors, m, n), variances of η (sensors, m), β (sensors, m, r).
+
+        One number for all sensors or one for each will do for the last two. ``process_deviation``
+        (r,) is Q^½, and ``plant.process_factor`` is Γ Q^½.
+
+        Raises:
+            ConfigurationError: a wrong shape, a variance <= 0, or an entry that is not finite.
+        """
+        matrix = validation.array("measurement_matrices", measurement_matrices, (None, None, None))
+        matrix = validation.array(
+            "measurement_matrices", measurement_matrices, (*matrix.shape[:2], plant.size)
+        )
+        sensors, size, _ = matrix.shape
+        variance = validation.positive(
+            "measurement_variance",
+            _one_each(measurement_variance, sensors, 1),
+            (sensors, size),
+        )
+        beta = validation.spread(
+            "noise_coupling",
+            _one_each(noise_coupling, sensors, 2),
+            (sensors, size, len(process_deviation)),
+        )
+        coupling = (beta * process_deviation)[..., None]
+        shared = linalg.matmul(coupling[:, None], linalg.transpose(coupling)[None])
+        own = variance[:, None, :, None] * np.eye(size) * np.eye(sensors)[:, :, None, None]
+        return cls(
+            measurement_matrix=matrix[..., None],
+            deviation=np.sqrt(variance)[..., None],
+            coupling=coupling,
+            covariance=shared + own[..., None],
+            cross_covariance=linalg.matmul(plant.process_factor, linalg.transpose(coupling)),
+        )
+
+    @property
+    def count(self) -> int:
+        """Number of sensors."""
+        return self.measurement_matrix.shape[0]
+
+    @property
+    def size(self) -> int:
+        """Number of measured components m of each sensor."""
+        return self.measurement_matrix.shape[1]
+
+    @property
+    def noise_channels(self) -> int:
+        """Standard normals that one measurement of all sensors consumes besides the plant's."""
+        return self.count * self.size
+
+    def measure(self, state: Array, process_noise: Array, noise: Array) -> Array:
+        """Measurements (sensors, m, N) of the state (n, N) that has just been reached.
+
+        ``process_noise`` (r, N) are the normals that moved the plant there, ``noise``
+        (sensors·m, N) the sensors' own; both of unit variance for noises at their bounds.
+
+        Source: adaptive_innovation, equations (2) and (3).
+        """
+        result = linalg.matvec(self.measurement_matrix, state)
+        result += self.deviation * noise.reshape(self.count, self.size, noise.shape[-1])
+        result += linalg.matvec(self.coupling, process_noise)
+        return result
+
+
+def _one_each(value: ArrayLike, sensors: int, missing: int) -> ArrayLike:
+    """One number a sensor as a column that broadcasts over its ``missing`` later axes."""
+    try:
+        given = np.asarray(value)
+    except ValueError:
+        return value
+    return given.reshape(-1, *[1] * missing) if given.shape == (sensors,) else value

@@ -1,0 +1,327 @@
+"""Correlated noises known by bounds, robust local filters, sequential fusion without feedback.
+
+Source: adaptive_innovation (K. Xu, X. Li, J. Wang and Y. Gao, "Robust sequential fusion estimation
+based on adaptive innovation event-triggered mechanism for uncertain networked systems", 2022).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.core.system import Feature, Signal, SignalArray, feature_block
+from fusion_gym.fusion.parallel import ParallelFusion
+from fusion_gym.fusion.sequential import SequentialFusion
+from fusion_gym.systems.correlated.filters import (
+    JointErrorCovariance,
+    RobustKalmanFilter,
+    RobustPlan,
+)
+from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.validation import ConfigurationError
+
+_RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
+RANDOM_SCALE = (0.4, 1.0)  # range of an episode's noise scale where it is drawn
+
+
+@dataclass(slots=True)
+class CorrelatedTrackingState:
+    """Everything about N runs at one time; n states, l sensors, m components.
+
+    Estimate 0 is the fused one and estimate i the one of node i. ``truth`` (n, N) · ``scale``
+    (N,), actual variances over their bounds · ``measurement`` (l, m, N) · ``held`` (l, m, N), the
+    last delivered measurement · ``age`` (l, N), steps since then · ``prior_mean`` (l + 1, n, N),
+    ``prior_covariance`` (l + 1, n, n, N), predictions · ``expected`` (l, m, N) and ``plan`` of the
+    nodes · ``mean`` (l + 1, n, N), ``covariance`` (l + 1, n, n, N), posteriors · ``joint``
+    (l + 1, l + 1, n, n, N), the actual covariances, if they are tracked.
+    """
+
+    truth: Array
+    scale: Array
+    measurement: Array
+    held: Array
+    age: Array
+    prior_mean: Array
+    prior_covariance: Array
+    expected: Array
+    plan: RobustPlan | None
+    mean: Array
+    covariance: Array
+    joint: Array | None
+
+
+_COMPONENTS = "(sensors, m, N)"
+SIGNALS = (
+    Signal("measurement", "sensor", _COMPONENTS, "the new measurement"),
+    Signal("innovation", "sensor", _COMPONENTS, "measurement minus the node's expectation"),
+    Signal("held", "centre", _COMPONENTS, "the last delivered measurement"),
+    Signal("age", "centre", "(sensors, N)", "steps since the last delivery"),
+    Signal("expected_measurement", "centre", _COMPONENTS, "the node's expectation"),
+    Signal("innovation_deviation", "centre", _COMPONENTS, "the innovation's deviation (bound)"),
+    Signal("prior_mean", "centre", "(n, N)", "prediction of the fused estimate"),
+    Signal("prior_covariance", "centre", "(n, n, N)", "its conservative covariance"),
+    Signal("silent_variance", "centre", "(N,)", "weighted fused trace if nobody transmits"),
+    Signal(
+        "variance_reduction",
+        "centre",
+        "(sensors, N)",
+        "how far that trace falls if this sensor alone transmits, whatever it measured",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class CorrelatedTrackingSystem:
+    """Joins a plant, sensors that share its noise, robust local filters, and a fusion rule.
+
+    ``plant.process_factor`` is Γ Q^½, so that the plant's normals are the sensors' too.
+    ``noise_scale`` is the ratio of actual variances to bounds, ``None`` draws it for each episode
+    from ``RANDOM_SCALE``. ``state_weights`` (n,) weigh the traces among the signals, ``magnitude``
+    (n,) divides observed estimates and ``reference`` (n,) observed variances. ``joint`` tracks
+    the actual covariances.
+    """
+
+    plant: LinearPlant
+    filter: RobustKalmanFilter
+    fusion: SequentialFusion | ParallelFusion
+    noise_scale: float | None
+    state_names: tuple[str, ...]
+    state_weights: Array
+    magnitude: Array
+    reference: Array
+    joint: JointErrorCovariance | None = None
+
+    @property
+    def sensor_count(self) -> int:
+        """Number of sensors."""
+        return self.filter.sensors.count
+
+    @property
+    def noise_channels(self) -> int:
+        """Normals of one step: process noise, then the sensors' own."""
+        return self.plant.noise_channels + self.filter.sensors.noise_channels
+
+    @property
+    def start_channels(self) -> int:
+        """Normals of a start: the state's deviation, then the noise scale."""
+        return self.plant.initial_factor.shape[1] + 1
+
+    @property
+    def covariance_cycle(self) -> int:
+        """1: all covariances follow from the deliveries, by a recursion that never changes."""
+        return 1
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """The signals that :meth:`read` offers."""
+        return SIGNALS
+
+    @property
+    def features(self) -> tuple[tuple[Feature, ...], ...]:
+        """Blocks of the observation; see docs/correlated_tracking.md."""
+        nodes = range(self.sensor_count)
+        components = [
+            (node, f"{node},{c}") for node in nodes for c in range(self.filter.sensors.size)
+        ]
+        local_states = [(node, f"{node},{name}") for node in nodes for name in self.state_names]
+        fused = [(None, name) for name in self.state_names]
+        return (
+            feature_block("whitened_innovation", components, "sensor", _RANGE),
+            feature_block(
+                "fused_innovation", [(None, place) for _, place in components], "sensor", _RANGE
+            ),
+            feature_block("age", [(node, f"{node}") for node in nodes], "centre"),
+            feature_block("local_log_deviation", local_states, "centre", _RANGE),
+            feature_block("log_deviation", fused, "centre", _RANGE),
+            feature_block("estimate", fused, "centre", _RANGE),
+        )
+
+    def start(self, noise: Array) -> CorrelatedTrackingState:
+        """Time 0: the state is drawn about the initial mean; nothing has been measured."""
+        runs, nodes, n = noise.shape[-1], self.sensor_count, self.plant.size
+        if self.noise_scale is None:
+            low, high = RANDOM_SCALE
+            scale = low + (high - low) * ndtr(noise[-1])
+        else:
+            scale = np.full(runs, self.noise_scale)
+        plant = self.plant
+        mean = np.broadcast_to(plant.initial_mean, (nodes + 1, n, runs)).copy()
+        covariance = np.broadcast_to(plant.initial_covariance, (nodes + 1, n, n, runs)).copy()
+        expected = self.filter.expect(mean[1:])
+        return CorrelatedTrackingState(
+            truth=plant.start(mean[0], np.sqrt(scale) * noise[:-1]),
+            scale=scale,
+            measurement=expected,
+            held=expected,
+            age=np.zeros((nodes, runs)),
+            prior_mean=mean,
+            prior_covariance=covariance,
+            expected=expected,
+            plan=None,
+            mean=mean,
+            covariance=covariance,
+            joint=None if self.joint is None else self.joint.start(scale),
+        )
+
+    def sense(self, state: CorrelatedTrackingState, noise: Array) -> CorrelatedTrackingState:
+        """The plant moves, the sensors measure with the same noise, all estimates predict.
+
+        Source: adaptive_innovation, equations (1)-(3), (12), (40), (52).
+        """
+        actual, r = np.sqrt(state.scale) * noise, self.plant.noise_channels
+        truth = self.plant.advance(state.truth, actual[:r])
+        prior_mean, prior_covariance = self.plant.predict(state.mean, state.covariance)
+        joint = state.joint
+        if self.joint is not None and joint is not None:
+            joint = self.joint.predict(joint, state.scale)
+        return replace(
+            state,
+            truth=truth,
+            measurement=self.filter.sensors.measure(truth, actual[:r], actual[r:]),
+            age=state.age + 1.0,
+            prior_mean=prior_mean,
+            prior_covariance=prior_covariance,
+            expected=self.filter.expect(prior_mean[1:]),
+            plan=self.filter.plan(prior_covariance[1:]),
+            joint=joint,
+        )
+
+    def deliver(
+        self, state: CorrelatedTrackingState, granted: NDArray[np.bool_]
+    ) -> CorrelatedTrackingState:
+        """Granted nodes update, and the centre fuses its prediction with theirs.
+
+        Source: adaptive_innovation, equations (12), (37)-(41) or (47)-(53).
+        """
+        plan = _sensed(state)
+        grant = granted[:, None]
+        mean, covariance = state.prior_mean.copy(), state.prior_covariance.copy()
+        correction = linalg.matvec(plan.gain, state.measurement - state.expected)
+        mean[1:] += np.where(grant, correction, 0.0)
+        np.copyto(covariance[1:], plan.delivered_covariance, where=grant[:, None])
+        fused = self.fusion.fuse(mean[0], covariance[0], mean[1:], covariance[1:], granted)
+        mean[0], covariance[0] = fused.mean, fused.covariance
+        joint = state.joint
+        if self.joint is not None and joint is not None:
+            joint = self.joint.update(joint, plan.gain, granted, state.scale)
+            joint = self.joint.fuse(joint, fused.gains)
+        return replace(
+            state,
+            held=np.where(grant, state.measurement, state.held),
+            age=np.where(granted, 0.0, state.age),
+            mean=mean,
+            covariance=covariance,
+            joint=joint,
+        )
+
+    def read(
+        self, state: CorrelatedTrackingState
+    ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
+        """The signals named in ``SIGNALS``."""
+        plan = _sensed(state)
+        return {
+            "measurement": state.measurement,
+            "innovation": lambda: state.measurement - state.expected,
+            "held": state.held,
+            "age": state.age,
+            "expected_measurement": state.expected,
+            "innovation_deviation": lambda: _deviation(plan.innovation_covariance),
+            "prior_mean": state.prior_mean[0],
+            "prior_covariance": state.prior_covariance[0],
+            "silent_variance": lambda: self._weighted_trace(state.prior_covariance[0]),
+            "variance_reduction": lambda: self._variance_reduction(state, plan),
+        }
+
+    def observe(self, state: CorrelatedTrackingState) -> Sequence[Array]:
+        """The blocks named in :attr:`features`, before clipping to their bounds."""
+        plan = _sensed(state)
+        runs = state.truth.shape[-1]
+        whitened = (state.measurement - state.expected) / _deviation(plan.innovation_covariance)
+        fused_deviation = _deviation(self.filter.innovation_covariance(state.prior_covariance[0]))
+        surprise = state.measurement - self.filter.expect(state.prior_mean[0])
+        variance = linalg.diagonal(state.prior_covariance) / self.reference[:, None]
+        log_deviation = 0.5 * np.log(variance)
+        return (
+            whitened.reshape(-1, runs),
+            (surprise / fused_deviation).reshape(-1, runs),
+            state.age / (state.age + 10.0),
+            log_deviation[1:].reshape(-1, runs),
+            log_deviation[0],
+            state.prior_mean[0] / self.magnitude[:, None],
+        )
+
+    def truth(self, state: CorrelatedTrackingState) -> Array:
+        """The plant's state (n, N)."""
+        return state.truth
+
+    def fused(self, state: CorrelatedTrackingState) -> tuple[Array, Array]:
+        """The centre's mean (n, N) and conservative covariance (n, n, N)."""
+        return state.mean[0], state.covariance[0]
+
+    def local_means(self, state: CorrelatedTrackingState) -> Array:
+        """The nodes' posterior means (sensors, n, N); nothing is fed back to them."""
+        return state.mean[1:]
+
+    def actual_covariance(self, state: CorrelatedTrackingState) -> Array:
+        """Actual covariances (l + 1, l + 1, n, n, N), estimate 0 fused: for the analyst alone.
+
+        Raises:
+            ConfigurationError: they are not tracked.
+        """
+        if state.joint is None:
+            raise ConfigurationError(
+                "track_actual = False is not allowed here: it must be True for actual covariances"
+            )
+        return state.joint
+
+    def with_actual_covariance(self) -> CorrelatedTrackingSystem:
+        """The same system with its actual covariances tracked."""
+        joint = JointErrorCovariance.create(self.plant, self.filter.sensors)
+        return replace(self, joint=joint)
+
+    def error_covariance(self, state: CorrelatedTrackingState) -> Array:
+        """Actual covariance (n, n, N) of the fused error.
+
+        Gains and fusion weights come from the bounds, so it is proportional to the noise scale,
+        and the mean over drawn scales is its value at the mean scale: that of a start with zeros.
+
+        Raises:
+            ConfigurationError: it is not tracked.
+        """
+        return self.actual_covariance(state)[0, 0]
+
+    def open_loop(self, horizon: int) -> Array:
+        """Mean error variance (n,) over t = 1..horizon of a centre that only predicts (bound)."""
+        return self.plant.open_loop(horizon)
+
+    def _weighted_trace(self, covariance: Array) -> Array:
+        return (self.state_weights[:, None] * linalg.diagonal(covariance)).sum(-2)
+
+    def _variance_reduction(self, state: CorrelatedTrackingState, plan: RobustPlan) -> Array:
+        mean, covariance = state.prior_mean, state.prior_covariance
+        silent = self._weighted_trace(covariance[0])
+        result = np.empty((self.sensor_count, len(silent)))
+        for sensor in range(self.sensor_count):
+            alone = np.zeros(result.shape, dtype=np.bool_)
+            alone[sensor] = True
+            delivered = plan.delivered_covariance
+            fused = self.fusion.fuse(mean[0], covariance[0], mean[1:], delivered, alone)
+            result[sensor] = silent - self._weighted_trace(fused.covariance)
+        return result
+
+
+def _deviation(covariance: Array) -> Array:
+    """Square roots of the diagonals: (..., m, m, N) to (..., m, N)."""
+    return np.sqrt(linalg.diagonal(covariance))
+
+
+def _sensed(state: CorrelatedTrackingState) -> RobustPlan:
+    if state.plan is None:
+        raise RuntimeError("the state has no measurements yet: call sense first")
+    return state.plan

@@ -1,0 +1,117 @@
+"""Linear plant x' = A x + w with a process covariance of any rank."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
+
+
+def covariance_factor(matrix: Array) -> Array:
+    """A factor F of shape (n, rank) with F Fᵀ = matrix, for any positive semi-definite matrix.
+
+    A Cholesky factor does not exist for a matrix of deficient rank; the eigenvectors do.
+    """
+    values, vectors = np.linalg.eigh(matrix)
+    keep = values > 1e-14 * max(float(values[-1]), 1e-300)
+    return np.ascontiguousarray(vectors[:, keep] * np.sqrt(values[keep]))
+
+
+@dataclass(frozen=True)
+class LinearPlant:
+    """x(t+1) = A x(t) + w(t), w ~ N(0, W), x(0) ~ N(initial_mean, initial_covariance).
+
+    Shapes: ``transition`` (n, n, 1), ``process_covariance`` (n, n, 1), ``process_factor``
+    (n, r, 1) with r the rank of W, ``initial_mean`` (n, 1), ``initial_covariance`` (n, n, 1),
+    ``initial_factor`` (n, r₀, 1). Build one with :meth:`create`, which checks its arguments.
+
+    Source: tobit_token_bucket, equation (1).
+    """
+
+    transition: Array
+    process_covariance: Array
+    process_factor: Array
+    initial_mean: Array
+    initial_covariance: Array
+    initial_factor: Array
+
+    @classmethod
+    def create(
+        cls,
+        transition: ArrayLike,
+        process_covariance: ArrayLike,
+        initial_mean: ArrayLike,
+        initial_covariance: ArrayLike,
+    ) -> LinearPlant:
+        """Check the plain matrices (no batch axis) and prepare their factors.
+
+        Raises:
+            ConfigurationError: a wrong shape, a non-finite entry, or a covariance that is not
+                symmetric positive semi-definite (``initial_covariance``: definite).
+        """
+        matrix = validation.array("transition", transition, (None, None))
+        size = len(matrix)
+        matrix = validation.array("transition", transition, (size, size))
+        process = validation.covariance("process_covariance", process_covariance, size)
+        start = validation.covariance("initial_covariance", initial_covariance, size, definite=True)
+        return cls(
+            transition=matrix[..., None],
+            process_covariance=process[..., None],
+            process_factor=covariance_factor(process)[..., None],
+            initial_mean=validation.array("initial_mean", initial_mean, (size,))[..., None],
+            initial_covariance=start[..., None],
+            initial_factor=covariance_factor(start)[..., None],
+        )
+
+    @property
+    def size(self) -> int:
+        """Number of states n."""
+        return self.transition.shape[0]
+
+    @property
+    def noise_channels(self) -> int:
+        """Standard normals that one step consumes: the rank of the process covariance."""
+        return self.process_factor.shape[1]
+
+    def start(self, mean: Array, noise: Array) -> Array:
+        """Draw x(0), shape (n, N), about ``mean`` (n, N) from standard normals (n, N)."""
+        return mean + linalg.matvec(self.initial_factor, noise)
+
+    def advance(self, state: Array, noise: Array) -> Array:
+        """x(t+1), shape (n, N), from x(t) (n, N) and standard normals (r, N)."""
+        return linalg.matvec(self.transition, state) + linalg.matvec(self.process_factor, noise)
+
+    def predict(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
+        """Prior mean (n, N) and covariance A P Aᵀ + W (n, n, N) of the next state.
+
+        Source: tobit_token_bucket, equations (21) and (29).
+        """
+        prior = linalg.congruence(self.transition, covariance) + self.process_covariance
+        return linalg.matvec(self.transition, mean), prior
+
+    def open_loop(self, horizon: int) -> Array:
+        """Mean over t = 1..horizon of the error variance without measurements, shape (n,)."""
+        matrix, process = self.transition[..., 0], self.process_covariance[..., 0]
+        current = self.initial_covariance[..., 0]
+        total = np.zeros(self.size)
+        for _ in range(horizon):
+            current = matrix @ current @ matrix.T + process
+            total += np.diagonal(current)
+        return total / horizon
+
+
+def typical_magnitude(plant: LinearPlant, horizon: int, random_start: bool) -> Array:
+    """Root of the mean second moment of each state over t = 0..horizon, shape (n,)."""
+    transition, process = plant.transition[..., 0], plant.process_covariance[..., 0]
+    mean, size = plant.initial_mean[:, 0], plant.size
+    moment = np.eye(size) * (mean @ mean) / size if random_start else np.outer(mean, mean)
+    moment = moment + plant.initial_covariance[..., 0]
+    total = np.diagonal(moment).copy()
+    for _ in range(horizon):
+        moment = transition @ moment @ transition.T + process
+        total += np.diagonal(moment)
+    return np.sqrt(total / (horizon + 1))

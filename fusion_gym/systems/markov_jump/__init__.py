@@ -1,0 +1,1 @@
+"""A Markov jump plant with fading, asynchronous sensors: markov_jump."""

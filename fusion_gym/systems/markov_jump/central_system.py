@@ -1,0 +1,360 @@
+"""The Markov jump plant with a centre that takes the measurements themselves: references.
+
+Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
+systems with correlated noises and fading measurements), its plant and sensors; the centre is ours.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.core.system import Feature, Signal, SignalArray, feature_block
+from fusion_gym.systems.markov_jump.centralised_linear import (
+    Belief,
+    CentralisedLinearFilter,
+    Forecast,
+)
+from fusion_gym.systems.markov_jump.interacting_models import InteractingModels
+from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, Times
+from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes
+from fusion_gym.systems.markov_jump.sensors import FadingSensors
+from fusion_gym.systems.markov_jump.state import move
+
+_RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
+
+
+@dataclass(slots=True)
+class MarkovJumpCentralState:
+    """Everything about N runs at one time k; n states, l sensors.
+
+    ``time`` k (N,) · ``truth`` (n, N), ``mode`` θ (N,), ``process_noise`` w(k) (r, N), which moves
+    the plant next · ``measurement`` (l, N), the held value where a sensor does not sample ·
+    ``held`` (l, N), the last delivered measurement · ``age`` (l, N), steps since then ·
+    ``belief`` of the centre, a prediction until delivery · ``forecast`` from that prediction ·
+    ``mean`` (n, N), ``covariance`` (n, n, N), the centre's after the delivery.
+    """
+
+    time: Times
+    truth: Array
+    mode: Modes
+    process_noise: Array
+    measurement: Array
+    held: Array
+    age: Array
+    belief: Belief
+    forecast: Forecast | None
+    mean: Array
+    covariance: Array
+
+
+_SCALAR = "(sensors, 1, N)"
+_PER_SENSOR = "(sensors, N)"
+CENTRAL_SIGNALS = (
+    Signal("measurement", "sensor", _SCALAR, "the new one; held where the sensor does not sample"),
+    Signal("innovation", "sensor", _SCALAR, "that minus the centre's expectation, 0 if no sample"),
+    Signal("held", "centre", _SCALAR, "the last delivered measurement"),
+    Signal("age", "centre", _PER_SENSOR, "steps since the last delivery"),
+    Signal("expected_measurement", "centre", _SCALAR, "the centre's expectation of a sample"),
+    Signal("innovation_deviation", "centre", _SCALAR, "the innovation's deviation, given a sample"),
+    Signal("prior_mean", "centre", "(n, N)", "the centre's prediction"),
+    Signal("prior_covariance", "centre", "(n, n, N)", "its covariance"),
+    Signal("silent_variance", "centre", "(N,)", "its weighted trace"),
+    Signal(
+        "variance_reduction",
+        "centre",
+        _PER_SENSOR,
+        "how far that trace falls by the best linear use of this sensor's sample, 0 without one",
+    ),
+    Signal("centre_variance", "centre", "(N,)", "the plain trace if nobody transmits"),
+    Signal(
+        "greedy_variance",
+        "centre",
+        _PER_SENSOR,
+        "that trace if only the sensors before this one in the greedy order transmit, 0 if no "
+        "sample",
+    ),
+    Signal("sampled", "centre", _PER_SENSOR, "whether the sensor samples at this step"),
+)
+
+
+@dataclass(frozen=True)
+class MarkovJumpCentralSystem:
+    """Joins the plant, its sensors and one filter at the centre.
+
+    A packet carries the sensor's new measurement. A request of a sensor that does not sample
+    delivers nothing, though the network grants it and takes its tokens. Nothing is fed back.
+
+    ``state_weights`` (n,) weigh the traces among the signals, ``magnitude`` (n,) divides observed
+    estimates, ``reference`` (n,) observed variances and ``scale`` (l,) observed measurements.
+    Build one with :meth:`create`.
+    """
+
+    plant: MarkovJumpPlant
+    sensors: FadingSensors
+    model: AugmentedModel
+    estimator: CentralisedLinearFilter | InteractingModels
+    state_names: tuple[str, ...]
+    state_weights: Array
+    magnitude: Array
+    reference: Array
+    scale: Array
+
+    @classmethod
+    def create(
+        cls,
+        plant: MarkovJumpPlant,
+        sensors: FadingSensors,
+        interacting: bool,
+        state_names: tuple[str, ...],
+        state_weights: Array | None,
+        horizon: int,
+    ) -> MarkovJumpCentralSystem:
+        """With :class:`InteractingModels` or the linear filter, for ``horizon`` steps.
+
+        Weights of ``None`` make open loop cost one.
+        """
+        model = AugmentedModel.create(plant, sensors)
+        linear = CentralisedLinearFilter.create(model, horizon)
+        _, squares = model.state_moments(horizon)
+        reference = model.open_loop(horizon)
+        equal = 1.0 / (plant.size * reference)
+        return cls(
+            plant=plant,
+            sensors=sensors,
+            model=model,
+            estimator=InteractingModels.create(plant, sensors) if interacting else linear,
+            state_names=state_names,
+            state_weights=equal if state_weights is None else state_weights,
+            magnitude=np.sqrt(squares.mean(0)),
+            reference=reference,
+            scale=_measured(linear, horizon),
+        )
+
+    @property
+    def sensor_count(self) -> int:
+        """Number of sensors."""
+        return self.sensors.count
+
+    @property
+    def noise_channels(self) -> int:
+        """Normals of one step: process noise, the mode, the sensors'."""
+        return self.plant.noise_channels + 1 + self.sensors.noise_channels
+
+    @property
+    def start_channels(self) -> int:
+        """Normals of a start: the state's deviation, the mode, the first process noise."""
+        return self.plant.size + 1 + self.plant.noise_channels
+
+    @property
+    def covariance_cycle(self) -> int | None:
+        """Steps after which the sampling repeats itself; None if covariances depend on data."""
+        if isinstance(self.estimator, InteractingModels):
+            return None
+        return math.lcm(*self.sensors.period[:, 0].tolist())
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """The signals that :meth:`read` offers."""
+        return CENTRAL_SIGNALS
+
+    @property
+    def features(self) -> tuple[tuple[Feature, ...], ...]:
+        """Blocks of the observation; see docs/markov_jump.md."""
+        nodes = [(node, f"{node}") for node in range(self.sensor_count)]
+        centre = [(None, place) for _, place in nodes]
+        fused = [(None, name) for name in self.state_names]
+        blocks = (
+            feature_block("whitened_innovation", centre, "sensor", _RANGE),
+            feature_block("difference", nodes, "sensor", _RANGE),
+            feature_block("sampled", nodes, "centre"),
+            feature_block("phase", nodes, "centre"),
+            feature_block("age", nodes, "centre"),
+            feature_block("innovation_log_deviation", centre, "centre", _RANGE),
+            feature_block("log_deviation", fused, "centre", _RANGE),
+            feature_block("estimate", fused, "centre", _RANGE),
+        )
+        if isinstance(self.estimator, InteractingModels):
+            modes = [(None, f"{mode}") for mode in range(self.plant.modes)]
+            return (*blocks, feature_block("mode_probability", modes, "centre"))
+        return blocks
+
+    def start(self, noise: Array) -> MarkovJumpCentralState:
+        """Time 0: nothing is measured; what is held is what would be expected."""
+        runs, n = noise.shape[-1], self.plant.size
+        truth, mode = self.plant.start(noise[: n + 1])
+        belief, time = self.estimator.start(runs), np.zeros(runs, dtype=np.int64)
+        mean, covariance = self.estimator.estimate(belief)
+        held = self.estimator.forecast(belief, time).mean[n:]
+        return MarkovJumpCentralState(
+            time=time,
+            truth=truth,
+            mode=mode,
+            process_noise=self.plant.process_noise(noise[n + 1 :]),
+            measurement=held,
+            held=held,
+            age=np.zeros((self.sensor_count, runs)),
+            belief=belief,
+            forecast=None,
+            mean=mean,
+            covariance=covariance,
+        )
+
+    def sense(self, state: MarkovJumpCentralState, noise: Array) -> MarkovJumpCentralState:
+        """The plant moves and jumps, the sensors measure, the centre predicts.
+
+        Source: markov_jump, equations (3), (4).
+        """
+        truth, mode, process_noise, measurement = move(
+            self.plant, self.sensors, state.truth, state.mode, state.process_noise, noise
+        )
+        time = state.time + 1
+        belief = self.estimator.predict(state.belief, state.time)
+        return replace(
+            state,
+            time=time,
+            truth=truth,
+            mode=mode,
+            process_noise=process_noise,
+            measurement=np.where(self.sensors.sampled(time), measurement, state.held),
+            age=state.age + 1.0,
+            belief=belief,
+            forecast=self.estimator.forecast(belief, time),
+        )
+
+    def deliver(
+        self, state: MarkovJumpCentralState, granted: NDArray[np.bool_]
+    ) -> MarkovJumpCentralState:
+        """The centre updates with the samples that were granted, all at once."""
+        _sensed(state)
+        taken = granted & self.sensors.sampled(state.time)
+        belief = self.estimator.update(state.belief, state.measurement, taken, state.time)
+        mean, covariance = self.estimator.estimate(belief)
+        return replace(
+            state,
+            held=np.where(taken, state.measurement, state.held),
+            age=np.where(taken, 0.0, state.age),
+            belief=belief,
+            mean=mean,
+            covariance=covariance,
+        )
+
+    def read(
+        self, state: MarkovJumpCentralState
+    ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
+        """The signals named in ``CENTRAL_SIGNALS``."""
+        forecast, n = _sensed(state), self.plant.size
+        prior = forecast.covariance[:n, :n]
+        return {
+            "measurement": state.measurement[:, None],
+            "innovation": lambda: self._innovation(state, forecast)[:, None],
+            "held": state.held[:, None],
+            "age": state.age,
+            "expected_measurement": forecast.mean[n:, None],
+            "innovation_deviation": lambda: self._deviation(forecast)[:, None],
+            "prior_mean": forecast.mean[:n],
+            "prior_covariance": prior,
+            "silent_variance": lambda: (self.state_weights[:, None] * linalg.diagonal(prior)).sum(
+                0
+            ),
+            "variance_reduction": lambda: self._reduction(
+                forecast.covariance, self.state_weights, self.sensors.sampled(state.time)
+            ),
+            "centre_variance": lambda: linalg.trace(prior),
+            "greedy_variance": lambda: self._greedy_variance(state, forecast),
+            "sampled": lambda: self.sensors.sampled(state.time),
+        }
+
+    def observe(self, state: MarkovJumpCentralState) -> Sequence[Array]:
+        """The blocks named in :attr:`features`, before clipping to their bounds."""
+        forecast, n, scale = _sensed(state), self.plant.size, self.scale[:, None]
+        phase = (state.time % self.sensors.period) / self.sensors.period
+        deviation = self._deviation(forecast)
+        variance = linalg.diagonal(forecast.covariance)[:n] / self.reference[:, None]
+        blocks = (
+            self._innovation(state, forecast) / deviation,
+            (state.measurement - state.held) / scale,
+            (phase == 0.0).astype(np.float64),
+            phase,
+            state.age / (state.age + 10.0),
+            np.log(deviation / scale),
+            0.5 * np.log(variance),
+            forecast.mean[:n] / self.magnitude[:, None],
+        )
+        if isinstance(self.estimator, InteractingModels):
+            return (*blocks, state.belief.probability)
+        return blocks
+
+    def truth(self, state: MarkovJumpCentralState) -> Array:
+        """The plant's state (n, N)."""
+        return state.truth
+
+    def fused(self, state: MarkovJumpCentralState) -> tuple[Array, Array]:
+        """The centre's mean (n, N) and covariance (n, n, N)."""
+        return state.mean, state.covariance
+
+    def local_means(self, state: MarkovJumpCentralState) -> Array:
+        """The centre's estimate once for each sensor (sensors, n, N): nodes have no filters."""
+        return np.repeat(state.mean[None], self.sensor_count, axis=0)
+
+    def open_loop(self, horizon: int) -> Array:
+        """Mean error variance (n,) over t = 1..horizon of a centre that never receives."""
+        return self.model.open_loop(horizon)
+
+    def _innovation(self, state: MarkovJumpCentralState, forecast: Forecast) -> Array:
+        surprise = state.measurement - forecast.mean[self.plant.size :]
+        return np.where(self.sensors.sampled(state.time), surprise, 0.0)
+
+    def _deviation(self, forecast: Forecast) -> Array:
+        return np.sqrt(linalg.diagonal(forecast.covariance)[self.plant.size :])
+
+    def _reduction(self, covariance: Array, weights: Array, useful: NDArray[np.bool_]) -> Array:
+        """Fall (l, N) of the weighted trace by each measurement alone, best linear update."""
+        n = self.plant.size
+        cross = covariance[:n, n:]
+        squares = (weights[:, None, None] * cross * cross).sum(0)
+        own = linalg.diagonal(covariance)[n:]
+        return np.where(useful, squares / np.where(useful, own, 1.0), 0.0)
+
+    def _greedy_variance(self, state: MarkovJumpCentralState, forecast: Forecast) -> Array:
+        """Samples join one after another, each time the one that lowers the trace most."""
+        n, covariance = self.plant.size, forecast.covariance
+        left = self.sensors.sampled(state.time)
+        sensors, result = np.arange(self.sensor_count)[:, None], np.zeros(left.shape)
+        for _ in range(self.sensor_count):
+            gain = np.where(left, self._reduction(covariance, np.ones(n), left), -1.0)
+            best = gain.argmax(0)
+            chosen = (sensors == best) & left
+            trace = linalg.trace(covariance[:n, :n])
+            result[chosen] = np.broadcast_to(trace, left.shape)[chosen]
+            column = np.take_along_axis(covariance, (n + best)[None, None], axis=1)[:, 0]
+            own = np.take_along_axis(column, (n + best)[None], axis=0)[0]
+            weight = np.where(chosen.any(0), 1.0 / np.where(chosen.any(0), own, 1.0), 0.0)
+            covariance = covariance - linalg.outer(column, column) * weight
+            left = left & ~chosen
+        return result
+
+
+def _measured(linear: CentralisedLinearFilter, horizon: int) -> Array:
+    """Root mean squares (l,) of the sensors' measurements over k = 1..horizon."""
+    model = linear.model
+    sensors, noise = model.sensors, model.plant.noise_covariance
+    total = np.zeros(sensors.count)
+    coupling = sensors.noise_coupling[..., 0]
+    for time, step in zip(range(horizon + 1), model.steps(), strict=False):
+        if time > 0:
+            total += ((model.faded @ step.moment) * model.faded).sum(1)
+            total += linear.variance[:, min(time, linear.variance.shape[1] - 1)]
+    return np.asarray(np.sqrt(total / horizon + ((coupling @ noise) * coupling).sum(1)))
+
+
+def _sensed(state: MarkovJumpCentralState) -> Forecast:
+    if state.forecast is None:
+        raise RuntimeError("the state has no measurements yet: call sense first")
+    return state.forecast

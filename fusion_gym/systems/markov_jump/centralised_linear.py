@@ -1,0 +1,204 @@
+"""Linear-minimum-variance filter of a centre that takes the measurements themselves.
+
+Also what it shares with the interacting models: beliefs about state and noise, their update with
+any of the measurements, and what they say of measurements to come.
+
+Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
+systems with correlated noises and fading measurements), for all sensors at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, Times
+
+_LONGEST = 2000  # steps after which tables that have not settled end anyway
+_SETTLED = 1e-13  # relative change in a step below which they have
+
+
+class Belief(NamedTuple):
+    """What the centre believes of the state and of the noise w(k) that moves it next.
+
+    One normal distribution of z = col(state, w) for each of M models: ``probability`` (M, N),
+    ``mean`` (M, s, N), ``covariance`` (M, s, s, N). In a prediction w has mean 0 and covariance Q
+    and is independent of the state.
+    """
+
+    probability: Array
+    mean: Array
+    covariance: Array
+
+
+class Forecast(NamedTuple):
+    """Moments of col(x, y): the plant's states and all sensors' measurements.
+
+    ``mean`` (n + l, N), ``covariance`` (n + l, n + l, N), as if all sensors sampled.
+    """
+
+    mean: Array
+    covariance: Array
+
+
+def with_noise(
+    probability: Array, mean: Array, covariance: Array, noise_covariance: Array
+) -> Belief:
+    """A prediction: ``mean`` (M, a, N), ``covariance`` (M, a, a, N) of the state, Q (r, r)."""
+    models, size, runs = mean.shape
+    whole = size + len(noise_covariance)
+    means, spread = np.zeros((models, whole, runs)), np.zeros((models, whole, whole, runs))
+    means[:, :size], spread[:, :size, :size] = mean, covariance
+    spread[:, size:, size:] = noise_covariance[..., None]
+    return Belief(probability, means, spread)
+
+
+def absorb(
+    belief: Belief, rows: Array, variance: Array, measurement: Array, taken: NDArray[np.bool_]
+) -> tuple[Belief, Array]:
+    """The belief after the measurements that are ``taken``, and their log likelihood by model.
+
+    Measurement i is ``rows[:, i]`` z plus noise of its own: what the measurement noises share is w,
+    a part of z. So one after another they have the effect of all together.
+
+    Args:
+        belief: a prediction.
+        rows: (M, l, s, 1).
+        variance: (M, l, N), of each measurement's own noise, > 0.
+        measurement: (l, N).
+        taken: (l, N).
+
+    Returns:
+        The belief with the same probabilities, and (M, N) without its constant.
+    """
+    mean, covariance = belief.mean, belief.covariance
+    likelihood = np.zeros(belief.probability.shape)
+    for sensor in range(len(measurement)):
+        row = rows[:, sensor]
+        cross = linalg.matvec(covariance, row)
+        spread = linalg.dot(row, cross) + variance[:, sensor]
+        surprise = measurement[sensor] - linalg.dot(row, mean)
+        weight = np.where(taken[sensor], 1.0 / spread, 0.0)
+        mean = mean + cross * (weight * surprise)[:, None]
+        covariance = covariance - linalg.outer(cross, cross) * weight[:, None, None]
+        loss = surprise * surprise / spread + np.log(spread)
+        likelihood -= np.where(taken[sensor], 0.5 * loss, 0.0)
+    return Belief(belief.probability, mean, covariance), likelihood
+
+
+def mixture(belief: Belief, maps: Array) -> tuple[Array, Array]:
+    """Mean (p, N) and covariance (p, p, N) of maps · z, ``maps`` (M, p, s, 1), over all models."""
+    means = linalg.matvec(maps, belief.mean)
+    spreads = linalg.congruence(maps, belief.covariance)
+    if len(means) == 1:
+        return means[0], spreads[0]
+    mean = (belief.probability[:, None] * means).sum(0)
+    apart = means - mean
+    spreads += linalg.outer(apart, apart)
+    return mean, (belief.probability[:, None, None] * spreads).sum(0)
+
+
+def foresee(belief: Belief, maps: Array, variance: Array) -> Forecast:
+    """The forecast with ``maps`` (M, n + l, s, 1) and the noises' ``variance`` (M, l, N)."""
+    mean, covariance = mixture(belief, maps)
+    own, sensors = (belief.probability[:, None] * variance).sum(0), variance.shape[1]
+    for sensor in range(sensors):
+        place = len(mean) - sensors + sensor
+        covariance[place, place] += own[sensor]
+    return Forecast(mean, covariance)
+
+
+@dataclass(frozen=True)
+class CentralisedLinearFilter:
+    """The best linear estimate from all measurements delivered so far, of a mode nobody knows.
+
+    The state of the belief is ζ = col(x 1{θ = m}), and there is one model. Covariances depend on
+    time and on what was delivered, not on the data, and are exact.
+
+    With a = modes · n, s = a + r: ``maps`` (1, n + l, s, 1) from z to col(x, y), with
+    y_i = c_i ζ + α_i w plus own noise · ``motion`` [Ā B̄(k)] (a, s, T) · ``additional`` Q_c(k)
+    (a, a, T) · ``variance`` of the own noises σ_i² C_i P(k) C_iᵀ + R_i (l, T). Tables end when they
+    have settled.
+
+    Source: markov_jump, equations (5)-(22), with the measurements of all sensors in one vector.
+    """
+
+    model: AugmentedModel
+    maps: Array
+    motion: Array
+    additional: Array
+    variance: Array
+
+    @classmethod
+    def create(cls, model: AugmentedModel, horizon: int) -> CentralisedLinearFilter:
+        """Tables for the times 0..horizon + 1 at least, or until they have settled."""
+        sensors, n, size = model.sensors, model.plant.size, model.size
+        noises = len(model.plant.noise_covariance)
+        maps = np.zeros((n + sensors.count, size + noises))
+        maps[:n, :size] = np.tile(np.eye(n), model.plant.modes)
+        maps[n:, :size], maps[n:, size:] = model.faded, sensors.noise_coupling[..., 0]
+        rows: list[tuple[Array, Array, Array]] = []
+        for time, step in enumerate(model.steps()):
+            seen = ((model.unfaded @ step.moment) * model.unfaded).sum(1)
+            own = sensors.fading_variance * seen + sensors.variance[:, 0]
+            rows.append((np.hstack((model.transition, step.input)), step.additional, own))
+            if time > 0 and all(_same(*pair) for pair in zip(rows[-1], rows[-2], strict=True)):
+                break
+            if time >= max(horizon + 2, _LONGEST):
+                break
+        motion, additional, variance = (
+            np.stack(entries, -1) for entries in zip(*rows, strict=True)
+        )
+        return cls(model, maps[None, ..., None], motion, additional, variance)
+
+    def start(self, runs: int) -> Belief:
+        """Time 0: nothing is measured."""
+        first = next(self.model.steps())
+        covariance = first.moment - np.outer(first.mean, first.mean)
+        size = self.model.size
+        return with_noise(
+            np.ones((1, runs)),
+            np.broadcast_to(first.mean[:, None], (1, size, runs)),
+            np.broadcast_to(covariance[..., None], (1, size, size, runs)),
+            self.model.plant.noise_covariance,
+        )
+
+    def predict(self, belief: Belief, time: Times) -> Belief:
+        """From after the update at ``time`` (N,) to before the one at ``time`` + 1."""
+        place = self._at(time)
+        motion = self.motion.take(place, -1)
+        covariance = linalg.congruence(motion, belief.covariance[0])
+        covariance += self.additional.take(place, -1)
+        mean = linalg.matvec(motion, belief.mean[0])
+        noise = self.model.plant.noise_covariance
+        return with_noise(belief.probability, mean[None], covariance[None], noise)
+
+    def forecast(self, belief: Belief, time: Times) -> Forecast:
+        """What a prediction for ``time`` (N,) says of the plant and the measurements."""
+        return foresee(belief, self.maps, self._variance(time))
+
+    def update(
+        self, belief: Belief, measurement: Array, taken: NDArray[np.bool_], time: Times
+    ) -> Belief:
+        """A prediction for ``time`` after the ``taken`` (l, N) of the measurements (l, N)."""
+        rows = self.maps[:, self.model.plant.size :]
+        return absorb(belief, rows, self._variance(time), measurement, taken)[0]
+
+    def estimate(self, belief: Belief) -> tuple[Array, Array]:
+        """Mean (n, N) and covariance (n, n, N) of the plant's state."""
+        return mixture(belief, self.maps[:, : self.model.plant.size])
+
+    def _variance(self, time: Times) -> Array:
+        return self.variance.take(self._at(time), -1)[None]
+
+    def _at(self, time: Times) -> Times:
+        return np.minimum(time, self.variance.shape[-1] - 1)
+
+
+def _same(now: Array, before: Array) -> bool:
+    return bool(np.abs(now - before).max() <= _SETTLED * np.abs(now).max())

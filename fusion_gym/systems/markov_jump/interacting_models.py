@@ -1,0 +1,126 @@
+"""Interacting multiple models: one Kalman filter a mode, mixed by the mode's probabilities.
+
+Source: H. A. P. Blom and Y. Bar-Shalom, "The interacting multiple model algorithm for systems with
+Markovian switching coefficients", IEEE Trans. Automatic Control 33, 1988; the system is that of
+markov_jump.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.systems.markov_jump.centralised_linear import (
+    Belief,
+    Forecast,
+    absorb,
+    foresee,
+    mixture,
+    with_noise,
+)
+from fusion_gym.systems.markov_jump.linear_minimum_variance import Times
+from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
+from fusion_gym.systems.markov_jump.sensors import FadingSensors
+
+
+@dataclass(frozen=True)
+class InteractingModels:
+    """Estimates of the state and probabilities of the modes from the delivered measurements.
+
+    Model j stands for θ(k) = j; its belief is about z = col(x, w). Since θ(k) governs both the
+    measurement at k and the move to k + 1, beliefs are predicted by their own mode's matrices and
+    mixed afterwards: p(θ(k+1) = m) = Σ_j p_jm p(θ(k) = j), and the belief of m has the first two
+    moments of that mixture. Given the mode, y_i = β̄_i H_ij x + α_i w plus own noise whose variance
+    is R_i + σ_i² E(H_ij x)², by the prediction: fading is taken as noise of that variance, so that
+    neither estimates nor probabilities are exact, and covariances depend on the data.
+
+    Shapes, s = n + r: ``maps`` (M, n + l, s, 1) from z to col(x, y), ``motion`` [Φ_j Γ_j]
+    (M, n, s, 1), ``unfaded`` H (M, l, n, 1).
+    """
+
+    plant: MarkovJumpPlant
+    sensors: FadingSensors
+    maps: Array
+    motion: Array
+    unfaded: Array
+
+    @classmethod
+    def create(cls, plant: MarkovJumpPlant, sensors: FadingSensors) -> InteractingModels:
+        """From a plant and its sensors."""
+        n, count = plant.size, sensors.count
+        unfaded = sensors.measurement_matrix.transpose(2, 0, 1)
+        maps = np.zeros((plant.modes, n + count, n + len(plant.noise_covariance)))
+        maps[:, :n, :n] = np.eye(n)
+        maps[:, n:, :n] = sensors.fading_mean[:, None] * unfaded
+        maps[:, n:, n:] = sensors.noise_coupling[..., 0]
+        motion = np.concatenate((plant.transition, plant.process_gain), axis=1)
+        return cls(
+            plant=plant,
+            sensors=sensors,
+            maps=maps[..., None],
+            motion=np.ascontiguousarray(motion.transpose(2, 0, 1))[..., None],
+            unfaded=np.ascontiguousarray(unfaded)[..., None],
+        )
+
+    def start(self, runs: int) -> Belief:
+        """Time 0: the plant's own distributions; nothing is measured."""
+        plant, n = self.plant, self.plant.size
+        probability = np.broadcast_to(plant.initial_probabilities[:, None], (plant.modes, runs))
+        mean = np.broadcast_to(plant.initial_mean, (plant.modes, n, runs))
+        covariance = np.broadcast_to(plant.initial_covariance, (plant.modes, n, n, runs))
+        return with_noise(probability.copy(), mean, covariance, plant.noise_covariance)
+
+    def predict(self, belief: Belief, time: Times) -> Belief:
+        """From after the update at ``time`` (N,) to before the one at ``time`` + 1."""
+        del time  # the models do not depend on it
+        modes, chain = range(self.plant.modes), self.plant.mode_transition
+        moved = linalg.matvec(self.motion, belief.mean)
+        spread = linalg.congruence(self.motion, belief.covariance)
+        probability = np.empty_like(belief.probability)
+        mean, covariance = np.empty_like(moved), np.empty_like(spread)
+        for later in modes:
+            joint = chain[:, later, None] * belief.probability
+            probability[later] = joint.sum(0)
+            possible = probability[later] > 0.0  # else any weights will do
+            weights = np.where(possible, joint, 1.0 / self.plant.modes)
+            weights /= np.where(possible, probability[later], 1.0)
+            mean[later] = (weights[:, None] * moved).sum(0)
+            apart = moved - mean[later]
+            covariance[later] = (
+                weights[:, None, None] * (spread + linalg.outer(apart, apart))
+            ).sum(0)
+        probability /= probability.sum(0)
+        return with_noise(probability, mean, covariance, self.plant.noise_covariance)
+
+    def forecast(self, belief: Belief, time: Times) -> Forecast:
+        """What a prediction for ``time`` (N,) says of the plant and the measurements."""
+        del time
+        return foresee(belief, self.maps, self._variance(belief))
+
+    def update(
+        self, belief: Belief, measurement: Array, taken: NDArray[np.bool_], time: Times
+    ) -> Belief:
+        """A prediction for ``time`` after the ``taken`` (l, N) of the measurements (l, N)."""
+        del time
+        rows, variance = self.maps[:, self.plant.size :], self._variance(belief)
+        after, likelihood = absorb(belief, rows, variance, measurement, taken)
+        # The likeliest possible model has weight one, so that far tails do not make 0 / 0.
+        possible = np.where(belief.probability > 0.0, likelihood, -np.inf)
+        weights = belief.probability * np.exp(possible - possible.max(0))
+        return after._replace(probability=weights / weights.sum(0))
+
+    def estimate(self, belief: Belief) -> tuple[Array, Array]:
+        """Mean (n, N) and covariance (n, n, N) of the plant's state, over all modes."""
+        return mixture(belief, self.maps[:, : self.plant.size])
+
+    def _variance(self, belief: Belief) -> Array:
+        """Variances (M, l, N) of the measurements' own noises, fading included."""
+        n = self.plant.size
+        mean, covariance = belief.mean[:, :n], belief.covariance[:, :n, :n]
+        second = covariance + linalg.outer(mean, mean)
+        seen = linalg.quadratic(self.unfaded, second[:, None])
+        return np.asarray(self.sensors.fading_variance[:, None] * seen + self.sensors.variance)

@@ -1,0 +1,179 @@
+"""Joint error covariance of the nodes' estimates and the centre's copies, for any requests.
+
+Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
+systems with correlated noises and fading measurements).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.systems.markov_jump.linear_minimum_variance import LocalFilters, Times
+
+
+class LagCovariances(NamedTuple):
+    """Covariances of the lags d_i, node i's prediction minus the centre's copy of it, at k|k-1.
+
+    ``lag`` E d_i d_jᵀ (l (l + 1)/2, a, a, N), the pairs i <= j in the order (0, 0), (0, 1), … ·
+    ``crossed`` E d_i L_jᵀ (l (l - 1), a, a, N) with the node's error L_j, the pairs i ≠ j in the
+    order (0, 1), (0, 2), …
+    """
+
+    lag: Array
+    crossed: Array
+
+
+class Offer(NamedTuple):
+    """What may be sent at time k, in the plant's states: covariances after the nodes' update.
+
+    ``local`` E L⁺_i L⁺_jᵀ, ``crossed`` E d⁺_i L⁺_jᵀ and ``lag`` E d⁺_i d⁺_jᵀ, each
+    (l, l, n, n, N), with L⁺ the nodes' errors and d⁺ their lags as they are before anything is
+    sent. The copy of a node has the error L⁺_i if it is sent, else L⁺_i + d⁺_i.
+    """
+
+    local: Array
+    crossed: Array
+    lag: Array
+
+    def joint(self, sent: NDArray[np.bool_]) -> Array:
+        """Covariance of the copies' errors (l, l, n, n, N) if ``sent`` (l, N) is what is sent."""
+        behind = 1.0 - sent
+        crossed = behind[:, None, None, None] * self.crossed
+        result = crossed + crossed.swapaxes(0, 1).swapaxes(2, 3)
+        result += self.local
+        result += (behind[:, None] * behind[None])[:, :, None, None] * self.lag
+        return result
+
+
+@dataclass(frozen=True)
+class LagRecursion:
+    """The joint recursion of local and centre errors in the coordinates that make it small.
+
+    The errors of the nodes, L_i, and their covariances depend on time alone. The error of the
+    centre's copy is F_i = L_i + d_i with the lag d_i, the node's estimate minus its copy. A packet
+    makes the lag zero; otherwise d_i' = Ā d_i + u_i ε_i, driven by the node's innovations only:
+
+    - E d_i' L_j'ᵀ = s_i [Ā D Āᵀ - Ā y_ij u_jᵀ + u_i E(ε_i L_j')ᵀ], D = E d_i L_jᵀ, y_ij = D c_jᵀ;
+    - E d_i' d_j'ᵀ = s_i s_j [Ā D Āᵀ + Ā y_ij u_jᵀ + u_i (Ā y_ji)ᵀ + u_i u_jᵀ E ε_i ε_j],
+      D = E d_i d_jᵀ,
+
+    with s_i = 0 where node i was sent and 1 elsewhere. E d_i L_iᵀ = 0, for a node's error is
+    orthogonal to all that it measured. The result is the exact (2 l a)² recursion for every pattern
+    of packets that does not depend on the noise; the paper's (46)-(50) hold at full rate only.
+
+    ``filters`` holds the tables by time; ``states`` is n.
+    """
+
+    filters: LocalFilters
+    states: int
+    local: Array  # E L⁺_i L⁺_jᵀ, (l, l, n, n, T)
+    gain: Array  # K, (l, n, T)
+    filtered_cross: Array  # E ε_i L⁺_j, (l, l, n, T)
+
+    @classmethod
+    def create(cls, filters: LocalFilters, states: int) -> LagRecursion:
+        """From the nodes' tables and the number n of the plant's states."""
+        count, size, steps = filters.gain.shape
+        modes = size // states
+        blocks = filters.covariance.reshape(count, count, modes, states, modes, states, steps)
+        crosses = filters.filtered_cross.reshape(count, count, modes, states, steps)
+        return cls(
+            filters=filters,
+            states=states,
+            local=blocks.sum((2, 4)),
+            gain=filters.gain.reshape(count, modes, states, steps).sum(1),
+            filtered_cross=crosses.sum(2),
+        )
+
+    @property
+    def local_trace(self) -> Array:
+        """Trace of each node's error covariance after the update, (l, T), in the states."""
+        count = len(self.local)
+        return np.stack([linalg.trace(self.local[node, node]) for node in range(count)])
+
+    def start(self, runs: int) -> LagCovariances:
+        """At k = 0 the copies are the nodes' estimates: no lag."""
+        count, size, _ = self.filters.gain.shape
+        return LagCovariances(
+            np.zeros((count * (count + 1) // 2, size, size, runs)),
+            np.zeros((count * (count - 1), size, size, runs)),
+        )
+
+    def predict(self, now: LagCovariances, sent: NDArray[np.bool_], place: Times) -> LagCovariances:
+        """From k|k-1 to k+1|k after ``sent`` (l, N), with the ``place`` (N,) of the time k."""
+        filters, silent = self.filters, 1.0 - sent
+        count, transition = len(silent), filters.transition
+        step = filters.step.take(place, -1)
+        innovation = filters.innovation_covariance.take(place, -1)
+        ahead = filters.predicted_cross.take(place, -1)
+        following = LagCovariances(np.empty_like(now.lag), np.empty_like(now.crossed))
+        carried: dict[tuple[int, int], Array] = {}
+        for row, (i, j) in enumerate(_ordered(count)):
+            block = linalg.matmul(transition, now.crossed[row])
+            carried[i, j] = linalg.matvec(block, filters.measurement_matrix[j])
+            block = linalg.matmul(block, linalg.transpose(transition))
+            block -= linalg.outer(carried[i, j], step[j])
+            block += linalg.outer(step[i], ahead[i, j])
+            np.multiply(block, silent[i], out=following.crossed[row])
+        for row, (i, j) in enumerate(_pairs(count)):
+            if i == j:
+                block = linalg.congruence(transition, now.lag[row])
+                block += linalg.outer(step[i], innovation[i, i] * step[i])
+                np.multiply(block, silent[i], out=following.lag[row])
+                continue
+            block = linalg.matmul(transition, now.lag[row])
+            block = linalg.matmul(block, linalg.transpose(transition))
+            block += linalg.outer(carried[i, j], step[j])
+            block += linalg.outer(step[i], carried[j, i] + innovation[i, j] * step[j])
+            np.multiply(block, silent[i] * silent[j], out=following.lag[row])
+        return following
+
+    def offer(self, now: LagCovariances, place: Times) -> Offer:
+        """After the nodes' update at the time with the ``place`` (N,), before anything is sent."""
+        filters, n = self.filters, self.states
+        count, runs = len(filters.gain), len(place)
+        gain = self.gain.take(place, -1)
+        innovation = filters.innovation_covariance.take(place, -1)
+        filtered = self.filtered_cross.take(place, -1)
+        crossed = np.zeros((count, count, n, n, runs))
+        lag = np.empty((count, count, n, n, runs))
+        seen: dict[tuple[int, int], Array] = {}
+        for row, (i, j) in enumerate(_ordered(count)):
+            rows = _collapse(now.crossed[row], n)
+            seen[i, j] = linalg.matvec(rows, filters.measurement_matrix[j])
+            block = _collapse(rows.swapaxes(0, 1), n).swapaxes(0, 1)
+            block = block - linalg.outer(seen[i, j], gain[j])
+            block += linalg.outer(gain[i], filtered[i, j])
+            crossed[i, j] = block
+        for row, (i, j) in enumerate(_pairs(count)):
+            block = _collapse(_collapse(now.lag[row], n).swapaxes(0, 1), n).swapaxes(0, 1)
+            right = innovation[i, j] * gain[j]
+            if i != j:
+                block = block + linalg.outer(seen[i, j], gain[j])
+                right += seen[j, i]
+            lag[i, j] = block + linalg.outer(gain[i], right)
+            if i != j:
+                lag[j, i] = linalg.transpose(lag[i, j])
+        return Offer(self.local.take(place, -1), crossed, lag)
+
+
+def _ordered(count: int) -> list[tuple[int, int]]:
+    return [(i, j) for i in range(count) for j in range(count) if i != j]
+
+
+def _pairs(count: int) -> list[tuple[int, int]]:
+    return [(i, j) for i in range(count) for j in range(i, count)]
+
+
+def _collapse(rows: Array, states: int) -> Array:
+    """Sum of the modes' parts of the first axis: (modes · n, ...) to (n, ...)."""
+    result = rows[:states].copy()
+    for first in range(states, len(rows), states):
+        result += rows[first : first + states]
+    return result

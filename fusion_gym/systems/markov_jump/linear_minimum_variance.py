@@ -1,0 +1,317 @@
+"""Local linear-minimum-variance filters of a Markov jump system whose mode nobody knows.
+
+Gains and covariances do not depend on the measurements: they are tables over time, made once.
+
+Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
+systems with correlated noises and fading measurements).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
+from fusion_gym.systems.markov_jump.sensors import FadingSensors
+
+Times = NDArray[np.int64]
+
+_LONGEST = 2000  # steps after which tables that have not become periodic end anyway
+_SETTLED = 1e-13  # relative change over a period below which they have
+
+
+class AugmentedStep(NamedTuple):
+    """The augmented model at one time k, plain matrices; a = modes · n.
+
+    ``probabilities`` π(k) (modes,) · ``moment`` P(k) (a, a), block diagonal, the second moment of
+    ζ(k) · ``mean`` of ζ(k) (a,) · ``input`` B̄(k) (a, r) · ``additional`` Q_c(k) (a, a), the
+    covariance of what the unknown mode adds between k and k + 1.
+    """
+
+    probabilities: Array
+    moment: Array
+    mean: Array
+    input: Array
+    additional: Array
+
+
+@dataclass(frozen=True)
+class AugmentedModel:
+    """ζ(k+1) = Ā ζ(k) + B̄(k) w(k) + ξ(k), y_i = c_i ζ + v*_i, with ζ = col(x 1{θ = m}).
+
+    ξ is what the unknown mode adds, of covariance Q_c = P(k+1) - Ā P(k) Āᵀ - B̄ Q B̄ᵀ and
+    uncorrelated with all that came before. v*_i = (β_i - β̄_i) C_i ζ + α_i w + η_i has variance
+    σ_i² C_i P(k) C_iᵀ + α_i Q α_iᵀ + R_i, and Cov(v*_i, v*_j) = α_i Q α_jᵀ. Mode probabilities
+    move with π(k+1) = π(k) p, so that B̄ depends on time.
+
+    Shapes: ``transition`` Ā (a, a), ``faded`` c_i = β̄_i C_i (l, a), ``unfaded`` C_i (l, a).
+
+    Source: markov_jump, equations (5)-(11); in (9) the variance is that of sensor i, and P_n and
+    π_n of (10) are those at k - 1.
+    """
+
+    plant: MarkovJumpPlant
+    sensors: FadingSensors
+    transition: Array
+    faded: Array
+    unfaded: Array
+
+    @classmethod
+    def create(cls, plant: MarkovJumpPlant, sensors: FadingSensors) -> AugmentedModel:
+        """From a plant and its sensors."""
+        chain, phi = plant.mode_transition, plant.transition
+        modes = range(plant.modes)
+        unfaded = sensors.measurement_matrix.transpose(0, 2, 1).reshape(sensors.count, -1)
+        return cls(
+            plant=plant,
+            sensors=sensors,
+            transition=np.block([[chain[n, m] * phi[..., n] for n in modes] for m in modes]),
+            faded=sensors.fading_mean[:, None] * unfaded,
+            unfaded=unfaded,
+        )
+
+    @property
+    def size(self) -> int:
+        """Length a of ζ."""
+        return len(self.transition)
+
+    @property
+    def initial_mean(self) -> Array:
+        """Mean of ζ(0), col(π_m μ₀) (a,): what all estimates begin with."""
+        plant = self.plant
+        return np.outer(plant.initial_probabilities, plant.initial_mean[:, 0]).reshape(-1)
+
+    def steps(self) -> Iterator[AugmentedStep]:
+        """The model at k = 0, 1, 2, … without end."""
+        plant = self.plant
+        phi, gamma = np.moveaxis(plant.transition, -1, 0), np.moveaxis(plant.process_gain, -1, 0)
+        chain, noise = plant.mode_transition, plant.noise_covariance
+        start, pi = plant.initial_mean[:, 0], plant.initial_probabilities
+        second = plant.initial_covariance[..., 0] + np.outer(start, start)
+        moments = pi[:, None, None] * second
+        mean = self.initial_mean
+        driven = gamma @ noise @ gamma.swapaxes(1, 2)
+        while True:
+            following = np.tensordot(
+                chain.T, phi @ moments @ phi.swapaxes(1, 2) + pi[:, None, None] * driven, 1
+            )
+            entry = np.tensordot(chain.T, pi[:, None, None] * gamma, 1).reshape(self.size, -1)
+            now, later = _diagonal_blocks(moments), _diagonal_blocks(following)
+            carried = self.transition @ now @ self.transition.T + entry @ noise @ entry.T
+            yield AugmentedStep(pi, now, mean, entry, later - carried)
+            moments, pi, mean = following, pi @ chain, self.transition @ mean
+
+    def state_moments(self, last: int) -> tuple[Array, Array]:
+        """E x and the diagonal of E x xᵀ at k = 0..last, both (last + 1, n)."""
+        means, squares = [], []
+        for _, step in zip(range(last + 1), self.steps(), strict=False):
+            means.append(step.mean.reshape(-1, self.plant.size).sum(0))
+            squares.append(np.diagonal(step.moment).reshape(-1, self.plant.size).sum(0))
+        return np.array(means), np.array(squares)
+
+    def open_loop(self, horizon: int) -> Array:
+        """Mean variance (n,) of the state over k = 1..horizon: its error if nothing is known."""
+        means, squares = self.state_moments(horizon)
+        return np.asarray((squares - means * means)[1:].mean(0))
+
+
+def _diagonal_blocks(blocks: Array) -> Array:
+    count, size, _ = blocks.shape
+    result = np.zeros((count, size, count, size))
+    every = np.arange(count)
+    result[every, :, every] = blocks
+    return result.reshape(count * size, count * size)
+
+
+class FilterUpdate(NamedTuple):
+    """What the nodes make of their measurements.
+
+    ``mean`` ζ̂(k|k) (l, a, N) · ``noise_mean`` ŵ(k|k) (l, r, N) · ``innovation`` ε (l, N), zero
+    where a sensor does not sample.
+    """
+
+    mean: Array
+    noise_mean: Array
+    innovation: Array
+
+
+@dataclass(frozen=True)
+class LocalFilters:
+    """The nodes' filters, with the joint covariance of their errors, as tables over time.
+
+    Every table has time as its last axis; :meth:`at` turns times into places. A table ends when
+    it has become periodic (to 1e-13), and its last period then stands for all later times.
+
+    With l sensors, a = modes · n: ``transition`` Ā (a, a, 1) · ``measurement_matrix`` c (l, a, 1) ·
+    ``input`` B̄ (a, r, T) · ``gain`` K (l, a, T) · ``noise_gain`` K_w (l, r, T) ·
+    ``innovation_covariance`` E ε_i ε_j (l, l, T), as if all sampled · ``step`` u_i = Ā K_i + B̄ K_wi
+    (l, a, T), the innovation's part in the next prediction · ``covariance`` E L⁺_i L⁺_jᵀ
+    (l, l, a, a, T), L⁺ the errors after the update · ``filtered_cross`` E ε_i L⁺_j (l, l, a, T) ·
+    ``predicted_cross`` E ε_i L_j(k+1|k) (l, l, a, T). ``period`` is the number of steps after
+    which the sensors' sampling repeats, at most T.
+
+    Source: markov_jump, equations (12)-(22).
+    """
+
+    transition: Array
+    measurement_matrix: Array
+    input: Array
+    gain: Array
+    noise_gain: Array
+    innovation_covariance: Array
+    step: Array
+    covariance: Array
+    filtered_cross: Array
+    predicted_cross: Array
+    period: int
+
+    @classmethod
+    def create(cls, model: AugmentedModel, horizon: int) -> LocalFilters:
+        """Tables for the times 0..horizon + 1 at least, or until they are periodic.
+
+        At k = 0 nothing is measured, and all nodes hold the mean of ζ(0).
+        """
+        sensors, plant = model.sensors, model.plant
+        period = math.lcm(*sensors.period[:, 0].tolist())
+        first = next(model.steps())
+        joint = np.empty((sensors.count, sensors.count, model.size, model.size))
+        joint[:] = first.moment - np.outer(first.mean, first.mean)
+        shared = sensors.noise_coupling[..., 0] @ plant.noise_covariance
+        noise = shared @ sensors.noise_coupling[..., 0].T
+        rows: list[_Row] = []
+        seen: list[tuple[Array, ...]] = []
+        for time, step in enumerate(model.steps()):
+            row, following = _advance(model, step, joint, shared, noise, time)
+            rows.append(row)
+            seen.append((joint, step.moment, step.input))
+            if time > period and _same(seen[time], seen[time - period]):
+                break
+            if time >= max(horizon + 2, _LONGEST):
+                break
+            joint = following
+        tables = {
+            name: np.ascontiguousarray(np.moveaxis(np.array(entries), 0, -1))
+            for name, entries in zip(_Row._fields, zip(*rows, strict=True), strict=True)
+        }
+        return cls(
+            transition=model.transition[..., None],
+            measurement_matrix=model.faded[..., None],
+            period=min(period, len(rows)),
+            **tables,
+        )
+
+    @property
+    def length(self) -> int:
+        """Number of times in the tables."""
+        return self.gain.shape[-1]
+
+    def at(self, time: Times) -> Times:
+        """Places (N,) in the tables of the times (N,)."""
+        beyond = self.length - self.period + (time - self.length) % self.period
+        return np.where(time < self.length, time, beyond)
+
+    def predict(self, mean: Array, noise_mean: Array, place: Times) -> Array:
+        """ζ̂(k+1|k) = Ā ζ̂(k|k) + B̄ ŵ(k|k), (l, a, N), with ``place`` of the time k.
+
+        Source: markov_jump, equations (16), (36) and, with ŵ = 0, (38).
+        """
+        moved = linalg.matvec(self.transition, mean)
+        return moved + linalg.matvec(self.input.take(place, -1), noise_mean)
+
+    def update(
+        self, mean: Array, measurement: Array, sampled: NDArray[np.bool_], place: Times
+    ) -> FilterUpdate:
+        """The nodes (l, a, N) take their measurements (l, N) where they are ``sampled`` (l, N).
+
+        Source: markov_jump, equations (12), (13), (17).
+        """
+        surprise = measurement - linalg.dot(self.measurement_matrix, mean)
+        innovation = np.where(sampled, surprise, 0.0)
+        correction = self.gain.take(place, -1) * innovation[:, None]
+        noise_mean = self.noise_gain.take(place, -1) * innovation[:, None]
+        return FilterUpdate(mean + correction, noise_mean, innovation)
+
+
+class _Row(NamedTuple):
+    """One time's entries of the tables of :class:`LocalFilters`, without the time axis."""
+
+    input: Array
+    gain: Array
+    noise_gain: Array
+    innovation_covariance: Array
+    step: Array
+    covariance: Array
+    filtered_cross: Array
+    predicted_cross: Array
+
+
+def _same(now: tuple[Array, ...], before: tuple[Array, ...]) -> bool:
+    """Whether arrays agree to a relative 1e-13 of the largest entry of each."""
+    pairs = zip(now, before, strict=True)
+    return all(np.abs(a - b).max() <= _SETTLED * np.abs(a).max() for a, b in pairs)
+
+
+def _advance(
+    model: AugmentedModel,
+    step: AugmentedStep,
+    joint: Array,
+    shared: Array,
+    noise: Array,
+    time: int,
+) -> tuple[_Row, Array]:
+    """One time's row of the tables, and the joint prediction covariance of the next time.
+
+    ``joint`` E L_i L_jᵀ (l, l, a, a) is that of k|k-1, ``shared`` E v*_i wᵀ (l, r), ``noise``
+    E v*_i v*_j without the sensors' own part (l, l).
+    """
+    sensors, transition, faded = model.sensors, model.transition, model.faded
+    own = sensors.fading_variance * np.einsum(
+        "la,ab,lb->l", model.unfaded, step.moment, model.unfaded
+    )
+    noise = noise + np.diag(own + sensors.variance[:, 0])
+    seen = np.einsum("ijab,jb->ija", joint, faded)  # E L_i (c_j L_j)
+    innovation = np.einsum("ia,ija->ij", faded, seen) + noise
+    sampled = (time % sensors.period[:, 0] == 0) & (time > 0)
+    scale = np.where(sampled, 1.0 / np.diagonal(innovation), 0.0)[:, None]
+    gain = scale * np.einsum("iia->ia", seen)
+    noise_gain = scale * shared
+    stride = gain @ transition.T + noise_gain @ step.input.T
+    kept = np.eye(model.size) - gain[:, :, None] * faded[:, None]
+    moved = transition - stride[:, :, None] * faded[:, None]
+    covariance = _both_sides(kept, joint) + _both_sides(gain[..., None], noise[..., None, None])
+    entering = shared @ step.input.T  # E v*_i (B̄ w)
+    crossed = stride[:, None, :, None] * entering[:, None, None]
+    process = step.input @ model.plant.noise_covariance @ step.input.T + step.additional
+    following = _both_sides(moved, joint) + process
+    following -= crossed + crossed.transpose(1, 0, 3, 2)
+    following += _both_sides(stride[..., None], noise[..., None, None])
+    filtered_cross = np.einsum("jab,jib->ija", kept, seen) - noise[..., None] * gain
+    predicted_cross = np.einsum("jab,jib->ija", moved, seen) + entering[:, None]
+    predicted_cross -= noise[..., None] * stride
+    row = _Row(
+        input=step.input,
+        gain=gain,
+        noise_gain=noise_gain,
+        innovation_covariance=innovation,
+        step=stride,
+        covariance=_symmetric(covariance),
+        filtered_cross=filtered_cross,
+        predicted_cross=predicted_cross,
+    )
+    return row, _symmetric(following)
+
+
+def _symmetric(blocks: Array) -> Array:
+    return (blocks + blocks.transpose(1, 0, 3, 2)) / 2
+
+
+def _both_sides(factor: Array, blocks: Array) -> Array:
+    """F_i X_ij F_jᵀ for all pairs: (l, b, a) and (l, l, a, a) to (l, l, b, b)."""
+    return np.asarray(factor[:, None] @ blocks @ factor.swapaxes(1, 2)[None])

@@ -1,0 +1,169 @@
+"""Markov jump linear plant: the matrices follow the mode of a Markov chain.
+
+Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
+systems with correlated noises and fading measurements).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
+
+from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
+from fusion_gym.systems.linear_plant import covariance_factor
+from fusion_gym.validation import ConfigurationError
+
+Modes = NDArray[np.int64]
+
+
+def probabilities(field: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
+    """Entries from 0 to 1 whose last axis adds up to one; made to do so exactly.
+
+    Raises:
+        ConfigurationError: a wrong shape, an entry outside [0, 1], or another sum.
+    """
+    given = validation.array(field, value, shape)
+    total = given.sum(-1, keepdims=True)
+    if np.any(given < 0.0) or np.any(np.abs(total - 1.0) > 1e-9):
+        what = "rows add up" if given.ndim > 1 else "entries add up"
+        sums = np.round(total[..., 0], 12).tolist()
+        raise ConfigurationError(
+            f"{field} = {given.tolist()!r} is not allowed: it must have entries from 0 to 1 whose "
+            f"{what} to 1, not {sums}"
+        )
+    return np.asarray(given / total)
+
+
+def draw(cumulative: Array, noise: Array) -> Modes:
+    """Index (...) of a discrete distribution from standard normals (...).
+
+    ``cumulative`` (values - 1, ...) holds the cumulative probabilities without the last one.
+    """
+    return np.asarray((ndtr(noise) > cumulative).sum(0))
+
+
+@dataclass(frozen=True)
+class MarkovJumpPlant:
+    """x(k+1) = Φ_θ x(k) + Γ_θ w(k) with θ = θ(k) a Markov chain, w ~ N(0, Q).
+
+    Shapes, with n states, r noises and M modes: ``transition`` Φ (n, n, M), ``process_gain`` Γ
+    (n, r, M), ``noise_covariance`` Q (r, r), ``noise_factor`` Q^½ (r, r', 1),
+    ``mode_transition`` p (M, M), p[a, b] the probability to go from a to b,
+    ``initial_probabilities`` (M,), ``initial_mean`` μ₀ (n, 1), ``initial_covariance`` P₀
+    (n, n, 1), ``initial_factor`` (n, n, 1). Build one with :meth:`create`.
+
+    Source: markov_jump, equations (1) and (3), Assumptions 1 to 3.
+    """
+
+    transition: Array
+    process_gain: Array
+    noise_covariance: Array
+    noise_factor: Array
+    mode_transition: Array
+    initial_probabilities: Array
+    initial_mean: Array
+    initial_covariance: Array
+    initial_factor: Array
+
+    @classmethod
+    def create(
+        cls,
+        transitions: ArrayLike,
+        process_gains: ArrayLike,
+        process_covariance: ArrayLike,
+        mode_transition: ArrayLike,
+        initial_probabilities: ArrayLike,
+        initial_mean: ArrayLike,
+        initial_covariance: ArrayLike,
+    ) -> MarkovJumpPlant:
+        """Check plain arrays: Φ (modes, n, n), Γ (modes, n, r), Q (r, r) or a number for r = 1.
+
+        Raises:
+            ConfigurationError: a wrong shape, an entry that is not finite, probabilities that do
+                not add up to one, a covariance that is not positive semi-definite
+                (``initial_covariance``: definite), or a plant that is not mean-square stable.
+        """
+        matrices = validation.array("transitions", transitions, (None, None, None))
+        modes, size, _ = matrices.shape
+        matrices = validation.array("transitions", transitions, (modes, size, size))
+        gains = validation.array("process_gains", process_gains, (modes, size, None))
+        noises = gains.shape[2]
+        given: ArrayLike = process_covariance
+        if isinstance(process_covariance, (int, float, np.number)):
+            given = validation.number("process_covariance", process_covariance) * np.eye(noises)
+        noise = validation.covariance("process_covariance", given, noises)
+        start = validation.covariance("initial_covariance", initial_covariance, size, definite=True)
+        plant = cls(
+            transition=np.ascontiguousarray(matrices.transpose(1, 2, 0)),
+            process_gain=np.ascontiguousarray(gains.transpose(1, 2, 0)),
+            noise_covariance=noise,
+            noise_factor=(covariance_factor(noise) if noise.any() else noise)[..., None],
+            mode_transition=probabilities("mode_transition", mode_transition, (modes, modes)),
+            initial_probabilities=probabilities(
+                "initial_probabilities", initial_probabilities, (modes,)
+            ),
+            initial_mean=validation.array("initial_mean", initial_mean, (size,))[..., None],
+            initial_covariance=start[..., None],
+            initial_factor=covariance_factor(start)[..., None],
+        )
+        radius = plant.second_moment_radius()
+        if radius >= 1.0 - 1e-9:
+            raise ConfigurationError(
+                f"transitions = {matrices.tolist()!r} are not allowed: with this mode_transition "
+                "the plant must be mean-square stable, and the spectral radius of its "
+                f"second-moment operator is {radius:.4g}, which must be < 1"
+            )
+        return plant
+
+    @property
+    def size(self) -> int:
+        """Number of states n."""
+        return self.transition.shape[0]
+
+    @property
+    def modes(self) -> int:
+        """Number of modes M."""
+        return self.transition.shape[2]
+
+    @property
+    def noise_channels(self) -> int:
+        """Standard normals of one w: the rank of Q."""
+        return self.noise_factor.shape[1]
+
+    def second_moment_radius(self) -> float:
+        """Spectral radius of the operator [p_nm Φ_n ⊗ Φ_n] that moves the P_m of (10).
+
+        The plant is mean-square stable if and only if it is below one.
+        """
+        squares = [np.kron(phi, phi) for phi in np.moveaxis(self.transition, -1, 0)]
+        chain = self.mode_transition
+        operator = np.block(
+            [[chain[n, m] * squares[n] for n in range(self.modes)] for m in range(self.modes)]
+        )
+        return float(np.abs(np.linalg.eigvals(operator)).max())
+
+    def start(self, noise: Array) -> tuple[Array, Modes]:
+        """x(0) (n, N) and θ(0) (N,) from standard normals (n + 1, N), the last one the mode's."""
+        state = self.initial_mean + linalg.matvec(self.initial_factor, noise[:-1])
+        return state, draw(np.cumsum(self.initial_probabilities)[:-1, None], noise[-1])
+
+    def process_noise(self, noise: Array) -> Array:
+        """w (r, N) from standard normals (noise_channels, N)."""
+        return linalg.matvec(self.noise_factor, noise)
+
+    def advance(self, state: Array, mode: Modes, process_noise: Array) -> Array:
+        """x(k+1) (n, N) from x(k) (n, N), θ(k) (N,) and w(k) (r, N).
+
+        Source: markov_jump, equation (3).
+        """
+        moved = linalg.matvec(self.transition.take(mode, -1), state)
+        return moved + linalg.matvec(self.process_gain.take(mode, -1), process_noise)
+
+    def jump(self, mode: Modes, noise: Array) -> Modes:
+        """θ(k+1) (N,) from θ(k) (N,) and standard normals (N,)."""
+        cumulative = np.cumsum(self.mode_transition, 1).T[:-1]
+        return draw(cumulative.take(mode, -1), noise)

@@ -1,0 +1,118 @@
+"""State and signals of the Markov jump system, and the move that its systems share.
+
+Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
+systems with correlated noises and fading measurements).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym.arrays import Array
+from fusion_gym.core.system import Signal
+from fusion_gym.systems.markov_jump.lag_errors import LagCovariances, Offer
+from fusion_gym.systems.markov_jump.linear_minimum_variance import Times
+from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes
+from fusion_gym.systems.markov_jump.sensors import FadingSensors
+
+
+class Motion(NamedTuple):
+    """The plant at the next time: ``truth`` (n, N), ``mode`` (N,), ``process_noise`` w (r, N).
+
+    ``measurement`` (l, N) is what all sensors would measure there.
+    """
+
+    truth: Array
+    mode: Modes
+    process_noise: Array
+    measurement: Array
+
+
+def move(
+    plant: MarkovJumpPlant,
+    sensors: FadingSensors,
+    truth: Array,
+    mode: Modes,
+    process_noise: Array,
+    noise: Array,
+) -> Motion:
+    """The plant moves and jumps, the sensors measure.
+
+    ``noise`` (channels, N) holds the normals of the process noise, the mode, the sensors.
+
+    Source: markov_jump, equations (3), (4).
+    """
+    moving = plant.noise_channels
+    following = plant.advance(truth, mode, process_noise)
+    jumped = plant.jump(mode, noise[moving])
+    drawn = plant.process_noise(noise[:moving])
+    measurement = sensors.measure(following, jumped, drawn, noise[moving + 1 :])
+    return Motion(following, jumped, drawn, measurement)
+
+
+@dataclass(slots=True)
+class MarkovJumpState:
+    """Everything about N runs at one time k; n states, a = modes · n, r noises, l sensors.
+
+    ``time`` k (N,) · ``truth`` (n, N), ``mode`` θ (N,), ``process_noise`` w(k) (r, N), which moves
+    the plant next · ``innovation`` ε (l, N), zero where a sensor does not sample ·
+    ``node_mean`` ζ̂(k|k) (l, a, N), ``node_noise`` ŵ (l, r, N), the nodes' ·
+    ``copy_mean`` (l, a, N), ``copy_noise`` (l, r, N), the centre's: a prediction until delivery ·
+    ``held`` (l, n, N), the last delivered estimates · ``age`` (l, N), steps since then ·
+    ``sent`` (l, N) bool, the last deliveries · ``lags`` and ``offer``, covariances ·
+    ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N), fused if nobody transmits ·
+    ``mean`` (n, N), ``covariance`` (n, n, N), fused after the delivery.
+    """
+
+    time: Times
+    truth: Array
+    mode: Modes
+    process_noise: Array
+    innovation: Array
+    node_mean: Array
+    node_noise: Array
+    copy_mean: Array
+    copy_noise: Array
+    held: Array
+    age: Array
+    sent: NDArray[np.bool_]
+    lags: LagCovariances
+    offer: Offer | None
+    prior_mean: Array
+    prior_covariance: Array
+    mean: Array
+    covariance: Array
+
+
+_ESTIMATES = "(sensors, n, N)"
+_PER_SENSOR = "(sensors, N)"
+SIGNALS = (
+    Signal("measurement", "sensor", _ESTIMATES, "the node's new estimate: what it would send"),
+    Signal("innovation", "sensor", _ESTIMATES, "that minus the centre's copy of it"),
+    Signal("held", "centre", _ESTIMATES, "the last delivered estimate"),
+    Signal("age", "centre", _PER_SENSOR, "steps since the last delivery"),
+    Signal("expected_measurement", "centre", _ESTIMATES, "the centre's copy, predicted"),
+    Signal("innovation_deviation", "centre", _ESTIMATES, "the innovation's deviation"),
+    Signal("prior_mean", "centre", "(n, N)", "fused estimate if nobody transmits"),
+    Signal("prior_covariance", "centre", "(n, n, N)", "its covariance"),
+    Signal("silent_variance", "centre", "(N,)", "its weighted trace"),
+    Signal(
+        "variance_reduction",
+        "centre",
+        _PER_SENSOR,
+        "how far that trace falls if this sensor alone transmits, whatever it measured",
+    ),
+    Signal("centre_variance", "centre", "(N,)", "the plain trace if nobody transmits"),
+    Signal(
+        "greedy_variance",
+        "centre",
+        _PER_SENSOR,
+        "that trace if only the sensors before this one in the greedy order transmit",
+    ),
+    Signal("local_variance", "centre", _PER_SENSOR, "the plain trace of the node's covariance"),
+    Signal("sampled", "centre", _PER_SENSOR, "whether the sensor samples at this step"),
+)

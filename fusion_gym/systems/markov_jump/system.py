@@ -1,0 +1,330 @@
+"""Markov jump plant, nodes that filter, a link from node to centre, fusion of the centre's copies.
+
+Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
+systems with correlated noises and fading measurements).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.core.system import Feature, Signal, SignalArray, feature_block
+from fusion_gym.fusion.matrix_weighted import IntersectionOfCopies, MatrixWeightedFusion
+from fusion_gym.systems.markov_jump.lag_errors import LagRecursion, Offer
+from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
+from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
+from fusion_gym.systems.markov_jump.sensors import FadingSensors
+from fusion_gym.systems.markov_jump.state import SIGNALS, MarkovJumpState, move
+
+_RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
+_FLOOR = 1e-9  # least deviation of a lag, relative to open loop: it is zero right after a packet
+
+
+@dataclass(frozen=True)
+class MarkovJumpSystem:
+    """Joins the plant, its sensors, the nodes' filters, the joint recursion and a fusion rule.
+
+    ``state_weights`` (n,) weigh the traces among the signals, ``magnitude`` (n,) divides observed
+    estimates and ``reference`` (n,) observed variances. Build one with :meth:`create`.
+    """
+
+    plant: MarkovJumpPlant
+    sensors: FadingSensors
+    model: AugmentedModel
+    filters: LocalFilters
+    recursion: LagRecursion
+    fusion: MatrixWeightedFusion | IntersectionOfCopies
+    state_names: tuple[str, ...]
+    state_weights: Array
+    magnitude: Array
+    reference: Array
+
+    @classmethod
+    def create(
+        cls,
+        plant: MarkovJumpPlant,
+        sensors: FadingSensors,
+        fusion: MatrixWeightedFusion | IntersectionOfCopies,
+        state_names: tuple[str, ...],
+        state_weights: Array | None,
+        horizon: int,
+    ) -> MarkovJumpSystem:
+        """Tables for ``horizon`` steps; weights of ``None`` make open loop cost one."""
+        model = AugmentedModel.create(plant, sensors)
+        filters = LocalFilters.create(model, horizon)
+        squares = model.state_moments(horizon)[1]
+        reference = model.open_loop(horizon)
+        equal = 1.0 / (plant.size * reference)
+        return cls(
+            plant=plant,
+            sensors=sensors,
+            model=model,
+            filters=filters,
+            recursion=LagRecursion.create(filters, plant.size),
+            fusion=fusion,
+            state_names=state_names,
+            state_weights=equal if state_weights is None else state_weights,
+            magnitude=np.sqrt(squares.mean(0)),
+            reference=reference,
+        )
+
+    @property
+    def sensor_count(self) -> int:
+        """Number of sensors."""
+        return self.sensors.count
+
+    @property
+    def noise_channels(self) -> int:
+        """Normals of one step: process noise, the mode, the sensors'."""
+        return self.plant.noise_channels + 1 + self.sensors.noise_channels
+
+    @property
+    def start_channels(self) -> int:
+        """Normals of a start: the state's deviation, the mode, the first process noise."""
+        return self.plant.size + 1 + self.plant.noise_channels
+
+    @property
+    def covariance_cycle(self) -> int:
+        """Steps after which the sampling repeats itself; covariances depend on no data."""
+        return self.filters.period
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """The signals that :meth:`read` offers."""
+        return SIGNALS
+
+    @property
+    def features(self) -> tuple[tuple[Feature, ...], ...]:
+        """Blocks of the observation; see docs/markov_jump.md."""
+        nodes = [(node, f"{node}") for node in range(self.sensor_count)]
+        states = [(node, f"{place},{name}") for node, place in nodes for name in self.state_names]
+        fused = [(None, name) for name in self.state_names]
+        return (
+            feature_block("whitened_difference", states, "sensor", _RANGE),
+            feature_block("whitened_innovation", nodes, "sensor", _RANGE),
+            feature_block("sampled", nodes, "centre"),
+            feature_block("phase", nodes, "centre"),
+            feature_block("age", nodes, "centre"),
+            feature_block("local_log_deviation", nodes, "centre", _RANGE),
+            feature_block("copy_log_deviation", states, "centre", _RANGE),
+            feature_block("log_deviation", fused, "centre", _RANGE),
+            feature_block("estimate", fused, "centre", _RANGE),
+        )
+
+    def start(self, noise: Array) -> MarkovJumpState:
+        """Time 0: all estimates are the mean of ζ(0); nothing is measured, nothing lags behind."""
+        runs, n, count = noise.shape[-1], self.plant.size, self.sensor_count
+        truth, mode = self.plant.start(noise[: n + 1])
+        first = self.model.initial_mean
+        mean = np.broadcast_to(first[:, None], (count, len(first), runs)).copy()
+        noise_mean = np.zeros((count, self.plant.process_gain.shape[1], runs))
+        state_mean = np.broadcast_to(self.plant.initial_mean, (n, runs)).copy()
+        covariance = np.broadcast_to(self.plant.initial_covariance, (n, n, runs)).copy()
+        return MarkovJumpState(
+            time=np.zeros(runs, dtype=np.int64),
+            truth=truth,
+            mode=mode,
+            process_noise=self.plant.process_noise(noise[n + 1 :]),
+            innovation=np.zeros((count, runs)),
+            node_mean=mean,
+            node_noise=noise_mean,
+            copy_mean=mean,
+            copy_noise=noise_mean,
+            held=self._collapse(mean),
+            age=np.zeros((count, runs)),
+            sent=np.ones((count, runs), dtype=np.bool_),
+            lags=self.recursion.start(runs),
+            offer=None,
+            prior_mean=state_mean,
+            prior_covariance=covariance,
+            mean=state_mean,
+            covariance=covariance,
+        )
+
+    def sense(self, state: MarkovJumpState, noise: Array) -> MarkovJumpState:
+        """The plant moves and jumps, the sensors measure, the nodes update, the copies predict.
+
+        Source: markov_jump, equations (3), (4), (12)-(22), (36)-(39).
+        """
+        truth, mode, process_noise, measurement = move(
+            self.plant, self.sensors, state.truth, state.mode, state.process_noise, noise
+        )
+        time = state.time + 1
+        before, place = self.filters.at(state.time), self.filters.at(time)
+        prior = self.filters.predict(state.node_mean, state.node_noise, before)
+        update = self.filters.update(prior, measurement, self.sensors.sampled(time), place)
+        copy_mean = self.filters.predict(state.copy_mean, state.copy_noise, before)
+        lags = self.recursion.predict(state.lags, state.sent, before)
+        offer = self.recursion.offer(lags, place)
+        nobody = np.zeros(state.sent.shape, dtype=np.bool_)
+        prior_mean, prior_covariance = self.fusion.fuse(
+            self._collapse(copy_mean), offer.joint(nobody)
+        )
+        return replace(
+            state,
+            time=time,
+            truth=truth,
+            mode=mode,
+            process_noise=process_noise,
+            innovation=update.innovation,
+            node_mean=update.mean,
+            node_noise=update.noise_mean,
+            copy_mean=copy_mean,
+            copy_noise=np.zeros_like(state.copy_noise),
+            age=state.age + 1.0,
+            lags=lags,
+            offer=offer,
+            prior_mean=prior_mean,
+            prior_covariance=prior_covariance,
+        )
+
+    def deliver(self, state: MarkovJumpState, granted: NDArray[np.bool_]) -> MarkovJumpState:
+        """Granted estimates replace the centre's copies, and the centre fuses its copies.
+
+        Source: markov_jump, equations (34)-(39), (55)-(57).
+        """
+        grant = granted[:, None]
+        copy_mean = np.where(grant, state.node_mean, state.copy_mean)
+        mean, covariance = self.fusion.fuse(
+            self._collapse(copy_mean), _sensed(state).joint(granted)
+        )
+        return replace(
+            state,
+            copy_mean=copy_mean,
+            copy_noise=np.where(grant, state.node_noise, state.copy_noise),
+            held=np.where(grant, self._collapse(state.node_mean), state.held),
+            age=np.where(granted, 0.0, state.age),
+            sent=granted.copy(),
+            mean=mean,
+            covariance=covariance,
+        )
+
+    def read(self, state: MarkovJumpState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
+        """The signals named in ``SIGNALS``."""
+        offer = _sensed(state)
+        place = self.filters.at(state.time)
+        return {
+            "measurement": lambda: self._collapse(state.node_mean),
+            "innovation": lambda: self._collapse(state.node_mean - state.copy_mean),
+            "held": state.held,
+            "age": state.age,
+            "expected_measurement": lambda: self._collapse(state.copy_mean),
+            "innovation_deviation": lambda: self._lag_deviation(offer),
+            "prior_mean": state.prior_mean,
+            "prior_covariance": state.prior_covariance,
+            "silent_variance": lambda: self._weighted_trace(state.prior_covariance),
+            "variance_reduction": lambda: self._variance_reduction(state, offer),
+            "centre_variance": lambda: linalg.trace(state.prior_covariance),
+            "greedy_variance": lambda: self._greedy_variance(state, offer),
+            "local_variance": lambda: self.recursion.local_trace.take(place, -1),
+            "sampled": lambda: self.sensors.sampled(state.time),
+        }
+
+    def observe(self, state: MarkovJumpState) -> Sequence[Array]:
+        """The blocks named in :attr:`features`, before clipping to their bounds."""
+        offer, runs = _sensed(state), state.truth.shape[-1]
+        place, nodes = self.filters.at(state.time), np.arange(self.sensor_count)
+        variance = self.filters.innovation_covariance[nodes, nodes].take(place, -1)
+        difference = self._collapse(state.node_mean - state.copy_mean)
+        phase = (state.time % self.sensors.period) / self.sensors.period
+        local = self.recursion.local_trace.take(place, -1) / self.reference.sum()
+        copies = linalg.diagonal(offer.local[nodes, nodes] + offer.lag[nodes, nodes])
+        fused = linalg.diagonal(state.prior_covariance)
+        return (
+            (difference / self._lag_deviation(offer)).reshape(-1, runs),
+            state.innovation / np.sqrt(variance),
+            (phase == 0.0).astype(np.float64),
+            phase,
+            state.age / (state.age + 10.0),
+            0.5 * np.log(local),
+            0.5 * np.log(copies / self.reference[:, None]).reshape(-1, runs),
+            0.5 * np.log(fused / self.reference[:, None]),
+            state.prior_mean / self.magnitude[:, None],
+        )
+
+    def truth(self, state: MarkovJumpState) -> Array:
+        """The plant's state (n, N)."""
+        return state.truth
+
+    def fused(self, state: MarkovJumpState) -> tuple[Array, Array]:
+        """The centre's mean (n, N) and covariance (n, n, N)."""
+        return state.mean, state.covariance
+
+    def local_means(self, state: MarkovJumpState) -> Array:
+        """The nodes' estimates (sensors, n, N); nothing is fed back to them."""
+        return self._collapse(state.node_mean)
+
+    def open_loop(self, horizon: int) -> Array:
+        """Mean error variance (n,) over t = 1..horizon of a centre that never receives."""
+        return self.model.open_loop(horizon)
+
+    def full_rate_traces(self) -> Array:
+        """Trace of the optimal fused covariance over one period at full rate, (period,).
+
+        In the steady state, every node sending at every step: tr P_d of (33) and its period.
+        """
+        local = self.recursion.local[..., -self.filters.period :]
+        means = np.zeros((self.sensor_count, self.plant.size, self.filters.period))
+        return linalg.trace(MatrixWeightedFusion().fuse(means, local)[1])
+
+    def _collapse(self, mean: Array) -> Array:
+        """From ζ̂ (l, a, N) to x̂ = Σ_m ζ̂_m (l, n, N).
+
+        Source: markov_jump, equation (44).
+        """
+        n = self.plant.size
+        result = mean[:, :n].copy()
+        for first in range(n, mean.shape[1], n):
+            result += mean[:, first : first + n]
+        return result
+
+    def _lag_deviation(self, offer: Offer) -> Array:
+        """Predicted deviations (l, n, N) of node minus copy, never zero."""
+        nodes = np.arange(self.sensor_count)
+        variance = linalg.diagonal(offer.lag[nodes, nodes])
+        return np.sqrt(np.maximum(variance, (_FLOOR * _FLOOR) * self.reference[:, None]))
+
+    def _weighted_trace(self, covariance: Array) -> Array:
+        return (self.state_weights[:, None] * linalg.diagonal(covariance)).sum(-2)
+
+    def _variance_reduction(self, state: MarkovJumpState, offer: Offer) -> Array:
+        silent = self._weighted_trace(state.prior_covariance)
+        nobody = np.zeros(state.sent.shape, dtype=np.bool_)
+        each = self._covariances_with_one_more(state, offer, nobody)
+        return np.stack([silent - self._weighted_trace(covariance) for covariance in each])
+
+    def _greedy_variance(self, state: MarkovJumpState, offer: Offer) -> Array:
+        """Sensors join one after another, each time the one that lowers the trace most."""
+        sent = np.zeros(state.sent.shape, dtype=np.bool_)
+        sensors, result = np.arange(self.sensor_count)[:, None], np.empty(sent.shape)
+        trace = linalg.trace(state.prior_covariance)
+        for _ in range(self.sensor_count):
+            each = self._covariances_with_one_more(state, offer, sent)
+            options = np.where(sent, np.inf, [linalg.trace(covariance) for covariance in each])
+            chosen = sensors == options.argmin(0)
+            result[chosen] = np.broadcast_to(trace, sent.shape)[chosen]
+            trace, sent = options.min(0), sent | chosen
+        return result
+
+    def _covariances_with_one_more(
+        self, state: MarkovJumpState, offer: Offer, sent: NDArray[np.bool_]
+    ) -> list[Array]:
+        """Fused covariances (n, n, N) if ``sent`` (l, N) and one sensor more transmit, each."""
+        means, each = self._collapse(state.copy_mean), []
+        for sensor in range(self.sensor_count):
+            more = sent.copy()
+            more[sensor] = True
+            each.append(self.fusion.fuse(means, offer.joint(more))[1])
+        return each
+
+
+def _sensed(state: MarkovJumpState) -> Offer:
+    if state.offer is None:
+        raise RuntimeError("the state has no measurements yet: call sense first")
+    return state.offer

@@ -1,0 +1,1 @@
+"""Scalar sources over a lossy channel, the case with a solved optimum."""

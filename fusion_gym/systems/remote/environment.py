@@ -1,0 +1,200 @@
+"""Remote estimation of scalar sources, the case with a solved optimum: options, environment.
+
+Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop channel with
+Markovian state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.channel import CHANNELS, INITIAL_STATES, Channel
+from fusion_gym.core.options import CommonOptions, choose, finish, make_bucket
+from fusion_gym.core.reward import Price
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
+from fusion_gym.systems.remote.system import RemoteEstimationSystem
+from fusion_gym.validation import ConfigurationError
+
+
+@dataclass(frozen=True)
+class RemoteEstimationOptions(CommonOptions):
+    """Every option of the environment.
+
+    With the defaults the reward is the literature's cost, with the opposite sign: the squared
+    error plus ``cost_weight`` for each transmission.
+    """
+
+    # Sources
+    sensors: int = 1
+    coefficient: ArrayLike = 1.0
+    noise_deviation: ArrayLike = 1.0
+    initial_deviation: ArrayLike = 0.0
+    # Channel: a pair (bad, good) of losses where it is "gilbert_elliott", which has its own default
+    channel: str = "perfect"
+    drop_probability: ArrayLike | None = None
+    channel_transition: ArrayLike | None = None
+    initial_channel: str = "stationary"
+    # Observation
+    error_scale: ArrayLike | None = None
+    # Network
+    tokens: str = "unlimited"
+    token_rate: float = 0.25
+    token_capacity: float = 5.0
+    initial_tokens: float = 1.0
+    token_cost: ArrayLike = 1.0
+    # Episode and reward
+    horizon: int = 200
+    cost_weight: float | str = 5.0
+    state_weights: ArrayLike | None = None
+
+
+_DROP: dict[str, ArrayLike] = {"independent": 0.2, "gilbert_elliott": (0.7, 0.2)}
+_TRANSITION: ArrayLike = ((0.7, 0.3), (0.1, 0.9))
+
+
+def build(**options: Any) -> Task:
+    """The task for these options, checked before anything runs.
+
+    Raises:
+        ConfigurationError: an unknown option, or a value that is not allowed.
+    """
+    chosen, limit = choose(RemoteEstimationOptions, "fusion_gym/RemoteEstimation-v0", options)
+    validation.integer("horizon", chosen.horizon, at_least=1)
+    sensors = validation.integer("sensors", chosen.sensors, at_least=1)
+    weights = (
+        np.ones(sensors)
+        if chosen.state_weights is None
+        else validation.not_negative("state_weights", chosen.state_weights, (sensors,))
+    )
+    deviation = validation.positive("noise_deviation", chosen.noise_deviation, (sensors,))
+    system = RemoteEstimationSystem(
+        coefficient=validation.spread("coefficient", chosen.coefficient, (sensors,)),
+        deviation=deviation,
+        initial_deviation=validation.not_negative(
+            "initial_deviation", chosen.initial_deviation, (sensors,)
+        ),
+        channel=_channel(chosen, sensors),
+        error_scale=_error_scale(chosen, deviation, weights),
+        state_weights=weights,
+    )
+    with np.errstate(over="ignore"):
+        open_loop = system.open_loop(chosen.horizon)
+    if not np.isfinite(open_loop).all():
+        raise ConfigurationError(
+            f"coefficient = {np.asarray(chosen.coefficient).tolist()} is not allowed with "
+            f"horizon = {chosen.horizon}: the error without transmissions must stay finite"
+        )
+    return finish(chosen, system, limit, weights)
+
+
+def _channel(chosen: RemoteEstimationOptions, sensors: int) -> Channel:
+    kind = validation.choice("channel", chosen.channel, CHANNELS)
+    validation.choice("initial_channel", chosen.initial_channel, INITIAL_STATES)
+    if kind != "gilbert_elliott" and chosen.channel_transition is not None:
+        raise ConfigurationError(
+            f"channel_transition = {chosen.channel_transition!r} is not allowed with "
+            f"channel={kind!r}: it belongs to 'gilbert_elliott'"
+        )
+    if kind == "perfect":
+        if chosen.drop_probability is not None:
+            raise ConfigurationError(
+                f"drop_probability = {chosen.drop_probability!r} is not allowed with "
+                "channel='perfect': it belongs to 'independent' and 'gilbert_elliott'"
+            )
+        return Channel.perfect(sensors)
+    drop = _DROP[kind] if chosen.drop_probability is None else chosen.drop_probability
+    if kind == "independent":
+        return Channel.independent(drop, sensors)
+    transition = _TRANSITION if chosen.channel_transition is None else chosen.channel_transition
+    return Channel.gilbert_elliott(transition, drop, sensors, chosen.initial_channel)
+
+
+def _error_scale(chosen: RemoteEstimationOptions, deviation: Array, weights: Array) -> Array:
+    """What observed errors are divided by (n,): about the optimal threshold of a random walk.
+
+    A price alone makes it (6 price/weight)^¼ σ^½ in continuous time, a limited rate r of
+    transmissions σ/√r; a scale is never below σ.
+    """
+    sensors = len(deviation)
+    if chosen.error_scale is not None:
+        return validation.positive("error_scale", chosen.error_scale, (sensors,))
+    price = Price.create(chosen.cost_weight, chosen.price_range)
+    bucket = make_bucket(chosen, sensors)
+    weights = weights * validation.number("error_weight", chosen.error_weight, at_least=0.0)
+    middle = float(np.sqrt(np.prod(price.span))) if price.span else float(price.fixed or 0.0)
+    cost = bucket.cost[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(weights > 0.0, 6.0 * middle * cost / weights, 0.0)
+    threshold = ratio**0.25 * np.sqrt(deviation)
+    sharing = float(sensors) if chosen.access != "any" else 1.0
+    if not bucket.unlimited:
+        sharing = max(sharing, float(cost.sum()) / max(bucket.rate, 1e-3))
+    return np.maximum(np.maximum(threshold, deviation * np.sqrt(sharing)), deviation)
+
+
+_PAGE = """
+    Scalar sources that drift away from what the centre believes, and a price for every packet:
+    the problem whose optimum is known.
+
+    ## Description
+    Source i follows x(t+1) = a x(t) + w(t), w ~ N(0, σ²), and sensor i sees it exactly. The centre
+    takes over what arrives and predicts a x̂ otherwise. A channel may lose what was granted:
+    independently, or as a Gilbert-Elliott channel whose state of the step before is fed back.
+    With one source, or several that share nothing, a threshold on the absolute error that depends
+    on channel state and tokens is optimal, and ``fusion_gym.solvers`` computes it.
+
+    ## Action space
+    ``MultiBinary(sensors)``: 1 requests a transmission of that source's value. With
+    ``action="discrete"`` it is ``Discrete(2**sensors)``, the bits as one number, sensor 0 lowest.
+
+    ## Observation space
+    A ``Box`` of float32; ``env.unwrapped.observation_names`` names every entry. Entries marked *
+    are missing with ``information="centre"``, those marked + with a channel without states.
+
+    | entries | meaning | range |
+    |---|---|---|
+    | error[sensor] * | value minus the centre's prediction, over ``error_scale`` | -5..5 |
+    | age[sensor] | k/(k + 10), k steps since the last delivery | 0..1 |
+    | channel[sensor,bad], channel[sensor,good] + | state at the step before, one-hot | 0..1 |
+    | tokens | over the capacity | 0..1 |
+
+    ## Reward
+    -(error_weight · Σ wᵢ eᵢ² + cost_weight · tokens spent), e the error after the delivery. By
+    default every wᵢ is 1 and a transmission spends 1 token, lost or not, so that ``cost_weight``
+    is the price of a transmission. With ``error="trace"`` the variances by age stand for the
+    squared errors. ``info["rewards"]`` has the two terms.
+
+    ## Starting state
+    x(0) ~ N(0, initial_deviation²), by default 0, and the centre believes 0.
+
+    ## Episode end
+    Truncation after ``horizon`` steps, never termination.
+
+    ## Info
+    ``cost`` = ``cost_tokens`` (tokens spent, >= 0), ``rewards`` (``error``, ``cost``),
+    ``granted`` and ``denied`` (one a sensor; a granted packet may be lost), ``squared_error``
+    (one a source), ``diverged``.
+
+    ## Arguments
+    The fields of :class:`RemoteEstimationOptions`; docs/remote_estimation.md explains each.
+
+    ## Version history
+    - v0: first version.
+"""
+
+
+class RemoteEstimationEnv(RegisteredEnv):
+    __doc__ = _PAGE
+    build = staticmethod(build)
+
+
+class RemoteEstimationVectorEnv(RegisteredVectorEnv):
+    __doc__ = _PAGE
+    build = staticmethod(build)

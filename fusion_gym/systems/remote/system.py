@@ -1,0 +1,249 @@
+"""Scalar sources, each watched by a sensor that sees it exactly, over a channel that may lose.
+
+Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop channel with
+Markovian state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym.arrays import Array
+from fusion_gym.core.channel import STATES, Channel
+from fusion_gym.core.system import Feature, Signal, SignalArray, feature_block
+
+_RANGE = 5.0  # scaled errors are clipped here
+_FLOOR = 1e-12  # variance after a delivery, in process variances: zero could not be inverted
+
+
+@dataclass(slots=True)
+class RemoteEstimationState:
+    """Everything about N runs at one time; n sources, one sensor each.
+
+    ``truth`` x and ``prior`` a x̂(t-1) (n, N) · ``estimate`` x̂ (n, N), after the delivery ·
+    ``prior_variance`` and ``variance`` (n, N), of the errors by age · ``held`` (n, N), the last
+    delivered value · ``age`` (n, N), steps since then · ``channel`` (n, N), the state S(t-1) that
+    was fed back · ``next_channel`` (n, N), S(t) · ``lost`` (n, N) bool, whether a packet sent now
+    is lost.
+    """
+
+    truth: Array
+    prior: Array
+    estimate: Array
+    prior_variance: Array
+    variance: Array
+    held: Array
+    age: Array
+    channel: NDArray[np.int64]
+    next_channel: NDArray[np.int64]
+    lost: NDArray[np.bool_]
+
+
+_ONE = "(sensors, 1, N)"
+SIGNALS = (
+    Signal("measurement", "sensor", _ONE, "the source's value"),
+    Signal("innovation", "sensor", _ONE, "the error that silence leaves: value minus prediction"),
+    Signal("held", "centre", _ONE, "the last delivered value"),
+    Signal("age", "centre", "(sensors, N)", "steps since the last delivery"),
+    Signal("expected_measurement", "centre", _ONE, "the centre's prediction"),
+    Signal("innovation_deviation", "centre", _ONE, "the innovation's deviation by age"),
+    Signal("channel_state", "centre", "(sensors, N)", "channel at the step before: 0 bad, 1 good"),
+    Signal("prior_mean", "centre", "(n, N)", "prediction of the sources"),
+    Signal("prior_covariance", "centre", "(n, n, N)", "its covariance by age"),
+    Signal("silent_variance", "centre", "(N,)", "its weighted trace"),
+    Signal(
+        "variance_reduction",
+        "centre",
+        "(sensors, N)",
+        "how far that trace is expected to fall if this sensor alone transmits",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class RemoteEstimationSystem:
+    """n independent sources x(t+1) = a x(t) + w(t), w ~ N(0, σ²), and the optimal estimator.
+
+    x̂ = x on a delivery, a x̂ otherwise: optimal under every rule that is symmetric in the error.
+    Silence then says nothing about the error's sign; what it says about its size the variances by
+    age ignore. The centre feeds back the channel's state and whether a packet arrived, so that the
+    sensor knows x̂.
+
+    Shapes: ``coefficient`` a, ``deviation`` σ, ``initial_deviation`` of x(0), ``error_scale`` that
+    divides observed errors, and ``state_weights``: (n,).
+    """
+
+    coefficient: Array
+    deviation: Array
+    initial_deviation: Array
+    channel: Channel
+    error_scale: Array
+    state_weights: Array
+
+    @property
+    def sensor_count(self) -> int:
+        """Number of sensors, one a source."""
+        return len(self.coefficient)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """One name a source."""
+        return tuple(f"x{i + 1}" for i in range(self.sensor_count))
+
+    @property
+    def noise_channels(self) -> int:
+        """Normals of one step: the sources', then those of channel state and loss."""
+        extra = (self.channel.states > 1) + self.channel.loses
+        return self.sensor_count * (1 + extra)
+
+    @property
+    def start_channels(self) -> int:
+        """Normals of a start: x(0), then the channel's state."""
+        return self.sensor_count * (1 + (self.channel.states > 1))
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """The signals that :meth:`read` offers."""
+        return SIGNALS
+
+    @property
+    def features(self) -> tuple[tuple[Feature, ...], ...]:
+        """Blocks of the observation; see docs/remote_estimation.md."""
+        sensors = range(self.sensor_count)
+        own = [(i, f"{i}") for i in sensors]
+        error = feature_block("error", own, "sensor", _RANGE)
+        age = feature_block("age", own, "centre")
+        states = [(i, f"{i},{name}") for i in sensors for name in STATES]
+        channel = feature_block("channel", states, "centre")
+        return (error, age, channel) if self.channel.states > 1 else (error, age)
+
+    def start(self, noise: Array) -> RemoteEstimationState:
+        """Time 0: x(0) is drawn about zero, which is all that the centre knows."""
+        sensors, runs = self.sensor_count, noise.shape[-1]
+        truth = self.initial_deviation[:, None] * noise[:sensors]
+        nothing = np.zeros((sensors, runs))
+        variance = np.repeat(self.initial_deviation[:, None] ** 2, runs, axis=1)
+        known = np.zeros((sensors, runs), dtype=np.int64)
+        if self.channel.states > 1:
+            known = self.channel.start(noise[sensors:])
+        return RemoteEstimationState(
+            truth=truth,
+            prior=nothing,
+            estimate=nothing,
+            prior_variance=variance,
+            variance=variance,
+            held=nothing,
+            age=nothing,
+            channel=known,
+            next_channel=known,
+            lost=np.zeros((sensors, runs), dtype=np.bool_),
+        )
+
+    def sense(self, state: RemoteEstimationState, noise: Array) -> RemoteEstimationState:
+        """The sources and the channels move, the centre predicts."""
+        sensors = self.sensor_count
+        a, sigma = self.coefficient[:, None], self.deviation[:, None]
+        channel = state.next_channel
+        following, lost = channel, np.zeros(channel.shape, dtype=np.bool_)
+        if self.channel.states > 1:
+            following = self.channel.advance(channel, noise[sensors : 2 * sensors])
+        if self.channel.loses:
+            lost = self.channel.lost(following, noise[-sensors:])
+        return replace(
+            state,
+            truth=a * state.truth + sigma * noise[:sensors],
+            prior=a * state.estimate,
+            prior_variance=a * a * state.variance + sigma * sigma,
+            age=state.age + 1.0,
+            channel=channel,
+            next_channel=following,
+            lost=lost,
+        )
+
+    def deliver(
+        self, state: RemoteEstimationState, granted: NDArray[np.bool_]
+    ) -> RemoteEstimationState:
+        """What was granted and not lost arrives; elsewhere the centre keeps its prediction."""
+        arrived = granted & ~state.lost
+        floor = _FLOOR * self.deviation[:, None] ** 2
+        return replace(
+            state,
+            estimate=np.where(arrived, state.truth, state.prior),
+            variance=np.where(arrived, floor, state.prior_variance),
+            held=np.where(arrived, state.truth, state.held),
+            age=np.where(arrived, 0.0, state.age),
+        )
+
+    def read(
+        self, state: RemoteEstimationState
+    ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
+        """The signals named in ``SIGNALS``."""
+        return {
+            "measurement": state.truth[:, None],
+            "innovation": lambda: (state.truth - state.prior)[:, None],
+            "held": state.held[:, None],
+            "age": state.age,
+            "expected_measurement": state.prior[:, None],
+            "innovation_deviation": lambda: np.sqrt(state.prior_variance)[:, None],
+            "channel_state": state.channel,
+            "prior_mean": state.prior,
+            "prior_covariance": lambda: _diagonal(state.prior_variance),
+            "silent_variance": lambda: self._weighted(state.prior_variance).sum(0),
+            "variance_reduction": lambda: (
+                self._weighted(state.prior_variance) * self._arrival_probability(state.channel)
+            ),
+        }
+
+    def observe(self, state: RemoteEstimationState) -> Sequence[Array]:
+        """The blocks named in :attr:`features`, before clipping to their bounds."""
+        error = (state.truth - state.prior) / self.error_scale[:, None]
+        blocks = [error, state.age / (state.age + 10.0)]
+        if self.channel.states > 1:
+            hot = state.channel[:, None] == np.arange(len(STATES))[:, None]
+            blocks.append(hot.reshape(-1, error.shape[-1]).astype(np.float64))
+        return blocks
+
+    def truth(self, state: RemoteEstimationState) -> Array:
+        """The sources (n, N)."""
+        return state.truth
+
+    def fused(self, state: RemoteEstimationState) -> tuple[Array, Array]:
+        """The centre's mean (n, N) and covariance by age (n, n, N).
+
+        After a delivery the error is zero; its variance is given as 1e-12 σ².
+        """
+        return state.estimate, _diagonal(state.variance)
+
+    def local_means(self, state: RemoteEstimationState) -> Array:
+        """The nodes' means (sensors, n, N): each knows its source, and x̂ of the others."""
+        own = np.eye(self.sensor_count, dtype=np.bool_)[..., None]
+        return np.where(own, state.truth, state.estimate)
+
+    def open_loop(self, horizon: int) -> Array:
+        """Mean error variance (n,) over t = 1..horizon of a centre that never receives."""
+        variance, total = self.initial_deviation**2, np.zeros(self.sensor_count)
+        for _ in range(horizon):
+            variance = self.coefficient**2 * variance + self.deviation**2
+            total = total + variance
+        return total / horizon
+
+    def _weighted(self, variance: Array) -> Array:
+        return self.state_weights[:, None] * variance
+
+    def _arrival_probability(self, channel: NDArray[np.int64]) -> Array:
+        """Probability (sensors, N) that a packet arrives, given the state before."""
+        sensor = np.arange(self.sensor_count)[:, None]
+        return 1.0 - (self.channel.transition @ self.channel.drop)[channel, sensor]
+
+
+def _diagonal(variance: Array) -> Array:
+    """Covariances (n, n, N) of independent errors with variances (n, N)."""
+    size = len(variance)
+    result = np.zeros((size, *variance.shape))
+    for i in range(size):
+        result[i, i] = variance[i]
+    return result

@@ -1,0 +1,275 @@
+"""The paper's Tobit Kalman filter: it minimises a bound of its error covariance.
+
+Source: tobit_token_bucket, Theorems 1 and 2. Four readings, each checked by simulation and
+described in docs/tobit_oscillator.md: (29) starts from the previous posterior; K_{t+1} in (30) is
+K_t; C{Υ∘Ω}Cᵀ is Υ∘(C Ω Cᵀ); without a delivery the filter really updates with the held value.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
+from fusion_gym.systems.tobit.filters import Expectation, Plan, linear_update
+from fusion_gym.systems.tobit.sensors import CensoredSensors
+from fusion_gym.systems.tobit.tobit_filter import expect_censored
+from fusion_gym.validation import ConfigurationError
+
+# Below this probability of an uncensored value, q counts as this: q enters only in ratios whose
+# limits are reached long before, and 1/q must stay finite.
+_SMALLEST_PROBABILITY = 1e-290
+# The same where a held value is divided by q, and the ratio is squared.
+_SMALLEST_DIVISOR = 1e-140
+# Starved, the bound grows as 1.25^t; it is kept below this trace, where squares do not overflow.
+_LARGEST_TRACE = 1e100
+
+
+@dataclass(frozen=True)
+class BoundConstants:
+    """The constants κ₁..κ₈ of the bound and (1 + ε₁₄, 1 + 1/ε₁₄), from ε₁..ε₁₄ > 0.
+
+    Source: tobit_token_bucket, below equation (30).
+    """
+
+    kappa: tuple[float, ...]
+    second_moment: tuple[float, float]
+
+    @classmethod
+    def create(cls, epsilon: ArrayLike) -> BoundConstants:
+        """From the 14 scalars.
+
+        Raises:
+            ConfigurationError: not 14 numbers > 0.
+        """
+        e = validation.positive(
+            "bound_epsilon", validation.array("bound_epsilon", epsilon, (14,)), (14,)
+        )
+        kappa = (
+            1 + e[0] + e[1] + e[2] + e[3] + e[4],
+            1 + 1 / e[0] + 1 / e[6] + 1 / e[9] + 1 / e[11] + 1 / e[12],
+            1 + e[5],
+            1 + e[6] + e[7] + e[8] + 1 / e[1],
+            1 + 1 / e[2] + 1 / e[7] + e[9] + e[10],
+            1 + 1 / e[3] + e[11],
+            1 + 1 / e[4] + 1 / e[8] + 1 / e[10] + e[12],
+            1 + 1 / e[5],
+        )
+        return cls(tuple(float(k) for k in kappa), (float(1 + e[13]), float(1 + 1 / e[13])))
+
+
+@dataclass(frozen=True)
+class EventError:
+    """The bound Ξ of the event error that the paper adds to a delivered measurement.
+
+    Ξ(G) = ``growth`` G + ``offset``, G' = Ξ(G), G₀ = ``initial``; each of shape (sensors, 1), in
+    squared units of the measurement. It belongs to the dynamic event trigger: a delivered
+    measurement is the current one and has no event error, whatever the policy.
+    Source: tobit_token_bucket, equations (33), (34) and below (30).
+    """
+
+    growth: Array
+    offset: Array
+    initial: Array
+
+    def at(self, time: Array) -> Array:
+        """Ξ(G_{t-1}) at the steps t = ``time`` (N,) counted from 1, shape (sensors, N).
+
+        The trigger's first decision, at t = 1, uses η₀, whose square G₀ bounds.
+        """
+        rate, logarithm = self._growth_rate
+        ramp = np.where(rate == 0.0, time, np.expm1(logarithm * time) / np.where(rate, rate, 1.0))
+        return self.initial * np.exp(logarithm * time) + self.offset * ramp
+
+    @functools.cached_property
+    def _growth_rate(self) -> tuple[Array, Array]:
+        """Growth - 1 and the growth's logarithm, exact also where the growth is nearly 1."""
+        rate = self.growth - 1.0
+        return rate, np.log1p(rate)
+
+    @classmethod
+    def create(
+        cls,
+        threshold: ArrayLike,
+        decay: ArrayLike,
+        divisor: ArrayLike,
+        initial: ArrayLike,
+        young: tuple[float, float],
+        sensors: int,
+    ) -> EventError:
+        """From σ_m, λ_m, χ_m, η_{m,0} of the trigger and (d, e) of the bound.
+
+        Raises:
+            ConfigurationError: a wrong shape, a negative number, or χ, d, e not > 0.
+        """
+        shape = (sensors,)
+        sigma = validation.not_negative("trigger_threshold", threshold, shape)
+        lam = validation.not_negative("trigger_decay", decay, shape)
+        chi = validation.positive("trigger_divisor", divisor, shape)
+        eta = validation.not_negative("trigger_initial", initial, shape)
+        d, e = validation.positive("bound_young", young, (2,))
+        growth = (1 + d) * (1 + e) * lam**2 + (1 + chi) * (1 + 1 / d) / chi**2
+        offset = ((1 + d) * (1 + 1 / e) + (1 + 1 / d) * (1 + 1 / chi)) * sigma**2
+        return cls(growth[:, None], offset[:, None], (eta**2)[:, None])
+
+
+@dataclass(frozen=True)
+class BoundTobitFilter:
+    """Tobit Kalman filter whose gain minimises the trace of the paper's bound.
+
+    ``event_error`` (or None) is the κ₆ Ξ term of a delivery; ``hold`` says what happens without
+    one: True updates with the held value as the paper does, False predicts.
+    """
+
+    sensors: CensoredSensors
+    constants: BoundConstants
+    event_error: EventError | None
+    hold: bool
+
+    def __post_init__(self) -> None:
+        matrices = self.sensors.measurement_matrix[..., 0]
+        ranks = np.linalg.matrix_rank(matrices)
+        if self.hold and np.any(ranks < self.sensors.size):
+            raise ConfigurationError(
+                f"measurement_matrices with row ranks {ranks.tolist()} are not allowed with "
+                f"filter='paper', silent='hold': each must have its {self.sensors.size} rows "
+                "independent, since (37) has no noise term in the held update"
+            )
+
+    def expect(self, mean: Array) -> Expectation:
+        """See :class:`fusion_gym.systems.tobit.filters.NodeFilter`."""
+        return expect_censored(self.sensors, mean)
+
+    def plan(
+        self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
+    ) -> Plan:
+        """See :class:`fusion_gym.systems.tobit.filters.NodeFilter`.
+
+        Source: tobit_token_bucket, equations (30) and (37). At the optimal gain (30) is
+        κ₁ P - κ₁ P C̃ᵀ Φ⁻¹ C̃ P κ₁, with Φ = κ₁ C̃ P C̃ᵀ + S and C̃ = q C.
+        """
+        matrix = self.sensors.measurement_matrix
+        cross = linalg.matmul(matrix, covariance)
+        spread = linalg.matmul(cross, linalg.transpose(matrix))
+        latent = expectation.latent
+        grow, shift = self.constants.second_moment
+        moment = grow * spread + shift * linalg.outer(latent, latent)
+        correction, delivered = self._delivered(covariance, spread, moment, expectation, time)
+        if not self.hold:
+            return Plan(correction, delivered, mean, covariance)
+        silent = self._held(mean, covariance, cross, spread, moment, expectation, held)
+        return Plan(correction, delivered, *silent)
+
+    def _delivered(
+        self, covariance: Array, spread: Array, moment: Array, expectation: Expectation, time: Array
+    ) -> tuple[Array, Array]:
+        """θ = 0: correction and bound."""
+        k1, k2, k3, _, _, k6, _, k8 = self.constants.kappa
+        variance, threshold = self.sensors.variance, self.sensors.finite_threshold
+        q = np.maximum(expectation.uncensored_probability, _SMALLEST_PROBABILITY)
+        a = q * expectation.hazard * self.sensors.deviation
+        noise = q * variance + q * (1.0 - q) * (k3 * linalg.diagonal(moment) + k8 * threshold**2)
+        if self.event_error is not None:
+            noise = noise + k6 * self.event_error.at(time)[:, None]
+        total = linalg.outer(q, q) * (k1 * spread) + k2 * linalg.outer(a, a)
+        total = linalg.add_diagonal(total, noise)
+        weighted = q[:, :, None] * self.sensors.measurement_matrix
+        return linear_update(k1 * covariance, weighted, total)
+
+    def _held(
+        self,
+        mean: Array,
+        covariance: Array,
+        cross: Array,
+        spread: Array,
+        moment: Array,
+        expectation: Expectation,
+        held: Array,
+    ) -> tuple[Array, Array]:
+        """θ = 1: mean and bound after the update with the held value ȳ.
+
+        Every term of Φ but two is scaled by q on both sides, so the update is written in units of
+        q: Φ = q (N + F Fᵀ) q with F = [√κ₅ ȳ, √κ₇ (1 - q) τ]/q, whose rows may be huge and of very
+        different size. :func:`_pinned_solve` takes them in without loss of digits, and the gain
+        itself, which grows as 1/q, is never formed.
+        """
+        k1, k2, _, k4, k5, _, k7, _ = self.constants.kappa
+        threshold = self.sensors.finite_threshold
+        q = np.maximum(expectation.uncensored_probability, _SMALLEST_PROBABILITY)
+        bias = expectation.hazard * self.sensors.deviation
+        core = k1 * spread + k4 * moment + k2 * linalg.outer(bias, bias)
+        columns = _pinned_columns(held, threshold, q, np.sqrt(k5), np.sqrt(k7))
+        whitened, shift = _pinned_solve(core, cross, columns)
+        uncensored = expectation.latent + bias
+        step = linalg.matvec(linalg.transpose(cross), shift) - linalg.matvec(
+            linalg.transpose(whitened), uncensored
+        )
+        bound = k1 * covariance - k1**2 * linalg.matmul(linalg.transpose(cross), whitened)
+        bound = linalg.symmetrise(bound)
+        trace = linalg.trace(bound)
+        if np.any(trace > _LARGEST_TRACE):
+            bound *= np.minimum(1.0, _LARGEST_TRACE / trace)[:, None, None]
+        return mean + k1 * step, bound
+
+
+def _pinned_columns(
+    held: Array, threshold: Array, q: Array, a: float, b: float
+) -> list[tuple[Array, Array]]:
+    """Columns of F and factors c with F c = (ȳ - u)/q and F Fᵀ = (a² ȳ ȳᵀ + b² u uᵀ)/q².
+
+    ``held`` ȳ and ``q`` are (…, m, N), ``threshold`` τ broadcasts to them, u = (1 - q) τ; a factor
+    is (…, 1, N). The columns a ȳ and b u are rotated into each other so that the second is zero
+    in the row p where the first is largest. Its other rows are a b/r times
+    ȳ_p u - u_p ȳ = (e_p τ - τ_p e) - q ȳ_p τ + q_p τ_p ȳ with e = ȳ - τ, which loses no digits
+    where ȳ lies at the threshold and q is tiny.
+    """
+    floored = np.maximum(q, _SMALLEST_DIVISOR)
+    if not np.any(threshold):
+        return [(a * held / floored, np.full(held[..., :1, :].shape, 1.0 / a))]
+    u = (1.0 - q) * threshold
+    size = np.hypot(a * held, b * u)
+    row = np.argmax(size / floored, axis=-2)[..., None, :]
+
+    def at_row(values: Array) -> Array:
+        return np.take_along_axis(np.broadcast_to(values, size.shape), row, axis=-2)
+
+    radius = at_row(size)
+    radius = np.where(radius > 0.0, radius, 1.0)
+    held_p, u_p, q_p, threshold_p = at_row(held), at_row(u), at_row(q), at_row(threshold)
+    above = held - threshold
+    above_p = at_row(above)
+    crossed = (above_p * threshold - threshold_p * above) / floored
+    crossed += q_p / q * threshold_p * held - held_p * threshold
+    crossed *= a * b / radius
+    np.put_along_axis(crossed, row, 0.0, axis=-2)
+    first = (a * a * held_p * held + b * b * u_p * u) / (radius * floored)
+    return [
+        (first, (above_p + q_p * threshold_p) / radius),
+        (crossed, -(a / b * held_p + b / a * u_p) / radius),
+    ]
+
+
+def _pinned_solve(
+    core: Array, right: Array, columns: list[tuple[Array, Array]]
+) -> tuple[Array, Array]:
+    """(N + F Fᵀ)⁻¹ B and (N + F Fᵀ)⁻¹ F c, one column of F after another.
+
+    ``core`` N (…, m, m, N) is positive definite, ``right`` B (…, m, n, N); ``columns`` are those
+    of :func:`_pinned_columns`. Each step is the Sherman-Morrison formula: with h = M⁻¹ f,
+    (M + f fᵀ)⁻¹ = M⁻¹ - h hᵀ/(1 + fᵀ h), and (M + f fᵀ)⁻¹ f = h/(1 + fᵀ h).
+    """
+    n = right.shape[-2]
+    stacked = np.concatenate([right, *(f[..., None, :] for f, _ in columns)], axis=-2)
+    solved = linalg.solve(core, stacked)
+    shift = np.zeros_like(columns[0][0])
+    for place, (f, factor) in enumerate(columns):
+        h = solved[..., n + place, :]
+        weight = h / (1.0 + linalg.dot(f, h))[..., None, :]
+        shift = shift + weight * (factor - linalg.dot(f, shift)[..., None, :])
+        projected = linalg.matvec(linalg.transpose(solved), f)
+        solved = solved - linalg.outer(weight, projected)
+    return solved[..., :n, :], shift

@@ -1,0 +1,160 @@
+"""Nodes and fusion centre: from the centre's prediction and what arrived to the fused estimate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.fusion.feedback import FeedbackFusion
+from fusion_gym.systems.tobit.assumed_density import AssumedDensityFilter
+from fusion_gym.systems.tobit.filters import Expectation, NodeFilter, Plan
+from fusion_gym.systems.tobit.sensors import CensoredSensors
+
+
+class Outlook(NamedTuple):
+    """What centre and nodes expect before anything is sent.
+
+    ``expectation`` of the measurements, ``deviation`` (sensors, m, N) of the innovation, and the
+    nodes' ``plan`` where there are nodes.
+    """
+
+    expectation: Expectation
+    deviation: Array
+    plan: Plan | None
+
+
+class Posterior(NamedTuple):
+    """``mean`` (n, N) and ``covariance`` (n, n, N) of the centre, ``local_mean`` (sensors, n, N)
+    of the nodes before any feedback (the centre's own where it filters by itself)."""
+
+    mean: Array
+    covariance: Array
+    local_mean: Array
+
+
+class Centre(Protocol):
+    """Nodes and centre behind one interface."""
+
+    @property
+    def sensors(self) -> CensoredSensors:
+        """The sensors."""
+        ...
+
+    def look(self, mean: Array, covariance: Array, held: Array, time: Array) -> Outlook:
+        """Expectations under the centre's prediction (n, N), (n, n, N)."""
+        ...
+
+    def update(
+        self,
+        mean: Array,
+        covariance: Array,
+        outlook: Outlook,
+        measurement: Array,
+        granted: NDArray[np.bool_],
+    ) -> Posterior:
+        """The posterior after the granted (sensors, N) of the measurements (sensors, m, N)."""
+        ...
+
+    def variances(self, mean: Array, covariance: Array, outlook: Outlook) -> tuple[Array, Array]:
+        """Fused trace (N,) if nobody transmits, and its reduction (sensors, N) by each alone."""
+        ...
+
+
+@dataclass(frozen=True)
+class FeedbackCentre:
+    """A node filter for each sensor, fusion, and the result fed back to the nodes.
+
+    Source: tobit_token_bucket, equations (20)-(23), (29)-(37), (50), (51); round_robin_tobit,
+    equations (18)-(28).
+    """
+
+    filter: NodeFilter
+    fusion: FeedbackFusion
+
+    @property
+    def sensors(self) -> CensoredSensors:
+        """The sensors."""
+        return self.filter.sensors
+
+    def look(self, mean: Array, covariance: Array, held: Array, time: Array) -> Outlook:
+        """See :class:`Centre`."""
+        nodes = self.fusion.distribute(mean, covariance)
+        expectation = self.filter.expect(nodes[0])
+        matrix = self.sensors.measurement_matrix
+        spread = (matrix * linalg.matmul(matrix, covariance)).sum(-2)
+        q = expectation.uncensored_probability
+        floor = 1e-3 * self.sensors.variance
+        deviation = np.sqrt(q * q * spread + expectation.noise_variance + floor)
+        return Outlook(expectation, deviation, self.filter.plan(*nodes, expectation, held, time))
+
+    def update(
+        self,
+        mean: Array,
+        covariance: Array,
+        outlook: Outlook,
+        measurement: Array,
+        granted: NDArray[np.bool_],
+    ) -> Posterior:
+        """Each node takes the planned outcome of the network's answer; the centre fuses."""
+        plan = _planned(outlook)
+        innovation = measurement - outlook.expectation.value
+        update = linalg.matvec(linalg.transpose(plan.correction), innovation)
+        grant = granted[:, None]
+        local_mean = np.where(grant, mean + update, plan.silent_mean)
+        local = np.where(grant[:, None], plan.delivered_covariance, plan.silent_covariance)
+        return Posterior(*self.fusion.fuse(local_mean, local), local_mean)
+
+    def variances(self, mean: Array, covariance: Array, outlook: Outlook) -> tuple[Array, Array]:
+        """See :class:`Centre`; by the bound where the filter minimises one."""
+        plan = _planned(outlook)
+        fused = self.fusion.fuse_alone(plan.silent_covariance, plan.delivered_covariance)
+        silent, alone = (linalg.trace(covariance) for covariance in fused)
+        return silent, silent - alone
+
+
+@dataclass(frozen=True)
+class SequentialCentre:
+    """The centre itself takes the delivered measurements one after another; there are no nodes."""
+
+    filter: AssumedDensityFilter
+
+    @property
+    def sensors(self) -> CensoredSensors:
+        """The sensors."""
+        return self.filter.sensors
+
+    def look(self, mean: Array, covariance: Array, held: Array, time: Array) -> Outlook:
+        """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
+        expectation = self.filter.expect(mean, covariance)
+        floor = 1e-3 * self.sensors.variance
+        return Outlook(expectation, np.sqrt(expectation.noise_variance + floor), None)
+
+    def update(
+        self,
+        mean: Array,
+        covariance: Array,
+        outlook: Outlook,
+        measurement: Array,
+        granted: NDArray[np.bool_],
+    ) -> Posterior:
+        """See :class:`Centre`."""
+        mean, covariance = self.filter.update(mean, covariance, measurement, granted)
+        local = np.broadcast_to(mean, (self.sensors.count, *mean.shape))
+        return Posterior(mean, covariance, local)
+
+    def variances(self, mean: Array, covariance: Array, outlook: Outlook) -> tuple[Array, Array]:
+        """See :class:`Centre`; the reduction is the expected one."""
+        silent = linalg.trace(covariance)
+        expected = self.filter.expected_covariance(mean, covariance)
+        return silent, silent - linalg.trace(expected)
+
+
+def _planned(outlook: Outlook) -> Plan:
+    if outlook.plan is None:
+        raise RuntimeError("the outlook has no plan: it was made by another centre")
+    return outlook.plan

@@ -1,0 +1,182 @@
+"""What every node filter of censored sensors offers, and the two that take values as they are.
+
+Before the network answers, a node already knows everything but whether its request is granted:
+the delivered value would be the current measurement, the alternative is the held one. So a filter
+plans both outcomes at once; a grant selects one of them. Neither covariance depends on the
+current measurement, so a policy may look at both without looking at the measurement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
+from fusion_gym.systems.tobit.sensors import CensoredSensors
+from fusion_gym.validation import ConfigurationError
+
+
+class Expectation(NamedTuple):
+    """What a node expects of its next measurement; every array has shape (sensors, m, N).
+
+    ``latent``: C x̂, the expectation without censoring. ``value``: the expectation of the censored
+    measurement. ``noise_variance``: variance of the censored measurement given the predicted
+    state. ``uncensored_probability`` q, ``hazard`` λ and ``truncated_variance`` v of the
+    standardised threshold (of 1, 0 and 1 where a filter ignores censoring).
+    """
+
+    latent: Array
+    value: Array
+    noise_variance: Array
+    uncensored_probability: Array
+    hazard: Array
+    truncated_variance: Array
+
+
+class Plan(NamedTuple):
+    """Both outcomes at every node.
+
+    ``correction`` (sensors, m, n, N): the transposed gain of a delivery, so that the delivered
+    mean is prior + correctionᵀ innovation; ``delivered_covariance`` (sensors, n, n, N);
+    ``silent_mean`` (sensors, n, N) and ``silent_covariance`` (sensors, n, n, N).
+    """
+
+    correction: Array
+    delivered_covariance: Array
+    silent_mean: Array
+    silent_covariance: Array
+
+
+class NodeFilter(Protocol):
+    """A local filter for sensors of one kind, all nodes at once."""
+
+    @property
+    def sensors(self) -> CensoredSensors:
+        """The sensors whose measurements the nodes filter."""
+        ...
+
+    def expect(self, mean: Array) -> Expectation:
+        """Expectation of the measurements from the prior means (sensors, n, N)."""
+        ...
+
+    def plan(
+        self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
+    ) -> Plan:
+        """Both outcomes from the priors (sensors, n, N), (sensors, n, n, N).
+
+        ``held`` (sensors, m, N) is the last delivered measurement, ``time`` (N,) the number of
+        the step in its episode, counted from 1.
+        """
+        ...
+
+
+def linear_update(
+    covariance: Array, matrix: Array, innovation_covariance: Array
+) -> tuple[Array, Array]:
+    """Correction S⁻¹ C P (…, m, n, N) and posterior covariance P - P Cᵀ S⁻¹ C P (…, n, n, N).
+
+    The minimum-variance update for ``matrix`` C (…, m, n, N) and innovation covariance S
+    (…, m, m, N), S ⪰ C P Cᵀ.
+    """
+    cross = linalg.matmul(matrix, covariance)
+    correction = linalg.solve(innovation_covariance, cross)
+    reduction = linalg.matmul(linalg.transpose(cross), correction)
+    return correction, linalg.symmetrise(covariance - reduction)
+
+
+@dataclass(frozen=True)
+class KalmanFilter:
+    """Kalman filter that ignores censoring; when nothing arrives the prior is the posterior.
+
+    S = C P Cᵀ + R, K = P Cᵀ S⁻¹. Biased wherever measurements are censored: it stands beside the
+    Tobit filters to show what they are worth.
+    """
+
+    sensors: CensoredSensors
+
+    def expect(self, mean: Array) -> Expectation:
+        """See :class:`NodeFilter`."""
+        latent = linalg.matvec(self.sensors.measurement_matrix, mean)
+        one = np.ones_like(latent)
+        return Expectation(
+            latent=latent,
+            value=latent,
+            noise_variance=self.sensors.variance * one,
+            uncensored_probability=one,
+            hazard=np.zeros_like(latent),
+            truncated_variance=one,
+        )
+
+    def plan(
+        self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
+    ) -> Plan:
+        """See :class:`NodeFilter`; ``held`` and ``time`` do not matter here."""
+        matrix = self.sensors.measurement_matrix
+        innovation = linalg.congruence(matrix, covariance)
+        innovation = linalg.add_diagonal(innovation, self.sensors.variance)
+        correction, posterior = linear_update(covariance, matrix, innovation)
+        return Plan(correction, posterior, mean, covariance)
+
+
+@dataclass(frozen=True)
+class StochasticEventFilter:
+    """A delivery is a Kalman update; silence is a measurement too, of variance R + Z⁻¹.
+
+    A sensor that stays silent with probability exp(-zᵀ Z z / 2), z its innovation and
+    Z = ``weight`` · I, says by its silence that z was small: as if z = 0 had been measured with
+    the additional noise variance Z⁻¹. So the silent mean is the prior's, and
+    P' = P - P Cᵀ (C P Cᵀ + R + Z⁻¹)⁻¹ C P. Under federated fusion several nodes together give the
+    exact posterior, whatever mixture of deliveries and silences occurred, because z is taken
+    against the centre's prediction, which all nodes share.
+
+    Exact if the policy is ``stochastic_event`` with this weight, every request is granted and the
+    sensors are uncensored. Otherwise silence is over-interpreted: after a denial, under censoring
+    or with a more silent policy the claimed covariance is too small.
+
+    ``weight`` has shape (sensors, 1), in the inverse squared unit of the measurement, >= 0; with
+    weight 0 silence says nothing. Build one with :meth:`create`.
+
+    Source: D. Han, Y. Mo, J. Wu, S. Weerakkody, B. Sinopoli and L. Shi, "Stochastic
+    event-triggered sensor schedule for remote state estimation", IEEE Trans. Automatic Control
+    60(10), 2015, the estimator of the closed-loop schedule.
+    """
+
+    sensors: CensoredSensors
+    weight: Array
+
+    @classmethod
+    def create(cls, sensors: CensoredSensors, weight: ArrayLike | None) -> StochasticEventFilter:
+        """Check the weight, one number > 0 or one a sensor.
+
+        Raises:
+            ConfigurationError: no weight, another number of entries, or an entry <= 0.
+        """
+        if weight is None:
+            raise ConfigurationError(
+                "stochastic_weight = None is not allowed with filter='stochastic': it must be the "
+                "weight of the policy 'stochastic_event', a number > 0 or one a sensor"
+            )
+        checked = validation.positive("stochastic_weight", weight, (sensors.count,))
+        return cls(sensors, checked[:, None])
+
+    def expect(self, mean: Array) -> Expectation:
+        """See :class:`NodeFilter`; censoring is ignored."""
+        return KalmanFilter(self.sensors).expect(mean)
+
+    def plan(
+        self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
+    ) -> Plan:
+        """See :class:`NodeFilter`; ``held`` and ``time`` do not matter here."""
+        matrix = self.sensors.measurement_matrix
+        innovation = linalg.congruence(matrix, covariance)
+        innovation = linalg.add_diagonal(innovation, self.sensors.variance)
+        correction, delivered = linear_update(covariance, matrix, innovation)
+        # Both sides times √Z, so that weight 0 is no exception: √Z C measured with √Z S √Z + I.
+        weight = self.weight[:, None, None]
+        scaled = linalg.add_diagonal(weight * innovation, np.ones((matrix.shape[-3], 1)))
+        _, silent = linear_update(covariance, np.sqrt(weight) * matrix, scaled)
+        return Plan(correction, delivered, mean, silent)

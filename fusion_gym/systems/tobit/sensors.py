@@ -1,0 +1,104 @@
+"""Linear sensors whose components are censored at thresholds (the Tobit model)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
+from fusion_gym.validation import ConfigurationError
+
+
+@dataclass(frozen=True)
+class CensoredSensors:
+    """y = clip(C x + v, τ, υ) by component, v ~ N(0, diag(R)), for several sensors of equal size.
+
+    ``deviation`` is √R, ``uncensored`` marks lower thresholds of minus infinity, which
+    ``finite_threshold`` replaces by zero; ``two_sided`` says whether any upper threshold is
+    finite, and ``finite_upper`` replaces those that are not by zero.
+
+    Shapes: ``measurement_matrix`` C (sensors, m, n, 1), ``variance`` R (sensors, m, 1),
+    ``threshold`` τ and ``upper`` υ (sensors, m, 1), in the unit of the measurement, minus and plus
+    infinity where a component is not censored on that side. Build one with :meth:`create`.
+
+    Source: tobit_token_bucket, equations (1) and (2); round_robin_tobit, equations (2) and (6).
+    """
+
+    measurement_matrix: Array
+    variance: Array
+    threshold: Array
+    upper: Array
+    deviation: Array
+    uncensored: NDArray[np.bool_]
+    finite_threshold: Array
+    finite_upper: Array
+    two_sided: bool
+
+    @classmethod
+    def create(
+        cls,
+        measurement_matrix: ArrayLike,
+        variance: ArrayLike,
+        threshold: ArrayLike,
+        states: int,
+        upper: ArrayLike = np.inf,
+    ) -> CensoredSensors:
+        """Check plain arrays: C (sensors, m, states); R, τ and υ broadcast to (sensors, m).
+
+        Raises:
+            ConfigurationError: a wrong shape, a variance <= 0, a lower threshold that is not below
+                the upper one, or an entry that is not finite (but for infinite thresholds).
+        """
+        matrix = validation.array("measurement_matrices", measurement_matrix, (None, None, states))
+        shape = matrix.shape[:2]
+        low = validation.spread("censoring_threshold", threshold, shape, infinity=-1)
+        high = validation.spread("censoring_upper", upper, shape, infinity=1)
+        if np.any(low >= high):
+            raise ConfigurationError(
+                f"censoring_threshold = {low.tolist()} is not allowed: each must be below "
+                f"censoring_upper = {high.tolist()}"
+            )
+        uncensored = np.isneginf(low)
+        noise = validation.positive("measurement_variance", variance, shape)[..., None]
+        return cls(
+            measurement_matrix=matrix[..., None],
+            variance=noise,
+            threshold=low[..., None],
+            upper=high[..., None],
+            deviation=np.sqrt(noise),
+            uncensored=uncensored[..., None],
+            finite_threshold=np.where(uncensored, 0.0, low)[..., None],
+            finite_upper=np.where(np.isposinf(high), 0.0, high)[..., None],
+            two_sided=bool(np.isfinite(high).any()),
+        )
+
+    @property
+    def count(self) -> int:
+        """Number of sensors."""
+        return self.measurement_matrix.shape[0]
+
+    @property
+    def size(self) -> int:
+        """Number of measured components m of each sensor."""
+        return self.measurement_matrix.shape[1]
+
+    @property
+    def noise_channels(self) -> int:
+        """Standard normals that one measurement of all sensors consumes."""
+        return self.count * self.size
+
+    def measure(self, state: Array, noise: Array) -> Array:
+        """Censored measurements (sensors, m, N) of the state (n, N) from normals (sensors·m, N)."""
+        shape = (self.count, self.size, noise.shape[-1])
+        latent = linalg.matvec(self.measurement_matrix, state)
+        latent += self.deviation * noise.reshape(shape)
+        np.maximum(latent, self.threshold, out=latent)
+        return np.minimum(latent, self.upper, out=latent) if self.two_sided else latent
+
+    def censored(self, measurement: Array) -> NDArray[np.bool_]:
+        """Which components (sensors, m, N) lie at a threshold."""
+        below = measurement <= self.threshold
+        return below | (measurement >= self.upper) if self.two_sided else below

@@ -1,0 +1,283 @@
+"""A linear plant and censored sensors, with nodes and a fusion centre.
+
+Source: tobit_token_bucket (Chen, Han, Song and Zhang, Complex Eng. Syst. 4:19, 2024);
+round_robin_tobit (Geng, Wang, Alsaadi, Alharbi and Cheng, 2020).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.core.system import Feature, Knowledge, Signal, SignalArray
+from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.tobit.centre import Centre, FeedbackCentre, Outlook
+from fusion_gym.systems.tobit.filters import KalmanFilter
+
+_WHITE = 5.0  # whitened quantities are clipped at this many standard deviations
+_LOG_RANGE = 5.0  # log variance ratios are clipped here: starved bounds grow as 1.25^t
+
+
+@dataclass(slots=True)
+class CensoredState:
+    """Everything about N runs at one time; shapes with n states, l sensors, m components.
+
+    ``truth`` (n, N) · ``measurement`` (l, m, N) · ``held`` (l, m, N), the last delivered
+    measurement · ``age`` (l, N), steps since then · ``time`` (N,), the step in the episode ·
+    ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N), the centre's prediction · ``outlook``,
+    what is expected of the measurements · ``local_mean`` (l, n, N), the nodes' posterior before
+    the feedback · ``mean`` (n, N), ``covariance`` (n, n, N), the fused posterior.
+    """
+
+    truth: Array
+    measurement: Array
+    held: Array
+    age: Array
+    time: Array
+    prior_mean: Array
+    prior_covariance: Array
+    outlook: Outlook | None
+    local_mean: Array
+    mean: Array
+    covariance: Array
+
+
+_COMPONENTS = "(sensors, m, N)"
+SIGNALS = (
+    Signal("measurement", "sensor", _COMPONENTS, "the new censored measurement"),
+    Signal("innovation", "sensor", _COMPONENTS, "measurement minus its expectation"),
+    Signal("censored", "sensor", _COMPONENTS, "whether the component is at its threshold"),
+    Signal("held", "centre", _COMPONENTS, "the last delivered measurement"),
+    Signal("age", "centre", "(sensors, N)", "steps since the last delivery"),
+    Signal("expected_measurement", "centre", _COMPONENTS, "the measurement's expectation"),
+    Signal("innovation_deviation", "centre", _COMPONENTS, "the innovation's predicted deviation"),
+    Signal("uncensored_probability", "centre", _COMPONENTS, "predicted, from 0 to 1"),
+    Signal("prior_mean", "centre", "(n, N)", "the centre's prediction"),
+    Signal("prior_covariance", "centre", "(n, n, N)", "its covariance"),
+    Signal("silent_variance", "centre", "(N,)", "fused trace if nobody transmits"),
+    Signal(
+        "variance_reduction",
+        "centre",
+        "(sensors, N)",
+        "how far that trace falls if this sensor alone transmits, whatever it measured",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class CensoredSystem:
+    """Joins a plant, censored sensors, and a centre with or without nodes.
+
+    ``model`` is the plant that the filters believe in; the true one is ``plant``.
+
+    ``random_start`` draws the initial mean, known to the filters, in a uniformly random direction
+    with the length of the plant's initial mean; for the oscillator that is a random phase.
+    ``scale`` (n,) are the magnitudes by which observed state estimates are divided, and
+    ``reference`` (n,) the variances against which observed variances are taken.
+    """
+
+    plant: LinearPlant
+    model: LinearPlant
+    centre: Centre
+    random_start: bool
+    state_names: tuple[str, ...]
+    scale: Array
+    reference: Array
+
+    @property
+    def sensor_count(self) -> int:
+        """Number of sensors."""
+        return self.centre.sensors.count
+
+    @property
+    def noise_channels(self) -> int:
+        """Normals of one step: process noise, then the sensors' noises."""
+        return self.plant.noise_channels + self.centre.sensors.noise_channels
+
+    @property
+    def start_channels(self) -> int:
+        """Normals of a start: its direction, its deviation, the noise of the first measurement."""
+        return 2 * self.plant.size + self.centre.sensors.noise_channels
+
+    @property
+    def covariance_cycle(self) -> int | None:
+        """1 where covariances follow from the deliveries: Kalman filters, and nothing censored.
+
+        With federated fusion they are then the actual ones, if ``model`` is the plant; with
+        covariance intersection they are bounds.
+        """
+        sensors, centre = self.centre.sensors, self.centre
+        linear = isinstance(centre, FeedbackCentre) and isinstance(centre.filter, KalmanFilter)
+        return 1 if linear and sensors.uncensored.all() and not sensors.two_sided else None
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """The signals that :meth:`read` offers."""
+        return SIGNALS
+
+    @property
+    def features(self) -> tuple[tuple[Feature, ...], ...]:
+        """Blocks of the observation; see docs/tobit_oscillator.md."""
+        sensors, size = self.sensor_count, self.centre.sensors.size
+
+        def block(kind: str, knowledge: Knowledge, low: float, high: float) -> tuple[Feature, ...]:
+            return tuple(
+                Feature(f"{kind}[{s},{c}]", knowledge, low, high, sensor=s)
+                for s in range(sensors)
+                for c in range(size)
+            )
+
+        def fed_back(kind: str, limit: float) -> tuple[Feature, ...]:
+            return tuple(
+                Feature(f"{kind}[{name}]", "centre", -limit, limit, broadcast=True)
+                for name in self.state_names
+            )
+
+        return (
+            block("whitened_innovation", "sensor", -_WHITE, _WHITE),
+            block("censored", "sensor", 0.0, 1.0),
+            block("held_difference", "sensor", -_WHITE, _WHITE),
+            block("uncensored_probability", "centre", 0.0, 1.0),
+            tuple(Feature(f"age[{s}]", "centre", 0.0, 1.0, sensor=s) for s in range(sensors)),
+            fed_back("log_variance", _LOG_RANGE),
+            fed_back("estimate", _WHITE),
+        )
+
+    def start(self, noise: Array) -> CensoredState:
+        """Time 0: the state is drawn and every first measurement is known, free of charge."""
+        n, sensors = self.plant.size, self.centre.sensors
+        mean = np.broadcast_to(self.plant.initial_mean, (n, noise.shape[-1])).copy()
+        if self.random_start:
+            direction = noise[:n] / np.sqrt(linalg.dot(noise[:n], noise[:n]))
+            mean = np.sqrt(linalg.dot(mean, mean)) * direction
+        truth = self.plant.start(mean, noise[n : 2 * n])
+        measurement = sensors.measure(truth, noise[2 * n :])
+        runs = noise.shape[-1]
+        covariance = np.broadcast_to(self.model.initial_covariance, (n, n, runs)).copy()
+        return CensoredState(
+            truth=truth,
+            measurement=measurement,
+            held=measurement,
+            age=np.zeros((sensors.count, runs)),
+            time=np.zeros(runs),
+            prior_mean=mean,
+            prior_covariance=covariance,
+            outlook=None,
+            local_mean=np.broadcast_to(mean, (sensors.count, *mean.shape)).copy(),
+            mean=mean,
+            covariance=covariance,
+        )
+
+    def sense(self, state: CensoredState, noise: Array) -> CensoredState:
+        """The plant moves, the sensors measure, centre and nodes predict.
+
+        Source: tobit_token_bucket, equations (1), (2), (21), (23), (29).
+        """
+        r = self.plant.noise_channels
+        truth = self.plant.advance(state.truth, noise[:r])
+        prior_mean, prior_covariance = self.model.predict(state.mean, state.covariance)
+        time = state.time + 1.0
+        return CensoredState(
+            truth=truth,
+            measurement=self.centre.sensors.measure(truth, noise[r:]),
+            held=state.held,
+            age=state.age + 1.0,
+            time=time,
+            prior_mean=prior_mean,
+            prior_covariance=prior_covariance,
+            outlook=self.centre.look(prior_mean, prior_covariance, state.held, time),
+            local_mean=state.local_mean,
+            mean=state.mean,
+            covariance=state.covariance,
+        )
+
+    def deliver(self, state: CensoredState, granted: NDArray[np.bool_]) -> CensoredState:
+        """Nodes and centre update with what the network granted (sensors, N).
+
+        Source: tobit_token_bucket, equations (20), (22), (30), (50).
+        """
+        posterior = self.centre.update(
+            state.prior_mean, state.prior_covariance, _outlook(state), state.measurement, granted
+        )
+        return CensoredState(
+            truth=state.truth,
+            measurement=state.measurement,
+            held=np.where(granted[:, None], state.measurement, state.held),
+            age=np.where(granted, 0.0, state.age),
+            time=state.time,
+            prior_mean=state.prior_mean,
+            prior_covariance=state.prior_covariance,
+            outlook=state.outlook,
+            local_mean=posterior.local_mean,
+            mean=posterior.mean,
+            covariance=posterior.covariance,
+        )
+
+    def read(self, state: CensoredState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
+        """The signals named in ``SIGNALS``."""
+        expectation, deviation, _ = _outlook(state)
+
+        @functools.cache
+        def variances() -> tuple[Array, Array]:
+            return self.centre.variances(state.prior_mean, state.prior_covariance, _outlook(state))
+
+        return {
+            "measurement": state.measurement,
+            "innovation": lambda: state.measurement - expectation.value,
+            "censored": lambda: self.centre.sensors.censored(state.measurement),
+            "held": state.held,
+            "age": state.age,
+            "expected_measurement": expectation.value,
+            "innovation_deviation": deviation,
+            "uncensored_probability": expectation.uncensored_probability,
+            "prior_mean": state.prior_mean,
+            "prior_covariance": state.prior_covariance,
+            "silent_variance": lambda: variances()[0],
+            "variance_reduction": lambda: variances()[1],
+        }
+
+    def observe(self, state: CensoredState) -> Sequence[Array]:
+        """The blocks named in :attr:`features`, before clipping to their bounds."""
+        expectation, deviation, _ = _outlook(state)
+        runs = state.truth.shape[-1]
+        innovation = (state.measurement - expectation.value) / deviation
+        sensors = self.centre.sensors
+        difference = (state.measurement - state.held) / (2.0 * sensors.deviation)
+        variance = linalg.diagonal(state.prior_covariance) / self.reference[:, None]
+        return (
+            innovation.reshape(-1, runs),
+            sensors.censored(state.measurement).reshape(-1, runs).astype(np.float64),
+            difference.reshape(-1, runs),
+            expectation.uncensored_probability.reshape(-1, runs),
+            state.age / (state.age + 10.0),
+            np.log(variance),
+            state.prior_mean / self.scale[:, None],
+        )
+
+    def truth(self, state: CensoredState) -> Array:
+        """The plant's state (n, N)."""
+        return state.truth
+
+    def fused(self, state: CensoredState) -> tuple[Array, Array]:
+        """The centre's mean (n, N) and covariance (n, n, N)."""
+        return state.mean, state.covariance
+
+    def local_means(self, state: CensoredState) -> Array:
+        """The nodes' posterior means (sensors, n, N) before the feedback."""
+        return state.local_mean
+
+    def open_loop(self, horizon: int) -> Array:
+        """Mean error variance (n,) over t = 1..horizon of a centre that only predicts."""
+        return self.plant.open_loop(horizon)
+
+
+def _outlook(state: CensoredState) -> Outlook:
+    if state.outlook is None:
+        raise RuntimeError("the state has no measurements yet: call sense first")
+    return state.outlook

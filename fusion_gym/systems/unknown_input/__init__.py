@@ -1,0 +1,1 @@
+"""A plant with an unknown input: unknown_input."""

@@ -1,0 +1,336 @@
+"""Two carts under an unknown force, or the paper's example: numbers, options, environment.
+
+Source: unknown_input, Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
+cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", Frontiers of
+Information Technology & Electronic Engineering 24, 2023.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.options import CommonOptions, choose, finish
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
+from fusion_gym.policies.rules.adaptive_threshold import check_thresholds
+from fusion_gym.systems.unknown_input.bound_filter import BoundTables
+from fusion_gym.systems.unknown_input.examples import EXAMPLES
+from fusion_gym.systems.unknown_input.filters import ExactInputStateFilter, RandomWalkInputFilter
+from fusion_gym.systems.unknown_input.fusion import NodeFusion
+from fusion_gym.systems.unknown_input.input_state import InputModel, JointGain
+from fusion_gym.systems.unknown_input.nodes import Nodes, RunNodes, TableNodes
+from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
+from fusion_gym.systems.unknown_input.sensors import InputSensors
+from fusion_gym.systems.unknown_input.signals import (
+    GivenInput,
+    InputSignal,
+    MeanRevertingWalk,
+    Sinusoids,
+    Steps,
+)
+from fusion_gym.systems.unknown_input.system import UnknownInputSystem
+from fusion_gym.validation import ConfigurationError
+
+FILTERS = ("random_walk", "predict", "paper")
+FUSIONS = ("ci", "exact_ci", "sci", "sici", "ici")
+SIGNALS = ("sinusoids", "steps", "random_walk")
+
+
+@dataclass(frozen=True)
+class UnknownInputOptions(CommonOptions):
+    """Every option of the environment.
+
+    ``None`` stands for the number of the chosen ``example``, which
+    :mod:`fusion_gym.systems.unknown_input.examples` lists; a number that is given goes before it.
+    """
+
+    example: str = "two_carts"
+    # Plant, equation (1)
+    transition: ArrayLike | None = None
+    input_matrix: ArrayLike | None = None
+    process_covariance: ArrayLike | None = None
+    sampling_period: int = 2
+    initial_mean: ArrayLike | None = None
+    initial_covariance: ArrayLike | None = None
+    initial_half_width: ArrayLike | None = None
+    # The unknown input
+    input_signal: str | ArrayLike = "sinusoids"
+    input_amplitude: ArrayLike | None = None
+    input_period: ArrayLike | None = None
+    input_phase: ArrayLike | str | None = None
+    # Sensors, equation (2)
+    measurement_matrices: ArrayLike | None = None
+    measurement_covariance: ArrayLike | None = None
+    # Nodes and fusion, equations (8)-(25)
+    filter: str | None = None
+    young_factor: ArrayLike | None = None
+    input_memory: ArrayLike | None = None
+    input_change: ArrayLike | None = None
+    input_deviation: ArrayLike | None = None
+    hold_variance: ArrayLike | None = None
+    fusion: str = "ci"
+    # Adaptive threshold trigger, equations (5)-(7)
+    rho_bar: ArrayLike | None = None
+    rho_initial: ArrayLike | None = None
+    adaptation: ArrayLike | None = None
+    # Network, episode and reward
+    tokens: str = "unlimited"
+    input_weight: float = 1.0
+
+
+def build(**options: Any) -> Task:
+    """The task for these options, checked before anything runs.
+
+    Raises:
+        ConfigurationError: an unknown option, or a value that is not allowed.
+    """
+    chosen, limit = choose(UnknownInputOptions, "fusion_gym/UnknownInput-v0", options)
+    chosen = _with_example(chosen)
+    horizon = validation.integer("horizon", chosen.horizon, at_least=1)
+    plant = _plant(chosen)
+    signal = _signal(chosen, plant.inputs, horizon)
+    sensors = InputSensors.create(
+        _given(chosen.measurement_matrices), _given(chosen.measurement_covariance), plant
+    )
+    trigger = _trigger(chosen, sensors.count)
+    open_loop = plant.open_loop(signal, horizon)
+    if np.any(open_loop[plant.size :] <= 0.0):
+        raise ConfigurationError(
+            "input_signal is not allowed: every input must differ from zero somewhere before the "
+            "horizon, or there is nothing to estimate"
+        )
+    if np.any(open_loop <= 0.0):
+        raise ConfigurationError(
+            f"process_covariance = {np.asarray(chosen.process_covariance).tolist()} is not "
+            "allowed: every state must be moved by the input or by noise before the horizon, or "
+            "be uncertain at the start"
+        )
+    weights = _weights(chosen, open_loop, plant.inputs)
+    system = UnknownInputSystem(
+        plant=plant,
+        signal=signal,
+        nodes=_nodes(chosen, plant, sensors, horizon),
+        state_names=_state_names(chosen, plant),
+        state_weights=weights,
+        magnitude=plant.magnitude(signal, horizon),
+        reference=open_loop,
+    )
+    return finish(chosen, system, limit, weights, policy_defaults={"adaptive_threshold": trigger})
+
+
+def _with_example(chosen: UnknownInputOptions) -> UnknownInputOptions:
+    """The options with the example's numbers where none were given."""
+    example = EXAMPLES[validation.choice("example", chosen.example, EXAMPLES)]
+    numbers = {name: value for name, value in example.items() if name != "signals"}
+    kind = chosen.input_signal
+    if isinstance(kind, str):
+        validation.choice("input_signal", kind, SIGNALS)
+        shape = zip(
+            ("input_amplitude", "input_period", "input_phase"),
+            example["signals"][kind],
+            strict=True,
+        )
+        numbers |= dict(shape)
+    if chosen.transition is not None or chosen.initial_mean is not None:
+        numbers.pop("initial_half_width", None)
+    missing = {
+        field.name: numbers[field.name]
+        for field in fields(chosen)
+        if field.name in numbers and getattr(chosen, field.name) is None
+    }
+    return replace(chosen, **missing)
+
+
+def _plant(chosen: UnknownInputOptions) -> UnknownInputPlant:
+    half = chosen.initial_half_width
+    return UnknownInputPlant.create(
+        _given(chosen.transition),
+        _given(chosen.input_matrix),
+        _given(chosen.process_covariance),
+        chosen.sampling_period,
+        _given(chosen.initial_mean),
+        _given(chosen.initial_covariance),
+        half,
+    )
+
+
+def _given(value: ArrayLike | None) -> ArrayLike:
+    """A number that the example has filled in."""
+    assert value is not None, "the examples give every number"
+    return value
+
+
+def _signal(chosen: UnknownInputOptions, inputs: int, horizon: int) -> InputSignal:
+    kind = chosen.input_signal
+    shape = {
+        name: getattr(chosen, name) for name in ("input_amplitude", "input_period", "input_phase")
+    }
+    if not isinstance(kind, str):
+        for name, value in shape.items():
+            if value is not None:
+                raise ConfigurationError(
+                    f"{name} = {value!r} is not allowed with an array as input_signal: it must be "
+                    "None"
+                )
+        return GivenInput.create(inputs, kind, horizon)
+    amplitude, period, phase = shape.values()
+    if kind == "sinusoids":
+        return Sinusoids.create(inputs, amplitude, period, phase)
+    if not (isinstance(phase, str) and phase == "random"):
+        raise ConfigurationError(
+            f"input_phase = {phase!r} is not allowed with input_signal={kind!r}: phases belong to "
+            "'sinusoids'"
+        )
+    if kind == "steps":
+        return Steps.create(inputs, amplitude, period)
+    return MeanRevertingWalk.create(inputs, amplitude, period)
+
+
+def _nodes(
+    chosen: UnknownInputOptions, plant: UnknownInputPlant, sensors: InputSensors, horizon: int
+) -> Nodes:
+    kind = validation.choice("filter", chosen.filter, FILTERS)
+    factor = validation.positive("young_factor", _given(chosen.young_factor), (sensors.count,))
+    model = InputModel.create(
+        plant,
+        _given(chosen.input_memory),
+        _given(chosen.input_change),
+        _given(chosen.input_deviation),
+    )
+    joint = JointGain.create(plant, sensors)
+    fusion = NodeFusion(_fusion(chosen.fusion, sensors.count), plant.size)
+    hold = None
+    if chosen.hold_variance is not None:
+        if kind != "random_walk":
+            raise ConfigurationError(
+                f"hold_variance = {chosen.hold_variance!r} is not allowed with filter={kind!r}: "
+                "it belongs to filter='random_walk'"
+            )
+        hold = validation.not_negative("hold_variance", chosen.hold_variance, (sensors.count,))
+        hold = hold[:, None, None, None]
+    if kind == "paper":
+        tables = BoundTables.create(joint, model, _given(chosen.rho_bar), factor, horizon)
+        return TableNodes.create(model, sensors, tables, fusion)
+    if kind == "predict":
+        return RunNodes(model, sensors, ExactInputStateFilter(model, joint), fusion)
+    return RunNodes(model, sensors, RandomWalkInputFilter(model, sensors), fusion, hold)
+
+
+def _fusion(kind: str, sensors: int) -> str:
+    if kind in ("information", "federated"):
+        raise ConfigurationError(
+            f"fusion = {kind!r} is not allowed: it must be one of 'ci', 'exact_ci', 'sci', "
+            "'sici', 'ici', for the errors of all nodes contain the same process noise, nothing "
+            "is fed back, and adding their information would count it several times"
+        )
+    kind = validation.choice("fusion", kind, FUSIONS)
+    if kind == "ici" and sensors != 2:
+        raise ConfigurationError(
+            f"fusion = 'ici' is not allowed with {sensors} sensors: it joins exactly two (use "
+            "'sici', which takes one after the other)"
+        )
+    return kind
+
+
+def _trigger(chosen: UnknownInputOptions, sensors: int) -> dict[str, tuple[float, ...]]:
+    """Parameters of the adaptive threshold trigger, one number a sensor."""
+    names = ("rho_bar", "rho_initial", "adaptation")
+    spread = {
+        name: tuple(validation.spread(name, _given(getattr(chosen, name)), (sensors,)).tolist())
+        for name in names
+    }
+    check_thresholds(*spread.values())
+    return spread
+
+
+def _weights(chosen: UnknownInputOptions, open_loop: Array, inputs: int) -> Array:
+    """w_i = g_i/(Σ g · open loop of i), g = 1 for states and ``input_weight`` for inputs."""
+    if chosen.state_weights is not None:
+        return validation.not_negative("state_weights", chosen.state_weights, open_loop.shape)
+    share = np.ones(len(open_loop))
+    share[len(share) - inputs :] = validation.number(
+        "input_weight", chosen.input_weight, at_least=0.0
+    )
+    weights: Array = share / (share.sum() * open_loop)
+    return weights
+
+
+def _state_names(chosen: UnknownInputOptions, plant: UnknownInputPlant) -> tuple[str, ...]:
+    if chosen.example == "two_carts" and (plant.size, plant.inputs) == (4, 1):
+        return ("position_1", "velocity_1", "position_2", "velocity_2", "force")
+    states = tuple(f"x{i + 1}" for i in range(plant.size))
+    return states + tuple(f"d{i + 1}" for i in range(plant.inputs))
+
+
+_PAGE = """
+    Two carts, tied by springs, under a force that nobody knows. Three sensors each see the carts
+    in part: who should transmit, and when?
+
+    ## Description
+    The state is the positions and velocities of two carts; the force on the first is unknown to
+    filters and policies and drawn anew in every episode. The carts are sampled every second small
+    step. Each node estimates the state and, one sampling instant late, the force, from what its
+    sensor transmitted; the centre fuses the nodes by covariance intersection. Nothing is fed back.
+    ``example="paper"`` gives the paper's system instead: two states, two inputs, two sensors, and
+    its own filter.
+
+    ## Action space
+    ``MultiBinary(sensors)``: 1 requests a transmission of that sensor's measurement. With
+    ``action="discrete"`` it is ``Discrete(2**sensors)``, the bits as one number, sensor 0 lowest.
+
+    ## Observation space
+    A ``Box`` of float32; ``env.unwrapped.observation_names`` names every entry. Entries marked *
+    are missing with ``information="centre"``. A "state" is a state or an input.
+
+    | entries | meaning | range |
+    |---|---|---|
+    | whitened_innovation[sensor,component] * | innovation of the node over its deviation | -5..5 |
+    | held_difference[sensor,component] * | new minus held, over √2 noise deviations | -5..5 |
+    | age[sensor] | a/(a + 10), a instants since the last delivery | 0..1 |
+    | local_log_deviation[sensor,state] | ln of predicted over open-loop deviation, node | -5..5 |
+    | log_deviation[state] | the same of the last fused estimate | -5..5 |
+    | estimate[state] | fused prediction over the root mean square | -5..5 |
+    | tokens | over the capacity | 0..1 |
+
+    ## Reward
+    -(error_weight · Σ wᵢ eᵢ² + cost_weight · tokens spent), e the fused estimate's error of the
+    present state and of the input that has just acted. By default a centre that always takes the
+    force for zero pays 1 a step, each state and input an equal share of it; ``input_weight``
+    changes the inputs' share. With ``error="trace"`` the fused covariance stands for the squared
+    errors. ``info["rewards"]`` has the two terms.
+
+    ## Starting state
+    x₀ ~ N(0, 0.1 I), or, in the paper's example, uniform on [0.16, 0.18]. The measurement at time
+    0 has been delivered.
+
+    ## Episode end
+    Truncation after ``horizon`` steps, never termination.
+
+    ## Info
+    ``cost`` = ``cost_tokens`` (tokens spent, >= 0), ``rewards`` (``error``, ``cost``),
+    ``granted`` and ``denied`` (one a sensor), ``squared_error`` (states, then inputs),
+    ``diverged``.
+
+    ## Arguments
+    The fields of :class:`UnknownInputOptions`; docs/unknown_input.md explains each, and what the
+    paper's text gets wrong.
+
+    ## Version history
+    - v0: first version.
+"""
+
+
+class UnknownInputEnv(RegisteredEnv):
+    __doc__ = _PAGE
+    build = staticmethod(build)
+
+
+class UnknownInputVectorEnv(RegisteredVectorEnv):
+    __doc__ = _PAGE
+    build = staticmethod(build)

@@ -1,0 +1,72 @@
+"""The two filters of a state with an unknown input that predict where nothing arrives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.systems.unknown_input.input_state import InputModel, JointGain
+from fusion_gym.systems.unknown_input.sensors import InputSensors
+
+
+@dataclass(frozen=True)
+class ExactInputStateFilter:
+    """Unbiased minimum-variance estimates of state and input from the latest measurement.
+
+    An update assumes nothing about the input that has just acted: its estimate comes from this
+    measurement alone. While every measurement arrives the covariance is therefore the actual one,
+    for every input. Where none arrives there is nothing to estimate the input from, and the node
+    predicts with the :class:`InputModel`; from then on its covariance is a claim that is as good
+    as the model.
+
+    Source: S. Gillijns and B. De Moor, "Unbiased minimum-variance input and state estimation for
+    linear discrete-time systems", Automatica 43, 2007; unknown_input, equations (8)-(16) with
+    every measurement sent.
+    """
+
+    model: InputModel
+    joint: JointGain
+
+    def update(self, posterior: Array, noise: Array) -> tuple[Array, Array]:
+        """Gain (l, s, m, N) and covariance (l, s, s, N) from the posterior one instant earlier.
+
+        ``posterior`` is (l, s, s, N), ``noise`` (l, m, m, 1) the covariance of the measurements.
+        The gain hides the input, so it may be applied to y - C x̂ with any prediction of the input
+        in x̂: the updated estimate is the same.
+        """
+        before = self.model.without_input(posterior)
+        gain = self.joint.gain(before, noise)
+        return gain, self.joint.covariance(gain, before, noise)
+
+
+@dataclass(frozen=True)
+class RandomWalkInputFilter:
+    """The Kalman filter of z = [x(k); d(k - 1)] under an :class:`InputModel`.
+
+    Unlike the unbiased filters it uses what it knew of the input before, and it is optimal if the
+    input does follow the model. The actual input does not, so its covariance is a claim, not a
+    bound; how good a claim depends on the model's numbers.
+
+    Source: B. Friedland, "Treatment of bias in recursive filtering", IEEE Trans. Automatic
+    Control 14, 1969, for the augmented state.
+    """
+
+    model: InputModel
+    sensors: InputSensors
+
+    def update(self, prior: Array, noise: Array) -> tuple[Array, Array]:
+        """Gain (l, s, m, N) and covariance (l, s, s, N) from prior (l, s, s, N) and noise.
+
+        ``noise`` (l, m, m, N or 1) is the covariance of what is taken for the measurement.
+        """
+        n = self.model.size
+        matrix = self.sensors.matrix
+        cross = linalg.matmul(prior[:, :, :n], linalg.transpose(matrix))
+        innovation = linalg.matmul(matrix, cross[:, :n]) + noise
+        if self.sensors.size == 1:
+            gain = cross / innovation
+        else:
+            gain = linalg.transpose(linalg.solve(innovation, linalg.transpose(cross)))
+        covariance = prior - linalg.matmul(gain, linalg.transpose(cross))
+        return gain, linalg.symmetrise(covariance)

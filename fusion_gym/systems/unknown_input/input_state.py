@@ -1,0 +1,179 @@
+"""Joint estimation of a state and an unknown input: sensors, gain, covariance, input model.
+
+The estimated quantity is z(k) = [x(k); d(k - 1)], of length s = n + q: an input is seen only after
+it has acted, so its estimate comes one sampling instant late.
+
+Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
+cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023);
+S. Gillijns and B. De Moor, "Unbiased minimum-variance input and state estimation for linear
+discrete-time systems", Automatica 43, 2007.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
+from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
+from fusion_gym.systems.unknown_input.sensors import InputSensors
+from fusion_gym.validation import ConfigurationError
+
+
+@dataclass(frozen=True)
+class JointGain:
+    """The unbiased gain of the smallest variance for [x(k); d(k - 1)], whatever the input was.
+
+    The gain 𝒢 = [N; L] (l, s, m, N) must not let the input through: 𝒢 C ℬ = [ℬ; I], which is (13)
+    and (14). All such gains are [ℬ; I] (C ℬ)⁺ + Z Uᵀ with free Z, and the smallest covariance has
+    Z = (T - [ℬ; I] (C ℬ)⁺ Ω) U (Uᵀ Ω U)⁻¹ with T = [Φ Cᵀ; 0], Φ the covariance of x(k) given the
+    past without its input, and Ω = C Φ Cᵀ + R. This equals L = ((Cℬ)ᵀ Ω⁻¹ Cℬ)⁻¹ (Cℬ)ᵀ Ω⁻¹ and
+    N = ℬ L + Φ Cᵀ U (Uᵀ Ω U)⁻¹ Uᵀ, but inverts nothing that is nearly singular. With as many
+    inputs as measurements U is empty and nothing is left to choose.
+
+    ``sensors`` as above; ``onto`` [ℬ; I] (C ℬ)⁺ (l, s, m, 1).
+
+    Source: unknown_input, equations (8)-(14), (19), with (20) replaced by the minimiser.
+    """
+
+    sensors: InputSensors
+    onto: Array
+
+    @classmethod
+    def create(cls, plant: UnknownInputPlant, sensors: InputSensors) -> JointGain:
+        """From the plant and its sensors."""
+        lifted = np.concatenate((plant.input_matrix, linalg.identity(plant.inputs)))
+        return cls(sensors, linalg.matmul(lifted[None], sensors.inverse))
+
+    def gain(self, covariance: Array, noise: Array) -> Array:
+        """𝒢 (l, s, m, N) from Φ (l, n, n, N) and R (l, m, m, N)."""
+        sensors = self.sensors
+        u = sensors.complement
+        free = u.shape[-2]
+        if not free:
+            return np.broadcast_to(self.onto, (*self.onto.shape[:-1], covariance.shape[-1])).copy()
+        cross = linalg.matmul(covariance, linalg.transpose(sensors.matrix))
+        innovation = linalg.matmul(sensors.matrix, cross) + noise
+        through = linalg.matmul(innovation, u)
+        weight = linalg.matmul(linalg.transpose(u), through)
+        target = -linalg.matmul(self.onto, through)
+        target[:, : cross.shape[1]] += linalg.matmul(cross, u)
+        if free == 1:
+            choice = target / weight
+        else:
+            weight = linalg.symmetrise(weight)
+            choice = linalg.transpose(linalg.solve(weight, linalg.transpose(target)))
+        return self.onto + linalg.matmul(choice, linalg.transpose(u))
+
+    def covariance(self, gain: Array, covariance: Array, noise: Array) -> Array:
+        """Covariance (l, s, s, N) of [x(k); d(k - 1)] for any gain that hides the input.
+
+        M Φ Mᵀ + 𝒢 R 𝒢ᵀ with M = [I; 0] - 𝒢 C; its blocks are Ξ_x, Ξ_d and their exact cross term.
+        """
+        n = covariance.shape[1]
+        moved = -linalg.matmul(gain, self.sensors.matrix)
+        for row in range(n):
+            moved[:, row, row] += 1.0
+        return linalg.congruence(moved, covariance) + linalg.congruence(gain, noise)
+
+
+@dataclass(frozen=True)
+class InputModel:
+    """What a filter believes of the input while nothing arrives: d(k) = r d(k - 1) + η(k).
+
+    So z(k + 1) = F z(k) + [ℬ η + w; η] with F = [[𝒜, r ℬ], [0, r I]]. ``memory`` r = 1 is a random
+    walk; with r < 1 the input's variance stays bounded. The actual input follows no such model.
+
+    Shapes: ``state_rows`` [𝒜, r ℬ] (n, s, 1), ``memory`` (q, 1), ``change`` covariance of
+    [ℬ η + w; η] (s, s, 1), ``transition`` 𝒜 (n, n, 1), ``process_covariance`` 𝒲 (n, n, 1),
+    ``initial_mean`` (s, 1), ``initial_covariance`` (s, s, 1). Build one with :meth:`create`.
+    """
+
+    state_rows: Array
+    memory: Array
+    change: Array
+    transition: Array
+    process_covariance: Array
+    initial_mean: Array
+    initial_covariance: Array
+
+    @classmethod
+    def create(
+        cls,
+        plant: UnknownInputPlant,
+        memory: ArrayLike,
+        change: ArrayLike,
+        deviation: ArrayLike,
+    ) -> InputModel:
+        """``memory`` r in [0, 1]; ``change`` and ``deviation`` are standard deviations.
+
+        The first is that of η, the second that of an input of which nothing is known yet; each
+        one number, or one an input.
+
+        Raises:
+            ConfigurationError: a memory outside [0, 1], or a deviation <= 0.
+        """
+        n, q = plant.size, plant.inputs
+        kept = validation.not_negative("input_memory", memory, (q,))
+        if np.any(kept > 1.0):
+            raise ConfigurationError(
+                f"input_memory = {memory!r} is not allowed: it must be >= 0 and <= 1"
+            )
+        steps = validation.positive("input_change", change, (q,))
+        first = validation.positive("input_deviation", deviation, (q,))
+        b = plant.input_matrix[..., 0]
+        spread = np.concatenate((b, np.eye(q))) * steps
+        noise = spread @ spread.T
+        noise[:n, :n] += plant.process_covariance[..., 0]
+        start = np.zeros((n + q, n + q))
+        start[:n, :n] = plant.initial_covariance[..., 0]
+        start[n:, n:] = np.diag(first**2)
+        return cls(
+            state_rows=np.concatenate((plant.transition[..., 0], b * kept), axis=1)[..., None],
+            memory=kept[:, None],
+            change=noise[..., None],
+            transition=plant.transition,
+            process_covariance=plant.process_covariance,
+            initial_mean=np.concatenate((plant.initial_mean, np.zeros((q, 1)))),
+            initial_covariance=start[..., None],
+        )
+
+    @property
+    def size(self) -> int:
+        """Number of states n."""
+        return self.transition.shape[0]
+
+    def predict(self, mean: Array) -> Array:
+        """F ẑ (..., s, N) from (..., s, N)."""
+        n = self.size
+        return np.concatenate(
+            (linalg.matvec(self.state_rows, mean), self.memory * mean[..., n:, :]), axis=-2
+        )
+
+    def predict_covariance(self, covariance: Array) -> Array:
+        """F P Fᵀ plus the covariance of [ℬ η + w; η], (..., s, s, N) to the same."""
+        n = self.size
+        result = np.empty(covariance.shape)
+        rows = linalg.matmul(self.state_rows, covariance)
+        result[..., :n, :n, :] = linalg.matmul(rows, linalg.transpose(self.state_rows))
+        cross = rows[..., n:, :] * self.memory
+        result[..., :n, n:, :] = cross
+        result[..., n:, :n, :] = linalg.transpose(cross)
+        inputs = covariance[..., n:, n:, :] * self.memory
+        inputs *= self.memory[:, None]
+        result[..., n:, n:, :] = inputs
+        result += self.change
+        upper = result[..., :n, :n, :]
+        upper += linalg.transpose(upper).copy()
+        upper *= 0.5
+        return result
+
+    def without_input(self, covariance: Array) -> Array:
+        """Φ = 𝒜 Ξ_x 𝒜ᵀ + 𝒲 (..., n, n, N) from the joint covariance (..., s, s, N)."""
+        n = self.size
+        return (
+            linalg.congruence(self.transition, covariance[..., :n, :n, :]) + self.process_covariance
+        )

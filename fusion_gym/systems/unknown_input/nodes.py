@@ -1,0 +1,327 @@
+"""The nodes of an unknown-input system with their fusion centre, behind one interface.
+
+:class:`TableNodes` looks up what does not depend on the run; :class:`RunNodes` carries a
+covariance for every node and run. Nothing is ever fed back to a node.
+
+Source: unknown_input, equations (8), (24), (25).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.systems.unknown_input.bound_filter import BoundTables
+from fusion_gym.systems.unknown_input.filters import ExactInputStateFilter, RandomWalkInputFilter
+from fusion_gym.systems.unknown_input.fusion import NodeFusion
+from fusion_gym.systems.unknown_input.input_state import InputModel
+from fusion_gym.systems.unknown_input.sensors import InputSensors
+
+
+class Estimates(NamedTuple):
+    """Posteriors of [x(k); d(k - 1)], s = n + q entries.
+
+    ``mean`` (l, s, N) of the nodes and ``fused_mean`` (s, N) of the centre; ``covariance``
+    (l, s, s, N), ``fused_covariance`` (s, s, N) and ``weights`` (l, N) where each run has its own.
+    """
+
+    mean: Array
+    fused_mean: Array
+    covariance: Array | None
+    fused_covariance: Array | None
+    weights: Array | None
+
+
+class Outlook(NamedTuple):
+    """Predictions for the coming measurement.
+
+    ``mean`` (l, s, N), ``fused_mean`` (s, N), ``expected`` measurements (l, m, N), and
+    ``covariance`` (l, s, s, N) where each run has its own.
+    """
+
+    mean: Array
+    fused_mean: Array
+    expected: Array
+    covariance: Array | None
+
+
+class Nodes(Protocol):
+    """Nodes and centre."""
+
+    @property
+    def model(self) -> InputModel:
+        """What the nodes believe of plant and input."""
+        ...
+
+    @property
+    def sensors(self) -> InputSensors:
+        """The sensors."""
+        ...
+
+    def start(self, runs: int) -> Estimates:
+        """Before any measurement."""
+        ...
+
+    def look(self, estimates: Estimates, time: Array) -> Outlook:
+        """Predictions for the measurements at ``time`` (N,)."""
+        ...
+
+    def update(
+        self,
+        estimates: Estimates,
+        outlook: Outlook,
+        held: Array,
+        granted: NDArray[np.bool_],
+        time: Array,
+    ) -> Estimates:
+        """Posteriors; ``held`` (l, m, N) are the last delivered measurements, the new included."""
+        ...
+
+    def prior_covariance(self, outlook: Outlook, time: Array) -> Array:
+        """The nodes' covariances (l, s, s, N or 1) before the update at ``time``."""
+        ...
+
+    def fused_covariance(self, estimates: Estimates, time: Array) -> Array:
+        """The centre's covariance (s, s, N or 1) of the posterior at ``time``."""
+        ...
+
+    def variances(
+        self, estimates: Estimates, outlook: Outlook, weights: Array, time: Array
+    ) -> tuple[Array, Array]:
+        """Weighted fused trace (N,) if nobody transmits, and its reductions (l, N) by each alone.
+
+        ``weights`` (s,) weigh the entries of the trace.
+        """
+        ...
+
+
+def _start(model: InputModel, sensors: InputSensors, runs: int) -> tuple[Array, Array, Array]:
+    """Means (l, s, N) and (s, N) and a covariance (s, s, N), all the initial ones."""
+    fused = np.broadcast_to(model.initial_mean, (len(model.initial_mean), runs)).copy()
+    mean = np.broadcast_to(fused, (sensors.count, *fused.shape)).copy()
+    covariance = np.broadcast_to(model.initial_covariance, (*fused.shape[:1] * 2, runs)).copy()
+    return mean, fused, covariance
+
+
+def _predicted(
+    model: InputModel, sensors: InputSensors, estimates: Estimates, covariance: Array | None
+) -> Outlook:
+    every = np.concatenate((estimates.mean, estimates.fused_mean[None]))
+    prior = model.predict(every)
+    return Outlook(prior[:-1], prior[-1], sensors.expect(prior[:-1]), covariance)
+
+
+@dataclass(frozen=True)
+class TableNodes:
+    """Nodes that hold the last measurement; gains, bounds and fusion come from tables over time.
+
+    ``tables`` hold the nodes' gains and bounds. ``state_gain`` (l, n, n, T + 1) and ``input_gain``
+    (l, q, q, T + 1) are the fusion's, w_i P P_i⁻¹ of (24); ``fused`` (s, s, T + 1) is its bound;
+    ``delivered`` (l, s, s, T + 1) the bound when the measurement of one sensor alone is new;
+    ``prior`` (l, s, s, T + 1) what the input model makes of the bound of one time before. Build
+    one with :meth:`create`.
+    """
+
+    model: InputModel
+    sensors: InputSensors
+    tables: BoundTables
+    state_gain: Array
+    input_gain: Array
+    fused: Array
+    delivered: Array
+    prior: Array
+
+    @classmethod
+    def create(
+        cls, model: InputModel, sensors: InputSensors, tables: BoundTables, fusion: NodeFusion
+    ) -> TableNodes:
+        """Fuse the tables, with every time as a run; ``"ci"`` means the exact weights here."""
+        exact = fusion.exact()
+        n, times = fusion.states, tables.covariance.shape[-1]
+        count, size = tables.covariance.shape[:2]
+        start = exact.start(count, times)
+        gains = np.zeros((count, size, size, times))
+        fused = np.empty(0)
+        for node in range(count):
+            for entry in range(size):
+                # The fusion is linear in the means: unit vectors read off its gains.
+                unit = np.zeros((count, size, times))
+                unit[node, entry] = 1.0
+                result = exact.fuse(unit, tables.covariance, start)
+                gains[node, :, entry], fused = result.mean, result.covariance
+        delivered = []
+        for node in range(count):
+            alone = tables.covariance.copy()
+            alone[node] = tables.delivered[node]
+            delivered.append(exact.fuse(np.zeros((count, size, times)), alone, start).covariance)
+        return cls(
+            model=model,
+            sensors=sensors,
+            tables=tables,
+            state_gain=gains[:, :n, :n],
+            input_gain=gains[:, n:, n:],
+            fused=fused,
+            delivered=np.array(delivered),
+            prior=model.predict_covariance(np.roll(tables.covariance, 1, axis=-1)),
+        )
+
+    def start(self, runs: int) -> Estimates:
+        """Before any measurement; covariances stay in the tables."""
+        mean, fused, _ = _start(self.model, self.sensors, runs)
+        return Estimates(mean, fused, None, None, None)
+
+    def look(self, estimates: Estimates, time: Array) -> Outlook:
+        """See :class:`Nodes`."""
+        return _predicted(self.model, self.sensors, estimates, None)
+
+    def update(
+        self,
+        estimates: Estimates,
+        outlook: Outlook,
+        held: Array,
+        granted: NDArray[np.bool_],
+        time: Array,
+    ) -> Estimates:
+        """Every node takes the held measurement for the present one.
+
+        Source: unknown_input, equations (8), (24).
+        """
+        gain = self._at(self.tables.gain, time)
+        mean = outlook.mean + linalg.matvec(gain, held - outlook.expected)
+        n = self.model.size
+        state = linalg.matvec(self._at(self.state_gain, time), mean[:, :n])
+        inputs = linalg.matvec(self._at(self.input_gain, time), mean[:, n:])
+        fused = np.concatenate((state.sum(0), inputs.sum(0)))
+        return Estimates(mean, fused, None, None, None)
+
+    def prior_covariance(self, outlook: Outlook, time: Array) -> Array:
+        """From the table; at time 0, where nothing is predicted, without meaning."""
+        return self._at(self.prior, time)
+
+    def fused_covariance(self, estimates: Estimates, time: Array) -> Array:
+        """The bound (s, s, N); void if the trigger does not keep |σ|² <= ρ̄."""
+        return self._at(self.fused, time)
+
+    def variances(
+        self, estimates: Estimates, outlook: Outlook, weights: Array, time: Array
+    ) -> tuple[Array, Array]:
+        """The bound's trace, and how far it falls where one held difference is known to be zero."""
+        every = weights[:, None]
+        silent = (every * linalg.diagonal(self.fused)).sum(0)
+        reduction = silent - (every * linalg.diagonal(self.delivered)).sum(1)
+        rows = self._rows(time)
+        return silent[rows], reduction[:, rows]
+
+    def _rows(self, time: Array) -> NDArray[np.intp]:
+        return np.minimum(time, self.fused.shape[-1] - 1).astype(np.intp)
+
+    def _at(self, table: Array, time: Array) -> Array:
+        """The table's entry at every run's time; one lane where all runs are at the same time."""
+        rows = self._rows(time)
+        first = int(rows[0])
+        if (rows == first).all():
+            return table[..., first : first + 1]
+        return table.take(rows, axis=-1)
+
+
+@dataclass(frozen=True)
+class RunNodes:
+    """Nodes whose covariances depend on what arrived: each run carries its own.
+
+    A node that receives nothing predicts. With ``hold_variance`` h (l, 1, 1, 1) it instead takes
+    the last measurement for the present one with h added to its noise's variance; this needs the
+    random-walk filter.
+    """
+
+    model: InputModel
+    sensors: InputSensors
+    filter: RandomWalkInputFilter | ExactInputStateFilter
+    fusion: NodeFusion
+    hold_variance: Array | None = None
+
+    def start(self, runs: int) -> Estimates:
+        """Before any measurement; all nodes are alike."""
+        mean, fused, covariance = _start(self.model, self.sensors, runs)
+        every = np.broadcast_to(covariance, (self.sensors.count, *covariance.shape)).copy()
+        return Estimates(
+            mean, fused, every, covariance, self.fusion.start(self.sensors.count, runs)
+        )
+
+    def look(self, estimates: Estimates, time: Array) -> Outlook:
+        """See :class:`Nodes`."""
+        prior = self.model.predict_covariance(_own(estimates.covariance))
+        return _predicted(self.model, self.sensors, estimates, prior)
+
+    def update(
+        self,
+        estimates: Estimates,
+        outlook: Outlook,
+        held: Array,
+        granted: NDArray[np.bool_],
+        time: Array,
+    ) -> Estimates:
+        """Granted nodes update, the others predict (or hold); the centre fuses all."""
+        gain, covariance = self._outcome(estimates, outlook, granted)
+        correction = linalg.matvec(gain, held - outlook.expected)
+        if self.hold_variance is None:
+            grant = granted[:, None]
+            correction *= grant
+            covariance = np.where(grant[:, None], covariance, _own(outlook.covariance))
+        mean = outlook.mean + correction
+        fused = self.fusion.fuse(mean, covariance, _own(estimates.weights))
+        return Estimates(mean, fused.mean, covariance, fused.covariance, fused.weights)
+
+    def prior_covariance(self, outlook: Outlook, time: Array) -> Array:
+        """The runs' own (l, s, s, N)."""
+        return _own(outlook.covariance)
+
+    def fused_covariance(self, estimates: Estimates, time: Array) -> Array:
+        """The centre's covariance (s, s, N)."""
+        return _own(estimates.fused_covariance)
+
+    def variances(
+        self, estimates: Estimates, outlook: Outlook, weights: Array, time: Array
+    ) -> tuple[Array, Array]:
+        """See :class:`Nodes`; with the best fusion weights."""
+        count, runs, fusion = self.sensors.count, outlook.expected.shape[-1], self.fusion.exact()
+        nobody = np.zeros((count, runs), dtype=np.bool_)
+        silent = _own(outlook.covariance)
+        if self.hold_variance is not None:
+            silent = self._outcome(estimates, outlook, nobody)[1]
+        delivered = self._outcome(estimates, outlook, ~nobody)[1]
+
+        def trace(covariance: Array) -> Array:
+            fused = fusion.fuse(outlook.mean, covariance, _own(estimates.weights)).covariance
+            total: Array = (weights[:, None] * linalg.diagonal(fused)).sum(0)
+            return total
+
+        start = trace(silent)
+        reduction = np.empty((count, runs))
+        for node in range(count):
+            alone = silent.copy()
+            alone[node] = delivered[node]
+            reduction[node] = start - trace(alone)
+        return start, reduction
+
+    def _outcome(
+        self, estimates: Estimates, outlook: Outlook, granted: NDArray[np.bool_]
+    ) -> tuple[Array, Array]:
+        """Gain (l, s, m, N) and covariance (l, s, s, N) of an update."""
+        noise = self.sensors.covariance
+        if isinstance(self.filter, ExactInputStateFilter):
+            return self.filter.update(_own(estimates.covariance), noise)
+        if self.hold_variance is not None:
+            extra = self.hold_variance * ~granted[:, None, None]
+            noise = noise + linalg.identity(self.sensors.size) * extra
+        return self.filter.update(_own(outlook.covariance), noise)
+
+
+def _own(value: Array | None) -> Array:
+    if value is None:
+        raise RuntimeError("these estimates belong to nodes that share their covariances")
+    return value

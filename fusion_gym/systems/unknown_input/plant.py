@@ -1,0 +1,164 @@
+"""A linear plant with an unknown input, seen at its sampling instants.
+
+Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
+cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import ndtr
+
+from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
+from fusion_gym.systems.linear_plant import covariance_factor
+from fusion_gym.systems.unknown_input.signals import InputSignal
+
+
+@dataclass(frozen=True)
+class UnknownInputPlant:
+    """x(k + 1) = 𝒜 x(k) + ℬ d(k) + w(k), w ~ N(0, 𝒲), from one sampling instant to the next.
+
+    Between two instants the plant makes ``sampling_period`` a small steps
+    x' = A x + B d + ω, ω ~ N(0, W), with the input d held constant. So 𝒜 = Aᵃ, ℬ = Σ Aʲ B and
+    𝒲 = Σ Aʲ W Aʲᵀ over j = 0..a - 1, and moving by them at once with one draw is exact: no
+    filter and no sensor looks at the small steps.
+
+    Shapes: ``transition`` 𝒜 (n, n, 1), ``input_matrix`` ℬ (n, q, 1), ``process_covariance`` 𝒲
+    (n, n, 1), ``process_factor`` (n, r, 1), ``initial_mean`` (n, 1), ``initial_covariance``
+    (n, n, 1), which the filters believe, ``initial_factor`` (n, r₀, 1), and
+    ``initial_half_width`` (n, 1): if given, x(0) is uniform about the mean instead of normal.
+    Build one with :meth:`create`.
+
+    Source: unknown_input, equations (1), (3) and (4), lifted with a constant input.
+    """
+
+    transition: Array
+    input_matrix: Array
+    process_covariance: Array
+    process_factor: Array
+    initial_mean: Array
+    initial_covariance: Array
+    initial_factor: Array
+    initial_half_width: Array | None = None
+
+    @classmethod
+    def create(
+        cls,
+        transition: ArrayLike,
+        input_matrix: ArrayLike,
+        process_covariance: ArrayLike,
+        sampling_period: int,
+        initial_mean: ArrayLike,
+        initial_covariance: ArrayLike,
+        initial_half_width: ArrayLike | None = None,
+    ) -> UnknownInputPlant:
+        """Check the matrices of a small step (no batch axis) and lift them.
+
+        Raises:
+            ConfigurationError: a wrong shape, an entry that is not finite, a sampling period
+                below 1, more inputs than states, or a covariance that is not one
+                (``initial_covariance``: not definite).
+        """
+        small = validation.array("transition", transition, (None, None))
+        n = len(small)
+        small = validation.array("transition", transition, (n, n))
+        inputs = validation.array("input_matrix", input_matrix, (n, None))
+        process = validation.covariance("process_covariance", process_covariance, n)
+        start = validation.covariance("initial_covariance", initial_covariance, n, definite=True)
+        mean = validation.array("initial_mean", initial_mean, (n,))
+        half = None
+        if initial_half_width is not None:
+            half = validation.not_negative("initial_half_width", initial_half_width, (n,))
+        steps = validation.integer("sampling_period", sampling_period, at_least=1)
+        lifted, lifted_inputs, lifted_process = np.eye(n), np.zeros_like(inputs), np.zeros((n, n))
+        for _ in range(steps):
+            lifted_inputs += lifted @ inputs
+            lifted_process += lifted @ process @ lifted.T
+            lifted = small @ lifted
+        lifted_process = (lifted_process + lifted_process.T) / 2
+        return cls(
+            transition=lifted[..., None],
+            input_matrix=lifted_inputs[..., None],
+            process_covariance=lifted_process[..., None],
+            process_factor=covariance_factor(lifted_process)[..., None],
+            initial_mean=mean[:, None],
+            initial_covariance=start[..., None],
+            initial_factor=covariance_factor(start)[..., None],
+            initial_half_width=None if half is None else half[:, None],
+        )
+
+    @property
+    def size(self) -> int:
+        """Number of states n."""
+        return self.transition.shape[0]
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs q."""
+        return self.input_matrix.shape[1]
+
+    @property
+    def noise_channels(self) -> int:
+        """Standard normals from one instant to the next: the rank of 𝒲."""
+        return self.process_factor.shape[1]
+
+    @property
+    def start_channels(self) -> int:
+        """Standard normals that :meth:`start` consumes."""
+        return self.size
+
+    def start(self, noise: Array) -> Array:
+        """Draw x(0), shape (n, N), from standard normals (n, N)."""
+        if self.initial_half_width is None:
+            return self.initial_mean + linalg.matvec(self.initial_factor, noise)
+        return self.initial_mean + self.initial_half_width * (2.0 * ndtr(noise) - 1.0)
+
+    def advance(self, state: Array, inputs: Array, noise: Array) -> Array:
+        """x(k + 1) (n, N) from x(k) (n, N), d(k) (q, N) and standard normals (r, N)."""
+        moved = linalg.matvec(self.transition, state)
+        moved += linalg.matvec(self.input_matrix, inputs)
+        if self.noise_channels:
+            moved += linalg.matvec(self.process_factor, noise)
+        return moved
+
+    def open_loop(self, signal: InputSignal, horizon: int) -> Array:
+        """Mean squared error (n + q,) over k = 1..horizon of a centre that takes the input for 0.
+
+        It predicts the state from the initial mean; the last q entries are the input's own mean
+        square. Closed form from the signal's first two moments.
+        """
+        return self._second_moments(signal, horizon, np.zeros(self.size))
+
+    def magnitude(self, signal: InputSignal, horizon: int) -> Array:
+        """Root mean square (n + q,) of state and input over k = 1..horizon."""
+        return np.sqrt(self._second_moments(signal, horizon, self.initial_mean[:, 0]))
+
+    def _second_moments(self, signal: InputSignal, horizon: int, offset: Array) -> Array:
+        """E x xᵀ and E d dᵀ, diagonals averaged; the state's mean starts at ``offset`` (n,).
+
+        The error's random part has the covariance C' = 𝒜 C 𝒜ᵀ + 𝒜 X ℬᵀ + (𝒜 X ℬᵀ)ᵀ +
+        ℬ R(0) ℬᵀ + 𝒲 with X the covariance of the error and the coming input; in it
+        X(k + 1) = X(k) + 𝒜ᵏ ℬ R(k + 1).
+        """
+        a, b = self.transition[..., 0], self.input_matrix[..., 0]
+        means, lags = signal.mean(horizon), signal.covariance(horizon + 1)
+        if self.initial_half_width is None:
+            spread = self.initial_covariance[..., 0].copy()
+        else:
+            spread = np.diag(self.initial_half_width[:, 0] ** 2 / 3.0)
+        mean, cross, reach = offset, np.zeros((self.size, self.inputs)), b
+        total, inputs = np.zeros(self.size), np.zeros(self.inputs)
+        for k in range(horizon):
+            crossed = a @ cross @ b.T
+            spread = a @ spread @ a.T + crossed + crossed.T + b @ lags[0] @ b.T
+            spread = spread + self.process_covariance[..., 0]
+            mean = a @ mean + b @ means[k]
+            cross = cross + reach @ lags[k + 1]
+            reach = a @ reach
+            total += np.diagonal(spread) + mean**2
+            inputs += np.diagonal(lags[0]) + means[k] ** 2
+        return np.concatenate((total, inputs)) / horizon

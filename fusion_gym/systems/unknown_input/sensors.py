@@ -1,0 +1,122 @@
+"""Linear sensors of the state, each with a noise covariance of its own.
+
+Source: unknown_input, equation (2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
+from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
+from fusion_gym.validation import ConfigurationError
+
+_RANK = 1e-8  # singular values below this share of what they could be count as zero
+
+
+@dataclass(frozen=True)
+class InputSensors:
+    """y_i(k) = C_i x(k) + ν_i(k), ν_i ~ N(0, V_i), with an input that every sensor can see.
+
+    Shapes: ``matrix`` C (l, m, n, 1), ``covariance`` V (l, m, m, 1), ``factor`` (l, m, m, 1) with
+    factor factorᵀ = V. From the plant: ``inverse`` (C ℬ)⁺ (l, q, m, 1) and ``complement`` U
+    (l, m, m - q, 1), an orthonormal basis of the kernel of (C ℬ)ᵀ. Build one with :meth:`create`.
+
+    Source: unknown_input, equation (2).
+    """
+
+    matrix: Array
+    covariance: Array
+    factor: Array
+    inverse: Array
+    complement: Array
+
+    @classmethod
+    def create(
+        cls, matrices: ArrayLike, covariances: ArrayLike, plant: UnknownInputPlant
+    ) -> InputSensors:
+        """Check C (l, m, n) and V: one number, one a sensor, (l, m) variances, or (l, m, m).
+
+        Raises:
+            ConfigurationError: a wrong shape, a V_i that is not positive definite, or a sensor
+                that cannot see the input: rank(C_i ℬ) below the number of inputs.
+        """
+        c = validation.array("measurement_matrices", matrices, (None, None, None))
+        c = validation.array("measurement_matrices", matrices, (*c.shape[:2], plant.size))
+        noise = _noise_covariances(covariances, *c.shape[:2])
+        inverses, complements = [], []
+        for sensor, matrix in enumerate(c):
+            inverse, complement = _seen_input(sensor, matrix, plant)
+            inverses.append(inverse)
+            complements.append(complement)
+        return cls(
+            matrix=c[..., None],
+            covariance=noise[..., None],
+            factor=np.asarray(np.linalg.cholesky(noise), dtype=np.float64)[..., None],
+            inverse=np.array(inverses)[..., None],
+            complement=np.array(complements)[..., None],
+        )
+
+    @property
+    def count(self) -> int:
+        """Number of sensors l."""
+        return self.matrix.shape[0]
+
+    @property
+    def size(self) -> int:
+        """Number of measured components m of each sensor."""
+        return self.matrix.shape[1]
+
+    @property
+    def noise_channels(self) -> int:
+        """Standard normals that one measurement of all sensors consumes."""
+        return self.count * self.size
+
+    def measure(self, state: Array, noise: Array) -> Array:
+        """Measurements (l, m, N) of the state (n, N) with standard normals (l·m, N)."""
+        result = linalg.matvec(self.matrix, state)
+        result += linalg.matvec(self.factor, noise.reshape(self.count, self.size, -1))
+        return result
+
+    def expect(self, mean: Array) -> Array:
+        """C x̂ (l, m, N) from means (l, s, N) or (s, N), whose first n entries are the state's."""
+        return linalg.matvec(self.matrix, mean[..., : self.matrix.shape[2], :])
+
+
+def _noise_covariances(value: ArrayLike, sensors: int, size: int) -> Array:
+    """V as (l, m, m)."""
+    try:
+        given = np.asarray(value)
+    except ValueError:
+        given = np.empty(0)
+    if given.shape == (sensors, size, size):
+        return np.array(
+            [
+                validation.covariance(f"measurement_covariance[{i}]", one, size, definite=True)
+                for i, one in enumerate(given)
+            ]
+        )
+    if given.shape == (sensors,):
+        value = given[:, None]
+    variances = validation.positive("measurement_covariance", value, (sensors, size))
+    return variances[..., None] * np.eye(size)
+
+
+def _seen_input(sensor: int, matrix: Array, plant: UnknownInputPlant) -> tuple[Array, Array]:
+    """(C ℬ)⁺ and the kernel of (C ℬ)ᵀ, or an error if C ℬ has deficient rank."""
+    inputs = plant.input_matrix[..., 0]
+    q, seen = plant.inputs, matrix @ inputs
+    left, values, right = np.linalg.svd(seen)
+    possible = np.linalg.norm(matrix, 2) * np.linalg.norm(inputs, 2)
+    rank = int(np.sum(values > _RANK * possible))
+    if rank < q:
+        raise ConfigurationError(
+            f"measurement_matrices[{sensor}] = {matrix.tolist()} is not allowed: the sensor must "
+            f"see every input, but rank(C B) is {rank} for {q} input{'s' if q > 1 else ''} (B is "
+            "the input matrix over one sampling interval)"
+        )
+    return right.T @ np.diag(1.0 / values) @ left[:, :q].T, left[:, q:]

@@ -1,0 +1,316 @@
+"""Signals that drive a plant as its unknown input: sinusoids, steps, a random walk, an array.
+
+An input d(k) acts from sampling instant k to k + 1. A signal is drawn anew in every episode from
+that episode's noise, so that nobody can know it in advance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import ndtr
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.validation import ConfigurationError
+
+
+class InputSignal(Protocol):
+    """q inputs over time, for N runs at once (batch axis last).
+
+    ``start`` turns standard normals (start_channels, N) into a memory (rows, N), ``value`` reads
+    the input (q, N) at the runs' times (N,) from it, and ``advance`` moves the memory on by one
+    sampling instant with standard normals (noise_channels, N).
+    """
+
+    @property
+    def size(self) -> int:
+        """Number of inputs q."""
+        ...
+
+    @property
+    def start_channels(self) -> int:
+        """Standard normals that :meth:`start` consumes."""
+        ...
+
+    @property
+    def noise_channels(self) -> int:
+        """Standard normals that :meth:`advance` consumes."""
+        ...
+
+    def start(self, noise: Array) -> Array:
+        """Memory (rows, N) of new episodes."""
+        ...
+
+    def value(self, memory: Array, time: Array) -> Array:
+        """The input (q, N) from the instant ``time`` (N,) to the next."""
+        ...
+
+    def advance(self, memory: Array, noise: Array) -> Array:
+        """The memory one instant later."""
+        ...
+
+    def mean(self, horizon: int) -> Array:
+        """Expectation (horizon, q) of d(0), ..., d(horizon - 1) over episodes."""
+        ...
+
+    def covariance(self, horizon: int) -> Array:
+        """Cov(d(k), d(k + lag)) for lag = 0..horizon - 1, (horizon, q, q), the same for all k."""
+        ...
+
+
+@dataclass(frozen=True)
+class Sinusoids:
+    """d_j(k) = Σ_i a_ji sin(2π k / p_ji + φ_ji), its phases drawn evenly or given.
+
+    ``amplitude`` a, in the input's unit, and ``period`` p, in sampling instants, are (q, terms, 1);
+    ``phase`` φ, in radians, is (q, terms, 1) or ``None``: drawn for each episode. Build one with
+    :meth:`create`.
+    """
+
+    amplitude: Array
+    period: Array
+    phase: Array | None
+
+    @classmethod
+    def create(
+        cls, size: int, amplitude: ArrayLike, period: ArrayLike, phase: ArrayLike | str = "random"
+    ) -> Sinusoids:
+        """Check the numbers: one for all, (terms,) for all inputs, or (size, terms).
+
+        Raises:
+            ConfigurationError: a wrong shape, a period <= 0, or a phase that is text other than
+                "random".
+        """
+        random = isinstance(phase, str)
+        if random and phase != "random":
+            raise ConfigurationError(
+                f"input_phase = {phase!r} is not allowed: it must be 'random' or radians"
+            )
+        shape = (size, _terms(amplitude, period, 0.0 if random else phase))
+        return cls(
+            amplitude=validation.spread("input_amplitude", amplitude, shape)[..., None],
+            period=validation.positive("input_period", period, shape)[..., None],
+            phase=None if random else validation.spread("input_phase", phase, shape)[..., None],
+        )
+
+    @property
+    def size(self) -> int:
+        """Number of inputs q."""
+        return self.amplitude.shape[0]
+
+    @property
+    def start_channels(self) -> int:
+        """One for each phase that is drawn."""
+        return self.amplitude.size if self.phase is None else 0
+
+    @property
+    def noise_channels(self) -> int:
+        """None: a phase fixes the whole episode."""
+        return 0
+
+    def start(self, noise: Array) -> Array:
+        """The phases (q·terms, N), in radians."""
+        if self.phase is None:
+            return 2.0 * np.pi * ndtr(noise)
+        return np.broadcast_to(self.phase.reshape(-1, 1), (self.phase.size, noise.shape[-1])).copy()
+
+    def value(self, memory: Array, time: Array) -> Array:
+        """The input (q, N) at the runs' times (N,)."""
+        angle = memory.reshape(*self.amplitude.shape[:2], -1) + (2.0 * np.pi / self.period) * time
+        terms = self.amplitude * np.sin(angle)
+        total: Array = terms[:, 0].copy()
+        for term in range(1, terms.shape[1]):
+            total += terms[:, term]
+        return total
+
+    def advance(self, memory: Array, noise: Array) -> Array:
+        """The phases stay."""
+        return memory
+
+    def mean(self, horizon: int) -> Array:
+        """(horizon, q): zero if phases are drawn, else the signal itself."""
+        if self.phase is None:
+            return np.zeros((horizon, self.size))
+        memory = np.broadcast_to(self.phase.reshape(-1, 1), (self.phase.size, horizon))
+        return self.value(memory, np.arange(horizon, dtype=np.float64)).T
+
+    def covariance(self, horizon: int) -> Array:
+        """(horizon, q, q): Σ a²/2 cos(2π lag / p) for phases that are drawn, else zero."""
+        result = np.zeros((horizon, self.size, self.size))
+        if self.phase is None:
+            angle = 2.0 * np.pi / self.period * np.arange(horizon)
+            own = (0.5 * self.amplitude**2 * np.cos(angle)).sum(1)
+            result[:, np.arange(self.size), np.arange(self.size)] = own.T
+        return result
+
+
+def _terms(*values: ArrayLike) -> int:
+    """Number of sinusoids: the longest last axis; wrong shapes are told later, field by field."""
+    lengths = []
+    for value in values:
+        try:
+            given = np.asarray(value)
+        except ValueError:
+            continue
+        lengths.append(given.shape[-1] if given.ndim else 1)
+    return max(lengths, default=1)
+
+
+@dataclass(frozen=True)
+class _Stationary:
+    """What signals share whose memory is their value, drawn from a stationary distribution.
+
+    ``amplitude`` (q, 1) is its standard deviation in the input's unit, its mean is zero; ``period``
+    (q, 1) is in sampling instants, at least 1.
+    """
+
+    amplitude: Array
+    period: Array
+
+    @classmethod
+    def create(cls, size: int, amplitude: ArrayLike, period: ArrayLike) -> Self:
+        """Check the numbers: one for all inputs, or (size,).
+
+        Raises:
+            ConfigurationError: a wrong shape, an amplitude <= 0 or a period < 1.
+        """
+        return cls(*_scale_and_period(size, amplitude, period))
+
+    @property
+    def size(self) -> int:
+        """Number of inputs q."""
+        return len(self.amplitude)
+
+    @property
+    def start_channels(self) -> int:
+        """The first values."""
+        return self.size
+
+    def start(self, noise: Array) -> Array:
+        """Values (q, N) drawn from the stationary distribution."""
+        return self.amplitude * noise
+
+    def value(self, memory: Array, time: Array) -> Array:
+        """The values (q, N)."""
+        return memory
+
+    def mean(self, horizon: int) -> Array:
+        """Zero, (horizon, q)."""
+        return np.zeros((horizon, self.size))
+
+
+@dataclass(frozen=True)
+class Steps(_Stationary):
+    """Each input keeps its level and jumps to a new one with the probability 1/``period``."""
+
+    @property
+    def noise_channels(self) -> int:
+        """Whether to jump, and where to."""
+        return 2 * self.size
+
+    def advance(self, memory: Array, noise: Array) -> Array:
+        """The levels (q, N) one instant later."""
+        jump = ndtr(noise[: self.size]) * self.period < 1.0
+        return np.where(jump, self.amplitude * noise[self.size :], memory)
+
+    def covariance(self, horizon: int) -> Array:
+        """(horizon, q, q): a² (1 - 1/period)^lag on the diagonal."""
+        return _geometric(self.amplitude, 1.0 - 1.0 / self.period, horizon)
+
+
+@dataclass(frozen=True)
+class MeanRevertingWalk(_Stationary):
+    """d(k + 1) = r d(k) + a √(1 - r²) η with r = exp(-1/period): a random walk held back.
+
+    Its variance stays at a², ``period`` is the correlation time.
+    """
+
+    @property
+    def noise_channels(self) -> int:
+        """The steps of the walk."""
+        return self.size
+
+    def advance(self, memory: Array, noise: Array) -> Array:
+        """The values (q, N) one instant later."""
+        kept = np.exp(-1.0 / self.period)
+        return kept * memory + self.amplitude * np.sqrt(1.0 - kept * kept) * noise
+
+    def covariance(self, horizon: int) -> Array:
+        """(horizon, q, q): a² exp(-lag/period) on the diagonal."""
+        return _geometric(self.amplitude, np.exp(-1.0 / self.period), horizon)
+
+
+def _scale_and_period(size: int, amplitude: ArrayLike, period: ArrayLike) -> tuple[Array, Array]:
+    scale = validation.positive("input_amplitude", amplitude, (size,))
+    instants = validation.positive("input_period", period, (size,))
+    if np.any(instants < 1.0):
+        raise ConfigurationError(
+            f"input_period = {instants.tolist()} is not allowed: it must be >= 1 everywhere, for "
+            "an input is constant between two sampling instants"
+        )
+    return scale[:, None], instants[:, None]
+
+
+def _geometric(amplitude: Array, ratio: Array, horizon: int) -> Array:
+    own = amplitude**2 * ratio ** np.arange(horizon)
+    result: Array = own.T[:, :, None] * np.eye(len(amplitude))
+    return result
+
+
+@dataclass(frozen=True)
+class GivenInput:
+    """The same inputs in every episode: ``values`` (rows, q, 1), one row a sampling instant.
+
+    After the last row the input stays where it is.
+    """
+
+    values: Array
+
+    @classmethod
+    def create(cls, size: int, values: ArrayLike, horizon: int) -> GivenInput:
+        """Check an array (horizon + 1, size): d(0), ..., d(horizon).
+
+        Raises:
+            ConfigurationError: another shape, or an entry that is not finite.
+        """
+        return cls(validation.array("input_signal", values, (horizon + 1, size))[..., None])
+
+    @property
+    def size(self) -> int:
+        """Number of inputs q."""
+        return self.values.shape[1]
+
+    @property
+    def start_channels(self) -> int:
+        """None."""
+        return 0
+
+    @property
+    def noise_channels(self) -> int:
+        """None."""
+        return 0
+
+    def start(self, noise: Array) -> Array:
+        """Nothing to remember: (0, N)."""
+        return np.empty((0, noise.shape[-1]))
+
+    def value(self, memory: Array, time: Array) -> Array:
+        """The rows (q, N) of the runs' times (N,)."""
+        rows = np.minimum(time.astype(np.intp), len(self.values) - 1)
+        return np.ascontiguousarray(self.values[rows, :, 0].T)
+
+    def advance(self, memory: Array, noise: Array) -> Array:
+        """Nothing to move."""
+        return memory
+
+    def mean(self, horizon: int) -> Array:
+        """The rows themselves, (horizon, q)."""
+        return self.values[np.minimum(np.arange(horizon), len(self.values) - 1), :, 0]
+
+    def covariance(self, horizon: int) -> Array:
+        """Zero, (horizon, q, q): nothing is drawn."""
+        return np.zeros((horizon, self.size, self.size))

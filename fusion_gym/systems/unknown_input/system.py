@@ -1,0 +1,286 @@
+"""A plant with an unknown input, joint input-state filters, fusion without feedback.
+
+Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of multi-rate
+cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.core.system import Feature, Signal, SignalArray, feature_block
+from fusion_gym.systems.unknown_input.nodes import Estimates, Nodes, Outlook, RunNodes
+from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
+from fusion_gym.systems.unknown_input.signals import InputSignal
+
+_RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
+
+
+@dataclass(slots=True)
+class UnknownInputState:
+    """Everything about N runs at one time; n states, q inputs, s = n + q, l sensors, m components.
+
+    ``truth`` (s, N), the state x(k) and the input d(k - 1) that has just acted · ``signal``
+    (rows, N), the memory of the input signal · ``time`` (N,), sampling instants since the start ·
+    ``measurement`` (l, m, N) · ``held`` (l, m, N), the last delivered measurement · ``age`` (l, N),
+    instants since then · ``estimates``, the posteriors · ``outlook``, the predictions.
+    """
+
+    truth: Array
+    signal: Array
+    time: Array
+    measurement: Array
+    held: Array
+    age: Array
+    estimates: Estimates
+    outlook: Outlook | None
+
+
+_COMPONENTS = "(sensors, m, N)"
+SIGNALS = (
+    Signal("measurement", "sensor", _COMPONENTS, "the new measurement"),
+    Signal("innovation", "sensor", _COMPONENTS, "measurement minus the node's expectation"),
+    Signal("held", "centre", _COMPONENTS, "the last delivered measurement"),
+    Signal("age", "centre", "(sensors, N)", "sampling instants since the last delivery"),
+    Signal(
+        "expected_measurement",
+        "centre",
+        _COMPONENTS,
+        "the node's expectation, its last input estimate carried on",
+    ),
+    Signal("innovation_deviation", "centre", _COMPONENTS, "the innovation's predicted deviation"),
+    Signal("prior_mean", "centre", "(n, N)", "prediction of the fused state"),
+    Signal(
+        "prior_covariance",
+        "centre",
+        "(n, n, N)",
+        "its covariance, as if state and input estimates were uncorrelated",
+    ),
+    Signal("silent_variance", "centre", "(N,)", "weighted fused trace if nobody transmits"),
+    Signal(
+        "variance_reduction",
+        "centre",
+        "(sensors, N)",
+        "how far that trace falls if this sensor alone transmits, whatever it measured",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class UnknownInputSystem:
+    """Joins a plant, its input signal, and nodes with a fusion centre.
+
+    What is estimated is [x(k); d(k - 1)]: the input is seen only once it has acted. One step is
+    one sampling instant. ``state_weights`` (s,) weigh the traces among the signals, ``magnitude``
+    (s,) divides observed estimates, and ``reference`` (s,) observed variances.
+    """
+
+    plant: UnknownInputPlant
+    signal: InputSignal
+    nodes: Nodes
+    state_names: tuple[str, ...]
+    state_weights: Array
+    magnitude: Array
+    reference: Array
+
+    @property
+    def sensor_count(self) -> int:
+        """Number of sensors."""
+        return self.nodes.sensors.count
+
+    @property
+    def noise_channels(self) -> int:
+        """Normals of one step: the input's, the process noise, the sensors' noises."""
+        own = self.plant.noise_channels + self.nodes.sensors.noise_channels
+        return self.signal.noise_channels + own
+
+    @property
+    def start_channels(self) -> int:
+        """Normals of a start: the initial state, the first measurements' noise, the signal."""
+        own = self.plant.start_channels + self.nodes.sensors.noise_channels
+        return own + self.signal.start_channels
+
+    @property
+    def covariance_cycle(self) -> int | None:
+        """1 where covariances follow from the deliveries: nodes that predict while nothing arrives.
+
+        None with the paper's filter and with a hold variance, whose covariances do not show how
+        old the held measurement is. The covariances are claims under the filter's model of the
+        input, not the actual ones.
+        """
+        nodes = self.nodes
+        return 1 if isinstance(nodes, RunNodes) and nodes.hold_variance is None else None
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """The signals that :meth:`read` offers."""
+        return SIGNALS
+
+    @property
+    def features(self) -> tuple[tuple[Feature, ...], ...]:
+        """Blocks of the observation; see docs/unknown_input.md."""
+        nodes = range(self.sensor_count)
+        size = self.nodes.sensors.size
+        components = [(node, f"{node},{c}") for node in nodes for c in range(size)]
+        local_states = [(node, f"{node},{name}") for node in nodes for name in self.state_names]
+        fused = [(None, name) for name in self.state_names]
+        return (
+            feature_block("whitened_innovation", components, "sensor", _RANGE),
+            feature_block("held_difference", components, "sensor", _RANGE),
+            feature_block("age", [(node, f"{node}") for node in nodes], "centre"),
+            feature_block("local_log_deviation", local_states, "centre", _RANGE),
+            feature_block("log_deviation", fused, "centre", _RANGE),
+            feature_block("estimate", fused, "centre", _RANGE),
+        )
+
+    def start(self, noise: Array) -> UnknownInputState:
+        """Time 0: the state is drawn and every first measurement is known, free of charge."""
+        n, sensors = self.plant.size, self.nodes.sensors
+        runs, count = noise.shape[-1], sensors.noise_channels
+        state = self.plant.start(noise[:n])
+        measurement = sensors.measure(state, noise[n : n + count])
+        return UnknownInputState(
+            truth=np.concatenate((state, np.zeros((self.plant.inputs, runs)))),
+            signal=self.signal.start(noise[n + count :]),
+            time=np.zeros(runs),
+            measurement=measurement,
+            held=measurement,
+            age=np.zeros((sensors.count, runs)),
+            estimates=self.nodes.start(runs),
+            outlook=None,
+        )
+
+    def sense(self, state: UnknownInputState, noise: Array) -> UnknownInputState:
+        """The input acts for one sampling interval, the sensors measure, the nodes predict.
+
+        Source: unknown_input, equations (2) and (4).
+        """
+        r, drawn = self.plant.noise_channels, self.signal.noise_channels
+        inputs = self.signal.value(state.signal, state.time)
+        moved = self.plant.advance(state.truth[: self.plant.size], inputs, noise[drawn : drawn + r])
+        time = state.time + 1.0
+        return replace(
+            state,
+            truth=np.concatenate((moved, inputs)),
+            signal=self.signal.advance(state.signal, noise[:drawn]),
+            time=time,
+            measurement=self.nodes.sensors.measure(moved, noise[drawn + r :]),
+            age=state.age + 1.0,
+            outlook=self.nodes.look(state.estimates, time),
+        )
+
+    def deliver(self, state: UnknownInputState, granted: NDArray[np.bool_]) -> UnknownInputState:
+        """The nodes make of what was granted (sensors, N) what they can, the centre fuses.
+
+        Source: unknown_input, equations (8), (24), (25).
+        """
+        held = np.where(granted[:, None], state.measurement, state.held)
+        return replace(
+            state,
+            held=held,
+            age=np.where(granted, 0.0, state.age),
+            estimates=self.nodes.update(state.estimates, _sensed(state), held, granted, state.time),
+        )
+
+    def read(
+        self, state: UnknownInputState
+    ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
+        """The signals named in ``SIGNALS``."""
+        outlook = _sensed(state)
+
+        @functools.cache
+        def variances() -> tuple[Array, Array]:
+            return self.nodes.variances(state.estimates, outlook, self.state_weights, state.time)
+
+        def everyone(value: Array) -> Array:
+            return np.broadcast_to(value, (*value.shape[:-1], len(state.time)))
+
+        return {
+            "measurement": state.measurement,
+            "innovation": lambda: state.measurement - outlook.expected,
+            "held": state.held,
+            "age": state.age,
+            "expected_measurement": outlook.expected,
+            "innovation_deviation": lambda: everyone(self._deviation(state)),
+            "prior_mean": outlook.fused_mean[: self.plant.size],
+            "prior_covariance": lambda: everyone(self._fused_prior(state)),
+            "silent_variance": lambda: variances()[0],
+            "variance_reduction": lambda: variances()[1],
+        }
+
+    def observe(self, state: UnknownInputState) -> Sequence[Array]:
+        """The blocks named in :attr:`features`, before clipping to their bounds."""
+        outlook, runs = _sensed(state), len(state.time)
+        deviation = self._deviation(state)
+        noise = np.sqrt(2.0 * linalg.diagonal(self.nodes.sensors.covariance))
+        local = _log_deviation(self.nodes.prior_covariance(outlook, state.time), self.reference)
+        fused = _log_deviation(
+            self.nodes.fused_covariance(state.estimates, state.time - 1.0), self.reference
+        )
+        return (
+            ((state.measurement - outlook.expected) / deviation).reshape(-1, runs),
+            ((state.measurement - state.held) / noise).reshape(-1, runs),
+            state.age / (state.age + 10.0),
+            _lanes(local.reshape(-1, local.shape[-1]), runs),
+            _lanes(fused, runs),
+            outlook.fused_mean / self.magnitude[:, None],
+        )
+
+    def truth(self, state: UnknownInputState) -> Array:
+        """State and the input that has just acted, (n + q, N)."""
+        return state.truth
+
+    def fused(self, state: UnknownInputState) -> tuple[Array, Array]:
+        """The centre's mean (n + q, N) and covariance (n + q, n + q, N) of both."""
+        covariance = self.nodes.fused_covariance(state.estimates, state.time)
+        return state.estimates.fused_mean, _lanes(covariance, len(state.time))
+
+    def local_means(self, state: UnknownInputState) -> Array:
+        """The nodes' posterior means (sensors, n + q, N); nothing is fed back to them."""
+        return state.estimates.mean
+
+    def open_loop(self, horizon: int) -> Array:
+        """Mean squared error (n + q,) over k = 1..horizon of a centre that takes d for zero."""
+        return self.plant.open_loop(self.signal, horizon)
+
+    def _deviation(self, state: UnknownInputState) -> Array:
+        """The innovation's deviation (l, m, N or 1)."""
+        n, sensors = self.plant.size, self.nodes.sensors
+        prior = self.nodes.prior_covariance(_sensed(state), state.time)
+        spread = linalg.matmul(sensors.matrix, prior[:, :n, :n])
+        variance = spread[..., 0, :] * sensors.matrix[..., 0, :]
+        for column in range(1, n):
+            variance += spread[..., column, :] * sensors.matrix[..., column, :]
+        variance += linalg.diagonal(sensors.covariance)
+        return np.sqrt(variance, out=variance)
+
+    def _fused_prior(self, state: UnknownInputState) -> Array:
+        n = self.plant.size
+        before = self.nodes.fused_covariance(state.estimates, state.time - 1.0)
+        return self.nodes.model.predict_covariance(before)[:n, :n]
+
+
+def _log_deviation(covariance: Array, reference: Array) -> Array:
+    """ln √(variance/reference) (..., s, N) of covariances (..., s, s, N)."""
+    ratio = linalg.diagonal(covariance) / reference[:, None]
+    np.log(ratio, out=ratio)
+    ratio *= 0.5
+    return ratio
+
+
+def _lanes(value: Array, runs: int) -> Array:
+    """One lane for all, or a lane each, to (..., runs)."""
+    return np.broadcast_to(value, (*value.shape[:-1], runs))
+
+
+def _sensed(state: UnknownInputState) -> Outlook:
+    if state.outlook is None:
+        raise RuntimeError("the state has no measurements yet: call sense first")
+    return state.outlook
