@@ -26,7 +26,7 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,20 +39,17 @@ VALIDATION = {"every": 60_000, "episodes": 64}  # once on the way, and once at t
 BENCHMARK = "tobit_oscillator"
 # Takes a temporary folder and returns what is to be hashed.
 Work = Callable[[Path], bytes]
+Content = dict[str, Any]
 
 
 def command(module: str, *words: str) -> str:
-    """Run ``python -m module`` in the current directory and return its standard output.
+    """Run ``python -m module`` in the current directory, on one thread; its standard output.
 
     Raises:
         RuntimeError: it failed; the message ends with what it said.
     """
-    done = subprocess.run(
-        [sys.executable, "-m", module, *words],
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-    )
+    line, env = [sys.executable, "-m", module, *words], os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(line, env=env, capture_output=True, text=True)
     if done.returncode != 0:
         raise RuntimeError(f"{module} ended with {done.returncode}: {done.stderr.strip()[-1000:]}")
     return done.stdout
@@ -63,18 +60,13 @@ def read(path: Path) -> Any:
     return json.loads(path.read_text())
 
 
-def evaluate(
-    env: str, options: dict[str, Any], policies: list[str], episodes: int, folder: Path
-) -> bytes:
+def evaluate(env: str, options: Content, names: list[str], episodes: int, folder: Path) -> bytes:
     """Summaries and quantiles that ``agents.evaluate`` writes for these policies."""
-    found = folder / "evaluation.json"
-    texts = [f"{key}={value}" for key, value in options.items()]  # lists as Python writes them
-    command(
-        "agents.evaluate",
-        *("--env", env, *(["--set", *texts] if texts else []), "--policies", *policies),
-        *("--episodes", str(episodes), "--seed", "0", "--json", str(found)),
-    )
-    report = read(found)
+    words = ["--env", env, "--policies", *names, "--episodes", str(episodes), "--seed", "0"]
+    if options:
+        words += ["--set", *(f"{key}={value}" for key, value in options.items())]
+    command("agents.evaluate", *words, "--json", str(folder / "evaluation.json"))
+    report = read(folder / "evaluation.json")
     chosen = {key: report[key] for key in ("policies", "quantiles")}
     return json.dumps(chosen, sort_keys=True).encode()
 
@@ -85,7 +77,7 @@ def reproduce(config: Path, episodes: int, folder: Path) -> bytes:
     return command("agents.reproduce", *words).encode()
 
 
-def train(plain: dict[str, Any], folder: Path) -> bytes:
+def train(plain: Content, folder: Path) -> bytes:
     """Validations and final weights of a short training with this config."""
     config, output = folder / "config.yaml", folder / "training"
     plain = plain | {"validation": plain.get("validation", {}) | VALIDATION}
@@ -94,17 +86,15 @@ def train(plain: dict[str, Any], folder: Path) -> bytes:
     command("agents.train", *words)
     with zipfile.ZipFile(output / "final_model.zip") as model:
         weights = torch.load(io.BytesIO(model.read("policy.pth")), "cpu", weights_only=True)
-    tensors = [weights[key].contiguous().numpy().tobytes() for key in sorted(weights)]
-    return b"".join([*tensors, (output / "validation.jsonl").read_bytes()])
+    tensors = (weights[key].contiguous().numpy().tobytes() for key in sorted(weights))
+    return b"".join(tensors) + (output / "validation.jsonl").read_bytes()
 
 
 def numbers(content: Any) -> Iterator[float]:
     """All numbers of a JSON document but the wall times, by sorted keys."""
     if isinstance(content, dict):
-        for key in sorted(content):
-            if key != "seconds":
-                yield from numbers(content[key])
-    elif isinstance(content, list):
+        content = [content[key] for key in sorted(content) if key != "seconds"]
+    if isinstance(content, list):
         for entry in content:
             yield from numbers(entry)
     elif isinstance(content, (int, float)) and not isinstance(content, bool):
@@ -113,12 +103,9 @@ def numbers(content: Any) -> Iterator[float]:
 
 def benchmark(setting: str, folder: Path) -> bytes:
     """The numbers in every file that the quick benchmark of a setting writes."""
-    results = folder / "results"
-    command(
-        "agents.benchmark",
-        *("--quick", "--envs", setting, "--workers", "1"),
-        *("--results", str(results), "--work", str(folder / "work")),
-    )
+    results, work = folder / "results", folder / "work"
+    words = ["--quick", "--envs", setting, "--workers", "1"]
+    command("agents.benchmark", *words, "--results", str(results), "--work", str(work))
     files = sorted(results.glob(f"{setting}/*.json"))
     return json.dumps({file.name: list(numbers(read(file))) for file in files}).encode()
 
@@ -189,38 +176,31 @@ def run(output: Path, kinds: list[str], episodes: int, workers: int) -> int:
     print(f"{len(pieces)} pieces, {len(pieces) - len(left)} of them are finished", flush=True)
     output.parent.mkdir(parents=True, exist_ok=True)
     unfinished, failed = output.with_name(output.name + ".part"), 0
-    with ThreadPoolExecutor(workers) as pool:
-        futures: dict[Future[tuple[str, float]], str] = {
-            pool.submit(fingerprint, work): name for name, work in left.items()
-        }
-        try:
-            for future in as_completed(futures):
-                name = futures[future]
-                if (error := future.exception()) is not None:
-                    failed += 1
-                    print(f"{name} failed: {error!r}", file=sys.stderr, flush=True)
-                    continue
-                found[name], seconds = future.result()
-                unfinished.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n")
-                unfinished.replace(output)
-                print(f"{name}: {found[name][:12]}, {seconds:.0f} s", flush=True)
-        except KeyboardInterrupt:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    pool = ThreadPoolExecutor(workers)
+    futures = {pool.submit(fingerprint, work): name for name, work in left.items()}
+    try:
+        for future in as_completed(futures):
+            name, error = futures[future], future.exception()
+            if error is not None:
+                failed += 1
+                print(f"{name} failed: {error}", file=sys.stderr, flush=True)
+                continue
+            found[name], seconds = future.result()
+            unfinished.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n")
+            unfinished.replace(output)
+            print(f"{name}: {found[name][:12]}, {seconds:.0f} s", flush=True)
+    finally:
+        pool.shutdown(cancel_futures=True)
     return failed
 
 
 def compare(before: Path, after: Path) -> int:
     """Print the pieces that differ or that one of the files lacks; returns how many."""
     first, second = read(before), read(after)
-    names = sorted(first.keys() | second.keys())
-    differing = [name for name in names if first.get(name) != second.get(name)]
+    differing = sorted(name for name in first | second if first.get(name) != second.get(name))
     for name in differing:
-        lacking = [
-            str(path) for path, side in ((before, first), (after, second)) if name not in side
-        ]
-        print(f"{name}: {'not in ' + lacking[0] if lacking else 'differs'}")
-    print(f"{len(differing)} of {len(names)} pieces differ")
+        print(name, "differs" if name in first and name in second else "is in one file only")
+    print(f"{len(differing)} of {len(first | second)} pieces differ")
     return len(differing)
 
 
@@ -240,10 +220,12 @@ def main() -> None:
     given = parser.parse_args()
     try:
         if given.compare:
-            sys.exit(compare(*given.compare) > 0)
-        sys.exit(run(given.output, given.only, given.episodes, given.workers) > 0)
+            wrong = compare(*given.compare)
+        else:
+            wrong = run(given.output, given.only, given.episodes, given.workers)
     except KeyboardInterrupt:
         sys.exit(130)
+    sys.exit(wrong > 0)
 
 
 if __name__ == "__main__":
