@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +17,15 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import Signals
+from fusion_gym.envs.registered import CorrelatedTrackingEnv, CorrelatedTrackingVectorEnv
+from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.registry import make_trigger
 from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
 from fusion_gym.policies.rules.random import Random
-from fusion_gym.systems.correlated.environment import (
-    CorrelatedTrackingEnv,
-    CorrelatedTrackingOptions,
-    CorrelatedTrackingVectorEnv,
-    build,
-)
+from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
 from fusion_gym.validation import ConfigurationError
+
+build = partial(make_task, "fusion_gym/CorrelatedTracking-v0")
 
 Array = NDArray[np.float64]
 ROOT = Path(__file__).parent.parent

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -20,10 +20,12 @@ from scipy.optimize import brentq
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import Signals
+from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.registry import make_trigger
 from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
-from fusion_gym.systems.correlated.environment import build
+
+build = partial(make_task, "fusion_gym/CorrelatedTracking-v0")
 
 Array = NDArray[np.float64]
 RATES = (0.581, 0.463, 0.635)

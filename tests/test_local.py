@@ -15,7 +15,7 @@ import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.envs.views import LocalView
+from fusion_gym.envs.views import SensorView
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.make import make_policy
 from fusion_gym.policies.model import tag_model
@@ -35,7 +35,7 @@ def test_pettingzoos_own_checks(env_id: str) -> None:
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_a_row_has_what_the_sensor_knows_and_nothing_else(env_id: str) -> None:
     task = fusion_gym.make_task(env_id, price_range=(0.001, 0.1), cost_weight=0.01)
-    view, batch = LocalView(task), EpisodeBatch(task, 5)
+    view, batch = SensorView(task), EpisodeBatch(task, 5)
     batch.seed(np.arange(5), list(range(5)))
     batch.reset()
     for _ in range(3):
@@ -63,7 +63,7 @@ def test_a_row_has_what_the_sensor_knows_and_nothing_else(env_id: str) -> None:
 def test_another_sensors_measurement_changes_nothing() -> None:
     """The entries of sensor 0 are the same whatever the others have measured."""
     task = fusion_gym.make_task(TOBIT, filter="tobit")
-    view = LocalView(task)
+    view = SensorView(task)
     observation = np.zeros((1, len(EpisodeBatch(task, 1).layout.names)), dtype=np.float32)
     before = view.rows(observation)
     for entry, feature in enumerate(EpisodeBatch(task, 1).layout.entries):
@@ -101,7 +101,7 @@ def test_the_parallel_environment_is_the_coordinators_run() -> None:
     env = fusion_gym.parallel_env(TOBIT, horizon=5)
     whole = fusion_gym.make_sb3_vec_env(TOBIT, 1, seed=11, horizon=5)
     observations, _ = env.reset(seed=11)
-    view = LocalView(env.task)
+    view = SensorView(env.task)
     np.testing.assert_array_equal(np.stack(list(observations.values())), view.rows(whole.reset()))
     for step in range(5):
         chosen = np.array([1, 0, 1])
@@ -129,7 +129,7 @@ def test_a_shared_policy_is_trained_saved_and_evaluated(tmp_path: Path) -> None:
     batch.reset()
     rate = np.zeros((3, 3))
     for _ in range(10):
-        action, _ = model.predict(LocalView(task).rows(batch.observe()), deterministic=True)
+        action, _ = model.predict(SensorView(task).rows(batch.observe()), deterministic=True)
         rate += batch.step(action.reshape(3, 3).T.astype(np.bool_)).granted.T
     np.testing.assert_allclose(results.rate, rate / 10)
 

@@ -7,6 +7,7 @@ standard error of about 0.5 %, ours of half that, so 2.2 % are four standard err
 from __future__ import annotations
 
 import itertools
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,10 +19,12 @@ from scipy.stats import multivariate_normal
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import Signals
+from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.rules.constant import Always
 from fusion_gym.policies.rules.random import Random
-from fusion_gym.systems.markov_jump.environment import build
+
+build = partial(make_task, "fusion_gym/MarkovJumpTracking-v0")
 
 Array = NDArray[np.float64]
 FILTERS = ("centralised", "imm")

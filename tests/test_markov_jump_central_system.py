@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,16 @@ import fusion_gym
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import Signals
-from fusion_gym.envs.views import LocalView
+from fusion_gym.envs.registered import MarkovJumpTrackingEnv
+from fusion_gym.envs.registration import make_task
+from fusion_gym.envs.views import SensorView
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.make import make_policy
 from fusion_gym.policies.registry import make_trigger
 from fusion_gym.policies.rules.random import Random
-from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingEnv, build
 from fusion_gym.validation import ConfigurationError
+
+build = partial(make_task, "fusion_gym/MarkovJumpTracking-v0")
 
 Array = NDArray[np.float64]
 FILTERS = ("centralised", "imm")
@@ -195,7 +199,7 @@ def test_gymnasium_accepts_it_and_its_observations(where: str, entries: int) -> 
 
 @each_filter
 def test_a_sensor_alone_sees_what_its_node_knows(where: str) -> None:
-    view = LocalView(fusion_gym.make_task(ENV_ID, filter=where))
+    view = SensorView(fusion_gym.make_task(ENV_ID, filter=where))
     assert view.names[:4] == ("difference", "sampled", "phase", "age")
     assert not any(name.startswith(("whitened", "log", "mode")) for name in view.names)
 

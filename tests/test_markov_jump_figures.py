@@ -7,6 +7,8 @@ Traces depend on no noise and are held to the printed digits.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -14,14 +16,16 @@ from reference_markov_jump import options, random_model
 
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.rules.centre_variance import CentreVariance
 from fusion_gym.policies.rules.constant import Always
 from fusion_gym.policies.rules.local_variance import LocalVariance
 from fusion_gym.policies.rules.random import Random
-from fusion_gym.systems.markov_jump.environment import build
 from fusion_gym.systems.markov_jump.system import MarkovJumpSystem
+
+build = partial(make_task, "fusion_gym/MarkovJumpTracking-v0")
 
 Array = NDArray[np.float64]
 RMSE = 0.022  # relative: four standard errors

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,17 +15,16 @@ from reference_markov_jump import PAPER, Run, options, random_model
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import Signals
+from fusion_gym.envs.registered import MarkovJumpTrackingEnv, MarkovJumpTrackingVectorEnv
+from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_trigger
 from fusion_gym.policies.rules.centre_variance import CentreVariance
 from fusion_gym.policies.rules.local_variance import LocalVariance
 from fusion_gym.policies.rules.random import Random
-from fusion_gym.systems.markov_jump.environment import (
-    MarkovJumpTrackingEnv,
-    MarkovJumpTrackingVectorEnv,
-    build,
-)
 from fusion_gym.validation import ConfigurationError
+
+build = partial(make_task, "fusion_gym/MarkovJumpTracking-v0")
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_suppo
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.envs import spaces
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.envs.views import CoordinatorView
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.make import make_policy
 from fusion_gym.policies.model import ModelPolicy, tag_model
@@ -57,10 +57,11 @@ def test_grantable_is_what_the_network_grants_alone(options: dict[str, Any], ste
 def test_masks_close_exactly_the_actions_with_closed_sensors(options: dict[str, Any]) -> None:
     task = fusion_gym.make_task(ENV_ID, **options)
     patterns = np.array(list(product((False, True), repeat=3))).T
-    masks = spaces.action_masks(task, patterns)
+    view = CoordinatorView(task)
+    masks = view.masks(patterns)
     if options.get("action") == "discrete" or options.get("access") == "single":
         for action in range(masks.shape[1]):
-            chosen = spaces.requests(task, np.full(8, action), 8)
+            chosen = view.requests(np.full(8, action), 8)
             np.testing.assert_array_equal(masks[:, action], ~(chosen & ~patterns).any(0))
     else:
         np.testing.assert_array_equal(masks.reshape(8, 3, 2)[..., 0], True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,19 +13,18 @@ from numpy.typing import NDArray
 
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.channel import Channel
+from fusion_gym.envs.registered import RemoteEstimationEnv, RemoteEstimationVectorEnv
+from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.optimal import OptimalPolicy
 from fusion_gym.policies.registry import make_trigger
 from fusion_gym.solvers.joint import JointProblem, solve_joint_average
 from fusion_gym.solvers.single import SourceProblem, solve_average
 from fusion_gym.solvers.task import solve_task, source_problems
-from fusion_gym.systems.correlated.environment import build as build_tracking
-from fusion_gym.systems.remote.environment import (
-    RemoteEstimationEnv,
-    RemoteEstimationVectorEnv,
-    build,
-)
 from fusion_gym.validation import ConfigurationError
+
+build_tracking = partial(make_task, "fusion_gym/CorrelatedTracking-v0")
+build = partial(make_task, "fusion_gym/RemoteEstimation-v0")
 
 Array = NDArray[np.float64]
 LOSSY: dict[str, Any] = {

@@ -9,7 +9,7 @@ printed digit.
 from __future__ import annotations
 
 import math
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,11 +17,13 @@ import pytest
 from numpy.typing import NDArray
 
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
 from fusion_gym.policies.rules.constant import Always, Never
 from fusion_gym.policies.rules.random import Random
-from fusion_gym.systems.unknown_input.environment import build
+
+build = partial(make_task, "fusion_gym/UnknownInput-v0")
 
 Array = NDArray[np.float64]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,12 @@ import pytest
 
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.registry import make_trigger
-from fusion_gym.systems.unknown_input.environment import UnknownInputOptions, build
+from fusion_gym.systems.unknown_input.environment import UnknownInputOptions
 from fusion_gym.validation import ConfigurationError
+
+build = partial(make_task, "fusion_gym/UnknownInput-v0")
 
 ROOT = Path(__file__).parents[1]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from scipy.special import ndtr
 
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.envs.registered import UnknownInputEnv, UnknownInputVectorEnv
+from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.fusion.covariance_intersection import (
     covariance_intersection_many,
@@ -21,12 +24,9 @@ from fusion_gym.policies.registry import make_trigger
 from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
 from fusion_gym.policies.rules.constant import Always, Never
 from fusion_gym.policies.rules.random import Random
-from fusion_gym.systems.unknown_input.environment import (
-    UnknownInputEnv,
-    UnknownInputVectorEnv,
-    build,
-)
 from fusion_gym.systems.unknown_input.examples import EXAMPLES, two_carts
+
+build = partial(make_task, "fusion_gym/UnknownInput-v0")
 
 Array = NDArray[np.float64]
 ROOT = Path(__file__).parents[1]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, merge_runs
 from fusion_gym.core.access import access_mask, first_request
-from fusion_gym.core.observation import ObservationLayout
+from fusion_gym.core.observation import Network, ObservationLayout
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 
@@ -158,7 +158,7 @@ class EpisodeBatch:
 
     def observe(self) -> NDArray[np.float32]:
         """Observations (N, entries) of all runs, a fresh array."""
-        return self.layout.encode(self.state, self.tokens, self.admitted, self.price)
+        return self.layout.encode(self.state, Network(self.tokens, self.admitted, self.price))
 
     def admitted(self) -> NDArray[np.bool_]:
         """The sensors (sensors, N) that the network's access rule admits in the coming step."""

@@ -3,63 +3,128 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Feature
+from fusion_gym.core.knowledge import covers
+from fusion_gym.core.system import Block, numbered
 from fusion_gym.core.task import Task
+from fusion_gym.validation import ConfigurationError
 
-_NOTHING = np.empty((0, 1))
+
+class Network(NamedTuple):
+    """The network's side of an observation: ``tokens`` and ``price`` (N,), ``admitted()``
+    (sensors, N) bool."""
+
+    tokens: Array
+    admitted: Callable[[], NDArray[np.bool_]]
+    price: Array
+
+
+class Entry(NamedTuple):
+    """One number of an observation.
+
+    ``sensor`` is the sensor that sees it by itself, under the name ``own_name``; ``told`` says
+    that every sensor does.
+    """
+
+    name: str
+    own_name: str
+    sensor: int | None
+    told: bool
+
+
+def network_blocks(task: Task) -> tuple[Block, ...]:
+    """What the network adds to a system's own blocks; their values are made of a `Network`."""
+    capacity, price = task.bucket.capacity, task.reward.price
+    tokens = Block(
+        "tokens",
+        "centre",
+        "told",
+        (),
+        "tokens over the capacity",
+        lambda net: net.tokens / capacity,
+    )
+    admitted = Block(
+        "admitted",
+        "centre",
+        "own",
+        (numbered(task.sensors),),
+        "whether the network's access rule admits the sensor in this step",
+        lambda net: net.admitted(),
+    )
+    shown = Block(
+        "price",
+        "centre",
+        "told",
+        (),
+        "place of a token's price in its range, in the logarithm",
+        lambda net: price.encode(net.price),
+    )
+    decides = task.access in ("round_robin", "random")
+    return (
+        tokens,
+        *((admitted,) if decides else ()),
+        *((shown,) if price.span is not None else ()),
+    )
 
 
 class ObservationLayout:
     """Which entries an agent's observation has, by name, and how it is filled.
 
-    ``entries`` are its features, ``names`` has one name an entry, ``low`` and ``high`` (entries,)
-    float32 are its bounds.
+    ``blocks`` are those that the task's information mode shows, the network's last; ``entries``
+    and ``names`` have one item an entry, ``low`` and ``high`` (entries,) float32 are its bounds.
+
+    Raises:
+        ConfigurationError: two blocks of one name.
     """
 
     def __init__(self, task: Task) -> None:
-        admitted = tuple(
-            Feature(f"admitted[{sensor}]", "centre", 0.0, 1.0, sensor=sensor)
-            for sensor in range(task.sensors if task.access in ("round_robin", "random") else 0)
-        )
-        self._price = task.reward.price if task.reward.price.span is not None else None
-        price = (
-            () if self._price is None else (Feature("price", "centre", 0.0, 1.0, broadcast=True),)
-        )
-        tokens = (Feature("tokens", "centre", 0.0, 1.0, broadcast=True),)
-        blocks = (*task.system.features, tokens, admitted, price)
-        self._kept = [
-            number
-            for number, block in enumerate(blocks)
-            if block and (task.information == "sensors" or block[0].knowledge == "centre")
-        ]
-        entries = [entry for number in self._kept for entry in blocks[number]]
-        self.entries = tuple(entries)
-        self.names = tuple(entry.name for entry in entries)
-        self.low = np.array([entry.low for entry in entries], dtype=np.float32)
-        self.high = np.array([entry.high for entry in entries], dtype=np.float32)
-        self._shows_admitted = bool(admitted)
-        self._capacity = task.bucket.capacity
-        self._system = task.system
+        def shown(blocks: tuple[Block, ...]) -> tuple[Block, ...]:
+            return tuple(block for block in blocks if covers(task.knowledge, block.knowledge))
 
-    def encode(
-        self, state: Any, tokens: Array, admitted: Callable[[], NDArray[np.bool_]], price: Array
-    ) -> np.ndarray[Any, np.dtype[np.float32]]:
+        self._own, self._network = shown(task.system.observation), shown(network_blocks(task))
+        self.blocks = self._own + self._network
+        names = [block.name for block in self.blocks]
+        for name in names:
+            if names.count(name) > 1:
+                raise ConfigurationError(f"observation block {name!r} is declared twice")
+        self.entries = tuple(entry for block in self.blocks for entry in _entries(block))
+        self.names = tuple(entry.name for entry in self.entries)
+        bounds = [block.bounds for block in self.blocks for _ in block.places]
+        self.low, self.high = np.array(bounds, dtype=np.float32).T.copy()
+
+    def encode(self, state: Any, network: Network) -> NDArray[np.float32]:
         """Observations (N, entries) float32, clipped to their bounds.
 
-        ``tokens`` (N,) and ``admitted()`` (sensors, N) are the network's, ``price`` (N,) is that
-        of a token.
+        Raises:
+            ValueError: a block's value has not the declared shape.
         """
-        blocks = [*self._system.observe(state), tokens[None] / self._capacity]
-        blocks.append(admitted().astype(np.float64) if self._shows_admitted else _NOTHING)
-        if self._price is not None:
-            blocks.append(self._price.encode(price)[None])
-        rows = np.concatenate([blocks[number] for number in self._kept])
+        filled = [block.fill(state) for block in self._own]
+        filled += [block.fill(network) for block in self._network]
+        rows = np.concatenate(filled, dtype=np.float64)
         result = np.ascontiguousarray(rows.T, dtype=np.float32)
         np.maximum(result, self.low, out=result)
         return np.minimum(result, self.high, out=result)
+
+
+def _entries(block: Block) -> list[Entry]:
+    found = []
+    for place in block.places:
+        own, rest = block.node == "own", place[1:] if block.node == "own" else place
+        found.append(
+            Entry(
+                name=_named(block.name, place),
+                own_name=_named(block.name, rest),
+                sensor=block.labels[0].index(place[0]) if own else None,
+                told=block.node == "told",
+            )
+        )
+    return found
+
+
+def _named(kind: str, place: tuple[str, ...]) -> str:
+    return f"{kind}[{','.join(place)}]" if place else kind

@@ -1,18 +1,15 @@
-"""What the environments' options have in common: network, episode, reward, reports."""
+"""What the environments' options have in common, and what an environment makes of them."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
-from typing import Any, TypeVar
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.core.reward import Price, Reward
 from fusion_gym.core.system import System
-from fusion_gym.core.task import Task
-from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.validation import ConfigurationError
 
 
@@ -40,74 +37,19 @@ class CommonOptions:
     state_weights: ArrayLike | None = None
 
 
-Options = TypeVar("Options", bound=CommonOptions)
+@dataclass(frozen=True)
+class Scenario:
+    """What an environment makes of its options: all that is its own of a task.
 
-
-def choose(kind: type[Options], env_id: str, given: dict[str, Any]) -> tuple[Options, int | None]:
-    """The options as given, and ``max_episode_steps``, which every environment takes as well.
-
-    Raises:
-        ConfigurationError: an unknown option.
+    ``state_weights`` (n,) weigh the squared errors in the reward if the options give none; ``None``
+    weighs all states alike, so that open loop costs one a step. ``policy_defaults`` are the
+    scenario's own parameters of named policies.
     """
-    limit = given.pop("max_episode_steps", None)
-    known = [field.name for field in fields(kind)]
-    validation.keys(f"option of {env_id}", given, known)
-    if limit is not None:
-        limit = validation.integer("max_episode_steps", limit, at_least=1)
-    return kind(**given), limit
 
-
-def make_bucket(chosen: CommonOptions, sensors: int) -> TokenBucket:
-    """The token bucket of the options.
-
-    Raises:
-        ConfigurationError: a value that is not allowed.
-    """
-    unlimited = validation.choice("tokens", chosen.tokens, ("limited", "unlimited"))
-    return TokenBucket.create(
-        rate=chosen.token_rate,
-        capacity=chosen.token_capacity,
-        initial=chosen.initial_tokens,
-        cost=chosen.token_cost,
-        sensors=sensors,
-        sharing=chosen.sharing,
-        unlimited=unlimited == "unlimited",
-    )
-
-
-def finish(
-    chosen: CommonOptions,
-    system: System[Any],
-    limit: int | None,
-    weights: ArrayLike | None,
-    **task: Any,
-) -> Task:
-    """The task of a system with the options' network, reward and episode.
-
-    ``weights`` (n,) are the state weights if the options give none; ``limit`` shortens the episode
-    without changing any scale.
-
-    Raises:
-        ConfigurationError: a value that is not allowed.
-    """
-    reward = Reward.create(
-        chosen.error,
-        chosen.error_weight,
-        Price.create(chosen.cost_weight, chosen.price_range),
-        weights if chosen.state_weights is None else chosen.state_weights,
-        system.open_loop(chosen.horizon),
-    )
-    return Task(
-        system=system,
-        bucket=make_bucket(chosen, system.sensor_count),
-        reward=reward,
-        horizon=chosen.horizon if limit is None else min(chosen.horizon, limit),
-        information=chosen.information,
-        action=chosen.action,
-        access=chosen.access,
-        settings=plain(asdict(chosen)),
-        **task,
-    )
+    options: CommonOptions
+    system: System[Any]
+    state_weights: ArrayLike | None = None
+    policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 def plain(value: Any) -> Any:

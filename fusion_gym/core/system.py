@@ -1,8 +1,9 @@
-"""What the environments ask of a system, and the signals that a policy may look at."""
+"""What the environments ask of a system: its moves, its signals, its observation."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
@@ -10,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
+from fusion_gym.core.knowledge import Knowledge
 
-Knowledge = Literal["sensor", "centre"]
 SignalArray = NDArray[Any]
 
 StateT = TypeVar("StateT")
@@ -19,10 +20,12 @@ StateT = TypeVar("StateT")
 
 @dataclass(frozen=True)
 class Signal:
-    """A named quantity: who knows it before anything is sent, its axes, and what it is.
+    """A named quantity that a policy may look at: who knows it, its axes, and what it is.
 
-    ``knowledge`` is ``"sensor"`` for what only the sensor knows (its new measurement and all that
-    follows from it) and ``"centre"`` for what the fusion centre knows as well.
+    ``knowledge`` is ``"own"`` for what only the sensor knows before anything is sent (its new
+    measurement and all that follows from it), ``"centre"`` for what the fusion centre knows as
+    well, ``"clock"`` for what time alone tells. ``axes`` names the axes, as in
+    ``"(sensors, m, N)"``; an array has as many, the batch axis N last.
     """
 
     name: str
@@ -32,36 +35,72 @@ class Signal:
 
 
 @dataclass(frozen=True)
-class Feature:
-    """One entry of an agent's observation: its name, who knows it, and its bounds.
+class Block:
+    """Entries of an agent's observation, all that there is to know of them in one place.
 
-    ``sensor`` is the number of the sensor whose node knows the entry by itself, ``broadcast``
-    marks what every node is told; other entries are none of a single sensor's knowledge. A block
-    of ``Feature`` entries is filled by one array of as many rows.
+    ``labels`` has the labels of each axis: ``(("0", "1"), ("x1", "x2"))`` names the entries
+    ``name[0,x1]``, ``name[0,x2]``, …, and no axes at all the one entry ``name``. ``value`` takes a
+    state after sensing and returns the entries, scaled to order one, as an array of the labels'
+    shape and N runs; they are clipped to ±``limit``, or without a limit to 0..1.
+
+    ``knowledge`` is the least class that knows the block before anything is sent; ``node`` is what
+    a sensor sees of it by itself: its own row of the first axis (``"own"``), all of it, for the
+    centre tells everyone (``"told"``), or nothing (``"hidden"``).
     """
 
     name: str
     knowledge: Knowledge
-    low: float
-    high: float
-    sensor: int | None = None
-    broadcast: bool = False
+    node: Literal["own", "told", "hidden"]
+    labels: tuple[tuple[str, ...], ...]
+    meaning: str
+    value: Callable[[Any], NDArray[Any]]
+    limit: float | None = None
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the entries, without the batch axis."""
+        return tuple(len(axis) for axis in self.labels)
+
+    @property
+    def places(self) -> tuple[tuple[str, ...], ...]:
+        """The labels of each entry, in the order of a C-ordered array."""
+        return tuple(itertools.product(*self.labels))
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Lowest and highest value of an entry."""
+        return (0.0, 1.0) if self.limit is None else (-self.limit, self.limit)
+
+    def fill(self, state: Any) -> NDArray[Any]:
+        """The entries (rows, N) of a state, not yet clipped.
+
+        Raises:
+            ValueError: ``value`` returned another shape.
+        """
+        filled = self.value(state)
+        if filled.shape[:-1] != self.shape:
+            raise ValueError(
+                f"observation block {self.name!r} of shape {filled.shape} is not allowed: it must "
+                f"be {(*self.shape, 'N')}"
+            )
+        return filled.reshape(-1, filled.shape[-1])
 
 
-def feature_block(
-    kind: str,
-    places: Iterable[tuple[int | None, str]],
-    knowledge: Knowledge,
-    limit: float | None = None,
-) -> tuple[Feature, ...]:
-    """Entries ``kind[place]`` of (the sensor that knows it by itself, place).
-
-    Between -limit and limit, or without a limit from 0 to 1.
-    """
-    low, high = (0.0, 1.0) if limit is None else (-limit, limit)
-    return tuple(
-        Feature(f"{kind}[{place}]", knowledge, low, high, sensor=node) for node, place in places
+def age_block(sensors: tuple[str, ...]) -> Block:
+    """The entry that all systems have, of a state with ``age`` (sensors, N)."""
+    return Block(
+        "age",
+        "centre",
+        "own",
+        (sensors,),
+        "a/(a + 10), a steps since the last delivery",
+        lambda state: state.age / (state.age + 10.0),
     )
+
+
+def numbered(count: int) -> tuple[str, ...]:
+    """The labels "0", "1", … of an axis."""
+    return tuple(str(place) for place in range(count))
 
 
 class Signals(Mapping[str, SignalArray]):
@@ -137,8 +176,8 @@ class System(Protocol[StateT]):
         ...
 
     @property
-    def features(self) -> tuple[tuple[Feature, ...], ...]:
-        """The blocks of an agent's observation, in the order of :meth:`observe`."""
+    def observation(self) -> tuple[Block, ...]:
+        """The blocks of an agent's observation, in their order."""
         ...
 
     def start(self, noise: Array) -> StateT:
@@ -157,8 +196,12 @@ class System(Protocol[StateT]):
         """The signals after :meth:`sense`."""
         ...
 
-    def observe(self, state: StateT) -> Sequence[Array]:
-        """The observation's blocks after :meth:`sense`, each (rows, N), scaled to order one."""
+    def visible(self, state: StateT) -> StateT:
+        """The state without what no policy may know, for policies that plan with the model.
+
+        The truth and all that is not yet measured are not a number, coming losses are taken out:
+        :meth:`deliver` lets every grant arrive.
+        """
         ...
 
     def truth(self, state: StateT) -> Array:
@@ -175,6 +218,18 @@ class System(Protocol[StateT]):
 
     def open_loop(self, horizon: int) -> Array:
         """Mean error variance (n,) over t = 1..horizon of a centre that never receives."""
+        ...
+
+
+@runtime_checkable
+class LossySystem(System[StateT], Protocol[StateT]):
+    """A system whose channel may lose what was granted. Optional: others lose nothing."""
+
+    def arrival_probability(self, state: StateT) -> Array | None:
+        """Probability (sensors, N) that a packet sent after this sensing arrives, or None: surely.
+
+        From what is known before anything is sent.
+        """
         ...
 
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.access import ACCESS_RULES
-from fusion_gym.core.reward import Reward
+from fusion_gym.core.knowledge import Knowledge, covers
+from fusion_gym.core.options import CommonOptions, Scenario, plain
+from fusion_gym.core.reward import Price, Reward
 from fusion_gym.core.system import System
 from fusion_gym.core.token_bucket import TokenBucket
 
-INFORMATION_MODES = ("sensors", "centre")
+# What a policy of each information mode may know.
+INFORMATION_MODES: dict[str, Knowledge] = {"sensors": "coordinator", "centre": "centre"}
 ACTION_KINDS = ("binary", "discrete")
 
 
@@ -66,6 +69,40 @@ class Task:
                 f"system has {states} states, so it must be ({states}, 1)"
             )
 
+    @classmethod
+    def create(cls, scenario: Scenario, limit: int | None = None) -> Task:
+        """The scenario's system with its options' network, reward and episode.
+
+        ``limit`` shortens the episode without changing any scale.
+
+        Raises:
+            ConfigurationError: a value that is not allowed.
+        """
+        chosen, system = scenario.options, scenario.system
+        reward = Reward.create(
+            chosen.error,
+            chosen.error_weight,
+            Price.create(chosen.cost_weight, chosen.price_range),
+            scenario.state_weights if chosen.state_weights is None else chosen.state_weights,
+            system.open_loop(chosen.horizon),
+        )
+        return cls(
+            system=system,
+            bucket=make_bucket(chosen, system.sensor_count),
+            reward=reward,
+            horizon=chosen.horizon if limit is None else min(chosen.horizon, limit),
+            information=chosen.information,
+            action=chosen.action,
+            access=chosen.access,
+            settings=plain(asdict(chosen)),
+            policy_defaults=scenario.policy_defaults,
+        )
+
+    @property
+    def knowledge(self) -> Knowledge:
+        """What a policy may know, in the one vocabulary."""
+        return INFORMATION_MODES[self.information]
+
     @property
     def sensors(self) -> int:
         """Number of sensors."""
@@ -79,7 +116,24 @@ class Task:
     @property
     def hidden_signals(self) -> tuple[str, ...]:
         """Names of the system's signals that the information mode withholds."""
-        if self.information == "sensors":
-            return ()
-        hidden = (s.name for s in self.system.signals if s.knowledge == "sensor")
-        return ("state", *hidden)
+        signals = self.system.signals
+        hidden = (s.name for s in signals if not covers(self.knowledge, s.knowledge))
+        return (*hidden, *(() if self.knowledge == "coordinator" else ("state",)))
+
+
+def make_bucket(chosen: CommonOptions, sensors: int) -> TokenBucket:
+    """The token bucket of the options.
+
+    Raises:
+        ConfigurationError: a value that is not allowed.
+    """
+    unlimited = validation.choice("tokens", chosen.tokens, ("limited", "unlimited"))
+    return TokenBucket.create(
+        rate=chosen.token_rate,
+        capacity=chosen.token_capacity,
+        initial=chosen.initial_tokens,
+        cost=chosen.token_cost,
+        sensors=sensors,
+        sharing=chosen.sharing,
+        unlimited=unlimited == "unlimited",
+    )

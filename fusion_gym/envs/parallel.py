@@ -14,7 +14,7 @@ from pettingzoo import ParallelEnv
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
-from fusion_gym.envs.views import LocalView
+from fusion_gym.envs.views import SensorView
 
 Dict = dict[str, Any]
 
@@ -22,7 +22,7 @@ Dict = dict[str, Any]
 class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
     """One run, in which each sensor decides by itself whether to request (1) or not (0).
 
-    An agent observes what its sensor sees by itself (:class:`~fusion_gym.envs.views.LocalView`),
+    An agent observes what its sensor sees by itself (:class:`~fusion_gym.envs.views.SensorView`),
     all get the run's reward. Episodes end by truncation for all agents at once.
 
     Attributes:
@@ -34,13 +34,13 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
     def __init__(self, task: Task) -> None:
         self.task = task
         self.batch = EpisodeBatch(task, 1)
-        self.view = LocalView(task)
+        self.view = SensorView(task)
         self.observation_names = self.view.names
         self.render_mode = None
         self.possible_agents = [f"sensor_{sensor}" for sensor in range(task.sensors)]
         self.agents: list[str] = []
         self.observation_spaces = dict.fromkeys(self.possible_agents, self.view.space)
-        self.action_spaces = dict.fromkeys(self.possible_agents, Discrete(2))
+        self.action_spaces = dict.fromkeys(self.possible_agents, self.view.actions)
 
     def observation_space(self, agent: str) -> Box:
         """Box of shape (entries,), float32, the same for every agent."""
@@ -76,7 +76,7 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
                 f"{self.agents}"
             )
         chosen = np.array([actions[agent] for agent in self.agents])
-        outcome = self.batch.step(self.view.requests(chosen))
+        outcome = self.batch.step(self.view.requests(chosen, 1))
         reward, ended = float(outcome.reward[0]), bool(outcome.truncated[0])
         agents = self.agents
         costs = outcome.granted[:, 0] * self.task.bucket.cost[:, 0]

@@ -1,44 +1,63 @@
-"""Base of the registered environments: a ``build`` function from options to a task, two faces."""
+"""The registered environments' classes, made from their options when they are first asked for.
+
+``TobitOscillatorEnv`` and ``TobitOscillatorVectorEnv`` are what ``gym.make`` and ``gym.make_vec``
+build for ``fusion_gym/TobitOscillator-v0``; ``help`` shows their page, with every option.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, ClassVar
+import inspect
+from dataclasses import fields
+from typing import Any
 
 from gymnasium.vector import AutoresetMode
 
-from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import ENVIRONMENTS, class_name, make_task, options_of
 from fusion_gym.envs.single import FusionEnv
 from fusion_gym.envs.vector import FusionVectorEnv
 
 
-class RegisteredEnv(FusionEnv):
-    """The single environment of :attr:`build`; keyword arguments are its options.
+def __getattr__(name: str) -> type:
+    """The class of this name, made once."""
+    for env_id in ENVIRONMENTS:
+        prefix = class_name(env_id)
+        if name in (f"{prefix}Env", f"{prefix}VectorEnv"):
+            made = _vector(env_id) if name.endswith("VectorEnv") else _single(env_id)
+            made.__name__ = made.__qualname__ = name
+            globals()[name] = made
+            return made
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
-    Raises:
-        ConfigurationError: an unknown option, or a value that is not allowed.
-    """
 
-    build: ClassVar[Callable[..., Task]]
+def _single(env_id: str) -> type:
+    def __init__(self: FusionEnv, render_mode: str | None = None, **options: Any) -> None:
+        FusionEnv.__init__(self, make_task(env_id, **options), render_mode)
 
-    def __init__(self, render_mode: str | None = None, **options: Any) -> None:
-        super().__init__(type(self).build(**options), render_mode)
+    return _made(env_id, FusionEnv, __init__)
 
 
-class RegisteredVectorEnv(FusionVectorEnv):
-    """The vector environment of :attr:`build`; further keyword arguments are its options.
-
-    Raises:
-        ConfigurationError: an unknown option, or a value that is not allowed.
-    """
-
-    build: ClassVar[Callable[..., Task]]
-
+def _vector(env_id: str) -> type:
     def __init__(
-        self,
+        self: FusionVectorEnv,
         num_envs: int = 1,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        super().__init__(type(self).build(**options), num_envs, autoreset_mode, render_mode)
+        task = make_task(env_id, **options)
+        FusionVectorEnv.__init__(self, task, num_envs, autoreset_mode, render_mode)
+
+    return _made(env_id, FusionVectorEnv, __init__)
+
+
+def _made(env_id: str, base: type, init: Any) -> type:
+    """A class whose signature shows every option with its default."""
+    own = list(inspect.signature(init).parameters.values())[:-1]
+    options = [
+        inspect.Parameter(
+            f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=f.type
+        )
+        for f in fields(options_of(env_id))
+    ]
+    init.__signature__ = inspect.Signature([*own, *options])
+    return type(base.__name__, (base,), {"__init__": init, "__module__": __name__})

@@ -1,58 +1,138 @@
-"""Registration of the environments with Gymnasium, and the way to a task by its id."""
+"""The registered environments: an id stands for a ``build`` function from options to a scenario."""
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import typing
+from collections.abc import Callable
+from dataclasses import fields
 from typing import Any
 
 import gymnasium
-from gymnasium.envs.registration import load_env_creator
 
+from fusion_gym import validation
+from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.task import Task
-from fusion_gym.envs.vector import FusionVectorEnv
-from fusion_gym.validation import ConfigurationError, keys
+from fusion_gym.validation import ConfigurationError
 
-ENVIRONMENTS = {
-    "fusion_gym/TobitOscillator-v0": "fusion_gym.systems.tobit.oscillator:TobitOscillator",
-    "fusion_gym/CorrelatedTracking-v0": "fusion_gym.systems.correlated.environment:CorrelatedTracking",
-    "fusion_gym/MarkovJumpTracking-v0": "fusion_gym.systems.markov_jump.environment:MarkovJumpTracking",
-    "fusion_gym/UnknownInput-v0": "fusion_gym.systems.unknown_input.environment:UnknownInput",
-    "fusion_gym/BiasedOscillator-v0": "fusion_gym.systems.tobit.biased:BiasedOscillator",
-    "fusion_gym/BiasedTracking-v0": "fusion_gym.systems.tobit.biased:BiasedTracking",
-    "fusion_gym/RemoteEstimation-v0": "fusion_gym.systems.remote.environment:RemoteEstimation",
+Build = Callable[[Any], Scenario]
+
+ENVIRONMENTS: dict[str, str | Build] = {
+    "fusion_gym/TobitOscillator-v0": "fusion_gym.systems.tobit.oscillator:build",
+    "fusion_gym/CorrelatedTracking-v0": "fusion_gym.systems.correlated.environment:build",
+    "fusion_gym/MarkovJumpTracking-v0": "fusion_gym.systems.markov_jump.environment:build",
+    "fusion_gym/UnknownInput-v0": "fusion_gym.systems.unknown_input.environment:build",
+    "fusion_gym/BiasedOscillator-v0": "fusion_gym.systems.tobit.biased:build_oscillator",
+    "fusion_gym/BiasedTracking-v0": "fusion_gym.systems.tobit.biased:build_tracking",
+    "fusion_gym/RemoteEstimation-v0": "fusion_gym.systems.remote.environment:build",
 }
 
 
-def register() -> None:
-    """Register every environment with Gymnasium (again: no effect)."""
-    for name, prefix in ENVIRONMENTS.items():
+def class_name(env_id: str) -> str:
+    """Name of an environment's class in :mod:`fusion_gym.envs.registered`, without the ending.
+
+    ``fusion_gym/TobitOscillator-v0`` is TobitOscillator, ``mine/Tank-v1`` mine_Tank_v1.
+    """
+    own = env_id.removeprefix("fusion_gym/").removesuffix("-v0")
+    return own if own.isidentifier() else "".join(c if c.isalnum() else "_" for c in env_id)
+
+
+def register(env_id: str | None = None, build: str | Build | None = None) -> None:
+    """Register an environment of your own with Gymnasium, or (no arguments) all of this suite.
+
+    ``build`` takes one argument, annotated with a dataclass that extends
+    :class:`~fusion_gym.core.options.CommonOptions`, and returns a
+    :class:`~fusion_gym.core.options.Scenario`; ``"module:function"`` names one that is imported
+    when it is needed (and by worker processes). After that ``gym.make``, ``gym.make_vec``,
+    :func:`make_task` and all faces know ``env_id``.
+
+    Raises:
+        ConfigurationError: an id without a build function, or one that is taken.
+    """
+    if env_id is not None:
+        if build is None:
+            raise ConfigurationError(
+                f"build = None is not allowed for {env_id!r}: it must be a function or its name"
+            )
+        if ENVIRONMENTS.get(env_id, build) != build:
+            raise ConfigurationError(
+                f"env_id = {env_id!r} is not allowed: it is registered already"
+            )
+        ENVIRONMENTS[env_id] = build
+    for name in ENVIRONMENTS:
         if name not in gymnasium.registry:
+            prefix = f"fusion_gym.envs.registered:{class_name(name)}"
             gymnasium.register(
                 name, entry_point=f"{prefix}Env", vector_entry_point=f"{prefix}VectorEnv"
             )
 
 
-def make_task(env_id: str, **options: Any) -> Task:
-    """The task of a registered environment with these options.
+def build_of(env_id: str) -> Build:
+    """The ``build`` function of an id.
 
     Raises:
-        ConfigurationError: an id that is not one of this suite's, an unknown option, or a value
-            that is not allowed.
+        ConfigurationError: an unknown id.
     """
-    known = {
-        name
-        for name, spec in gymnasium.registry.items()
-        if spec.vector_entry_point is not None and name.startswith("fusion_gym/")
-    }
-    keys("environment", [env_id], known)
-    for name in ("num_envs", "autoreset_mode", "render_mode"):
-        if name in options:
+    validation.keys("environment", [env_id], ENVIRONMENTS)
+    entry = ENVIRONMENTS[env_id]
+    if not isinstance(entry, str):
+        return entry
+    module, _, name = entry.partition(":")
+    found: Build = getattr(importlib.import_module(module), name)
+    return found
+
+
+def options_of(env_id: str) -> type[CommonOptions]:
+    """The dataclass of an environment's options, with their defaults.
+
+    Raises:
+        ConfigurationError: an unknown id, or a build function whose argument is not annotated with
+            such a dataclass.
+    """
+    build = build_of(env_id)
+    first = next(iter(inspect.signature(build).parameters), "")
+    kind = typing.get_type_hints(build).get(first)
+    if not (isinstance(kind, type) and issubclass(kind, CommonOptions)):
+        raise ConfigurationError(
+            f"build of {env_id!r} is not allowed: its argument must be annotated with a dataclass "
+            "that extends CommonOptions"
+        )
+    return kind
+
+
+def make_task(env: str | CommonOptions, **options: Any) -> Task:
+    """The task of a registered environment, everything checked before anything runs.
+
+    ``env`` is an id, to which ``options`` and ``max_episode_steps`` (which every environment
+    takes) are added, or an options object such as
+    :class:`~fusion_gym.systems.tobit.oscillator.TobitOscillatorOptions`.
+
+    Raises:
+        ConfigurationError: an id that is not registered, an unknown option, or a value that is
+            not allowed.
+    """
+    if isinstance(env, CommonOptions):
+        validation.keys("option beside an options object", options, ["max_episode_steps"])
+        env_id = next((name for name in ENVIRONMENTS if options_of(name) is type(env)), None)
+        if env_id is None:
             raise ConfigurationError(
-                f"{name} = {options[name]!r} is not allowed: it is no option of a task"
+                f"options of type {type(env).__name__} are not allowed: they belong to none of the "
+                "registered environments"
             )
-    spec = gymnasium.spec(env_id)
-    entry = spec.vector_entry_point
-    creator = load_env_creator(entry) if isinstance(entry, str) else entry
-    assert creator is not None
-    env = creator(num_envs=1, **(spec.kwargs | options))
-    assert isinstance(env, FusionVectorEnv)
-    return env.task
+        chosen = env
+    else:
+        env_id, kind = env, options_of(env)
+        for name in ("num_envs", "autoreset_mode", "render_mode"):
+            if name in options:
+                raise ConfigurationError(
+                    f"{name} = {options[name]!r} is not allowed: it is no option of a task"
+                )
+    limit = options.pop("max_episode_steps", None)
+    if not isinstance(env, CommonOptions):
+        known = [field.name for field in fields(kind)]
+        validation.keys(f"option of {env_id}", options, known)
+        chosen = kind(**options)
+    if limit is not None:
+        limit = validation.integer("max_episode_steps", limit, at_least=1)
+    return Task.create(build_of(env_id)(chosen), limit)

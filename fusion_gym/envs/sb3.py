@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
@@ -16,9 +15,8 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
-from fusion_gym.envs import spaces
 from fusion_gym.envs.registration import make_task
-from fusion_gym.envs.views import LocalView
+from fusion_gym.envs.views import make_view
 
 
 class FusionSB3VecEnv(VecEnv):
@@ -33,7 +31,7 @@ class FusionSB3VecEnv(VecEnv):
     value of each truncated run, so episodes that all end together would stall it.
 
     With ``local`` every sensor of every run is a row of its own, with the observation of
-    :class:`~fusion_gym.envs.views.LocalView` and the action space ``Discrete(2)``: one shared
+    :class:`~fusion_gym.envs.views.SensorView` and the action space ``Discrete(2)``: one shared
     policy learns what each sensor can run by itself. All rows of a run get the run's reward.
 
     ``price_exponent``, from 0 to 1, is for training over a range of prices: an episode's rewards
@@ -41,7 +39,7 @@ class FusionSB3VecEnv(VecEnv):
 
     Attributes:
         task: the task.
-        view: the local view, if there is one.
+        view: who looks and decides, the coordinator or every sensor.
         observation_names: a name for each entry of an observation.
         seconds: wall time spent in :meth:`step_wait` and :meth:`reset` so far.
         totals: tokens spent and steps made so far, over all runs.
@@ -59,9 +57,9 @@ class FusionSB3VecEnv(VecEnv):
         self.runs = validation.integer("num_envs", num_envs, at_least=1)
         self.task = task
         self.batch = EpisodeBatch(task, num_envs)
-        self.view = LocalView(task) if validation.boolean("local", local) else None
-        self._rows = 1 if self.view is None else task.sensors  # of each run
-        self.observation_names = (self.view or self.batch.layout).names
+        self.view = make_view(task, validation.boolean("local", local))
+        self._rows = self.view.rows_per_run
+        self.observation_names = self.view.names
         self.stagger = validation.boolean("stagger", stagger)
         self.price_exponent = validation.number(
             "price_exponent", price_exponent, at_least=0.0, at_most=1.0
@@ -69,11 +67,7 @@ class FusionSB3VecEnv(VecEnv):
         self.seconds = 0.0
         self.totals = (0.0, 0)
         self.render_mode = None
-        if self.view is None:
-            shown, choices = spaces.observation_space(self.batch.layout), spaces.action_space(task)
-        else:
-            shown, choices = self.view.space, Discrete(2)
-        super().__init__(num_envs * self._rows, shown, choices)
+        super().__init__(num_envs * self._rows, self.view.space, self.view.actions)
         self._actions: Any = None
         self._returns = np.zeros(num_envs)
         self._spent = np.zeros(num_envs)
@@ -119,10 +113,7 @@ class FusionSB3VecEnv(VecEnv):
             ValueError: an action that is not in the action space.
         """
         began = time.perf_counter()
-        if self.view is None:
-            requests = spaces.requests(self.task, self._actions, self.runs)
-        else:
-            requests = self.view.requests(self._actions)
+        requests = self.view.requests(self._actions, self.runs)
         lengths, scale = self.batch.steps, self._scale()
         outcome = self.batch.step(requests)
         self._returns += outcome.reward
@@ -172,8 +163,7 @@ class FusionSB3VecEnv(VecEnv):
         return self.task.reward.price.scale(self.batch.price, self.price_exponent)
 
     def _observe(self) -> NDArray[np.float32]:
-        observation = self.batch.observe()
-        return observation if self.view is None else self.view.rows(observation)
+        return self.view.rows(self.batch.observe())
 
     def set_price(self, price: float) -> None:
         """From now on every token costs ``price``, for training to a budget.
@@ -193,10 +183,7 @@ class FusionSB3VecEnv(VecEnv):
 
         Closed are requests that the network would not grant even alone.
         """
-        allowed = self.batch.grantable()
-        if self.view is None:
-            return spaces.action_masks(self.task, allowed)
-        return self.view.action_masks(allowed)
+        return self.view.masks(self.batch.grantable())
 
     def close(self) -> None:
         """Nothing to release."""

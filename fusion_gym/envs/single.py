@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from fusion_gym import validation
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
-from fusion_gym.envs import spaces
 from fusion_gym.envs.vector import Infos, refuse_rendering, reset_infos, step_infos
+from fusion_gym.envs.views import CoordinatorView
 
 
 class FusionEnv(gymnasium.Env[Any, Any]):
@@ -30,9 +30,10 @@ class FusionEnv(gymnasium.Env[Any, Any]):
         self.render_mode = None
         self.task = task
         self.batch = EpisodeBatch(task, 1)
-        self.observation_names = self.batch.layout.names
-        self.observation_space = spaces.observation_space(self.batch.layout)
-        self.action_space = spaces.action_space(task)
+        self.view = CoordinatorView(task)
+        self.observation_names = self.view.names
+        self.observation_space = self.view.space
+        self.action_space = self.view.actions
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -57,14 +58,14 @@ class FusionEnv(gymnasium.Env[Any, Any]):
         """
         if self.batch.finished[0]:
             raise gymnasium.error.ResetNeeded("the episode is over or never began: call reset")
-        outcome = self.batch.step(spaces.requests(self.task, np.asarray(action)[None], 1))
+        outcome = self.batch.step(self.view.requests(np.asarray(action)[None], 1))
         observation = self.batch.observe()[0]
         infos = _first(step_infos(outcome))
         return observation, float(outcome.reward[0]), False, bool(outcome.truncated[0]), infos
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Open choices (choices,), for sb3-contrib's MaskablePPO."""
-        return spaces.action_masks(self.task, self.batch.grantable())[0]
+        return self.view.masks(self.batch.grantable())[0]
 
 
 def _first(infos: Infos) -> Infos:

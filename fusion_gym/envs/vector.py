@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fusion_gym import validation
 from fusion_gym.core.batch import EpisodeBatch, Outcome
 from fusion_gym.core.task import Task
-from fusion_gym.envs import spaces
+from fusion_gym.envs.views import CoordinatorView
 
 Infos = dict[str, Any]
 
@@ -48,9 +48,10 @@ class FusionVectorEnv(VectorEnv[Any, Any, Any]):
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.task = task
         self.batch = EpisodeBatch(task, self.num_envs)
-        self.observation_names = self.batch.layout.names
-        self.single_observation_space = spaces.observation_space(self.batch.layout)
-        self.single_action_space = spaces.action_space(task)
+        self.view = CoordinatorView(task)
+        self.observation_names = self.view.names
+        self.single_observation_space = self.view.space
+        self.single_action_space = self.view.actions
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._everyone = np.ones(self.num_envs, dtype=np.bool_)
@@ -122,7 +123,7 @@ class FusionVectorEnv(VectorEnv[Any, Any, Any]):
         if not self._started.all():
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         batch = self.batch
-        requests = spaces.requests(self.task, actions, self.num_envs)
+        requests = self.view.requests(actions, self.num_envs)
         finished = batch.finished
         if self.autoreset_mode == AutoresetMode.DISABLED and finished.any():
             raise gymnasium.error.ResetNeeded(

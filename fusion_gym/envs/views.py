@@ -1,94 +1,203 @@
-"""What each sensor can see by itself: the honest view for policies without a coordinator."""
+"""Who looks and decides: a coordinator of all sensors, or every sensor by itself.
+
+A view turns a batch's observations into rows, one for each decision of a policy, and the
+decisions into requests; the faces and saved agents hold one and never ask which it is.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.task import Task
 from fusion_gym.validation import ConfigurationError
 
+Rows = NDArray[np.float32]
+Requests = NDArray[np.bool_]
 
-class LocalView:
-    """Every sensor's part of a coordinator's observation.
+
+class View(Protocol):
+    """What a policy sees of N runs and how it answers, batch axis first.
+
+    ``names`` has one name an entry of a row, ``space`` is the Box of a row, ``actions`` the space
+    of its decision; ``rows_per_run`` rows of a run stand together. ``knowledge`` is what a row
+    shows, in the one vocabulary.
+    """
+
+    names: tuple[str, ...]
+    space: spaces.Box
+    actions: spaces.MultiBinary | spaces.Discrete[Any]
+    rows_per_run: int
+    knowledge: Knowledge
+
+    def rows(self, observation: Rows) -> Rows:
+        """From observations (N, coordinator's entries) to rows (N·rows_per_run, entries)."""
+        ...
+
+    def requests(self, actions: Any, runs: int) -> Requests:
+        """Requests (sensors, N) from the rows' actions, N ``runs``.
+
+        Raises:
+            ValueError: actions of another shape, not finite, or outside the action space.
+        """
+        ...
+
+    def masks(self, allowed: Requests) -> NDArray[np.bool_]:
+        """Open choices (N·rows_per_run, choices) where sensors (sensors, N) may request.
+
+        In the layout of sb3-contrib's MaskablePPO.
+        """
+        ...
+
+
+def make_view(task: Task, local: bool = False) -> View:
+    """The coordinator's view of a task, or with ``local`` the one that every sensor has.
+
+    Raises:
+        ConfigurationError: a local view of a task that has none (:class:`SensorView`).
+    """
+    return SensorView(task) if local else CoordinatorView(task)
+
+
+class CoordinatorView:
+    """One row a run: the task's whole observation, and a decision for all sensors.
+
+    The action space is ``MultiBinary(sensors)``; with ``action="discrete"`` it is
+    ``Discrete(2**sensors)``, the requests as bits of one number, sensor 0 lowest; with
+    ``access="single"`` it is ``Discrete(sensors + 1)``, 0 for nobody, m for sensor m - 1.
+    """
+
+    rows_per_run = 1
+
+    def __init__(self, task: Task) -> None:
+        layout = ObservationLayout(task)
+        self.knowledge = task.knowledge
+        self.names = layout.names
+        self.space = spaces.Box(layout.low, layout.high, dtype=np.float32)
+        self._sensors, self._single = task.sensors, task.access == "single"
+        self.actions: spaces.MultiBinary | spaces.Discrete[Any] = spaces.MultiBinary(task.sensors)
+        if self._single:
+            self.actions = spaces.Discrete(task.sensors + 1)
+        elif task.action == "discrete":
+            self.actions = spaces.Discrete(2**task.sensors)
+
+    def rows(self, observation: Rows) -> Rows:
+        """The observations themselves."""
+        return observation
+
+    def requests(self, actions: Any, runs: int) -> Requests:
+        """See :class:`View`: actions (N, sensors) of 0 and 1, or (N,) of whole numbers."""
+        try:
+            given = np.asarray(actions)
+        except ValueError:
+            raise ValueError(f"action {actions!r} is not allowed: it must be an array") from None
+        if given.dtype.kind not in "biuf":
+            raise ValueError(
+                f"action {given.tolist()!r} of type {given.dtype} is not allowed: it must be "
+                "numbers"
+            )
+        wanted = (runs, *self.actions.shape)
+        if given.shape != wanted:
+            raise ValueError(f"action of shape {given.shape} is not allowed: it must be {wanted}")
+        if isinstance(self.actions, spaces.MultiBinary):
+            requests = given == 1
+            _check(given, requests | (given == 0), "0 or 1")
+            return np.ascontiguousarray(requests.T)
+        high = int(self.actions.n) - 1
+        _check(given, (given >= 0) & (given <= high) & (given == np.floor(given)), f"0..{high}")
+        return self._decoded(given.astype(np.int64))
+
+    def masks(self, allowed: Requests) -> NDArray[np.bool_]:
+        """See :class:`View`: two choices a sensor for ``MultiBinary``, silence and a request.
+
+        For ``Discrete`` one choice a number, closed if any of its requests is.
+        """
+        if isinstance(self.actions, spaces.Discrete):
+            requested = self._decoded(np.arange(self.actions.n))
+            return np.asarray(~(requested[:, None] & ~allowed[:, :, None]).any(axis=0))
+        result = np.ones((allowed.shape[1], self._sensors, 2), dtype=np.bool_)
+        result[..., 1] = allowed.T
+        return result.reshape(len(result), -1)
+
+    def _decoded(self, numbers: NDArray[np.int64]) -> Requests:
+        """The requests (sensors, …) that whole numbers stand for."""
+        sensors = np.arange(self._sensors)[:, None]
+        return numbers == sensors + 1 if self._single else (numbers >> sensors & 1).astype(np.bool_)
+
+
+class SensorView:
+    """One row for each sensor of each run: what it sees by itself, and its own decision.
 
     A sensor sees the entries that its own node knows, what all nodes are told (the token level,
-    the price, an estimate that is fed back) and its own number. ``names`` has one name an entry,
-    without the sensor's index; ``low`` and ``high`` (entries,) float32 are its bounds.
+    the price, an estimate that is fed back) and its own number. Row run · sensors + sensor belongs
+    to that sensor of that run; ``names`` are without the sensor's index. The action space is
+    ``Discrete(2)``, 1 for a request: one shared policy, honest for deployment.
 
     Raises:
         ConfigurationError: a task whose information is not "sensors", or whose sensors do not see
             the same kinds of entries.
     """
 
+    knowledge: Knowledge = "own"
+
     def __init__(self, task: Task) -> None:
-        if task.information != "sensors":
+        if task.knowledge != "coordinator":
             raise ConfigurationError(
                 f"information = {task.information!r} is not allowed with a local view: it must be "
                 "'sensors', for a sensor sees its own measurement"
             )
-        layout = ObservationLayout(task)
-        self.sensors = task.sensors
-        shared = [i for i, entry in enumerate(layout.entries) if entry.broadcast]
+        layout, count = ObservationLayout(task), task.sensors
+        told = [place for place, entry in enumerate(layout.entries) if entry.told]
         columns, names = [], []
-        for sensor in range(task.sensors):
-            own = [i for i, entry in enumerate(layout.entries) if entry.sensor == sensor]
-            columns.append(own + shared)
-            names.append([_without(sensor, layout.names[i]) for i in own])
+        for sensor in range(count):
+            own = [place for place, entry in enumerate(layout.entries) if entry.sensor == sensor]
+            columns.append(own + told)
+            names.append([layout.entries[place].own_name for place in own])
         if any(kinds != names[0] for kinds in names):
             raise ConfigurationError(
                 f"observation entries {names} are not allowed in a local view: all sensors must "
                 "see the same kinds"
             )
         self._columns = np.array(columns)
-        identity = [f"sensor[{sensor}]" for sensor in range(task.sensors)]
-        self.names = (*names[0], *(layout.names[i] for i in shared), *identity)
-        zeros, ones = np.zeros(task.sensors), np.ones(task.sensors)
-        self.low = np.concatenate((layout.low[self._columns[0]], zeros)).astype(np.float32)
-        self.high = np.concatenate((layout.high[self._columns[0]], ones)).astype(np.float32)
+        self.rows_per_run = count
+        identity = [f"sensor[{sensor}]" for sensor in range(count)]
+        self.names = (*names[0], *(layout.names[place] for place in told), *identity)
+        low = np.concatenate((layout.low[columns[0]], np.zeros(count, dtype=np.float32)))
+        high = np.concatenate((layout.high[columns[0]], np.ones(count, dtype=np.float32)))
+        self.space = spaces.Box(low, high, dtype=np.float32)
+        self.actions: spaces.MultiBinary | spaces.Discrete[Any] = spaces.Discrete(2)
 
-    @property
-    def space(self) -> spaces.Box:
-        """Box of shape (entries,), float32."""
-        return spaces.Box(self.low, self.high, dtype=np.float32)
+    def rows(self, observation: Rows) -> Rows:
+        """See :class:`View`: (N, coordinator's entries) to (N·sensors, entries)."""
+        seen = observation[:, self._columns]
+        identity = np.eye(self.rows_per_run, dtype=np.float32)
+        shared = np.broadcast_to(identity, (len(observation), *identity.shape))
+        return np.concatenate((seen, shared), axis=-1).reshape(-1, len(self.names))
 
-    def rows(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """One row for each sensor of each run: (N, coordinator's entries) to (N·sensors, entries).
-
-        Row run · sensors + sensor belongs to that sensor of that run.
-        """
-        runs, entries = len(observation), len(self.names)
-        result = np.zeros((runs, self.sensors, entries), dtype=np.float32)
-        result[..., : self._columns.shape[1]] = observation[:, self._columns]
-        result[..., self._columns.shape[1] :] = np.eye(self.sensors, dtype=np.float32)
-        return result.reshape(runs * self.sensors, entries)
-
-    def requests(self, actions: NDArray[Any]) -> NDArray[np.bool_]:
-        """Requests (sensors, N) from the rows' actions (N·sensors,), 1 for a request.
-
-        Raises:
-            ValueError: actions of another shape, or other than 0 and 1.
-        """
+    def requests(self, actions: Any, runs: int) -> Requests:
+        """See :class:`View`: actions (N·sensors,), 1 for a request."""
         given = np.asarray(actions)
-        if given.ndim != 1 or given.size % self.sensors or not np.isin(given, (0, 1)).all():
+        wanted = (runs * self.rows_per_run,)
+        if given.shape != wanted or not np.isin(given, (0, 1)).all():
             raise ValueError(
                 f"actions of shape {given.shape} are not allowed: there must be one of 0 and 1 "
-                f"for each of {self.sensors} sensors of each run"
+                f"for each of {self.rows_per_run} sensors of each run"
             )
-        return np.ascontiguousarray((given == 1).reshape(-1, self.sensors).T)
+        return np.ascontiguousarray((given == 1).reshape(-1, self.rows_per_run).T)
 
-    @staticmethod
-    def action_masks(allowed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Open choices (N·sensors, 2) where sensors (sensors, N) are allowed to request."""
+    def masks(self, allowed: Requests) -> NDArray[np.bool_]:
+        """See :class:`View`: silence, and a request, (N·sensors, 2)."""
         return np.stack((np.ones(allowed.size, dtype=np.bool_), allowed.T.ravel()), axis=1)
 
 
-def _without(sensor: int, name: str) -> str:
-    """``kind[sensor,place]`` as ``kind[place]``, ``kind[sensor]`` as ``kind``."""
-    kind, _, inner = name.partition("[")
-    places = inner.rstrip("]").split(",")
-    return kind if places == [str(sensor)] else f"{kind}[{','.join(places[1:])}]"
+def _check(given: NDArray[Any], valid: NDArray[np.bool_], allowed: str) -> None:
+    if not valid.all():
+        place = tuple(int(i) for i in np.argwhere(~valid)[0])
+        raise ValueError(
+            f"action {list(place)} = {given[place]} is not allowed: it must be {allowed}"
+        )

@@ -10,19 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from fusion_gym import validation
-from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.reward import Price
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import ACTION_KINDS, Task
-from fusion_gym.envs import spaces
-from fusion_gym.envs.views import LocalView
+from fusion_gym.envs.views import make_view
 from fusion_gym.policies.base import Requests
 from fusion_gym.validation import ConfigurationError
 
@@ -41,7 +38,7 @@ def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
 
     ``local`` marks a policy that every sensor runs on its own view.
     """
-    names = (LocalView(task) if local else EpisodeBatch(task, 1).layout).names
+    names = make_view(task, local).names
     algorithm = next(name for name, kind in ALGORITHMS.items() if type(model) is kind)
     tag = {
         "algorithm": algorithm,
@@ -76,7 +73,7 @@ class ModelPolicy:
         self.deterministic = deterministic
         self._shown = task.reward.price.span is not None
         self._task = _priced(task, price_range)
-        self._view = LocalView(self._task) if local else None
+        self._view = make_view(self._task, local)
         self._memory: Any = None  # of a recurrent policy
         span = self._task.reward.price.span
         self._price: float | None = None  # as the model sees it, in place of the task's own
@@ -106,27 +103,17 @@ class ModelPolicy:
             own = observation[:, :-1] if self._shown else observation  # the price comes last
             column = np.full((len(own), 1), self._price, dtype=np.float32)
             observation = np.concatenate((own, column), axis=1)
-        start, masks = signals["start"], {}
-        if self._view is not None:
-            observation = self._view.rows(observation)
-            start = start.repeat(self._view.sensors)
+        masks = {}
         if isinstance(self.model, MaskablePPO):
-            masks["action_masks"] = self._masks(signals["grantable"])
+            masks["action_masks"] = self._view.masks(signals["grantable"])
         action, self._memory = self.model.predict(
-            observation,
+            self._view.rows(observation),
             state=self._memory,
-            episode_start=start,
+            episode_start=signals["start"].repeat(self._view.rows_per_run),
             deterministic=self.deterministic,
             **masks,
         )
-        if self._view is not None:
-            return self._view.requests(action)
-        return spaces.requests(self._task, action, len(action))
-
-    def _masks(self, allowed: Requests) -> NDArray[np.bool_]:
-        if self._view is None:
-            return spaces.action_masks(self._task, allowed)
-        return LocalView.action_masks(allowed)
+        return self._view.requests(action, len(observation))
 
 
 def _priced(task: Task, price_range: tuple[float, float] | None) -> Task:
@@ -167,18 +154,18 @@ def load_model_policy(
 
 def _fitted(path: str, data: dict[str, Any], task: Task, local: bool) -> Task:
     """The task with the kind of action that the model has, its observation layout checked."""
-    layout = LocalView(task) if local else EpisodeBatch(task, 1).layout
+    view = make_view(task, local)
     names = data.get(_TAG, {}).get("observation_names")
-    if names is not None and list(names) != list(layout.names):
-        missing = [name for name in names if name not in layout.names]
-        extra = [name for name in layout.names if name not in names]
+    if names is not None and list(names) != list(view.names):
+        missing = [name for name in names if name not in view.names]
+        extra = [name for name in view.names if name not in names]
         raise ConfigurationError(
             f"model {path!r} was trained for another observation layout: it expects {len(names)} "
-            f"entries, the task (information={task.information!r}) has {len(layout.names)}; "
+            f"entries, the task (information={task.information!r}) has {len(view.names)}; "
             f"missing are {missing[:4] or 'none'}, unknown to the model {extra[:4] or 'none'}"
             + ("" if missing or extra else " (the order differs)")
         )
-    wanted = layout.low
+    wanted = view.space
     have = data["observation_space"]
     if have.shape != wanted.shape:
         raise ConfigurationError(
@@ -193,7 +180,7 @@ def _fitted(path: str, data: dict[str, Any], task: Task, local: bool) -> Task:
         if task.access == "single"
         else [dataclasses.replace(task, action=kind) for kind in ACTION_KINDS]
     )
-    allowed = [spaces.action_space(kind) for kind in kinds]
+    allowed = [make_view(kind).actions for kind in kinds]
     if action not in allowed:
         raise ConfigurationError(
             f"model {path!r} has the action space {action}: the task has {task.sensors} sensors, "

@@ -8,15 +8,12 @@ Section 6.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.core.options import CommonOptions, arrival_order, choose, finish
-from fusion_gym.core.task import Task
-from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
+from fusion_gym.core.options import CommonOptions, Scenario, arrival_order
 from fusion_gym.fusion.parallel import ParallelFusion
 from fusion_gym.fusion.sequential import SequentialFusion
 from fusion_gym.systems.correlated.filters import JointErrorCovariance, RobustKalmanFilter
@@ -64,13 +61,12 @@ class CorrelatedTrackingOptions(CommonOptions):
     cost_weight: float = 0.001
 
 
-def build(**options: Any) -> Task:
-    """The task for these options, checked before anything runs.
+def build(chosen: CorrelatedTrackingOptions) -> Scenario:
+    """The scenario of these options, checked before anything runs.
 
     Raises:
-        ConfigurationError: an unknown option, or a value that is not allowed.
+        ConfigurationError: a value that is not allowed.
     """
-    chosen, limit = choose(CorrelatedTrackingOptions, "fusion_gym/CorrelatedTracking-v0", options)
     horizon = validation.integer("horizon", chosen.horizon, at_least=1)
     plant, sensors = _plant_and_sensors(chosen)
     open_loop = plant.open_loop(horizon)
@@ -92,7 +88,7 @@ def build(**options: Any) -> Task:
         joint=JointErrorCovariance.create(plant, sensors) if track else None,
     )
     trigger = _trigger(chosen, sensors.count)
-    return finish(chosen, system, limit, weights, policy_defaults={"adaptive_innovation": trigger})
+    return Scenario(chosen, system, weights, {"adaptive_innovation": trigger})
 
 
 def _plant_and_sensors(
@@ -168,71 +164,3 @@ def _state_names(size: int) -> tuple[str, ...]:
     if size == 3:
         return ("position", "velocity", "acceleration")
     return tuple(f"x{i + 1}" for i in range(size))
-
-
-_PAGE = """
-    A target's position, velocity and acceleration, each measured by a sensor of its own whose
-    noise is correlated with the noise that moves the target: which sensor should transmit, and
-    when?
-
-    ## Description
-    Three states driven by one noise, sampled every 0.01. Sensor 0 measures the position, sensor 1
-    the velocity, sensor 2 the acceleration, each with noise of its own plus a multiple of the
-    noise that has just moved the target. Filters know only upper bounds of all variances;
-    ``noise_scale`` says how far below them the actual ones lie. Each node runs a robust Kalman
-    filter that updates with what the network grants, and the centre fuses its own prediction with
-    the estimates of those nodes, one after another. Nothing is fed back.
-
-    ## Action space
-    ``MultiBinary(sensors)``: 1 requests a transmission of that sensor's measurement. With
-    ``action="discrete"`` it is ``Discrete(2**sensors)``, the bits as one number, sensor 0 lowest.
-
-    ## Observation space
-    A ``Box`` of float32; ``env.unwrapped.observation_names`` names every entry. Entries marked *
-    are missing with ``information="centre"``.
-
-    | entries | meaning | range |
-    |---|---|---|
-    | whitened_innovation[sensor,component] * | innovation of the node over its deviation | -5..5 |
-    | fused_innovation[sensor,component] * | the same against the fused prediction | -5..5 |
-    | age[sensor] | a/(a + 10), a steps since the last delivery | 0..1 |
-    | local_log_deviation[sensor,state] | ln of predicted over open-loop deviation, node | -5..5 |
-    | log_deviation[state] | the same of the fused prediction | -5..5 |
-    | estimate[state] | fused prediction over the state's root mean square | -5..5 |
-    | tokens | over the capacity | 0..1 |
-
-    ## Reward
-    -(error_weight · Σ wᵢ eᵢ² + cost_weight · tokens spent), e the fused estimate's error at the
-    time of the request. By default wᵢ is 1/n over the state's open-loop error variance at the
-    bounds, so that never transmitting costs about 1 a step there, each state a third of it. With
-    ``error="trace"`` the conservative covariance stands for the squared errors.
-    ``info["rewards"]`` has the two terms.
-
-    ## Starting state
-    x₀ ~ N((0.3, 0.1, 0.2), noise_scale · I). The filters know the mean and the bound I; nothing
-    has been measured.
-
-    ## Episode end
-    Truncation after ``horizon`` steps, never termination.
-
-    ## Info
-    ``cost`` = ``cost_tokens`` (tokens spent, >= 0), ``rewards`` (``error``, ``cost``),
-    ``granted`` and ``denied`` (one a sensor), ``squared_error`` (one a state), ``diverged``.
-
-    ## Arguments
-    The fields of :class:`CorrelatedTrackingOptions`; docs/correlated_tracking.md explains each,
-    and what the paper's text gets wrong.
-
-    ## Version history
-    - v0: first version.
-"""
-
-
-class CorrelatedTrackingEnv(RegisteredEnv):
-    __doc__ = _PAGE
-    build = staticmethod(build)
-
-
-class CorrelatedTrackingVectorEnv(RegisteredVectorEnv):
-    __doc__ = _PAGE
-    build = staticmethod(build)

@@ -6,7 +6,7 @@ based on adaptive innovation event-triggered mechanism for uncertain networked s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from scipy.special import ndtr
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Feature, Signal, SignalArray, feature_block
+from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 from fusion_gym.fusion.parallel import ParallelFusion
 from fusion_gym.fusion.sequential import SequentialFusion
 from fusion_gym.systems.correlated.filters import (
@@ -58,8 +58,8 @@ class CorrelatedTrackingState:
 
 _COMPONENTS = "(sensors, m, N)"
 SIGNALS = (
-    Signal("measurement", "sensor", _COMPONENTS, "the new measurement"),
-    Signal("innovation", "sensor", _COMPONENTS, "measurement minus the node's expectation"),
+    Signal("measurement", "own", _COMPONENTS, "the new measurement"),
+    Signal("innovation", "own", _COMPONENTS, "measurement minus the node's expectation"),
     Signal("held", "centre", _COMPONENTS, "the last delivered measurement"),
     Signal("age", "centre", "(sensors, N)", "steps since the last delivery"),
     Signal("expected_measurement", "centre", _COMPONENTS, "the node's expectation"),
@@ -123,23 +123,60 @@ class CorrelatedTrackingSystem:
         return SIGNALS
 
     @property
-    def features(self) -> tuple[tuple[Feature, ...], ...]:
-        """Blocks of the observation; see docs/correlated_tracking.md."""
-        nodes = range(self.sensor_count)
-        components = [
-            (node, f"{node},{c}") for node in nodes for c in range(self.filter.sensors.size)
-        ]
-        local_states = [(node, f"{node},{name}") for node in nodes for name in self.state_names]
-        fused = [(None, name) for name in self.state_names]
+    def observation(self) -> tuple[Block, ...]:
+        """Blocks of the observation."""
+        nodes, states = numbered(self.sensor_count), self.state_names
+        components = (nodes, numbered(self.filter.sensors.size))
         return (
-            feature_block("whitened_innovation", components, "sensor", _RANGE),
-            feature_block(
-                "fused_innovation", [(None, place) for _, place in components], "sensor", _RANGE
+            Block(
+                "whitened_innovation",
+                "own",
+                "own",
+                components,
+                "innovation of the node over its predicted deviation",
+                lambda state: (
+                    (state.measurement - state.expected)
+                    / _deviation(_sensed(state).innovation_covariance)
+                ),
+                limit=_RANGE,
             ),
-            feature_block("age", [(node, f"{node}") for node in nodes], "centre"),
-            feature_block("local_log_deviation", local_states, "centre", _RANGE),
-            feature_block("log_deviation", fused, "centre", _RANGE),
-            feature_block("estimate", fused, "centre", _RANGE),
+            Block(
+                "fused_innovation",
+                "coordinator",
+                "hidden",
+                components,
+                "the same against the fused prediction",
+                self._fused_innovation,
+                limit=_RANGE,
+            ),
+            age_block(nodes),
+            Block(
+                "local_log_deviation",
+                "centre",
+                "own",
+                (nodes, states),
+                "logarithm of the node's predicted over the open-loop deviation",
+                lambda state: self._log_deviation(state.prior_covariance[1:]),
+                limit=_RANGE,
+            ),
+            Block(
+                "log_deviation",
+                "centre",
+                "hidden",
+                (states,),
+                "the same of the fused prediction",
+                lambda state: self._log_deviation(state.prior_covariance[0]),
+                limit=_RANGE,
+            ),
+            Block(
+                "estimate",
+                "centre",
+                "hidden",
+                (states,),
+                "fused prediction over the state's root mean square",
+                lambda state: state.prior_mean[0] / self.magnitude[:, None],
+                limit=_RANGE,
+            ),
         )
 
     def start(self, noise: Array) -> CorrelatedTrackingState:
@@ -238,23 +275,10 @@ class CorrelatedTrackingSystem:
             "variance_reduction": lambda: self._variance_reduction(state, plan),
         }
 
-    def observe(self, state: CorrelatedTrackingState) -> Sequence[Array]:
-        """The blocks named in :attr:`features`, before clipping to their bounds."""
-        plan = _sensed(state)
-        runs = state.truth.shape[-1]
-        whitened = (state.measurement - state.expected) / _deviation(plan.innovation_covariance)
-        fused_deviation = _deviation(self.filter.innovation_covariance(state.prior_covariance[0]))
-        surprise = state.measurement - self.filter.expect(state.prior_mean[0])
-        variance = linalg.diagonal(state.prior_covariance) / self.reference[:, None]
-        log_deviation = 0.5 * np.log(variance)
-        return (
-            whitened.reshape(-1, runs),
-            (surprise / fused_deviation).reshape(-1, runs),
-            state.age / (state.age + 10.0),
-            log_deviation[1:].reshape(-1, runs),
-            log_deviation[0],
-            state.prior_mean[0] / self.magnitude[:, None],
-        )
+    def visible(self, state: CorrelatedTrackingState) -> CorrelatedTrackingState:
+        """The state without the truth, the actual noise scale and the actual covariances."""
+        hidden = np.full_like(state.truth, np.nan)
+        return replace(state, truth=hidden, scale=hidden[0], joint=None)
 
     def truth(self, state: CorrelatedTrackingState) -> Array:
         """The plant's state (n, N)."""
@@ -299,6 +323,14 @@ class CorrelatedTrackingSystem:
     def open_loop(self, horizon: int) -> Array:
         """Mean error variance (n,) over t = 1..horizon of a centre that only predicts (bound)."""
         return self.plant.open_loop(horizon)
+
+    def _fused_innovation(self, state: CorrelatedTrackingState) -> Array:
+        deviation = _deviation(self.filter.innovation_covariance(state.prior_covariance[0]))
+        return (state.measurement - self.filter.expect(state.prior_mean[0])) / deviation
+
+    def _log_deviation(self, covariance: Array) -> Array:
+        """ln √(variance/reference) (..., n, N) of covariances (..., n, n, N)."""
+        return 0.5 * np.log(linalg.diagonal(covariance) / self.reference[:, None])
 
     def _weighted_trace(self, covariance: Array) -> Array:
         return (self.state_weights[:, None] * linalg.diagonal(covariance)).sum(-2)

@@ -7,7 +7,7 @@ systems with correlated noises and fading measurements), its plant and sensors; 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Feature, Signal, SignalArray, feature_block
+from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 from fusion_gym.systems.markov_jump.centralised_linear import (
     Belief,
     CentralisedLinearFilter,
@@ -25,7 +25,7 @@ from fusion_gym.systems.markov_jump.interacting_models import InteractingModels
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, Times
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
-from fusion_gym.systems.markov_jump.state import move
+from fusion_gym.systems.markov_jump.state import move, sampling_blocks, without_truth
 
 _RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
 
@@ -57,8 +57,8 @@ class MarkovJumpCentralState:
 _SCALAR = "(sensors, 1, N)"
 _PER_SENSOR = "(sensors, N)"
 CENTRAL_SIGNALS = (
-    Signal("measurement", "sensor", _SCALAR, "the new one; held where the sensor does not sample"),
-    Signal("innovation", "sensor", _SCALAR, "that minus the centre's expectation, 0 if no sample"),
+    Signal("measurement", "own", _SCALAR, "the new one; held where the sensor does not sample"),
+    Signal("innovation", "own", _SCALAR, "that minus the centre's expectation, 0 if no sample"),
     Signal("held", "centre", _SCALAR, "the last delivered measurement"),
     Signal("age", "centre", _PER_SENSOR, "steps since the last delivery"),
     Signal("expected_measurement", "centre", _SCALAR, "the centre's expectation of a sample"),
@@ -165,25 +165,77 @@ class MarkovJumpCentralSystem:
         return CENTRAL_SIGNALS
 
     @property
-    def features(self) -> tuple[tuple[Feature, ...], ...]:
-        """Blocks of the observation; see docs/markov_jump.md."""
-        nodes = [(node, f"{node}") for node in range(self.sensor_count)]
-        centre = [(None, place) for _, place in nodes]
-        fused = [(None, name) for name in self.state_names]
+    def observation(self) -> tuple[Block, ...]:
+        """Blocks of the observation; mode probabilities only with interacting models."""
+        nodes, states, n = numbered(self.sensor_count), self.state_names, self.plant.size
+        scale = self.scale[:, None]
         blocks = (
-            feature_block("whitened_innovation", centre, "sensor", _RANGE),
-            feature_block("difference", nodes, "sensor", _RANGE),
-            feature_block("sampled", nodes, "centre"),
-            feature_block("phase", nodes, "centre"),
-            feature_block("age", nodes, "centre"),
-            feature_block("innovation_log_deviation", centre, "centre", _RANGE),
-            feature_block("log_deviation", fused, "centre", _RANGE),
-            feature_block("estimate", fused, "centre", _RANGE),
+            Block(
+                "whitened_innovation",
+                "coordinator",
+                "hidden",
+                (nodes,),
+                "innovation against the centre's expectation, whitened, 0 without a sample",
+                lambda state: (
+                    self._innovation(state, _sensed(state)) / self._deviation(_sensed(state))
+                ),
+                limit=_RANGE,
+            ),
+            Block(
+                "difference",
+                "own",
+                "own",
+                (nodes,),
+                "new minus held measurement over its root mean square",
+                lambda state: (state.measurement - state.held) / scale,
+                limit=_RANGE,
+            ),
+            *sampling_blocks(self.sensors),
+            age_block(nodes),
+            Block(
+                "innovation_log_deviation",
+                "centre",
+                "hidden",
+                (nodes,),
+                "logarithm of the innovation's deviation over the measurement's root mean square",
+                lambda state: np.log(self._deviation(_sensed(state)) / scale),
+                limit=_RANGE,
+            ),
+            Block(
+                "log_deviation",
+                "centre",
+                "hidden",
+                (states,),
+                "logarithm of the predicted over the open-loop deviation",
+                lambda state: (
+                    0.5
+                    * np.log(
+                        linalg.diagonal(_sensed(state).covariance)[:n] / self.reference[:, None]
+                    )
+                ),
+                limit=_RANGE,
+            ),
+            Block(
+                "estimate",
+                "centre",
+                "hidden",
+                (states,),
+                "prediction over the state's root mean square",
+                lambda state: _sensed(state).mean[:n] / self.magnitude[:, None],
+                limit=_RANGE,
+            ),
         )
-        if isinstance(self.estimator, InteractingModels):
-            modes = [(None, f"{mode}") for mode in range(self.plant.modes)]
-            return (*blocks, feature_block("mode_probability", modes, "centre"))
-        return blocks
+        if not isinstance(self.estimator, InteractingModels):
+            return blocks
+        probability = Block(
+            "mode_probability",
+            "centre",
+            "hidden",
+            (numbered(self.plant.modes),),
+            "probability of the mode",
+            lambda state: state.belief.probability,
+        )
+        return (*blocks, probability)
 
     def start(self, noise: Array) -> MarkovJumpCentralState:
         """Time 0: nothing is measured; what is held is what would be expected."""
@@ -271,25 +323,9 @@ class MarkovJumpCentralSystem:
             "sampled": lambda: self.sensors.sampled(state.time),
         }
 
-    def observe(self, state: MarkovJumpCentralState) -> Sequence[Array]:
-        """The blocks named in :attr:`features`, before clipping to their bounds."""
-        forecast, n, scale = _sensed(state), self.plant.size, self.scale[:, None]
-        phase = (state.time % self.sensors.period) / self.sensors.period
-        deviation = self._deviation(forecast)
-        variance = linalg.diagonal(forecast.covariance)[:n] / self.reference[:, None]
-        blocks = (
-            self._innovation(state, forecast) / deviation,
-            (state.measurement - state.held) / scale,
-            (phase == 0.0).astype(np.float64),
-            phase,
-            state.age / (state.age + 10.0),
-            np.log(deviation / scale),
-            0.5 * np.log(variance),
-            forecast.mean[:n] / self.magnitude[:, None],
-        )
-        if isinstance(self.estimator, InteractingModels):
-            return (*blocks, state.belief.probability)
-        return blocks
+    def visible(self, state: MarkovJumpCentralState) -> MarkovJumpCentralState:
+        """The state without the truth, the mode and the noise that moves the plant next."""
+        return without_truth(state)
 
     def truth(self, state: MarkovJumpCentralState) -> Array:
         """The plant's state (n, N)."""

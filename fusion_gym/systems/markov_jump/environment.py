@@ -7,14 +7,11 @@ systems with correlated noises and fading measurements), Section 6.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.core.options import CommonOptions, choose, finish
-from fusion_gym.core.task import Task
-from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
+from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.fusion.matrix_weighted import IntersectionOfCopies, MatrixWeightedFusion
 from fusion_gym.fusion.sequential import SequentialFusion
 from fusion_gym.systems.markov_jump.central_system import MarkovJumpCentralSystem
@@ -64,13 +61,12 @@ class MarkovJumpTrackingOptions(CommonOptions):
     cost_weight: float = 0.01
 
 
-def build(**options: Any) -> Task:
-    """The task for these options, checked before anything runs.
+def build(chosen: MarkovJumpTrackingOptions) -> Scenario:
+    """The scenario of these options, checked before anything runs.
 
     Raises:
-        ConfigurationError: an unknown option, or a value that is not allowed.
+        ConfigurationError: a value that is not allowed.
     """
-    chosen, limit = choose(MarkovJumpTrackingOptions, "fusion_gym/MarkovJumpTracking-v0", options)
     horizon = validation.integer("horizon", chosen.horizon, at_least=1)
     where = validation.choice("filter", chosen.filter, ("local", "centralised", "imm"))
     fusion = _fusion(chosen.fusion, where)
@@ -102,16 +98,11 @@ def build(**options: Any) -> Task:
         central = MarkovJumpCentralSystem.create(
             plant, sensors, where == "imm", names, weights, horizon
         )
-        return finish(chosen, central, limit, central.state_weights)
+        return Scenario(chosen, central, central.state_weights)
     system = MarkovJumpSystem.create(plant, sensors, fusion, names, weights, horizon)
     reference = float(system.full_rate_traces().mean())
-    return finish(
-        chosen,
-        system,
-        limit,
-        system.state_weights,
-        policy_defaults={"local_variance": {"reference": reference}},
-    )
+    defaults = {"local_variance": {"reference": reference}}
+    return Scenario(chosen, system, system.state_weights, defaults)
 
 
 def _fusion(kind: str | None, where: str) -> MatrixWeightedFusion | IntersectionOfCopies | None:
@@ -147,82 +138,3 @@ def _state_names(size: int) -> tuple[str, ...]:
     if size == 2:
         return ("position", "velocity")
     return tuple(f"x{i + 1}" for i in range(size))
-
-
-_PAGE = """
-    A target that jumps between two motions, seen by three sensors with different sampling periods
-    and fading measurements: which node should send its estimate to the centre, and when?
-
-    ## Description
-    Position and velocity follow one of two linear motions, chosen by a Markov chain that nobody
-    sees. Sensor 0 measures at every step, sensor 1 at every second, sensor 2 at every third; a
-    measurement is multiplied by a random number between 0 and 1, and its noise is correlated with
-    the others' and with the noise that moves the target next. Each node runs its own
-    linear-minimum-variance filter at every step, so the link is between node and centre: a packet
-    carries the node's estimate. The centre keeps a copy of each node's estimate, replaces it when
-    a packet arrives, predicts it otherwise, and fuses its copies with matrix weights, knowing the
-    exact joint covariance of their errors. Nothing is fed back.
-
-    With ``filter="centralised"`` or ``"imm"`` packets carry measurements, and one filter at the
-    centre takes those that are granted: the best linear one, or interacting multiple models. A
-    request of a sensor that does not sample then delivers nothing and costs its tokens all the
-    same.
-
-    ## Action space
-    ``MultiBinary(sensors)``: 1 requests a transmission of that node's estimate. With
-    ``action="discrete"`` it is ``Discrete(2**sensors)``, the bits as one number, sensor 0 lowest.
-
-    ## Observation space
-    A ``Box`` of float32; ``env.unwrapped.observation_names`` names every entry. Entries marked *
-    are missing with ``information="centre"``.
-
-    | entries | meaning | range |
-    |---|---|---|
-    | whitened_difference[sensor,state] * | node's estimate minus the centre's copy, over its deviation | -5..5 |
-    | whitened_innovation[sensor] * | node's innovation over its deviation, 0 without a sample | -5..5 |
-    | sampled[sensor] | 1 if the sensor samples at this step | 0..1 |
-    | phase[sensor] | steps since its last sampling time over its period | 0..1 |
-    | age[sensor] | a/(a + 10), a steps since the last delivery | 0..1 |
-    | local_log_deviation[sensor] | ln of the root of the node's trace over the open-loop trace | -5..5 |
-    | copy_log_deviation[sensor,state] | ln of the copy's predicted over open-loop deviation | -5..5 |
-    | log_deviation[state] | the same of the fused estimate if nobody transmits | -5..5 |
-    | estimate[state] | that estimate over the state's root mean square | -5..5 |
-    | tokens | over the capacity | 0..1 |
-
-    With a filter at the centre the differences, the local and the copies' deviations give way to
-    others; docs/markov_jump.md lists them.
-
-    ## Reward
-    -(error_weight · Σ wᵢ eᵢ² + cost_weight · tokens spent), e the fused estimate's error at the
-    time of the request. By default wᵢ is 1/n over the state's open-loop error variance, so that
-    never transmitting costs about 1 a step. With ``error="trace"`` the fused covariance stands for
-    the squared errors. ``info["rewards"]`` has the two terms.
-
-    ## Starting state
-    x₀ ~ N(0, 0.1 I), the mode 1 or 2 with probability 1/2 each. Nodes and centre know these
-    distributions; nothing has been measured.
-
-    ## Episode end
-    Truncation after ``horizon`` steps, never termination.
-
-    ## Info
-    ``cost`` = ``cost_tokens`` (tokens spent, >= 0), ``rewards`` (``error``, ``cost``),
-    ``granted`` and ``denied`` (one a sensor), ``squared_error`` (one a state), ``diverged``.
-
-    ## Arguments
-    The fields of :class:`MarkovJumpTrackingOptions`; docs/markov_jump.md explains each, and what
-    the paper's text gets wrong.
-
-    ## Version history
-    - v0: first version.
-"""  # noqa: E501
-
-
-class MarkovJumpTrackingEnv(RegisteredEnv):
-    __doc__ = _PAGE
-    build = staticmethod(build)
-
-
-class MarkovJumpTrackingVectorEnv(RegisteredVectorEnv):
-    __doc__ = _PAGE
-    build = staticmethod(build)

@@ -6,14 +6,14 @@ systems with correlated noises and fading measurements).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Signal
+from fusion_gym.core.system import Block, Signal, numbered
 from fusion_gym.systems.markov_jump.lag_errors import LagCovariances, Offer
 from fusion_gym.systems.markov_jump.linear_minimum_variance import Times
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes
@@ -91,8 +91,8 @@ class MarkovJumpState:
 _ESTIMATES = "(sensors, n, N)"
 _PER_SENSOR = "(sensors, N)"
 SIGNALS = (
-    Signal("measurement", "sensor", _ESTIMATES, "the node's new estimate: what it would send"),
-    Signal("innovation", "sensor", _ESTIMATES, "that minus the centre's copy of it"),
+    Signal("measurement", "own", _ESTIMATES, "the node's new estimate: what it would send"),
+    Signal("innovation", "own", _ESTIMATES, "that minus the centre's copy of it"),
     Signal("held", "centre", _ESTIMATES, "the last delivered estimate"),
     Signal("age", "centre", _PER_SENSOR, "steps since the last delivery"),
     Signal("expected_measurement", "centre", _ESTIMATES, "the centre's copy, predicted"),
@@ -116,3 +116,39 @@ SIGNALS = (
     Signal("local_variance", "centre", _PER_SENSOR, "the plain trace of the node's covariance"),
     Signal("sampled", "centre", _PER_SENSOR, "whether the sensor samples at this step"),
 )
+
+
+def sampling_blocks(sensors: FadingSensors) -> tuple[Block, Block]:
+    """Blocks of the observation that tell where in their sampling the sensors are."""
+    nodes = (numbered(sensors.count),)
+    return (
+        Block(
+            "sampled",
+            "centre",
+            "own",
+            nodes,
+            "whether the sensor samples at this step",
+            lambda state: sensors.sampled(state.time),
+        ),
+        Block(
+            "phase",
+            "centre",
+            "own",
+            nodes,
+            "steps since the sensor's last sampling time over its period",
+            lambda state: (state.time % sensors.period) / sensors.period,
+        ),
+    )
+
+
+AnyState = TypeVar("AnyState", bound=Any)
+
+
+def without_truth(state: AnyState) -> AnyState:
+    """A state of this family without the truth, the mode and the process noise to come."""
+    return replace(
+        state,
+        truth=np.full_like(state.truth, np.nan),
+        mode=np.zeros_like(state.mode),
+        process_noise=np.full_like(state.process_noise, np.nan),
+    )

@@ -6,7 +6,7 @@ systems with correlated noises and fading measurements).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,13 +14,19 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Feature, Signal, SignalArray, feature_block
+from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 from fusion_gym.fusion.matrix_weighted import IntersectionOfCopies, MatrixWeightedFusion
 from fusion_gym.systems.markov_jump.lag_errors import LagRecursion, Offer
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
-from fusion_gym.systems.markov_jump.state import SIGNALS, MarkovJumpState, move
+from fusion_gym.systems.markov_jump.state import (
+    SIGNALS,
+    MarkovJumpState,
+    move,
+    sampling_blocks,
+    without_truth,
+)
 
 _RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
 _FLOOR = 1e-9  # least deviation of a lag, relative to open loop: it is zero right after a packet
@@ -100,21 +106,71 @@ class MarkovJumpSystem:
         return SIGNALS
 
     @property
-    def features(self) -> tuple[tuple[Feature, ...], ...]:
-        """Blocks of the observation; see docs/markov_jump.md."""
-        nodes = [(node, f"{node}") for node in range(self.sensor_count)]
-        states = [(node, f"{place},{name}") for node, place in nodes for name in self.state_names]
-        fused = [(None, name) for name in self.state_names]
+    def observation(self) -> tuple[Block, ...]:
+        """Blocks of the observation."""
+        nodes, states = numbered(self.sensor_count), self.state_names
         return (
-            feature_block("whitened_difference", states, "sensor", _RANGE),
-            feature_block("whitened_innovation", nodes, "sensor", _RANGE),
-            feature_block("sampled", nodes, "centre"),
-            feature_block("phase", nodes, "centre"),
-            feature_block("age", nodes, "centre"),
-            feature_block("local_log_deviation", nodes, "centre", _RANGE),
-            feature_block("copy_log_deviation", states, "centre", _RANGE),
-            feature_block("log_deviation", fused, "centre", _RANGE),
-            feature_block("estimate", fused, "centre", _RANGE),
+            Block(
+                "whitened_difference",
+                "own",
+                "own",
+                (nodes, states),
+                "node's estimate minus the centre's copy, over its deviation",
+                lambda state: (
+                    self._collapse(state.node_mean - state.copy_mean)
+                    / self._lag_deviation(_sensed(state))
+                ),
+                limit=_RANGE,
+            ),
+            Block(
+                "whitened_innovation",
+                "own",
+                "own",
+                (nodes,),
+                "node's innovation over its deviation, 0 without a sample",
+                self._whitened_innovation,
+                limit=_RANGE,
+            ),
+            *sampling_blocks(self.sensors),
+            age_block(nodes),
+            Block(
+                "local_log_deviation",
+                "centre",
+                "own",
+                (nodes,),
+                "logarithm of the root of the node's trace over the open-loop trace",
+                lambda state: 0.5 * np.log(self._local_trace(state) / self.reference.sum()),
+                limit=_RANGE,
+            ),
+            Block(
+                "copy_log_deviation",
+                "centre",
+                "own",
+                (nodes, states),
+                "logarithm of the copy's predicted over the open-loop deviation",
+                self._copy_log_deviation,
+                limit=_RANGE,
+            ),
+            Block(
+                "log_deviation",
+                "centre",
+                "hidden",
+                (states,),
+                "the same of the fused estimate if nobody transmits",
+                lambda state: (
+                    0.5 * np.log(linalg.diagonal(state.prior_covariance) / self.reference[:, None])
+                ),
+                limit=_RANGE,
+            ),
+            Block(
+                "estimate",
+                "centre",
+                "hidden",
+                (states,),
+                "that estimate over the state's root mean square",
+                lambda state: state.prior_mean / self.magnitude[:, None],
+                limit=_RANGE,
+            ),
         )
 
     def start(self, noise: Array) -> MarkovJumpState:
@@ -226,27 +282,9 @@ class MarkovJumpSystem:
             "sampled": lambda: self.sensors.sampled(state.time),
         }
 
-    def observe(self, state: MarkovJumpState) -> Sequence[Array]:
-        """The blocks named in :attr:`features`, before clipping to their bounds."""
-        offer, runs = _sensed(state), state.truth.shape[-1]
-        place, nodes = self.filters.at(state.time), np.arange(self.sensor_count)
-        variance = self.filters.innovation_covariance[nodes, nodes].take(place, -1)
-        difference = self._collapse(state.node_mean - state.copy_mean)
-        phase = (state.time % self.sensors.period) / self.sensors.period
-        local = self.recursion.local_trace.take(place, -1) / self.reference.sum()
-        copies = linalg.diagonal(offer.local[nodes, nodes] + offer.lag[nodes, nodes])
-        fused = linalg.diagonal(state.prior_covariance)
-        return (
-            (difference / self._lag_deviation(offer)).reshape(-1, runs),
-            state.innovation / np.sqrt(variance),
-            (phase == 0.0).astype(np.float64),
-            phase,
-            state.age / (state.age + 10.0),
-            0.5 * np.log(local),
-            0.5 * np.log(copies / self.reference[:, None]).reshape(-1, runs),
-            0.5 * np.log(fused / self.reference[:, None]),
-            state.prior_mean / self.magnitude[:, None],
-        )
+    def visible(self, state: MarkovJumpState) -> MarkovJumpState:
+        """The state without the truth, the mode and the noise that moves the plant next."""
+        return without_truth(state)
 
     def truth(self, state: MarkovJumpState) -> Array:
         """The plant's state (n, N)."""
@@ -283,6 +321,19 @@ class MarkovJumpSystem:
         for first in range(n, mean.shape[1], n):
             result += mean[:, first : first + n]
         return result
+
+    def _whitened_innovation(self, state: MarkovJumpState) -> Array:
+        nodes, place = np.arange(self.sensor_count), self.filters.at(state.time)
+        variance = self.filters.innovation_covariance[nodes, nodes].take(place, -1)
+        return state.innovation / np.sqrt(variance)
+
+    def _local_trace(self, state: MarkovJumpState) -> Array:
+        return self.recursion.local_trace.take(self.filters.at(state.time), -1)
+
+    def _copy_log_deviation(self, state: MarkovJumpState) -> Array:
+        offer, nodes = _sensed(state), np.arange(self.sensor_count)
+        copies = linalg.diagonal(offer.local[nodes, nodes] + offer.lag[nodes, nodes])
+        return 0.5 * np.log(copies / self.reference[:, None])
 
     def _lag_deviation(self, offer: Offer) -> Array:
         """Predicted deviations (l, n, N) of node minus copy, never zero."""

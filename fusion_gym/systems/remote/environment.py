@@ -7,7 +7,6 @@ Markovian state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,10 +14,9 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.channel import CHANNELS, INITIAL_STATES, Channel
-from fusion_gym.core.options import CommonOptions, choose, finish, make_bucket
+from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.reward import Price
-from fusion_gym.core.task import Task
-from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
+from fusion_gym.core.task import make_bucket
 from fusion_gym.systems.remote.system import RemoteEstimationSystem
 from fusion_gym.validation import ConfigurationError
 
@@ -59,13 +57,12 @@ _DROP: dict[str, ArrayLike] = {"independent": 0.2, "gilbert_elliott": (0.7, 0.2)
 _TRANSITION: ArrayLike = ((0.7, 0.3), (0.1, 0.9))
 
 
-def build(**options: Any) -> Task:
-    """The task for these options, checked before anything runs.
+def build(chosen: RemoteEstimationOptions) -> Scenario:
+    """The scenario of these options, checked before anything runs.
 
     Raises:
-        ConfigurationError: an unknown option, or a value that is not allowed.
+        ConfigurationError: a value that is not allowed.
     """
-    chosen, limit = choose(RemoteEstimationOptions, "fusion_gym/RemoteEstimation-v0", options)
     validation.integer("horizon", chosen.horizon, at_least=1)
     sensors = validation.integer("sensors", chosen.sensors, at_least=1)
     weights = (
@@ -91,7 +88,7 @@ def build(**options: Any) -> Task:
             f"coefficient = {np.asarray(chosen.coefficient).tolist()} is not allowed with "
             f"horizon = {chosen.horizon}: the error without transmissions must stay finite"
         )
-    return finish(chosen, system, limit, weights)
+    return Scenario(chosen, system, weights)
 
 
 def _channel(chosen: RemoteEstimationOptions, sensors: int) -> Channel:
@@ -137,64 +134,3 @@ def _error_scale(chosen: RemoteEstimationOptions, deviation: Array, weights: Arr
     if not bucket.unlimited:
         sharing = max(sharing, float(cost.sum()) / max(bucket.rate, 1e-3))
     return np.maximum(np.maximum(threshold, deviation * np.sqrt(sharing)), deviation)
-
-
-_PAGE = """
-    Scalar sources that drift away from what the centre believes, and a price for every packet:
-    the problem whose optimum is known.
-
-    ## Description
-    Source i follows x(t+1) = a x(t) + w(t), w ~ N(0, σ²), and sensor i sees it exactly. The centre
-    takes over what arrives and predicts a x̂ otherwise. A channel may lose what was granted:
-    independently, or as a Gilbert-Elliott channel whose state of the step before is fed back.
-    With one source, or several that share nothing, a threshold on the absolute error that depends
-    on channel state and tokens is optimal, and ``fusion_gym.solvers`` computes it.
-
-    ## Action space
-    ``MultiBinary(sensors)``: 1 requests a transmission of that source's value. With
-    ``action="discrete"`` it is ``Discrete(2**sensors)``, the bits as one number, sensor 0 lowest.
-
-    ## Observation space
-    A ``Box`` of float32; ``env.unwrapped.observation_names`` names every entry. Entries marked *
-    are missing with ``information="centre"``, those marked + with a channel without states.
-
-    | entries | meaning | range |
-    |---|---|---|
-    | error[sensor] * | value minus the centre's prediction, over ``error_scale`` | -5..5 |
-    | age[sensor] | k/(k + 10), k steps since the last delivery | 0..1 |
-    | channel[sensor,bad], channel[sensor,good] + | state at the step before, one-hot | 0..1 |
-    | tokens | over the capacity | 0..1 |
-
-    ## Reward
-    -(error_weight · Σ wᵢ eᵢ² + cost_weight · tokens spent), e the error after the delivery. By
-    default every wᵢ is 1 and a transmission spends 1 token, lost or not, so that ``cost_weight``
-    is the price of a transmission. With ``error="trace"`` the variances by age stand for the
-    squared errors. ``info["rewards"]`` has the two terms.
-
-    ## Starting state
-    x(0) ~ N(0, initial_deviation²), by default 0, and the centre believes 0.
-
-    ## Episode end
-    Truncation after ``horizon`` steps, never termination.
-
-    ## Info
-    ``cost`` = ``cost_tokens`` (tokens spent, >= 0), ``rewards`` (``error``, ``cost``),
-    ``granted`` and ``denied`` (one a sensor; a granted packet may be lost), ``squared_error``
-    (one a source), ``diverged``.
-
-    ## Arguments
-    The fields of :class:`RemoteEstimationOptions`; docs/remote_estimation.md explains each.
-
-    ## Version history
-    - v0: first version.
-"""
-
-
-class RemoteEstimationEnv(RegisteredEnv):
-    __doc__ = _PAGE
-    build = staticmethod(build)
-
-
-class RemoteEstimationVectorEnv(RegisteredVectorEnv):
-    __doc__ = _PAGE
-    build = staticmethod(build)

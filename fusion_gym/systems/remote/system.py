@@ -6,7 +6,7 @@ Markovian state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.channel import STATES, Channel
-from fusion_gym.core.system import Feature, Signal, SignalArray, feature_block
+from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 
 _RANGE = 5.0  # scaled errors are clipped here
 _FLOOR = 1e-12  # variance after a delivery, in process variances: zero could not be inverted
@@ -45,8 +45,8 @@ class RemoteEstimationState:
 
 _ONE = "(sensors, 1, N)"
 SIGNALS = (
-    Signal("measurement", "sensor", _ONE, "the source's value"),
-    Signal("innovation", "sensor", _ONE, "the error that silence leaves: value minus prediction"),
+    Signal("measurement", "own", _ONE, "the source's value"),
+    Signal("innovation", "own", _ONE, "the error that silence leaves: value minus prediction"),
     Signal("held", "centre", _ONE, "the last delivered value"),
     Signal("age", "centre", "(sensors, N)", "steps since the last delivery"),
     Signal("expected_measurement", "centre", _ONE, "the centre's prediction"),
@@ -111,14 +111,27 @@ class RemoteEstimationSystem:
         return SIGNALS
 
     @property
-    def features(self) -> tuple[tuple[Feature, ...], ...]:
-        """Blocks of the observation; see docs/remote_estimation.md."""
-        sensors = range(self.sensor_count)
-        own = [(i, f"{i}") for i in sensors]
-        error = feature_block("error", own, "sensor", _RANGE)
-        age = feature_block("age", own, "centre")
-        states = [(i, f"{i},{name}") for i in sensors for name in STATES]
-        channel = feature_block("channel", states, "centre")
+    def observation(self) -> tuple[Block, ...]:
+        """Blocks of the observation; the channel's is missing where it has no states."""
+        nodes = numbered(self.sensor_count)
+        error = Block(
+            "error",
+            "own",
+            "own",
+            (nodes,),
+            "value minus the centre's prediction, over ``error_scale``",
+            lambda state: (state.truth - state.prior) / self.error_scale[:, None],
+            limit=_RANGE,
+        )
+        age = age_block(nodes)
+        channel = Block(
+            "channel",
+            "centre",
+            "own",
+            (nodes, STATES),
+            "state of the channel at the step before, one-hot",
+            lambda state: state.channel[:, None] == np.arange(len(STATES))[:, None],
+        )
         return (error, age, channel) if self.channel.states > 1 else (error, age)
 
     def start(self, noise: Array) -> RemoteEstimationState:
@@ -198,14 +211,16 @@ class RemoteEstimationSystem:
             ),
         }
 
-    def observe(self, state: RemoteEstimationState) -> Sequence[Array]:
-        """The blocks named in :attr:`features`, before clipping to their bounds."""
-        error = (state.truth - state.prior) / self.error_scale[:, None]
-        blocks = [error, state.age / (state.age + 10.0)]
-        if self.channel.states > 1:
-            hot = state.channel[:, None] == np.arange(len(STATES))[:, None]
-            blocks.append(hot.reshape(-1, error.shape[-1]).astype(np.float64))
-        return blocks
+    def visible(self, state: RemoteEstimationState) -> RemoteEstimationState:
+        """The state without what the channel is about to do: every grant arrives.
+
+        The sources are what the sensors measure, so they stay.
+        """
+        return replace(state, next_channel=state.channel, lost=np.zeros_like(state.lost))
+
+    def arrival_probability(self, state: RemoteEstimationState) -> Array | None:
+        """Probability (sensors, N) that a packet sent now arrives, given the channel before."""
+        return self._arrival_probability(state.channel) if self.channel.loses else None
 
     def truth(self, state: RemoteEstimationState) -> Array:
         """The sources (n, N)."""

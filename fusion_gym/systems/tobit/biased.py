@@ -10,16 +10,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import choose, finish
-from fusion_gym.core.task import Task
-from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
+from fusion_gym.core.options import Scenario
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.tobit.centre import Centre
 from fusion_gym.systems.tobit.filters import KalmanFilter
@@ -93,25 +90,25 @@ class BiasedTrackingOptions(BiasedOscillatorOptions):
     censoring_upper: ArrayLike = ((1000.0,), (200.0,))
 
 
-def build_oscillator(**options: Any) -> Task:
-    """The oscillator's task, checked before anything runs.
+def build_oscillator(chosen: BiasedOscillatorOptions) -> Scenario:
+    """The oscillator's scenario, checked before anything runs.
 
     Raises:
-        ConfigurationError: an unknown option, or a value that is not allowed.
+        ConfigurationError: a value that is not allowed.
     """
-    return _build(*choose(BiasedOscillatorOptions, "fusion_gym/BiasedOscillator-v0", options))
+    return _build(chosen)
 
 
-def build_tracking(**options: Any) -> Task:
-    """The tracking task, checked before anything runs.
+def build_tracking(chosen: BiasedTrackingOptions) -> Scenario:
+    """The target's scenario, checked before anything runs.
 
     Raises:
-        ConfigurationError: an unknown option, or a value that is not allowed.
+        ConfigurationError: a value that is not allowed.
     """
-    return _build(*choose(BiasedTrackingOptions, "fusion_gym/BiasedTracking-v0", options))
+    return _build(chosen)
 
 
-def _build(chosen: BiasedOscillatorOptions, limit: int | None) -> Task:
+def _build(chosen: BiasedOscillatorOptions) -> Scenario:
     horizon = validation.integer("horizon", chosen.horizon, at_least=1)
     random_start = validation.boolean("random_start", chosen.random_start)
     plant, states = _augmented(chosen, aware=True)
@@ -141,7 +138,7 @@ def _build(chosen: BiasedOscillatorOptions, limit: int | None) -> Task:
     # Every state counts alike, relative to its variance without any transmission.
     weights = 1.0 / (plant.size * system.open_loop(horizon))
     defaults = stochastic_defaults(chosen, chosen.filter)
-    return finish(chosen, system, limit, weights, policy_defaults=defaults)
+    return Scenario(chosen, system, weights, defaults)
 
 
 def _augmented(chosen: BiasedOscillatorOptions, aware: bool) -> tuple[LinearPlant, int]:
@@ -190,72 +187,3 @@ def _centre(chosen: BiasedOscillatorOptions, sensors: CensoredSensors) -> Centre
         return assumed_density_centre(chosen, sensors)
     paper = kind == "paper"
     return feedback_centre(chosen, TobitKalmanFilter(sensors) if paper else KalmanFilter(sensors))
-
-
-_PAGE = """
-    {title}
-
-    ## Description
-    A plant whose state is driven by a stochastic bias that no sensor sees. Each sensor measures
-    one component of the state and reports it clipped to an interval. One sensor a step may
-    transmit. The nodes run Tobit Kalman filters on state and bias together, and the centre fuses
-    them and feeds the result back.
-
-    ## Action space
-    ``Discrete(sensors + 1)``: 0 for nobody, m for sensor m - 1. With ``access="any"``
-    ``MultiBinary(sensors)``.
-
-    ## Observation space
-    A ``Box`` of float32, bounded; ``env.unwrapped.observation_names`` names every entry. Entries
-    marked * are missing with ``information="centre"``: whitened_innovation *, censored *,
-    held_difference *, uncensored_probability, age, log_variance, estimate (of state and bias),
-    tokens, and admitted where the network itself decides on access.
-
-    ## Reward
-    -(error_weight · Σ wᵢ eᵢ² + cost_weight · tokens spent), e the fused error of state and bias;
-    by default every entry counts alike, relative to its variance without any transmission.
-
-    ## Starting state
-    x₀ ~ N({start}), b₀ ~ N(0, 0.1).
-
-    ## Episode end
-    Truncation after ``horizon`` steps, never termination.
-
-    ## Info
-    ``cost``, ``cost_tokens``, ``rewards``, ``granted``, ``denied``, ``squared_error``,
-    ``diverged``: see docs/biased.md.
-
-    ## Arguments
-    The fields of :class:`{options}`.
-
-    ## Version history
-    - v0: first version.
-"""
-
-
-class BiasedOscillatorEnv(RegisteredEnv):
-    __doc__ = _PAGE.format(
-        title="An oscillator with a stochastic bias, seen by two sensors that saturate at ±5.",
-        start="(5, 0), 0.1 I",
-        options="BiasedOscillatorOptions",
-    )
-    build = staticmethod(build_oscillator)
-
-
-class BiasedOscillatorVectorEnv(RegisteredVectorEnv):
-    __doc__ = BiasedOscillatorEnv.__doc__
-    build = staticmethod(build_oscillator)
-
-
-class BiasedTrackingEnv(RegisteredEnv):
-    __doc__ = _PAGE.format(
-        title="A target with an unknown acceleration, its position and velocity measured.",
-        start="(10, 0), I",
-        options="BiasedTrackingOptions",
-    )
-    build = staticmethod(build_tracking)
-
-
-class BiasedTrackingVectorEnv(RegisteredVectorEnv):
-    __doc__ = BiasedTrackingEnv.__doc__
-    build = staticmethod(build_tracking)

@@ -15,9 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.core.options import choose, finish
-from fusion_gym.core.task import Task
-from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
+from fusion_gym.core.options import Scenario
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.tobit.bound_filter import BoundConstants, BoundTobitFilter, EventError
 from fusion_gym.systems.tobit.centre import Centre
@@ -75,13 +73,12 @@ class TobitOscillatorOptions(FeedbackOptions):
     trigger_initial: ArrayLike = 1.5
 
 
-def build(**options: Any) -> Task:
-    """The task for these options, checked before anything runs.
+def build(chosen: TobitOscillatorOptions) -> Scenario:
+    """The scenario of these options, checked before anything runs.
 
     Raises:
-        ConfigurationError: an unknown option, or a value that is not allowed.
+        ConfigurationError: a value that is not allowed.
     """
-    chosen, limit = choose(TobitOscillatorOptions, "fusion_gym/TobitOscillator-v0", options)
     horizon = validation.integer("horizon", chosen.horizon, at_least=1)
     plant = _plant(chosen)
     sensors = CensoredSensors.create(
@@ -102,7 +99,7 @@ def build(**options: Any) -> Task:
         reference=plant.open_loop(horizon),
     )
     defaults = {"dynamic_event": trigger} | stochastic_defaults(chosen, chosen.filter)
-    return finish(chosen, system, limit, None, policy_defaults=defaults)
+    return Scenario(chosen, system, policy_defaults=defaults)
 
 
 def _plant(chosen: TobitOscillatorOptions) -> LinearPlant:
@@ -168,70 +165,3 @@ def _trigger(chosen: TobitOscillatorOptions, sensors: int) -> dict[str, tuple[fl
         values = validation.not_negative(f"trigger_{name}", value, (sensors,))
         result[name] = tuple(values.tolist())
     return result
-
-
-_PAGE = """
-    An oscillator measured by three sensors that see nothing below a threshold, over a network
-    with a token bucket: which sensor should transmit, and when?
-
-    ## Description
-    A two-dimensional rotation by 0.052 π a step, driven by noise. Three sensors measure both
-    states with noise of variance 0.5 and report max(z, 0) of each component. At every step the
-    policy requests transmissions; the bucket (5 tokens a step, 30 at most, 3 a transmission)
-    grants or denies; each node runs a Tobit Kalman filter on what got through, and the centre
-    fuses the three and feeds the result back.
-
-    ## Action space
-    ``MultiBinary(sensors)``: 1 requests a transmission of that sensor's measurement. With
-    ``action="discrete"`` it is ``Discrete(2**sensors)``, the bits as one number, sensor 0 lowest.
-
-    ## Observation space
-    A ``Box`` of float32; ``env.unwrapped.observation_names`` names every entry. Entries marked *
-    are missing with ``information="centre"``.
-
-    | entries | meaning | range |
-    |---|---|---|
-    | whitened_innovation[sensor,component] * | innovation over its predicted deviation | -5..5 |
-    | censored[sensor,component] * | whether the component is at its threshold | 0, 1 |
-    | held_difference[sensor,component] * | (measurement - last delivered) / 2√R | -5..5 |
-    | uncensored_probability[sensor,component] | predicted | 0..1 |
-    | age[sensor] | a/(a + 10), a steps since the last delivery | 0..1 |
-    | log_variance[state] | ln of the predicted variance over its open-loop mean | -5..5 |
-    | estimate[state] | prediction over the state's root mean square | -5..5 |
-    | tokens | over the capacity | 0..1 |
-
-    ## Reward
-    -(error_weight · Σ wᵢ eᵢ² + cost_weight · tokens spent), e the fused estimate's error at the
-    time of the request. By default all wᵢ are equal and never transmitting costs about 1 a step.
-    ``error="trace"`` takes the claimed covariance instead; under the paper's filter a delivery
-    can raise it, so such an agent learns silence. ``info["rewards"]`` has the two terms.
-
-    ## Starting state
-    x₀ ~ N((5, 0), 0.1 I), or with ``random_start=True`` about a random point at the same
-    distance, known to the filters. The first measurement is known to the centre free of charge.
-
-    ## Episode end
-    Truncation after ``horizon`` steps, never termination.
-
-    ## Info
-    ``cost`` = ``cost_tokens`` (tokens spent, >= 0), ``rewards`` (``error``, ``cost``),
-    ``granted`` and ``denied`` (one a sensor), ``squared_error`` (one a state), ``diverged``
-    (a squared error above 100 times its open-loop mean, or not finite).
-
-    ## Arguments
-    The fields of :class:`TobitOscillatorOptions`; docs/tobit_oscillator.md explains each, and
-    what the paper's text gets wrong.
-
-    ## Version history
-    - v0: first version.
-"""
-
-
-class TobitOscillatorEnv(RegisteredEnv):
-    __doc__ = _PAGE
-    build = staticmethod(build)
-
-
-class TobitOscillatorVectorEnv(RegisteredVectorEnv):
-    __doc__ = _PAGE
-    build = staticmethod(build)

@@ -7,15 +7,15 @@ round_robin_tobit (Geng, Wang, Alsaadi, Alharbi and Cheng, 2020).
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Feature, Knowledge, Signal, SignalArray
+from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.centre import Centre, FeedbackCentre, Outlook
 from fusion_gym.systems.tobit.filters import KalmanFilter
@@ -50,9 +50,9 @@ class CensoredState:
 
 _COMPONENTS = "(sensors, m, N)"
 SIGNALS = (
-    Signal("measurement", "sensor", _COMPONENTS, "the new censored measurement"),
-    Signal("innovation", "sensor", _COMPONENTS, "measurement minus its expectation"),
-    Signal("censored", "sensor", _COMPONENTS, "whether the component is at its threshold"),
+    Signal("measurement", "own", _COMPONENTS, "the new censored measurement"),
+    Signal("innovation", "own", _COMPONENTS, "measurement minus its expectation"),
+    Signal("censored", "own", _COMPONENTS, "whether the component is at its threshold"),
     Signal("held", "centre", _COMPONENTS, "the last delivered measurement"),
     Signal("age", "centre", "(sensors, N)", "steps since the last delivery"),
     Signal("expected_measurement", "centre", _COMPONENTS, "the measurement's expectation"),
@@ -122,31 +122,67 @@ class CensoredSystem:
         return SIGNALS
 
     @property
-    def features(self) -> tuple[tuple[Feature, ...], ...]:
-        """Blocks of the observation; see docs/tobit_oscillator.md."""
-        sensors, size = self.sensor_count, self.centre.sensors.size
-
-        def block(kind: str, knowledge: Knowledge, low: float, high: float) -> tuple[Feature, ...]:
-            return tuple(
-                Feature(f"{kind}[{s},{c}]", knowledge, low, high, sensor=s)
-                for s in range(sensors)
-                for c in range(size)
-            )
-
-        def fed_back(kind: str, limit: float) -> tuple[Feature, ...]:
-            return tuple(
-                Feature(f"{kind}[{name}]", "centre", -limit, limit, broadcast=True)
-                for name in self.state_names
-            )
-
+    def observation(self) -> tuple[Block, ...]:
+        """Blocks of the observation."""
+        sensors = self.centre.sensors
+        nodes, states = numbered(sensors.count), self.state_names
+        components = (nodes, numbered(sensors.size))
         return (
-            block("whitened_innovation", "sensor", -_WHITE, _WHITE),
-            block("censored", "sensor", 0.0, 1.0),
-            block("held_difference", "sensor", -_WHITE, _WHITE),
-            block("uncensored_probability", "centre", 0.0, 1.0),
-            tuple(Feature(f"age[{s}]", "centre", 0.0, 1.0, sensor=s) for s in range(sensors)),
-            fed_back("log_variance", _LOG_RANGE),
-            fed_back("estimate", _WHITE),
+            Block(
+                "whitened_innovation",
+                "own",
+                "own",
+                components,
+                "innovation over its predicted deviation",
+                _whitened_innovation,
+                limit=_WHITE,
+            ),
+            Block(
+                "censored",
+                "own",
+                "own",
+                components,
+                "whether the component is at its threshold",
+                lambda state: sensors.censored(state.measurement),
+            ),
+            Block(
+                "held_difference",
+                "own",
+                "own",
+                components,
+                "new minus last delivered measurement, over two noise deviations",
+                lambda state: (state.measurement - state.held) / (2.0 * sensors.deviation),
+                limit=_WHITE,
+            ),
+            Block(
+                "uncensored_probability",
+                "centre",
+                "own",
+                components,
+                "predicted probability that the component is not censored",
+                lambda state: _outlook(state).expectation.uncensored_probability,
+            ),
+            age_block(nodes),
+            Block(
+                "log_variance",
+                "centre",
+                "told",
+                (states,),
+                "logarithm of the predicted variance over its open-loop mean",
+                lambda state: np.log(
+                    linalg.diagonal(state.prior_covariance) / self.reference[:, None]
+                ),
+                limit=_LOG_RANGE,
+            ),
+            Block(
+                "estimate",
+                "centre",
+                "told",
+                (states,),
+                "prediction over the state's root mean square",
+                lambda state: state.prior_mean / self.scale[:, None],
+                limit=_WHITE,
+            ),
         )
 
     def start(self, noise: Array) -> CensoredState:
@@ -242,23 +278,9 @@ class CensoredSystem:
             "variance_reduction": lambda: variances()[1],
         }
 
-    def observe(self, state: CensoredState) -> Sequence[Array]:
-        """The blocks named in :attr:`features`, before clipping to their bounds."""
-        expectation, deviation, _ = _outlook(state)
-        runs = state.truth.shape[-1]
-        innovation = (state.measurement - expectation.value) / deviation
-        sensors = self.centre.sensors
-        difference = (state.measurement - state.held) / (2.0 * sensors.deviation)
-        variance = linalg.diagonal(state.prior_covariance) / self.reference[:, None]
-        return (
-            innovation.reshape(-1, runs),
-            sensors.censored(state.measurement).reshape(-1, runs).astype(np.float64),
-            difference.reshape(-1, runs),
-            expectation.uncensored_probability.reshape(-1, runs),
-            state.age / (state.age + 10.0),
-            np.log(variance),
-            state.prior_mean / self.scale[:, None],
-        )
+    def visible(self, state: CensoredState) -> CensoredState:
+        """The state without the truth; nothing else is hidden."""
+        return replace(state, truth=np.full_like(state.truth, np.nan))
 
     def truth(self, state: CensoredState) -> Array:
         """The plant's state (n, N)."""
@@ -275,6 +297,11 @@ class CensoredSystem:
     def open_loop(self, horizon: int) -> Array:
         """Mean error variance (n,) over t = 1..horizon of a centre that only predicts."""
         return self.plant.open_loop(horizon)
+
+
+def _whitened_innovation(state: CensoredState) -> Array:
+    expectation, deviation, _ = _outlook(state)
+    return (state.measurement - expectation.value) / deviation
 
 
 def _outlook(state: CensoredState) -> Outlook:

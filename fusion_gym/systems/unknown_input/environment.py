@@ -8,16 +8,13 @@ Information Technology & Electronic Engineering 24, 2023.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import CommonOptions, choose, finish
-from fusion_gym.core.task import Task
-from fusion_gym.envs.registered import RegisteredEnv, RegisteredVectorEnv
+from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.policies.rules.adaptive_threshold import check_thresholds
 from fusion_gym.systems.unknown_input.bound_filter import BoundTables
 from fusion_gym.systems.unknown_input.examples import EXAMPLES
@@ -84,13 +81,12 @@ class UnknownInputOptions(CommonOptions):
     input_weight: float = 1.0
 
 
-def build(**options: Any) -> Task:
-    """The task for these options, checked before anything runs.
+def build(chosen: UnknownInputOptions) -> Scenario:
+    """The scenario of these options, checked before anything runs.
 
     Raises:
-        ConfigurationError: an unknown option, or a value that is not allowed.
+        ConfigurationError: a value that is not allowed.
     """
-    chosen, limit = choose(UnknownInputOptions, "fusion_gym/UnknownInput-v0", options)
     chosen = _with_example(chosen)
     horizon = validation.integer("horizon", chosen.horizon, at_least=1)
     plant = _plant(chosen)
@@ -121,7 +117,7 @@ def build(**options: Any) -> Task:
         magnitude=plant.magnitude(signal, horizon),
         reference=open_loop,
     )
-    return finish(chosen, system, limit, weights, policy_defaults={"adaptive_threshold": trigger})
+    return Scenario(chosen, system, weights, {"adaptive_threshold": trigger})
 
 
 def _with_example(chosen: UnknownInputOptions) -> UnknownInputOptions:
@@ -266,71 +262,3 @@ def _state_names(chosen: UnknownInputOptions, plant: UnknownInputPlant) -> tuple
         return ("position_1", "velocity_1", "position_2", "velocity_2", "force")
     states = tuple(f"x{i + 1}" for i in range(plant.size))
     return states + tuple(f"d{i + 1}" for i in range(plant.inputs))
-
-
-_PAGE = """
-    Two carts, tied by springs, under a force that nobody knows. Three sensors each see the carts
-    in part: who should transmit, and when?
-
-    ## Description
-    The state is the positions and velocities of two carts; the force on the first is unknown to
-    filters and policies and drawn anew in every episode. The carts are sampled every second small
-    step. Each node estimates the state and, one sampling instant late, the force, from what its
-    sensor transmitted; the centre fuses the nodes by covariance intersection. Nothing is fed back.
-    ``example="paper"`` gives the paper's system instead: two states, two inputs, two sensors, and
-    its own filter.
-
-    ## Action space
-    ``MultiBinary(sensors)``: 1 requests a transmission of that sensor's measurement. With
-    ``action="discrete"`` it is ``Discrete(2**sensors)``, the bits as one number, sensor 0 lowest.
-
-    ## Observation space
-    A ``Box`` of float32; ``env.unwrapped.observation_names`` names every entry. Entries marked *
-    are missing with ``information="centre"``. A "state" is a state or an input.
-
-    | entries | meaning | range |
-    |---|---|---|
-    | whitened_innovation[sensor,component] * | innovation of the node over its deviation | -5..5 |
-    | held_difference[sensor,component] * | new minus held, over √2 noise deviations | -5..5 |
-    | age[sensor] | a/(a + 10), a instants since the last delivery | 0..1 |
-    | local_log_deviation[sensor,state] | ln of predicted over open-loop deviation, node | -5..5 |
-    | log_deviation[state] | the same of the last fused estimate | -5..5 |
-    | estimate[state] | fused prediction over the root mean square | -5..5 |
-    | tokens | over the capacity | 0..1 |
-
-    ## Reward
-    -(error_weight · Σ wᵢ eᵢ² + cost_weight · tokens spent), e the fused estimate's error of the
-    present state and of the input that has just acted. By default a centre that always takes the
-    force for zero pays 1 a step, each state and input an equal share of it; ``input_weight``
-    changes the inputs' share. With ``error="trace"`` the fused covariance stands for the squared
-    errors. ``info["rewards"]`` has the two terms.
-
-    ## Starting state
-    x₀ ~ N(0, 0.1 I), or, in the paper's example, uniform on [0.16, 0.18]. The measurement at time
-    0 has been delivered.
-
-    ## Episode end
-    Truncation after ``horizon`` steps, never termination.
-
-    ## Info
-    ``cost`` = ``cost_tokens`` (tokens spent, >= 0), ``rewards`` (``error``, ``cost``),
-    ``granted`` and ``denied`` (one a sensor), ``squared_error`` (states, then inputs),
-    ``diverged``.
-
-    ## Arguments
-    The fields of :class:`UnknownInputOptions`; docs/unknown_input.md explains each, and what the
-    paper's text gets wrong.
-
-    ## Version history
-    - v0: first version.
-"""
-
-
-class UnknownInputEnv(RegisteredEnv):
-    __doc__ = _PAGE
-    build = staticmethod(build)
-
-
-class UnknownInputVectorEnv(RegisteredVectorEnv):
-    __doc__ = _PAGE
-    build = staticmethod(build)

@@ -7,7 +7,7 @@ cyber-physical systems with unknown inputs under adaptive event-triggered mechan
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Feature, Signal, SignalArray, feature_block
+from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 from fusion_gym.systems.unknown_input.nodes import Estimates, Nodes, Outlook, RunNodes
 from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
 from fusion_gym.systems.unknown_input.signals import InputSignal
@@ -45,8 +45,8 @@ class UnknownInputState:
 
 _COMPONENTS = "(sensors, m, N)"
 SIGNALS = (
-    Signal("measurement", "sensor", _COMPONENTS, "the new measurement"),
-    Signal("innovation", "sensor", _COMPONENTS, "measurement minus the node's expectation"),
+    Signal("measurement", "own", _COMPONENTS, "the new measurement"),
+    Signal("innovation", "own", _COMPONENTS, "measurement minus the node's expectation"),
     Signal("held", "centre", _COMPONENTS, "the last delivered measurement"),
     Signal("age", "centre", "(sensors, N)", "sampling instants since the last delivery"),
     Signal(
@@ -124,20 +124,59 @@ class UnknownInputSystem:
         return SIGNALS
 
     @property
-    def features(self) -> tuple[tuple[Feature, ...], ...]:
-        """Blocks of the observation; see docs/unknown_input.md."""
-        nodes = range(self.sensor_count)
-        size = self.nodes.sensors.size
-        components = [(node, f"{node},{c}") for node in nodes for c in range(size)]
-        local_states = [(node, f"{node},{name}") for node in nodes for name in self.state_names]
-        fused = [(None, name) for name in self.state_names]
+    def observation(self) -> tuple[Block, ...]:
+        """Blocks of the observation; a "state" is a state or an input."""
+        nodes, states = numbered(self.sensor_count), self.state_names
+        components = (nodes, numbered(self.nodes.sensors.size))
         return (
-            feature_block("whitened_innovation", components, "sensor", _RANGE),
-            feature_block("held_difference", components, "sensor", _RANGE),
-            feature_block("age", [(node, f"{node}") for node in nodes], "centre"),
-            feature_block("local_log_deviation", local_states, "centre", _RANGE),
-            feature_block("log_deviation", fused, "centre", _RANGE),
-            feature_block("estimate", fused, "centre", _RANGE),
+            Block(
+                "whitened_innovation",
+                "own",
+                "own",
+                components,
+                "innovation of the node over its predicted deviation",
+                lambda state: (
+                    (state.measurement - _sensed(state).expected) / self._deviation(state)
+                ),
+                limit=_RANGE,
+            ),
+            Block(
+                "held_difference",
+                "own",
+                "own",
+                components,
+                "new minus held measurement over √2 noise deviations",
+                lambda state: (state.measurement - state.held) / self._noise_deviation,
+                limit=_RANGE,
+            ),
+            age_block(nodes),
+            Block(
+                "local_log_deviation",
+                "centre",
+                "own",
+                (nodes, states),
+                "logarithm of the node's predicted over the open-loop deviation",
+                self._local_log_deviation,
+                limit=_RANGE,
+            ),
+            Block(
+                "log_deviation",
+                "centre",
+                "hidden",
+                (states,),
+                "the same of the last fused estimate",
+                self._fused_log_deviation,
+                limit=_RANGE,
+            ),
+            Block(
+                "estimate",
+                "centre",
+                "hidden",
+                (states,),
+                "fused prediction over the root mean square",
+                lambda state: _sensed(state).fused_mean / self.magnitude[:, None],
+                limit=_RANGE,
+            ),
         )
 
     def start(self, noise: Array) -> UnknownInputState:
@@ -215,22 +254,12 @@ class UnknownInputSystem:
             "variance_reduction": lambda: variances()[1],
         }
 
-    def observe(self, state: UnknownInputState) -> Sequence[Array]:
-        """The blocks named in :attr:`features`, before clipping to their bounds."""
-        outlook, runs = _sensed(state), len(state.time)
-        deviation = self._deviation(state)
-        noise = np.sqrt(2.0 * linalg.diagonal(self.nodes.sensors.covariance))
-        local = _log_deviation(self.nodes.prior_covariance(outlook, state.time), self.reference)
-        fused = _log_deviation(
-            self.nodes.fused_covariance(state.estimates, state.time - 1.0), self.reference
-        )
-        return (
-            ((state.measurement - outlook.expected) / deviation).reshape(-1, runs),
-            ((state.measurement - state.held) / noise).reshape(-1, runs),
-            state.age / (state.age + 10.0),
-            _lanes(local.reshape(-1, local.shape[-1]), runs),
-            _lanes(fused, runs),
-            outlook.fused_mean / self.magnitude[:, None],
+    def visible(self, state: UnknownInputState) -> UnknownInputState:
+        """The state without the truth and the input to come."""
+        return replace(
+            state,
+            truth=np.full_like(state.truth, np.nan),
+            signal=np.full_like(state.signal, np.nan),
         )
 
     def truth(self, state: UnknownInputState) -> Array:
@@ -260,6 +289,19 @@ class UnknownInputSystem:
             variance += spread[..., column, :] * sensors.matrix[..., column, :]
         variance += linalg.diagonal(sensors.covariance)
         return np.sqrt(variance, out=variance)
+
+    @functools.cached_property
+    def _noise_deviation(self) -> Array:
+        """√2 deviations of the measurement noise, (l, m, 1)."""
+        return np.sqrt(2.0 * linalg.diagonal(self.nodes.sensors.covariance))
+
+    def _local_log_deviation(self, state: UnknownInputState) -> Array:
+        prior = self.nodes.prior_covariance(_sensed(state), state.time)
+        return _lanes(_log_deviation(prior, self.reference), len(state.time))
+
+    def _fused_log_deviation(self, state: UnknownInputState) -> Array:
+        before = self.nodes.fused_covariance(state.estimates, state.time - 1.0)
+        return _lanes(_log_deviation(before, self.reference), len(state.time))
 
     def _fused_prior(self, state: UnknownInputState) -> Array:
         n = self.plant.size
