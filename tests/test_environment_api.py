@@ -183,7 +183,7 @@ def test_withheld_signals() -> None:
     env = make(information="centre").unwrapped
     env.reset(seed=0)
     signals = env.batch.signals()
-    hidden = {s.name for s in env.task.system.signals if s.knowledge == "sensor"}
+    hidden = {s.name for s in env.task.system.signals if s.knowledge == "own"}
     assert hidden == {"measurement", "innovation", "censored"}
     assert hidden.isdisjoint(signals)
     assert {"age", "held", "variance_reduction", "tokens", "observation"} <= set(signals)

@@ -17,7 +17,7 @@ from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.envs.views import SensorView
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.model import tag_model
 from fusion_gym.validation import ConfigurationError
 
@@ -42,7 +42,7 @@ def test_a_row_has_what_the_sensor_knows_and_nothing_else(env_id: str) -> None:
         batch.step(np.ones((task.sensors, 5), dtype=np.bool_))
     observation = batch.observe()
     rows = view.rows(observation).reshape(5, task.sensors, -1)
-    assert rows.shape[-1] == len(view.names) == len(view.low)
+    assert rows.shape[-1] == len(view.names) == len(view.space.low)
     for sensor in range(task.sensors):
         for place, name in enumerate(view.names):
             kind, _, inner = name.partition("[")
@@ -54,7 +54,7 @@ def test_a_row_has_what_the_sensor_knows_and_nothing_else(env_id: str) -> None:
             entry = batch.layout.names.index(source)
             np.testing.assert_array_equal(rows[:, sensor, place], observation[:, entry])
     kinds = {name.partition("[")[0] for name in view.names}
-    measured = {f.name.partition("[")[0] for f in batch.layout.entries if f.knowledge == "sensor"}
+    measured = {block.name for block in batch.layout.blocks if block.knowledge == "own"}
     assert measured & kinds, "a sensor must see what it measures"
     assert {"tokens", "price", "sensor"} <= kinds
     assert not kinds & GLOBAL.get(env_id, set())

@@ -20,8 +20,8 @@ from fusion_gym.envs.registered import MarkovJumpTrackingEnv
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.views import SensorView
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.make import make_policy
-from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.registry import make_rule
 from fusion_gym.policies.rules.random import Random
 from fusion_gym.validation import ConfigurationError
 
@@ -50,15 +50,16 @@ def test_nothing_that_was_not_sent_or_sampled_leaks(where: str) -> None:
     for time in range(1, 8):
         noise = draw.standard_normal((system.noise_channels, runs))
         before, state = state, system.sense(state, noise)
-        offered, blocks = Signals(system.read(state)), system.observe(state)
+        offered = Signals(system.read(state))
         for signal in system.signals:
             value = np.asarray(offered[signal.name], dtype=np.float64)
             same = np.abs(value - value[..., :1]).max() == 0.0
             assert same == (signal.knowledge == "centre"), signal.name
-        for block, values in zip(system.features, blocks, strict=True):
+        for block in system.observation:
+            values = block.fill(state)
             same = bool((values == values[..., :1]).all())
-            assert same == (block[0].knowledge == "centre"), block[0].name
-            assert values.shape == (len(block), runs)
+            assert same == (block.knowledge == "centre"), block.name
+            assert values.shape == (len(block.places), runs)
         # Other fadings and noises of the sensors that do not sample: nothing changes at all.
         silent = np.flatnonzero(time % np.array([1, 2, 3]) != 0)
         changed = noise.copy()
@@ -67,8 +68,8 @@ def test_nothing_that_was_not_sent_or_sampled_leaks(where: str) -> None:
         other = system.sense(before, changed)
         for name, value in system.read(other).items():
             np.testing.assert_array_equal(Signals({name: value})[name], offered[name])
-        for found, values in zip(system.observe(other), blocks, strict=True):
-            np.testing.assert_array_equal(found, values)
+        for block in system.observation:
+            np.testing.assert_array_equal(block.fill(other), block.fill(state))
         everyone = np.ones((3, runs), dtype=bool)
         for found, expected in zip(
             system.fused(system.deliver(other, everyone)),
@@ -234,4 +235,4 @@ def test_what_is_not_allowed_is_said_in_one_error(given: dict[str, Any], message
 def test_the_nodes_trigger_has_no_meaning_at_the_centre() -> None:
     with pytest.raises(ConfigurationError, match=r"'local_variance'.*unknown signal"):
         make_policy("local_variance", build(filter="imm"))
-    assert make_trigger("local_variance") is not None
+    assert make_rule("local_variance") is not None

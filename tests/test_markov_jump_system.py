@@ -18,7 +18,7 @@ from fusion_gym.core.system import Signals
 from fusion_gym.envs.registered import MarkovJumpTrackingEnv, MarkovJumpTrackingVectorEnv
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.registry import make_rule
 from fusion_gym.policies.rules.centre_variance import CentreVariance
 from fusion_gym.policies.rules.local_variance import LocalVariance
 from fusion_gym.policies.rules.random import Random
@@ -102,10 +102,11 @@ def test_nothing_that_was_not_sent_leaks_into_the_centres_signals() -> None:
             value = np.asarray(offered[signal.name], dtype=np.float64)
             same = np.abs(value - value[..., :1]).max() == 0.0
             assert same == (signal.knowledge == "centre"), signal.name
-        for block, values in zip(system.features, system.observe(state), strict=True):
+        for block in system.observation:
+            values = block.fill(state)
             same = bool((values == values[..., :1]).all())
-            assert same == (block[0].knowledge == "centre"), block[0].name
-            assert values.shape == (len(block), runs)
+            assert same == (block.knowledge == "centre"), block.name
+            assert values.shape == (len(block.places), runs)
         state = system.deliver(state, nobody)
 
 
@@ -163,7 +164,7 @@ def test_existing_policies_work_on_its_signals() -> None:
         if information == "sensors":
             names += ["innovation_threshold", "innovation_threshold:whitened=true"]
             names += ["send_on_delta", "dynamic_event", "adaptive_innovation"]
-        policies = [(name, make_trigger(name)) for name in names]
+        policies = [(name, make_rule(name)) for name in names]
         reference = task.policy_defaults["local_variance"]
         policies += [("local", LocalVariance(**reference)), ("centre", CentreVariance(1.6))]
         for name, policy in policies:
@@ -275,7 +276,7 @@ def test_short_and_long_episodes_of_rare_deliveries(horizon: int) -> None:
 
 
 def test_open_loop_is_what_never_costs() -> None:
-    results = run_episodes(build(), make_trigger("never"), 3000, 0)
+    results = run_episodes(build(), make_rule("never"), 3000, 0)
     task = build()
     expected = task.system.open_loop(task.horizon)
     np.testing.assert_allclose(results.squared_error.mean(0), expected, rtol=0.05)
