@@ -3,7 +3,7 @@
 Every function works element by element on arrays of any broadcastable shapes (plain floats
 included), in float64, and never issues a NumPy warning; a NaN in gives a NaN out. A result for
 floats only is a NumPy float64 scalar or an array of shape ``()``. Standardised arguments are
-dimensionless; `mean`, `std`, `lower` and `upper` share one unit, a variance has its square.
+dimensionless.
 
 With phi and Phi the standard normal density and distribution function and Q = 1 - Phi, a normal
 variable known to exceed z has
@@ -17,8 +17,6 @@ which neither overflows nor underflows for z above -38. Far above zero d and v l
 difference of nearly equal numbers; there they come from the continued fraction of Laplace
 (Abramowitz and Stegun, Handbook of Mathematical Functions, 26.2.14),
 ``d = 1 / (z + r)`` with ``r = 2 / (z + 3 / (z + 4 / (z + ...)))``, whence ``v = d (r - d)``.
-
-Censoring is clipping, ``y = clip(x, lower, upper)``; truncation is conditioning on the interval.
 """
 
 from __future__ import annotations
@@ -120,14 +118,6 @@ def hazard(z: ArrayLike) -> FloatArray:
     Increasing, close to z for large z; it underflows to zero below about -38.
     """
     return _beyond(z)[0]
-
-
-def hazard_excess(z: ArrayLike) -> FloatArray:
-    """Mean distance ``hazard(z) - z`` from z given that z is exceeded, of z's shape.
-
-    Positive and decreasing, close to 1 / z for large z.
-    """
-    return _beyond(z)[1]
 
 
 def truncated_variance(z: ArrayLike) -> FloatArray:
@@ -234,109 +224,3 @@ def _ordered(
             f"{low_name} must be below {high_name}"
         )
     return low, high
-
-
-def _checked_std(std: ArrayLike) -> FloatArray:
-    std = np.asarray(std, dtype=np.float64)
-    valid = (std > 0.0) & (std < np.inf)
-    if not valid.all():
-        first = np.unravel_index(int(np.argmin(valid)), valid.shape)
-        raise ValueError(f"std = {std[first]} is not allowed: it must be finite and > 0")
-    return std
-
-
-def _overshoot(z: FloatArray) -> FloatArray:
-    """Mean ``Q(z) d(z)`` of ``max(standard normal - z, 0)`` for z not below zero."""
-    z = np.minimum(z, _OUTER)
-    return ndtr(-z) * (_HAZARD_SCALE / erfcx(_ROOT_HALF * z) - z)
-
-
-def _mirrored(
-    mean: FloatArray, std: FloatArray, lower: FloatArray, upper: FloatArray
-) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
-    """Mirror where the nearer threshold is `upper`: mirrored, near end, width."""
-    low = (lower - mean) / std
-    high = (upper - mean) / std
-    flip = low + high < 0.0
-    return flip, *_truncate(np.where(flip, -high, low), (upper - lower) / std)
-
-
-@np.errstate(all="ignore")
-def censored_mean(
-    mean: ArrayLike, std: ArrayLike, lower: ArrayLike | None, upper: ArrayLike | None = None
-) -> FloatArray:
-    """Mean of ``y = clip(x, lower, upper)`` for x normal.
-
-    One-sided: ``max(mean, lower) + std Q(|z|) d(|z|)`` with ``z = (lower - mean) / std``, and the
-    mirror image for `upper`. Two-sided: the near threshold plus ``std (p m + b w)``, where p and
-    b are the probabilities of the interval and of the far threshold, m the distance of the
-    truncated mean from the near threshold and w the width; the two one-sided corrections to
-    `mean` where the thresholds are well apart around it.
-
-    Args:
-        mean: mean of x.
-        std: standard deviation of x.
-        lower: lower threshold; None or minus infinity for none.
-        upper: upper threshold; None or infinity for none.
-
-    Returns:
-        The mean of y, of the broadcast shape of the arguments.
-
-    Raises:
-        ValueError: `std` is not finite and positive, or `lower` is not below `upper`.
-    """
-    mean = np.asarray(mean, dtype=np.float64)
-    std = _checked_std(std)
-    if lower is None and upper is None:
-        return mean + 0.0 * std
-    if lower is None:
-        upper = np.asarray(upper, dtype=np.float64)
-        return np.minimum(mean, upper) - std * _overshoot(np.abs((upper - mean) / std))
-    if upper is None:
-        lower = np.asarray(lower, dtype=np.float64)
-        return np.maximum(mean, lower) + std * _overshoot(np.abs((lower - mean) / std))
-    lower, upper = _ordered("lower", lower, "upper", upper)
-    flip, near, width = _mirrored(mean, std, lower, upper)
-    probability, offset, _, _ = _inside(near, width)
-    far = near + width
-    sign = np.where(flip, -std, std)
-    from_end = np.where(flip, upper, lower) + sign * (probability * offset + ndtr(-far) * width)
-    around = mean + sign * (_overshoot(np.abs(near)) - _overshoot(far))
-    return np.where((near < 0.0) & (width > 1.0), around, from_end)
-
-
-@np.errstate(all="ignore")
-def censored_variance(
-    mean: ArrayLike, std: ArrayLike, lower: ArrayLike | None, upper: ArrayLike | None = None
-) -> FloatArray:
-    """Total variance of ``y = clip(x, lower, upper)`` for x normal.
-
-    By the law of total variance, a sum of terms that are all positive. One-sided:
-    ``std^2 q (v + (1 - q) d^2)`` with q the probability of not being censored and d, v the
-    excess and variance beyond the threshold. Two-sided, with a, p, b the probabilities of the
-    near threshold, the interval and the far threshold, m and v the distance of the truncated
-    mean from the near threshold and the truncated variance, and w the width:
-    ``std^2 (p v + a p m^2 + a b w^2 + p b (w - m)^2)``.
-
-    Arguments and errors are those of `censored_mean`.
-
-    Returns:
-        The variance of y, of the broadcast shape of the arguments.
-    """
-    mean = np.asarray(mean, dtype=np.float64)
-    std = _checked_std(std)
-    if lower is None and upper is None:
-        return std * std + 0.0 * mean
-    if lower is None or upper is None:
-        threshold = np.asarray(upper if lower is None else lower, dtype=np.float64)
-        z = (mean - threshold if lower is None else threshold - mean) / std
-        inside, _, excess, variance = tobit_moments(np.maximum(z, -_OUTER))
-        return std * std * inside * (variance + (1.0 - inside) * excess * excess)
-    lower, upper = _ordered("lower", lower, "upper", upper)
-    _, near, width = _mirrored(mean, std, lower, upper)
-    inside, offset, _, variance = _inside(near, width)
-    at_near, at_far = ndtr(near), ndtr(-(near + width))
-    spread = inside * variance + at_near * inside * offset * offset
-    spread += at_near * at_far * width * width
-    spread += inside * at_far * (width - offset) * (width - offset)
-    return std * std * spread

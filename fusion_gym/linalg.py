@@ -9,7 +9,7 @@ small axes. Each lane therefore sees exactly the same floating-point operations 
 number of lanes, and a lane's result is bitwise the same alone and in a batch.
 
 The routines for symmetric positive definite matrices (`cholesky`, `solve`, `solve_vector`,
-`inverse`, `is_positive_definite`) read only the diagonal and the lower triangle. They first
+`inverse`) read only the diagonal and the lower triangle. They first
 scale rows and columns by ``1 / sqrt(diagonal)``, which gives a unit diagonal: the accuracy then
 depends on the conditioning of the correlation matrix and not on the units of the components,
 and diagonal entries from 1e-200 to 1e200 neither overflow nor underflow. A lane whose matrix is
@@ -320,22 +320,3 @@ def inverse(a: FloatArray) -> FloatArray:
         column = stack[..., size : size + k + 1, k, :]
         result[..., : k + 1, : k + 1, :] += outer(column, column)
     return result
-
-
-@np.errstate(all="ignore")
-def is_positive_definite(a: FloatArray) -> NDArray[np.bool_]:
-    """Whether each matrix is positive definite beyond rounding: ``(..., n, n, N)`` to ``(..., N)``.
-
-    True where the diagonal is positive and finite and every pivot of the equilibrated matrix
-    exceeds ``4 n`` times the float64 epsilon, below which it cannot be told from zero (behind an
-    ill-conditioned leading block rounding can be larger than that). Only the lower triangle is
-    read, so symmetry is for the caller to check.
-    """
-    size = a.shape[-2]
-    work, _ = _equilibrate(a)
-    last = _eliminate(work, None)
-    largest = 0.5 / np.sqrt(size * np.finfo(np.float64).eps)
-    mask: NDArray[np.bool_] = last < largest
-    for k in range(size - 1):
-        mask &= work[..., k, k, :] < largest
-    return mask

@@ -19,7 +19,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import Signals
 from fusion_gym.envs.registered import CorrelatedTrackingEnv, CorrelatedTrackingVectorEnv
 from fusion_gym.envs.registration import make_task
-from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.registry import make_rule
 from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
 from fusion_gym.policies.rules.random import Random
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
@@ -107,7 +107,7 @@ def test_existing_policies_work_on_its_signals() -> None:
         if information == "sensors":
             names += ["innovation_threshold", "send_on_delta", "dynamic_event"]
         for name in names:
-            policy = make_trigger(name)
+            policy = make_rule(name)
             policy.reset(6)
             asked = 0
             for _ in range(30):
@@ -248,11 +248,11 @@ def test_other_sizes_and_fusions_run() -> None:
         batch = EpisodeBatch(task, 8)
         batch.seed(np.arange(8), list(range(8)))
         batch.reset()
-        policy = make_trigger("adaptive_innovation", task.policy_defaults)
+        policy = make_rule("adaptive_innovation", task.policy_defaults)
         for _ in range(20):
             outcome = batch.step(policy(batch.signals()))
             assert np.isfinite(outcome.reward).all()
-            assert linalg.is_positive_definite(batch.delivered.covariance).all()
+            assert np.isfinite(linalg.cholesky(batch.delivered.covariance)).all()
         assert np.isfinite(batch.observe()).all()
         assert task.system.state_names == ("x1", "x2")
 
@@ -267,7 +267,7 @@ def test_short_and_long_episodes_of_rare_deliveries(horizon: int) -> None:
         outcome = batch.step(policy(batch.signals()))
         assert np.isfinite(outcome.reward).all()
     assert outcome.truncated.all()
-    assert linalg.is_positive_definite(batch.delivered.covariance).all()
+    assert np.isfinite(linalg.cholesky(batch.delivered.covariance)).all()
 
 
 @pytest.mark.parametrize(
@@ -311,9 +311,9 @@ def test_what_is_not_allowed_is_said_in_one_error(options: dict[str, Any], messa
 
 def test_trigger_options_are_the_policys_defaults() -> None:
     task = build(trigger_threshold=(0.1, 0.2, 0.3), trigger_sensitivity=0.0)
-    policy = make_trigger("adaptive_innovation", task.policy_defaults)
+    policy = make_rule("adaptive_innovation", task.policy_defaults)
     assert policy == AdaptiveInnovation((0.1, 0.2, 0.3), (0.2,) * 3, (0.0,) * 3)
-    changed = make_trigger("adaptive_innovation:threshold=0.5", task.policy_defaults)
+    changed = make_rule("adaptive_innovation:threshold=0.5", task.policy_defaults)
     assert changed == AdaptiveInnovation(0.5, (0.2,) * 3, (0.0,) * 3)
 
 
@@ -332,6 +332,6 @@ def test_page_names_every_option_and_observation_and_configs_are_of_this_environ
     for spec in (*sweep["points"], *specs):
         batch = EpisodeBatch(task, 2)
         batch.reset()
-        policy = make_trigger(spec, task.policy_defaults)
+        policy = make_rule(spec, task.policy_defaults)
         policy.reset(2)
         assert policy(batch.signals()).shape == (3, 2), spec

@@ -9,7 +9,7 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fusion_gym import gaussian
@@ -61,30 +61,6 @@ def exact_inside(low: Any, high: Any) -> tuple[Any, Any, Any]:
     return probability, mean, square - mean**2
 
 
-def exact_censored(mean: float, std: float, lower: float, upper: float) -> tuple[Any, Any, Any]:
-    """Mean, variance and distance of the mean from the nearer threshold of clip(x, lower, upper).
-
-    From the first two moments about the nearer threshold. One threshold may be infinite.
-    """
-    centre, deviation = mpmath.mpf(mean), mpmath.mpf(std)
-    if abs(upper - mean) < abs(lower - mean):
-        value, variance, distance = exact_censored(-mean, std, -upper, -lower)
-        return -value, variance, distance
-    low = (mpmath.mpf(lower) - centre) / deviation
-    if upper == INFINITY:
-        hazard, excess, _ = exact_beyond(low)
-        first = exact_tail(low) * excess
-        second = exact_tail(low) * (1 + low * hazard - 2 * low * hazard + low**2)
-    else:
-        high = (mpmath.mpf(upper) - centre) / deviation
-        probability, inside, variance = exact_inside(low, high)
-        first = probability * (inside - low) + exact_tail(high) * (high - low)
-        second = probability * (variance + (inside - low) ** 2)
-        second += exact_tail(high) * (high - low) ** 2
-    distance = deviation * first
-    return mpmath.mpf(lower) + distance, deviation**2 * (second - first**2), distance
-
-
 def error(actual: Any, expected: Any) -> float:
     """Relative error, where both underflow to nothing zero."""
     size = abs(expected)
@@ -104,23 +80,10 @@ def test_reference_agrees_with_quadrature() -> None:
         assert abs(mean - moments[1] / moments[0]) < mpmath.mpf("1e-55")
         square = moments[2] / moments[0] - (moments[1] / moments[0]) ** 2
         assert abs(variance - square) < mpmath.mpf("1e-50")
-        total = [
-            mpmath.quad(lambda x, n=n: (2 * x + 1) ** n * exact_density(x), points)
-            + (2 * mpmath.mpf(low) + 1) ** n * exact_tail(-low)
-            + (2 * mpmath.mpf(high) + 1) ** n * exact_tail(high)
-            for n in (1, 2)
-        ]
-        censored = exact_censored(1.0, 2.0, 2.0 * low + 1.0, 2.0 * high + 1.0)
-        assert abs(censored[0] - total[0]) < mpmath.mpf("1e-55")
-        assert abs(censored[1] - (total[1] - total[0] ** 2)) < mpmath.mpf("1e-50")
     hazard, _, variance = exact_beyond(1.0)
     truncated = exact_inside(1.0, 40.0)
     assert abs(hazard - truncated[1]) < mpmath.mpf("1e-100")
     assert abs(variance - truncated[2]) < mpmath.mpf("1e-100")
-    one_sided = exact_censored(0.0, 1.0, 1.0, INFINITY)
-    two_sided = exact_censored(0.0, 1.0, 1.0, 40.0)
-    assert abs(one_sided[0] - two_sided[0]) < mpmath.mpf("1e-100")
-    assert abs(one_sided[1] - two_sided[1]) < mpmath.mpf("1e-100")
 
 
 def test_density_and_upper_tail() -> None:
@@ -129,8 +92,7 @@ def test_density_and_upper_tail() -> None:
 
 
 @pytest.mark.parametrize(
-    ("function", "position"),
-    [(gaussian.hazard, 0), (gaussian.hazard_excess, 1), (gaussian.truncated_variance, 2)],
+    ("function", "position"), [(gaussian.hazard, 0), (gaussian.truncated_variance, 2)]
 )
 def test_moments_beyond_z(function: Callable[[Any], Any], position: int) -> None:
     expected = [exact_beyond(z)[position] for z in Z_GRID]
@@ -139,10 +101,15 @@ def test_moments_beyond_z(function: Callable[[Any], Any], position: int) -> None
     np.testing.assert_array_equal(alone, function(Z_GRID))
 
 
+def excess_beyond(z: Any) -> Any:
+    """Mean distance from z given that z is exceeded."""
+    return gaussian.tobit_moments(z).excess
+
+
 def test_moments_beyond_z_far_out() -> None:
     z = np.geomspace(40.0, 1e8, 60)
     hazard, excess, variance = (
-        f(z) for f in (gaussian.hazard, gaussian.hazard_excess, gaussian.truncated_variance)
+        f(z) for f in (gaussian.hazard, excess_beyond, gaussian.truncated_variance)
     )
     np.testing.assert_allclose(hazard, z + 1 / z, rtol=1e-5)
     np.testing.assert_allclose(excess * z, 1 - 2 / z**2 + 10 / z**4, rtol=1e-7)
@@ -171,7 +138,7 @@ def test_tobit_moments_are_the_single_functions(shape: tuple[int, ...]) -> None:
         (
             gaussian.upper_tail,
             gaussian.hazard,
-            gaussian.hazard_excess,
+            excess_beyond,
             gaussian.truncated_variance,
         ),
         strict=True,
@@ -225,79 +192,13 @@ def test_interval_moments_where_the_probability_underflows() -> None:
     assert gaussian.interval_moments(-1e300, -1e299) == (0.0, -1e299, 0.0)
 
 
-@pytest.mark.parametrize("threshold", [0.0, -3.5, 250.0])
-@pytest.mark.parametrize("std", [1.0, 2e-3, 70.0])
-def test_one_sided_censoring(threshold: float, std: float) -> None:
-    means = threshold + std * np.linspace(-40.0, 40.0, 81)
-    expected = [exact_censored(m, std, threshold, INFINITY) for m in means]
-    for arguments in [(threshold,), (threshold, None), (threshold, INFINITY)]:
-        mean = gaussian.censored_mean(means, std, *arguments)
-        variance = gaussian.censored_variance(means, std, *arguments)
-        assert worst(mean, [e[0] for e in expected]) < TOLERANCE
-        assert worst(variance, [e[1] for e in expected]) < TOLERANCE
-    for lower in (None, -INFINITY):
-        mirrored = gaussian.censored_mean(-means, std, lower, -threshold)
-        assert worst(mirrored, [-e[0] for e in expected]) < TOLERANCE
-        mirrored = gaussian.censored_variance(-means, std, lower, -threshold)
-        assert worst(mirrored, [e[1] for e in expected]) < TOLERANCE
-
-
-@pytest.mark.parametrize("width", WIDTHS)
-@pytest.mark.parametrize("std", [1.0, 0.01])
-def test_two_sided_censoring(width: float, std: float) -> None:
-    means = std * LOWS
-    lower, upper = 0.0, std * width  # a threshold at zero shows the distance from it
-    expected = [exact_censored(m, std, lower, upper) for m in means]
-    mean = gaussian.censored_mean(means, std, lower, upper)
-    variance = gaussian.censored_variance(means, std, lower, upper)
-    assert worst(mean, [e[0] for e in expected]) < TOLERANCE
-    assert worst(variance, [e[1] for e in expected]) < TOLERANCE
-    mean = gaussian.censored_mean(-means, std, -upper, -lower)
-    np.testing.assert_array_equal(mean, -gaussian.censored_mean(means, std, lower, upper))
-    alone = [float(gaussian.censored_variance(m, std, lower, upper)) for m in means]
-    np.testing.assert_array_equal(alone, variance)
-
-
-def test_thresholds_may_be_absent_per_element() -> None:
-    lower = np.array([-INFINITY, -1.0, -INFINITY, -1.0, -1e10])
-    upper = np.array([INFINITY, INFINITY, 2.0, 2.0, 2.0])
-    mean = gaussian.censored_mean(0.5, 1.5, lower, upper)
-    variance = gaussian.censored_variance(0.5, 1.5, lower, upper)
-    assert mean[0] == 0.5
-    assert variance[0] == 2.25
-    for i in range(1, 5):
-        finite_lower = max(lower[i], -1e4)  # 1e4 stands for infinity, 6,000 deviations out
-        exact = exact_censored(0.5, 1.5, finite_lower, upper[i])
-        assert error(mean[i], exact[0]) < TOLERANCE
-        assert error(variance[i], exact[1]) < TOLERANCE
-
-
-def test_no_censoring_broadcasts() -> None:
-    mean = gaussian.censored_mean(np.array([1.0, 2.0]), np.array([[1.0], [3.0]]), None)
-    np.testing.assert_array_equal(mean, [[1.0, 2.0], [1.0, 2.0]])
-    variance = gaussian.censored_variance(np.array([1.0, 2.0]), np.array([[1.0], [3.0]]), None)
-    np.testing.assert_array_equal(variance, [[1.0, 1.0], [9.0, 9.0]])
-
-
-@pytest.mark.parametrize("function", [gaussian.censored_mean, gaussian.censored_variance])
-def test_refused_arguments(function: Callable[..., Any]) -> None:
-    for std in (0.0, -2.0, float("nan"), INFINITY):
-        with pytest.raises(ValueError, match=rf"std = {std} is not allowed.*finite and > 0"):
-            function(0.0, np.array([1.0, std]), 0.0)
-    for lower, upper in [(2.0, 2.0), (3.0, -1.0), (float("nan"), 1.0)]:
-        with pytest.raises(ValueError, match=rf"lower = {lower} and upper = {upper} .*below"):
-            function(0.0, 1.0, np.array([-9.0, lower]), upper)
-    with pytest.raises(ValueError, match=r"low = 1.0 and high = 0.5 .*low must be below high"):
-        gaussian.interval_moments(1.0, 0.5)
-
-
 reals = st.floats(-60.0, 60.0)
 widths = st.floats(-4.0, 2.0).map(lambda exponent: 10.0**exponent)
 
 
 @given(z=st.floats(-1e8, 1e8))
 def test_truncated_variance_within_bounds(z: float) -> None:
-    hazard, excess = gaussian.hazard(z), gaussian.hazard_excess(z)
+    hazard, excess = gaussian.hazard(z), excess_beyond(z)
     assert 0.0 < gaussian.truncated_variance(z) <= 1.0
     assert excess > 0.0
     assert hazard >= max(z, 0.0)
@@ -306,7 +207,7 @@ def test_truncated_variance_within_bounds(z: float) -> None:
 @given(z=st.floats(-37.0, 1e6), step=st.floats(1e-3, 10.0))
 def test_monotone(z: float, step: float) -> None:
     assert gaussian.hazard(z + step) > gaussian.hazard(z)
-    assert gaussian.hazard_excess(z + step) < gaussian.hazard_excess(z)
+    assert excess_beyond(z + step) < excess_beyond(z)
     assert gaussian.truncated_variance(z + step) <= gaussian.truncated_variance(z)
     assert gaussian.upper_tail(z + step) <= gaussian.upper_tail(z)
 
@@ -321,20 +222,3 @@ def test_interval_moments_are_moments(low: float, width: float) -> None:
     assert 0.0 < variance <= min(1.0, (high - low) ** 2 / 12) * (1 + 1e-12)
     mirrored = gaussian.interval_moments(-high, -low)
     assert mirrored == (probability, -mean, variance)
-
-
-@settings(deadline=None)
-@given(mean=reals, lower=reals, width=widths, std=st.floats(0.1, 10.0))
-def test_censoring_reduces_variance(mean: float, lower: float, width: float, std: float) -> None:
-    upper = lower + width
-    for thresholds in [(lower, upper), (lower, None), (None, upper)]:
-        value = gaussian.censored_mean(mean, std, *thresholds)
-        variance = gaussian.censored_variance(mean, std, *thresholds)
-        ulp = np.spacing(max(abs(lower), abs(upper), abs(mean)))
-        below = -INFINITY if thresholds[0] is None else lower
-        above = INFINITY if thresholds[1] is None else upper
-        assert below - ulp <= value <= above + ulp
-        assert 0.0 <= variance <= std * std * (1 + 1e-12)
-        mirrored = [None if t is None else -t for t in reversed(thresholds)]
-        assert gaussian.censored_mean(-mean, std, *mirrored) == -value
-        assert gaussian.censored_variance(-mean, std, *mirrored) == variance

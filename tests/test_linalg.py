@@ -127,8 +127,7 @@ def test_definite_systems(seed: int, lead: tuple[int, ...], count: int, n: int, 
     inverse = linalg.inverse(a)
     np.testing.assert_allclose(inverse, last(np.linalg.inv(first(a))), **close)
     np.testing.assert_array_equal(inverse, linalg.transpose(inverse))
-    assert linalg.is_positive_definite(a).shape == (*lead, count)
-    assert linalg.is_positive_definite(a).all()
+    assert np.isfinite(linalg.cholesky(a)).all()
     np.testing.assert_array_equal(a, untouched)
     np.testing.assert_array_equal(b, untouched_b)
 
@@ -144,7 +143,7 @@ def test_only_the_lower_triangle_is_read(seed: int, n: int) -> None:
     np.testing.assert_array_equal(linalg.cholesky(hidden), linalg.cholesky(a))
     np.testing.assert_array_equal(linalg.solve(hidden, b), linalg.solve(a, b))
     np.testing.assert_array_equal(linalg.inverse(hidden), linalg.inverse(a))
-    assert linalg.is_positive_definite(hidden).all()
+    assert np.isfinite(linalg.cholesky(hidden)).all()
 
 
 @settings(deadline=None)
@@ -167,7 +166,7 @@ def test_badly_scaled_matrices_keep_full_precision(seed: int, n: int) -> None:
     np.testing.assert_allclose(
         linalg.cholesky(scaled) / power[:, None], linalg.cholesky(a), **close
     )
-    assert linalg.is_positive_definite(scaled).all()
+    assert np.isfinite(linalg.cholesky(scaled)).all()
 
 
 @pytest.mark.parametrize("low", [1e-200, 1e-3])
@@ -192,7 +191,7 @@ def test_nearly_singular_pair() -> None:
     determinant = gap * (2.0 - gap)
     expected = np.array([[1.0, gap - 1.0], [gap - 1.0, 1.0]]) / determinant
     np.testing.assert_allclose(linalg.inverse(a)[..., 0], expected, rtol=1e-14)
-    assert linalg.is_positive_definite(a).all()
+    assert np.isfinite(linalg.cholesky(a)).all()
 
 
 def indefinite(n: int) -> dict[str, Array]:
@@ -231,19 +230,6 @@ def test_a_lane_that_is_not_definite_is_nan_and_alone(n: int) -> None:
         for actual, expected in pairs:
             assert np.isnan(actual[..., 1]).all(), name
             np.testing.assert_array_equal(actual[..., [0, 2]], expected[..., [0, 2]], name)
-        assert linalg.is_positive_definite(a).tolist() == [True, False, True], name
-
-
-def test_singular_but_for_rounding_is_not_definite() -> None:
-    """The last component is a combination of four independent ones, up to rounding."""
-    weights = np.random.default_rng(8).normal(size=(4, 200))
-    a = np.zeros((5, 5, 200))
-    a[:4, :4] = linalg.identity(4)
-    a[:4, 4] = a[4, :4] = weights
-    a[4, 4] = linalg.dot(weights, weights)
-    assert not linalg.is_positive_definite(a).any()
-    a[4, 4] *= 1.0 + 1e-12
-    assert linalg.is_positive_definite(a).all()
 
 
 @settings(deadline=None)

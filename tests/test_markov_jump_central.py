@@ -321,7 +321,7 @@ def test_a_far_outlier_leaves_everything_finite(where: str) -> None:
         state = system.deliver(system.sense(state, noise), np.ones((3, 2), dtype=bool))
         mean, covariance = system.fused(state)
         assert np.isfinite(mean).all()
-        assert linalg.is_positive_definite(covariance).all()
+        assert np.isfinite(linalg.cholesky(covariance)).all()
 
 
 @each_filter
@@ -335,5 +335,5 @@ def test_short_and_long_episodes(where: str, horizon: int) -> None:
     for _ in range(horizon):
         outcome = batch.step(policy(batch.signals()))
         assert np.isfinite(outcome.reward).all()
-    assert linalg.is_positive_definite(task.system.fused(batch.delivered)[1]).all()
+    assert np.isfinite(linalg.cholesky(task.system.fused(batch.delivered)[1])).all()
     assert outcome.truncated.all()
