@@ -12,9 +12,20 @@ from typing import Any
 
 from gymnasium.vector import AutoresetMode
 
+from fusion_gym.envs.pages import page
 from fusion_gym.envs.registration import ENVIRONMENTS, class_name, make_task, options_of
 from fusion_gym.envs.single import FusionEnv
 from fusion_gym.envs.vector import FusionVectorEnv
+
+
+class _Page:
+    """A docstring that is written when it is first asked for; an object's tells of its own task."""
+
+    def __init__(self, env_id: str) -> None:
+        self._env_id = env_id
+
+    def __get__(self, env: FusionEnv | FusionVectorEnv | None, owner: type) -> str:
+        return page(self._env_id, None if env is None else env.task)
 
 
 def __getattr__(name: str) -> type:
@@ -60,4 +71,5 @@ def _made(env_id: str, base: type, init: Any) -> type:
         for f in fields(options_of(env_id))
     ]
     init.__signature__ = inspect.Signature([*own, *options])
-    return type(base.__name__, (base,), {"__init__": init, "__module__": __name__})
+    body = {"__init__": init, "__module__": __name__, "__doc__": _Page(env_id)}
+    return type(base.__name__, (base,), body)

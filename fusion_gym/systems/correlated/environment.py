@@ -27,10 +27,21 @@ _T = 0.01  # the paper's sampling time
 
 @dataclass(frozen=True)
 class CorrelatedTrackingOptions(CommonOptions):
-    """Every option of the environment; the defaults are the paper's Section 6.
+    """A target's position, velocity and acceleration, each measured by a sensor of its own.
 
-    Not given in the paper, our choice: ``horizon`` (the paper runs 600 steps), the token bucket
-    (the paper has none, hence ``tokens="unlimited"``) and the reward.
+    Three states driven by one noise, sampled every 0.01. Sensor 0 measures the position, sensor 1
+    the velocity, sensor 2 the acceleration, each with noise of its own plus a multiple of the noise
+    that has just moved the target. Filters know only upper bounds of all variances; ``noise_scale``
+    says how far below them the actual ones lie. Each node runs a robust Kalman filter that updates
+    with what the network grants, and the centre fuses its own prediction with the estimates of
+    those nodes, one after another. Nothing is fed back.
+
+    Starting state: x₀ ~ N((0.3, 0.1, 0.2), noise_scale · I). The filters know the mean and the
+    bound I; nothing has been measured.
+
+    The defaults are the paper's Section 6. Not given in the paper, our choice: ``horizon`` (the
+    paper runs 600 steps), the token bucket (the paper has none, hence ``tokens="unlimited"``) and
+    the reward.
     """
 
     # Plant, equations (1) and (64): position, velocity, acceleration

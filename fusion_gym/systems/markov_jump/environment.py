@@ -25,10 +25,28 @@ _T = 0.5  # the paper's sampling time in seconds
 
 @dataclass(frozen=True)
 class MarkovJumpTrackingOptions(CommonOptions):
-    """Every option of the environment; the defaults are the paper's Section 6.
+    """A target that jumps between two motions, seen by three fading, asynchronous sensors.
 
-    Not given in the paper, our choice: ``horizon``, the token bucket (the paper has none, hence
-    ``tokens="unlimited"``) and the reward.
+    Position and velocity follow one of two linear motions, chosen by a Markov chain that nobody
+    sees. Sensor 0 measures at every step, sensor 1 at every second, sensor 2 at every third; a
+    measurement is multiplied by a random number between 0 and 1, and its noise is correlated with
+    the others' and with the noise that moves the target next. Each node runs its own
+    linear-minimum-variance filter at every step, so the link is between node and centre: a packet
+    carries the node's estimate. The centre keeps a copy of each node's estimate, replaces it when a
+    packet arrives, predicts it otherwise, and fuses its copies with matrix weights, knowing the
+    exact joint covariance of their errors. Nothing is fed back.
+
+    With ``filter="centralised"`` or ``"imm"`` packets carry measurements, and one filter at the
+    centre takes those that are granted: the best linear one, or interacting multiple models. A
+    request of a sensor that does not sample then delivers nothing and costs its tokens all the
+    same. The observation has other entries then: ``print(env.unwrapped.__doc__)`` of such an
+    environment shows them.
+
+    Starting state: x₀ ~ N(0, 0.1 I), the mode 1 or 2 with probability 1/2 each. Nodes and centre
+    know these distributions; nothing has been measured.
+
+    The defaults are the paper's Section 6. Not given in the paper, our choice: ``horizon``, the
+    token bucket (the paper has none, hence ``tokens="unlimited"``) and the reward.
     """
 
     # Plant, equation (1): position, velocity; one Φ and Γ a mode

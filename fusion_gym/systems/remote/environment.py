@@ -23,7 +23,16 @@ from fusion_gym.validation import ConfigurationError
 
 @dataclass(frozen=True)
 class RemoteEstimationOptions(CommonOptions):
-    """Every option of the environment.
+    """Scalar sources that drift away from what the centre believes, and a price for every packet.
+
+    The problem whose optimum is known. Source i follows x(t+1) = a x(t) + w(t), w ~ N(0, σ²), and
+    sensor i sees it exactly. The centre takes over what arrives and predicts a x̂ otherwise. A
+    channel may lose what was granted: independently, or as a Gilbert-Elliott channel whose state of
+    the step before is fed back and observed (``channel="gilbert_elliott"``). With one source, or
+    several that share nothing, a threshold on the absolute error that depends on channel state and
+    tokens is optimal, and ``fusion_gym.solvers`` computes it.
+
+    Starting state: x(0) ~ N(0, initial_deviation²), by default 0, and the centre believes 0.
 
     With the defaults the reward is the literature's cost, with the opposite sign: the squared
     error plus ``cost_weight`` for each transmission.

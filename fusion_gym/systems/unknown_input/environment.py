@@ -41,7 +41,18 @@ SIGNALS = ("sinusoids", "steps", "random_walk")
 
 @dataclass(frozen=True)
 class UnknownInputOptions(CommonOptions):
-    """Every option of the environment.
+    """Two carts, tied by springs, under a force that nobody knows, seen in part by three sensors.
+
+    The state is the positions and velocities of two carts; the force on the first is unknown to
+    filters and policies and drawn anew in every episode. The carts are sampled every second small
+    step. Each node estimates the state and, one sampling instant late, the force, from what its
+    sensor transmitted; the centre fuses the nodes by covariance intersection. Nothing is fed back.
+    ``example="paper"`` gives the paper's system instead: two states, two inputs, two sensors, and
+    its own filter. The inputs stand behind the states wherever states are listed, and the reward
+    weighs their errors by ``input_weight``.
+
+    Starting state: x₀ ~ N(0, 0.1 I), or, in the paper's example, uniform on [0.16, 0.18]. The
+    measurement at time 0 has been delivered.
 
     ``None`` stands for the number of the chosen ``example``, which
     :mod:`fusion_gym.systems.unknown_input.examples` lists; a number that is given goes before it.

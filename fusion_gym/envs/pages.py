@@ -1,0 +1,239 @@
+"""An environment's page, made from what the code declares: options, blocks, spaces.
+
+``python -m fusion_gym.envs.pages docs/*.md`` writes the observation tables of these files anew. A
+table stands between ``<!-- observation: ID name=value -->`` and ``<!-- end -->``; after a semicolon
+follow other options, and what they add is marked so.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import shlex
+import sys
+from collections.abc import Iterable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fusion_gym.core.knowledge import covers
+from fusion_gym.core.observation import ObservationLayout, network_blocks
+from fusion_gym.core.options import CommonOptions, plain
+from fusion_gym.core.reward import Price
+from fusion_gym.core.system import Block, numbered
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import make_task, options_of
+from fusion_gym.envs.vector import reset_infos
+from fusion_gym.envs.views import make_view
+
+LEGEND = """\
+A star marks what only the sensors know: `information="centre"` leaves it out. The third column
+tells what a sensor that decides by itself sees of these entries."""
+
+_PAGE = """\
+{title}
+
+{description}
+
+## Action space
+`{actions}`. Of a `MultiBinary(sensors)` a 1 is a request; with `action="discrete"` it is
+`Discrete(2**sensors)`, the bits as one number, sensor 0 the lowest; with `access="single"` it is
+`Discrete(sensors + 1)`, 0 for nobody, m for sensor m - 1.
+
+## Observation space
+A `Box` of {entries} float32 numbers, clipped to their ranges; `env.unwrapped.observation_names`
+names them in order. Sensors: {sensors}. States: {states}.
+
+{legend}
+
+{table}
+
+## Reward
+-(`error_weight` · Σ wᵢ eᵢ² + `cost_weight` · tokens spent), with e the error of the fused estimate
+at the time of the request. The weights w, the option `state_weights`, are here
+{weights}, so that never transmitting costs about {open_loop} a step.
+`error="trace"` puts the diagonal of the claimed covariance in the place of the squared errors,
+which a policy may be able to game. `cost_weight="random"` draws the price of a token from
+`price_range` for each episode, evenly in its logarithm.
+
+## Episode end
+Truncation after `horizon` steps, here {horizon}, never termination. `max_episode_steps` truncates
+earlier without changing any scale.
+
+## Info
+`cost` = `cost_tokens` (tokens spent, never negative), `rewards` (its terms {terms}),
+`granted` and `denied` (one flag a sensor), `squared_error` (one number a state), `diverged` (a
+squared error above 100 times its open-loop mean, or not finite).
+
+## Arguments
+The fields of `{options}`, of which `fusion_gym.make_task` also takes an object.
+
+{arguments}
+
+## Version history
+{history}
+"""
+
+# Blocks of the network that not every task has, and when they are there.
+_NETWORK = {
+    "admitted": 'only with `access="round_robin"` or `"random"`',
+    "price": "only with a `price_range`",
+}
+_SEES = {"own": "its own", "told": "all", "hidden": "none"}
+_MARKED = re.compile(r"(<!-- observation: (.*?) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def page(env_id: str, task: Task | None = None) -> str:
+    """The page of a registered environment: of a task of it, or with its defaults.
+
+    Title and description are the docstring of its options' dataclass; paragraphs that begin
+    ``v1:``, ``v2:``, … there are the version history.
+
+    Raises:
+        ConfigurationError: an id that is not registered.
+    """
+    kind = options_of(env_id)
+    task = make_task(env_id) if task is None else task
+    system, view = task.system, make_view(task)
+    title, *description = _paragraphs(kind) or [env_id]
+    versions = [text for text in description if re.match(r"v\d+: ", text)]
+    weights = task.reward.state_weights[:, 0]
+    return _PAGE.format(
+        title=title,
+        description="\n\n".join(text for text in description if text not in versions),
+        actions=view.actions,
+        entries=len(view.names),
+        sensors=task.sensors,
+        states=", ".join(system.state_names),
+        legend=LEGEND,
+        table=observation_table(task),
+        weights=_short(weights),
+        open_loop=f"{float(weights @ system.open_loop(task.horizon)):.3g}",
+        horizon=task.horizon,
+        terms=" and ".join(f"`{term}`" for term in reset_infos(task, 1)["rewards"]),
+        options=kind.__name__,
+        arguments=_arguments(kind),
+        history="\n".join(f"- {text}" for text in ["v0: first version.", *versions]),
+    )
+
+
+def observation_table(task: Task, *others: tuple[str, Task]) -> str:
+    """The observation's blocks as a Markdown table, those of all information modes.
+
+    ``others`` are named tasks of the same environment whose blocks may be different; what the
+    first does not have is marked with the name. So is what only some networks show.
+    """
+    rows = {block.name: _row(task, block) for block in task.system.observation}
+    for name, other in others:
+        for block in other.system.observation:
+            rows.setdefault(block.name, _row(other, block, f"only with {name}"))
+    always = [block.name for block in network_blocks(task)]
+    price = replace(task.reward, price=Price(None, (0.01, 1.0)))
+    for block in network_blocks(replace(task, access="round_robin", reward=price)):
+        rows[block.name] = _row(task, block, "" if block.name in always else _NETWORK[block.name])
+    return _table(("entries", "range", "a sensor sees", "meaning"), rows.values())
+
+
+def documented(text: str) -> str:
+    """The text with all its marked tables made anew.
+
+    Raises:
+        ConfigurationError: an id or an option in a marker that does not exist.
+    """
+
+    def anew(match: re.Match[str]) -> str:
+        first, *others = match[2].split(";")
+        env_id, *options = shlex.split(first)
+        tasks = [
+            (_listed(words), make_task(env_id, **_options(words)))
+            for words in (options, *(shlex.split(other) for other in others))
+        ]
+        (given, task), *rest = tasks
+        count = len(ObservationLayout(task).names)
+        states = ", ".join(f"`{name}`" for name in task.system.state_names)
+        last = f"With {given or 'the defaults'} these are {count} numbers; states: {states}."
+        table = observation_table(task, *rest)
+        return f"{match[1]}{LEGEND}\n\n{table}\n\n{last}\n{match[3]}"
+
+    return _MARKED.sub(anew, text)
+
+
+def _paragraphs(kind: type[CommonOptions]) -> list[str]:
+    text = inspect.cleandoc(kind.__doc__ or "")
+    # A dataclass without a docstring gets its signature for one.
+    return [] if text.startswith(f"{kind.__name__}(") else [_plain(t) for t in text.split("\n\n")]
+
+
+def _plain(text: str) -> str:
+    """Markdown's code marks, in the place of those of docstrings."""
+    return re.sub(r":\w+:`~?|``", "`", text)
+
+
+def _row(task: Task, block: Block, condition: str = "") -> tuple[str, ...]:
+    axes = ",".join(_axis(task, block, place) for place in range(len(block.labels)))
+    name = f"`{block.name}[{axes}]`" if axes else f"`{block.name}`"
+    star = "" if covers("centre", block.knowledge) else " *"
+    low, high = block.bounds
+    meaning = _plain(block.meaning) + (f"; {condition}" if condition else "")
+    return name + star, f"{low:g}..{high:g}", _SEES[block.node], meaning
+
+
+def _axis(task: Task, block: Block, place: int) -> str:
+    """What an axis runs over: sensors, states, components, or its own labels."""
+    labels = block.labels[place]
+    if place == 0 and (block.node == "own" or labels == numbered(task.sensors)):
+        return "sensor"
+    if labels == task.system.state_names:
+        return "state"
+    return "component" if place and labels == numbered(len(labels)) else "/".join(labels)
+
+
+def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    lines = [head, *rows]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(head) - 1)]
+    padded = ["| " + " | ".join(map(str.ljust, line, (*widths, 0))) + " |" for line in lines]
+    return "\n".join((padded[0], "|---" * len(head) + "|", *padded[1:]))
+
+
+def _arguments(kind: type[CommonOptions]) -> str:
+    """The options with their defaults: the environment's own, then those that all have."""
+    common = {field.name for field in fields(CommonOptions)}
+    ordered = sorted(fields(kind), key=lambda field: field.name in common)
+    return "\n".join(f"    {field.name} = {_short(field.default)}" for field in ordered)
+
+
+def _short(value: Any) -> str:
+    """A default as it would be written, its numbers with four digits."""
+    value = plain(value)
+    if isinstance(value, list):
+        return f"({', '.join(map(_short, value))}{',' if len(value) == 1 else ''})"
+    return f"{value:.4g}" if isinstance(value, float) and np.isfinite(value) else repr(value)
+
+
+def _options(words: list[str]) -> dict[str, Any]:
+    """Options from ``name=value``, the value a literal of Python or a string."""
+    result: dict[str, Any] = {}
+    for name, _, value in (word.partition("=") for word in words):
+        try:
+            result[name] = ast.literal_eval(value)
+        except (SyntaxError, ValueError):
+            result[name] = value
+    return result
+
+
+def _listed(words: list[str]) -> str:
+    shown = (f"{name}={value!r}" for name, value in _options(words).items())
+    return ", ".join(f"`{text}`" for text in shown).replace("'", '"')
+
+
+def main(paths: list[str]) -> None:
+    """Write the tables of these files anew."""
+    for path in map(Path, paths):
+        path.write_text(documented(path.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
