@@ -1,1 +1,1 @@
-"""Scripts: training, evaluation, the demo. Run them with ``python -m agents.NAME``."""
+"""The commands (train, evaluate, benchmark, …) as modules, and in rooms what they share."""

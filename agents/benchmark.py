@@ -9,27 +9,109 @@ what is there. ``python -m agents.report`` makes tables and figures of it.
 
 from __future__ import annotations
 
-import argparse
 import json
 import shlex
 import signal
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import joblib
 from tqdm import tqdm
 
-from agents.arrays import load_results
-from agents.config import parse
-from agents.evaluate import write
-from agents.jobs import Folders, Job, jobs, run, setting_task
-from agents.suite import COMPARABLE, Setting, Suite, load_suite
-from agents.verdict import judge
 from fusion_gym.evaluation.envelope import lower_envelope
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.validation import ConfigurationError, choice, integer
+
+from .command_line import Command, spelled, start
+from .output.files import load_results, write
+from .suite.config import COMPARABLE, Setting, Suite, load_suite
+from .suite.jobs import Folders, Job, jobs, run, setting_task
+from .suite.verdict import judge
+from .training.checked import parse
+
+
+@dataclass(frozen=True)
+class Benchmark(Command):
+    """The benchmark of policies: tuned baselines, learned fronts and references."""
+
+    config: str = "benchmark"
+    """The suite: a YAML file, or the name of a shipped config."""
+    envs: tuple[str, ...] = ()
+    """Settings by name; none stands for all."""
+    modes: tuple[str, ...] = ()
+    """Some of sensors, centre and local; none stands for all."""
+    quick: bool = False
+    """Less of everything, in minutes."""
+    resume: bool = False
+    """Skip what is finished."""
+    results: Path | None = None
+    """Folder for JSON, instead of results or results/quick."""
+    work: Path | None = None
+    """Folder for models and episodes, instead of runs/benchmark/full or quick."""
+    workers: int = 2
+    """Processes side by side."""
+    seeds: int | None = None
+    """Number of training seeds, instead of the config's."""
+    timesteps: int | None = None
+    """Steps of each training, instead of the config's."""
+
+    def run(self) -> None:
+        """Do all work that is not finished, and judge every setting."""
+        # Ended from outside like by Ctrl-C: the workers stop too.
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+        try:
+            self._run()
+        finally:
+            signal.signal(signal.SIGTERM, before)
+
+    def interrupted(self) -> str:
+        """Finished pieces of work are kept."""
+        words = [word for word in sys.argv[1:] if word != "--resume"]
+        command = shlex.join([*spelled("benchmark").split(), *words, "--resume"])
+        return f"interrupted; go on with: {command}"
+
+    def suite(self) -> Suite:
+        """The config with what the command line says instead, checked again.
+
+        Raises:
+            ConfigurationError: a config or a value that is not allowed.
+        """
+        suite = load_suite(self.config, self.quick)
+        changed = {"training_seeds": self.seeds, "timesteps": self.timesteps}
+        changed = {key: value for key, value in changed.items() if value is not None}
+        return parse(Suite, suite.model_dump() | changed, "command line")
+
+    def _run(self) -> None:
+        suite = self.suite()
+        folders = Folders(
+            self.results or Path("results/quick" if self.quick else "results"),
+            self.work or Path("runs/benchmark/quick" if self.quick else "runs/benchmark/full"),
+        )
+        integer("workers", self.workers, at_least=1)
+        by_name = {setting.name: setting for setting in suite.settings}
+        chosen = [by_name[choice("envs", name, by_name)] for name in self.envs or by_name]
+        for mode in self.modes:
+            choice("modes", mode, suite.modes)
+        modes = [mode for mode in suite.modes if not self.modes or mode in self.modes]
+        work = list(jobs(suite, chosen, modes))
+        done = [
+            job for job in work if folders.report(job).exists() and folders.episodes(job).exists()
+        ]
+        if done and not self.resume:
+            raise ConfigurationError(
+                f"results = {str(folders.results)!r} holds {len(done)} finished pieces of work: go "
+                "on with --resume, or give another --results and --work"
+            )
+        for setting in chosen:
+            setting_task(setting)
+        execute(suite, [job for job in work if job not in done], folders, self.workers)
+        for setting in chosen:
+            conclude(suite, setting, folders)
+        report = f"{spelled('report')} --results {folders.results}"
+        print(f"results in {folders.results}: {report}")
 
 
 def conclude(suite: Suite, setting: Setting, folders: Folders) -> dict[str, Any] | None:
@@ -83,72 +165,9 @@ def execute(suite: Suite, work: list[Job], folders: Folders, workers: int) -> No
     print(f"{len(work)} pieces of work in {time.perf_counter() - began:.0f} s")
 
 
-def parser() -> argparse.ArgumentParser:
-    """The command line."""
-    result = argparse.ArgumentParser(
-        prog="python -m agents.benchmark",
-        description="Tuned baselines, learned fronts and references in every setting.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    result.add_argument("--config", default="configs/benchmark.yaml")
-    result.add_argument("--envs", nargs="+", metavar="NAME", help="settings, all by default")
-    result.add_argument("--modes", nargs="+", help="sensors, centre, local; all by default")
-    result.add_argument("--quick", action="store_true", help="less of everything, in minutes")
-    result.add_argument("--resume", action="store_true", help="skip what is finished")
-    result.add_argument("--results", type=Path, help="folder for JSON (results, or results/quick)")
-    result.add_argument("--work", type=Path, help="folder for models and episodes")
-    result.add_argument("--workers", type=int, default=2, help="processes side by side")
-    result.add_argument("--seeds", type=int, help="training seeds, instead of the config's")
-    result.add_argument("--timesteps", type=int, help="of each training, instead of the config's")
-    return result
-
-
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
-    given = parser().parse_args()
-    kind = "quick" if given.quick else "full"
-    folders = Folders(
-        given.results or Path("results/quick" if given.quick else "results"),
-        given.work or Path("runs/benchmark") / kind,
-    )
-    # Ended from outside like by Ctrl-C: the workers stop too.
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        suite = load_suite(given.config, given.quick)
-        changed = {"training_seeds": given.seeds, "timesteps": given.timesteps}
-        changed = {key: value for key, value in changed.items() if value is not None}
-        suite = parse(Suite, suite.model_dump() | changed, "command line")
-        integer("workers", given.workers, at_least=1)
-        by_name = {setting.name: setting for setting in suite.settings}
-        for name in given.envs or []:
-            choice("envs", name, by_name)
-        for mode in given.modes or []:
-            choice("modes", mode, suite.modes)
-        chosen = [by_name[name] for name in given.envs or by_name]
-        work = list(jobs(suite, chosen, given.modes or list(suite.modes)))
-        done = [
-            job for job in work if folders.report(job).exists() and folders.episodes(job).exists()
-        ]
-        if done and not given.resume:
-            raise ConfigurationError(
-                f"results = {str(folders.results)!r} holds {len(done)} finished pieces of work: go "
-                "on with --resume, or give another --results and --work"
-            )
-        for setting in chosen:
-            setting_task(setting)
-        execute(suite, [job for job in work if job not in done], folders, given.workers)
-        for setting in chosen:
-            conclude(suite, setting, folders)
-        print(f"results in {folders.results}: python -m agents.report --results {folders.results}")
-    except ConfigurationError as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        words = [word for word in sys.argv[1:] if word != "--resume"]
-        command = shlex.join(["python", "-m", "agents.benchmark", *words, "--resume"])
-        print(f"interrupted; go on with: {command}", file=sys.stderr)
-        sys.exit(130)
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    start(Benchmark)
 
 
 if __name__ == "__main__":

@@ -9,21 +9,22 @@ episode. A finished or interrupted training in the output folder is gone on with
 
 from __future__ import annotations
 
-import argparse
 import shutil
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from agents import figures
-from agents.compare import compare, run_all
-from agents.config import Experiment, Sweep, load_experiment, load_sweep
-from agents.train import train
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import record_episode
-from fusion_gym.policies.make import make_policy
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.policies.registry import make_policy
+
+from .command_line import Command, spelled, start
+from .output import figures
+from .suite.comparison import compare, run_all
+from .suite.sweep import Sweep
+from .training.checked import load
+from .training.config import Experiment
+from .training.run import train
 
 
 @dataclass(frozen=True)
@@ -38,32 +39,68 @@ class Setting:
 SETTINGS = (
     Setting(
         "benchmark",
-        "configs/tobit_oscillator_ppo.yaml",
+        "tobit_oscillator_ppo",
         "benchmark setting (Tobit filter, random start, 2 tokens a step)",
     ),
     Setting(
         "paper",
-        "configs/tobit_oscillator_paper_ppo.yaml",
+        "tobit_oscillator_paper_ppo",
         "paper's setting (its filter and bucket)",
     ),
 )
 
 
-def demonstrate(
-    setting: Setting, experiment: Experiment, sweep: Sweep, arguments: argparse.Namespace
-) -> bool:
+@dataclass(frozen=True)
+class Demo(Command):
+    """Baselines, a trained agent, and a fair comparison."""
+
+    output: Path = Path("runs/demo")
+    """Folder for the results."""
+    episodes: int = 1000
+    """Test episodes of each policy."""
+    seed: int = 0
+    """Seed of the first test episode."""
+    sweep: str = "tobit_oscillator_sweep"
+    """The baselines' YAML, or the name of a shipped one."""
+    timesteps: int | None = None
+    """Steps of each training, instead of the configs'."""
+    fresh: bool = False
+    """Remove earlier results first."""
+
+    def run(self) -> None:
+        """Both settings from baselines to figures."""
+        began = time.perf_counter()
+        for setting in SETTINGS if self.fresh else ():
+            shutil.rmtree(self.output / setting.name, ignore_errors=True)
+        sweep = load(Sweep, self.sweep)
+        for setting in SETTINGS:
+            experiment = load(Experiment, setting.config)
+            if self.timesteps is not None:
+                training = experiment.training.model_copy(update={"timesteps": self.timesteps})
+                experiment = experiment.model_copy(update={"training": training})
+            if not demonstrate(setting, experiment, sweep, self):
+                raise KeyboardInterrupt
+        seconds = time.perf_counter() - began
+        print(f"\nfigures, tables and models are in {self.output}; {seconds:.0f} s")
+
+    def interrupted(self) -> str:
+        """Nothing is lost."""
+        return f"interrupted: run {spelled('demo')} again to go on"
+
+
+def demonstrate(setting: Setting, experiment: Experiment, sweep: Sweep, given: Demo) -> bool:
     """One setting from baselines to figures; false if its training was interrupted."""
-    folder: Path = arguments.output / setting.name
+    folder = given.output / setting.name
     task = make_task(experiment.environment.id, **experiment.environment.options)
     print(f"\n{setting.title}")
-    baselines = run_all(task, sweep.policies, arguments.episodes, arguments.seed, "baselines")
+    baselines = run_all(task, sweep.policies, given.episodes, given.seed, "baselines")
     plain = experiment.model_dump() | {"output": str(folder / "agent")}
     training = Experiment.model_validate(plain)
     summary = train(training, resume=(folder / "agent" / "config.yaml").exists())
     if not summary["finished"]:
         return False
     agent = f"model:{folder / 'agent' / 'best_model.zip'}"
-    learned = run_all(task, [agent], arguments.episodes, arguments.seed, "agent")[agent]
+    learned = run_all(task, [agent], given.episodes, given.seed, "agent")[agent]
     compare(
         experiment.environment.id,
         task,
@@ -72,11 +109,11 @@ def demonstrate(
         sweep,
         agent,
         learned,
-        arguments.seed,
+        given.seed,
         folder,
     )
     for name, text in (("agent", agent), ("dynamic_event", "dynamic_event")):
-        trajectory = record_episode(task, make_policy(text, task), arguments.seed)
+        trajectory = record_episode(task, make_policy(text, task), given.seed)
         figures.episode(
             folder / f"episode_{name}.png", f"{setting.name}: {name}", trajectory,
             task.bucket.capacity,
@@ -84,43 +121,9 @@ def demonstrate(
     return True
 
 
-def parser() -> argparse.ArgumentParser:
-    """The command line."""
-    result = argparse.ArgumentParser(
-        prog="python -m agents.demo",
-        description="Baselines, a trained agent, and a fair comparison.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    result.add_argument("--output", type=Path, default=Path("runs/demo"))
-    result.add_argument("--episodes", type=int, default=1000)
-    result.add_argument("--seed", type=int, default=0, help="seed of the first test episode")
-    result.add_argument("--sweep", default="configs/tobit_oscillator_sweep.yaml")
-    result.add_argument("--timesteps", type=int, help="of each training, instead of the configs'")
-    result.add_argument("--fresh", action="store_true", help="remove earlier results first")
-    return result
-
-
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
-    arguments = parser().parse_args()
-    began = time.perf_counter()
-    try:
-        for setting in SETTINGS if arguments.fresh else ():
-            shutil.rmtree(arguments.output / setting.name, ignore_errors=True)
-        sweep = load_sweep(arguments.sweep)
-        for setting in SETTINGS:
-            experiment = load_experiment(setting.config)
-            if arguments.timesteps is not None:
-                training = experiment.training.model_copy(update={"timesteps": arguments.timesteps})
-                experiment = experiment.model_copy(update={"training": training})
-            if not demonstrate(setting, experiment, sweep, arguments):
-                sys.exit(130)
-    except ConfigurationError as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("interrupted: run the same command again to go on")
-    print(f"\nfigures, tables and models are in {arguments.output}; "
-          f"{time.perf_counter() - began:.0f} s")  # fmt: skip
+    start(Demo)
 
 
 if __name__ == "__main__":

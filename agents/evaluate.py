@@ -9,147 +9,160 @@ written after each policy; with ``--resume`` the policies that it already holds 
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import fusion_gym
-from agents import tables
-from agents.config import load_experiment
-from agents.progress import progress_bar
+import tyro
+
+from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.metrics import paired_difference, robust_summary, summarise
-from fusion_gym.policies.make import make_policy
-from fusion_gym.policies.registry import parse_settings
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError
 
-
-def parser() -> argparse.ArgumentParser:
-    """The command line."""
-    result = argparse.ArgumentParser(
-        prog="python -m agents.evaluate",
-        description="Evaluate policies on paired episodes.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    result.add_argument("--env", help="id of a registered environment")
-    result.add_argument("--config", help="take environment and options from a training's YAML")
-    result.add_argument(
-        "--set",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="OPTION=VALUE",
-        help="options of gym.make for the environment; they go before the config's",
-    )
-    result.add_argument(
-        "--policies",
-        nargs="+",
-        action="extend",
-        required=True,
-        metavar="NAME[:key=value,…]",
-        help="analytic policies by name, or model:PATH",
-    )
-    result.add_argument("--episodes", type=int, default=1000)
-    result.add_argument("--seed", type=int, default=0, help="seed of the first episode")
-    result.add_argument("--reference", help="one of the policies: print paired differences to it")
-    result.add_argument("--json", type=Path, help="write the results to this file")
-    result.add_argument("--resume", action="store_true", help="keep what the JSON already holds")
-    return result
+from .command_line import Command, Words, start
+from .output import tables
+from .output.files import write
+from .output.progress import progress_bar
 
 
-def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Evaluate(Command):
+    """Evaluate policies on paired episodes."""
+
+    policies: Annotated[
+        Words, tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME[:key=value,…] …")
+    ]
+    """Rules and references by name, zoo:NAME, or model:PATH."""
+    env: str | None = None
+    """Id of a registered environment."""
+    config: str | None = None
+    """Take environment and options from a training's YAML, or from a shipped config by its name."""
+    options: Annotated[
+        Words, tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE …")
+    ] = ()
+    """Options of gym.make for the environment; they go before the config's."""
+    episodes: int = 1000
+    """Episodes of each policy."""
+    seed: int = 0
+    """Seed of the first episode."""
+    reference: str | None = None
+    """One of the policies: print paired differences to it."""
+    json: Path | None = None
+    """Write the results to this file."""
+    resume: bool = False
+    """Keep what the JSON already holds."""
+
+    def run(self) -> None:
+        """Evaluate and print the tables."""
+        evaluate(self)
+
+    def interrupted(self) -> str:
+        """Finished policies are kept."""
+        return "interrupted: finished policies are in the JSON, if one was asked for"
+
+    def environment(self) -> tuple[str, dict[str, Any]]:
+        """Id and options from ``--config``, ``--env`` and ``--set``.
+
+        Raises:
+            ConfigurationError: neither an id nor a config, or a config that is not allowed.
+        """
+        options = parse_settings("option", list(chain(*self.options)))
+        if self.config is None:
+            if self.env is None:
+                raise ConfigurationError(
+                    "env = None is not allowed: give --env ID or --config FILE"
+                )
+            return self.env, options
+        # Here, for it needs Stable-Baselines3, which takes seconds to load.
+        from .training.checked import load
+        from .training.config import Experiment
+
+        chosen = load(Experiment, self.config).environment
+        return self.env or chosen.id, dict(chosen.options) | options
+
+
+def evaluate(given: Evaluate) -> dict[str, Any]:
     """Run the evaluation that the command line asks for and return what the JSON holds.
 
     Raises:
         ConfigurationError: anything that is not allowed, before the first episode.
     """
-    env_id, options = environment(arguments)
-    task = fusion_gym.make_task(env_id, **options)
-    names = list(dict.fromkeys(arguments.policies))
-    if arguments.reference is not None and arguments.reference not in names:
+    env_id, options = given.environment()
+    task = make_task(env_id, **options)
+    names = list(dict.fromkeys(chain(*given.policies)))
+    if not names:
+        raise ConfigurationError("policies = [] is not allowed: give --policies NAME …")
+    if given.reference is not None and given.reference not in names:
         raise ConfigurationError(
-            f"reference = {arguments.reference!r} is not allowed: it must be one of the policies "
+            f"reference = {given.reference!r} is not allowed: it must be one of the policies "
             f"{names}"
         )
-    if arguments.resume and arguments.json is None:
-        raise ConfigurationError("resume = True is not allowed without json: there is no file")
-    if arguments.resume and arguments.reference:
+    if given.resume and given.reference:
         raise ConfigurationError(
-            f"resume = True is not allowed with reference = {arguments.reference!r}: paired "
+            f"resume = True is not allowed with reference = {given.reference!r}: paired "
             "differences need the episodes of every policy, and the JSON holds only their means"
         )
     policies = {name: make_policy(name, task) for name in names}
     report: dict[str, Any] = {
         "env": env_id,
-        "episodes": arguments.episodes,
-        "seed": arguments.seed,
+        "episodes": given.episodes,
+        "seed": given.seed,
         "horizon": task.horizon,
         "settings": task.settings,
         "states": list(task.system.state_names),
         "policies": {},
         "quantiles": {},
     }
-    done = finished(arguments.json, report) if arguments.resume else {"policies": {}}
+    done = finished(given.json, report) if given.resume else {"policies": {}}
     results: dict[str, EpisodeResults] = {}
-    steps = len(names) * arguments.episodes * task.horizon
-    with progress_bar(steps, "evaluating") as bar:
+    steps = given.episodes * task.horizon
+    with progress_bar(len(names) * steps, "evaluating") as bar:
         for name, policy in policies.items():
             if name in done["policies"]:
                 report["policies"][name] = done["policies"][name]
                 report["quantiles"][name] = done["quantiles"][name]
-                bar.update(arguments.episodes * task.horizon)
+                bar.update(steps)
                 continue
             bar.set_postfix_str(name, refresh=False)
-            results[name] = run_episodes(
-                task, policy, arguments.episodes, arguments.seed, bar.update
-            )
+            results[name] = run_episodes(task, policy, given.episodes, given.seed, bar.update)
             report["policies"][name] = summarise(results[name])
             report["quantiles"][name] = robust_summary(results[name])
-            write(arguments.json, report)
+            if given.json is not None:
+                write(given.json, report)
     differences = {
-        name: paired_difference(found, results[arguments.reference])
+        name: paired_difference(found, results[given.reference])
         for name, found in results.items()
-        if arguments.reference and name != arguments.reference
+        if given.reference and name != given.reference
     }
-    if arguments.reference:
+    if given.reference:
         report["reference"] = {
-            "name": arguments.reference,
+            "name": given.reference,
             "differences": {name: found._asdict() for name, found in differences.items()},
         }
-    write(arguments.json, report)
-    title = (
-        f"{env_id}: {arguments.episodes} episodes of {task.horizon} steps, seed {arguments.seed}"
-    )
-    tables.console().print(
+    if given.json is not None:
+        write(given.json, report)
+    title = f"{env_id}: {given.episodes} episodes of {task.horizon} steps, seed {given.seed}"
+    console = tables.console()
+    console.print(
         tables.evaluation_table(title, report["policies"], report["quantiles"], differences)
     )
-    tables.console().print(tables.state_table(task.system.state_names, report["policies"]))
+    console.print(tables.state_table(task.system.state_names, report["policies"]))
     return report
 
 
-def environment(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
-    """Id and options from ``--config``, ``--env`` and ``--set``.
-
-    Raises:
-        ConfigurationError: neither an id nor a config, or a config that is not allowed.
-    """
-    options = parse_settings("option", arguments.set)
-    if arguments.config is None:
-        if arguments.env is None:
-            raise ConfigurationError("env = None is not allowed: give --env ID or --config FILE")
-        return arguments.env, options
-    chosen = load_experiment(arguments.config).environment
-    return arguments.env or chosen.id, dict(chosen.options) | options
-
-
-def finished(path: Path, report: dict[str, Any]) -> dict[str, Any]:
+def finished(path: Path | None, report: dict[str, Any]) -> dict[str, Any]:
     """What an earlier run of the same evaluation has written.
 
     Raises:
-        ConfigurationError: the file is of another evaluation.
+        ConfigurationError: no file is named, or it is of another evaluation.
     """
+    if path is None:
+        raise ConfigurationError("resume = True is not allowed without json: there is no file")
     if not path.exists():
         return {"policies": {}}
     earlier: dict[str, Any] = json.loads(path.read_text())
@@ -163,24 +176,9 @@ def finished(path: Path, report: dict[str, Any]) -> dict[str, Any]:
     return earlier
 
 
-def write(path: Path | None, report: dict[str, Any]) -> None:
-    """Replace the file in one move, so that an interrupt never leaves half of it."""
-    if path is None:
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".part")
-    partial.write_text(json.dumps(report, indent=1) + "\n")
-    partial.replace(path)
-
-
 def main() -> None:
-    """Entry point."""
-    try:
-        evaluate(parser().parse_args())
-    except ConfigurationError as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("interrupted: finished policies are in the JSON, if one was asked for")
+    """Entry point; exit status 130 after an interrupt."""
+    start(Evaluate)
 
 
 if __name__ == "__main__":

@@ -8,17 +8,18 @@ Reads the JSON in the results folder and writes ``README.md``, a figure for each
 
 from __future__ import annotations
 
-import argparse
 import base64
 import json
-import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import markdown
 
-from agents import figures
 from fusion_gym.validation import ConfigurationError
+
+from .command_line import Command, spelled, start
+from .output import figures
 
 LEAST_ROOM = 0.05  # below that the share of it that an agent closes says nothing
 MODES = {
@@ -26,6 +27,26 @@ MODES = {
     "centre": "what the centre knows before anything is sent",
     "local": "one shared policy that every sensor runs by itself",
 }
+
+
+@dataclass(frozen=True)
+class Report(Command):
+    """Tables and figures of the benchmark's results, as Markdown and as one HTML page."""
+
+    results: Path = Path("results")
+    """Folder of the benchmark's JSON, and for what is made of it."""
+
+    def run(self) -> None:
+        """Draw the figures, write README.md and report.html."""
+        found = read(self.results)
+        for name, parts in found.items():
+            draw(self.results, name, parts)
+        quick = " --quick" if self.results.name == "quick" else ""
+        text = text_of(found, f"{spelled('benchmark')}{quick}", spelled("report"))
+        page, readme = self.results / "report.html", self.results / "README.md"
+        readme.write_text(text)
+        page.write_text(page_of(text, self.results))
+        print(f"wrote {readme} and {page}")
 
 
 def read(results: Path) -> dict[str, dict[str, Any]]:
@@ -44,7 +65,7 @@ def read(results: Path) -> dict[str, dict[str, Any]]:
     }
     if not found:
         raise ConfigurationError(
-            f"results = {str(results)!r} is not allowed: it must hold results of agents.benchmark"
+            f"results = {str(results)!r} is not allowed: it must hold results of the benchmark"
         )
     return found
 
@@ -183,13 +204,15 @@ def draw(results: Path, name: str, parts: dict[str, Any]) -> None:
     )
 
 
-def text_of(found: dict[str, dict[str, Any]], command: str) -> str:
-    """The report in Markdown."""
+def text_of(
+    found: dict[str, dict[str, Any]], command: str, second: str = "python -m agents.report"
+) -> str:
+    """The report in Markdown, made by these two commands."""
     first = next(iter(found.values()))["baselines"]
     lines = [
         "# Results of the benchmark",
         "",
-        f"Made by `{command}` and `python -m agents.report` from the JSON beside this file. "
+        f"Made by `{command}` and `{second}` from the JSON beside this file. "
         f"{first['episodes']:,} test episodes a policy, seeds {first['seed']} to "
         f"{first['seed'] + first['episodes'] - 1:,}, the same noise for all.",
         "",
@@ -241,25 +264,8 @@ def page_of(text: str, results: Path) -> str:
 
 
 def main() -> None:
-    """Entry point."""
-    parser = argparse.ArgumentParser(
-        prog="python -m agents.report",
-        description="Tables and figures of the benchmark's results.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    parser.add_argument("--results", type=Path, default=Path("results"))
-    results = parser.parse_args().results
-    try:
-        found = read(results)
-    except ConfigurationError as error:
-        sys.exit(f"error: {error}")
-    for name, parts in found.items():
-        draw(results, name, parts)
-    quick = " --quick" if results.name == "quick" else ""
-    text = text_of(found, f"python -m agents.benchmark{quick}")
-    (results / "README.md").write_text(text)
-    (results / "report.html").write_text(page_of(text, results))
-    print(f"wrote {results / 'README.md'} and {results / 'report.html'}")
+    """Entry point; exit status 130 after an interrupt."""
+    start(Report)
 
 
 if __name__ == "__main__":

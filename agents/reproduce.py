@@ -7,26 +7,55 @@ Every row runs on the same seeds. ``--markdown`` prints the table as the documen
 
 from __future__ import annotations
 
-import argparse
-import sys
+from dataclasses import dataclass
 
 import numpy as np
 from rich import box
 from rich.table import Table
 
-from agents import tables
-from agents.config import Comparison, load_comparison
-from agents.progress import progress_bar
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.intervals import mean_interval
-from fusion_gym.policies.make import make_policy
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.policies.registry import make_policy
+
+from .command_line import Command, start
+from .output import tables
+from .output.progress import progress_bar
+from .suite.sweep import Comparison
+from .training.checked import load
 
 COLUMNS = ("setting", "requests", "rate", "MSE", "median", "ARMSE", "trace P", "NEES")
 
 
-def run(comparison: Comparison, episodes: int, seed: int) -> list[tuple[str, ...]]:
+@dataclass(frozen=True)
+class Reproduce(Command):
+    """Print the documentation's table of filters, triggers and buckets."""
+
+    config: str = "tobit_oscillator_reproduce"
+    """The rows: a YAML file, or the name of a shipped config."""
+    episodes: int = 2000
+    """Episodes of each row."""
+    seed: int = 0
+    """Seed of the first episode."""
+    markdown: bool = False
+    """Print the table as the documentation holds it."""
+
+    def run(self) -> None:
+        """Run every row and print the table."""
+        rows = table(load(Comparison, self.config), self.episodes, self.seed)
+        if self.markdown:
+            lines = [COLUMNS, ("---",) * len(COLUMNS), *rows]
+            print("\n".join("| " + " | ".join(line) + " |" for line in lines))
+            return
+        shown = Table(title=f"{self.episodes} episodes, seed {self.seed}", box=box.SIMPLE_HEAD)
+        for column in COLUMNS:
+            shown.add_column(column, justify="left" if column == "setting" else "right")
+        for row in rows:
+            shown.add_row(*row)
+        tables.console().print(shown)
+
+
+def table(comparison: Comparison, episodes: int, seed: int) -> list[tuple[str, ...]]:
     """One row of text for each of the config's rows.
 
     Raises:
@@ -58,33 +87,8 @@ def _cells(label: str, results: EpisodeResults) -> tuple[str, ...]:
 
 
 def main() -> None:
-    """Entry point."""
-    parser = argparse.ArgumentParser(
-        prog="python -m agents.reproduce",
-        description="Print the documentation's table of filters, triggers and buckets.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    parser.add_argument("--config", default="configs/tobit_oscillator_reproduce.yaml")
-    parser.add_argument("--episodes", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first episode")
-    parser.add_argument("--markdown", action="store_true")
-    arguments = parser.parse_args()
-    try:
-        rows = run(load_comparison(arguments.config), arguments.episodes, arguments.seed)
-    except ConfigurationError as error:
-        sys.exit(f"error: {error}")
-    if arguments.markdown:
-        lines = [COLUMNS, ("---",) * len(COLUMNS), *rows]
-        print("\n".join("| " + " | ".join(line) + " |" for line in lines))
-        return
-    table = Table(
-        title=f"{arguments.episodes} episodes, seed {arguments.seed}", box=box.SIMPLE_HEAD
-    )
-    for column in COLUMNS:
-        table.add_column(column, justify="left" if column == "setting" else "right")
-    for row in rows:
-        table.add_row(*row)
-    tables.console().print(table)
+    """Entry point; exit status 130 after an interrupt."""
+    start(Reproduce)
 
 
 if __name__ == "__main__":

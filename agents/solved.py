@@ -8,24 +8,66 @@ with. Costs are compared on the same test seeds, paired.
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich import box
 from rich.table import Table
 
-from agents import tables
-from agents.config import Experiment, load_experiment
-from agents.evaluate import write
-from agents.train import train
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.intervals import mean_interval
-from fusion_gym.policies.make import make_policy
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.policies.registry import make_policy
+
+from .command_line import Command, start
+from .output import tables
+from .output.files import write
+from .training.checked import load
+from .training.config import Experiment
+from .training.run import train
+
+
+@dataclass(frozen=True)
+class Solved(Command):
+    """Train agents in the solved case and print what they cost above the optimum."""
+
+    config: str = "remote_estimation_ppo"
+    """The training: a YAML file, or the name of a shipped config."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the trainings."""
+    episodes: int = 4000
+    """Test episodes of each policy."""
+    seed: int = 0
+    """Seed of the first test episode."""
+    output: Path = Path("runs/solved")
+    """Folder for the results."""
+
+    def run(self) -> None:
+        """Train what is not trained, run all on the same seeds, write and print the costs."""
+        experiment = load(Experiment, self.config)
+        name, chosen = experiment.algorithm.name, experiment.environment
+        task = make_task(chosen.id, **chosen.options)
+        best = run_episodes(task, make_policy("optimal", task), self.episodes, self.seed)
+        table = Table(title=f"{self.config}: {self.episodes} episodes", box=box.SIMPLE_HEAD)
+        for column in ("policy", "cost of an episode", "rate", "above the optimum [95 %]"):
+            table.add_column(column, justify="left" if column == "policy" else "right")
+        report: dict[str, Any] = {"config": self.config, "agents": {}}
+        table.add_row("optimal", f"{-best.returns.mean():.4f}", f"{best.rate.mean():.4f}", "")
+        for seed in self.seeds:
+            policy = make_policy(f"model:{trained(experiment, seed, self.output)}", task)
+            agent = run_episodes(task, policy, self.episodes, self.seed)
+            found = excess(agent, best)
+            report["agents"][str(seed)] = found
+            write(self.output / f"{name}.json", report)
+            table.add_row(
+                f"{name}, training seed {seed}",
+                f"{-agent.returns.mean():.4f}",
+                f"{agent.rate.mean():.4f}",
+                f"{found['mean']:+.2%} [{found['low']:+.2%}, {found['high']:+.2%}]",
+            )
+        tables.console().print(table)
 
 
 def trained(experiment: Experiment, seed: int, folder: Path) -> Path:
@@ -57,45 +99,7 @@ def excess(agent: EpisodeResults, best: EpisodeResults) -> dict[str, float]:
 
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
-    parser = argparse.ArgumentParser(
-        prog="python -m agents.solved",
-        description="What agents cost above the optimum, where it is known.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    parser.add_argument("--config", default="configs/remote_estimation_ppo.yaml")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="of the trainings")
-    parser.add_argument("--episodes", type=int, default=4000)
-    parser.add_argument("--seed", type=int, default=0, help="of the first test episode")
-    parser.add_argument("--output", type=Path, default=Path("runs/solved"))
-    given = parser.parse_args()
-    try:
-        experiment = load_experiment(given.config)
-        chosen = experiment.environment
-        task = make_task(chosen.id, **chosen.options)
-        best = run_episodes(task, make_policy("optimal", task), given.episodes, given.seed)
-        table = Table(title=f"{given.config}: {given.episodes} episodes", box=box.SIMPLE_HEAD)
-        for column in ("policy", "cost of an episode", "rate", "above the optimum [95 %]"):
-            table.add_column(column, justify="left" if column == "policy" else "right")
-        report: dict[str, Any] = {"config": given.config, "agents": {}}
-        table.add_row("optimal", f"{-best.returns.mean():.4f}", f"{best.rate.mean():.4f}", "")
-        for seed in given.seeds:
-            model = trained(experiment, seed, given.output)
-            policy = make_policy(f"model:{model}", task)
-            agent = run_episodes(task, policy, given.episodes, given.seed)
-            found = excess(agent, best)
-            report["agents"][str(seed)] = found
-            write(given.output / f"{experiment.algorithm.name}.json", report)
-            table.add_row(
-                f"{experiment.algorithm.name}, training seed {seed}",
-                f"{-agent.returns.mean():.4f}",
-                f"{agent.rate.mean():.4f}",
-                f"{found['mean']:+.2%} [{found['low']:+.2%}, {found['high']:+.2%}]",
-            )
-        tables.console().print(table)
-    except ConfigurationError as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit(130)
+    start(Solved)
 
 
 if __name__ == "__main__":

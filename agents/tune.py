@@ -10,9 +10,9 @@ config with what was found, and the command that found it.
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,12 @@ import optuna
 import yaml
 from optuna.trial import TrialState
 
-from agents.config import Experiment, load_experiment
-from agents.train import train
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, integer
+
+from .command_line import Command, spelled, start
+from .training.checked import load, parse
+from .training.config import Experiment
+from .training.run import train
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
@@ -35,6 +38,41 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "n_epochs": (2, 4, 8),
     "hidden": ("64,64", "128,128"),
 }
+
+
+@dataclass(frozen=True)
+class Tune(Command):
+    """Find an agent's hyper-parameters with Optuna, in a study that can be gone on with."""
+
+    config: str
+    """The experiment to begin with: a YAML file, or the name of a shipped config."""
+    output: Path
+    """Folder of the study."""
+    trials: int = 30
+    """Trials of the study in all."""
+    timesteps: int | None = None
+    """Steps of a trial, instead of the config's."""
+
+    def run(self) -> None:
+        """Search, and write the best config under the command that found it."""
+        integer("trials", self.trials, at_least=1)
+        experiment = load(Experiment, self.config)
+        plain = experiment.model_dump()
+        if self.timesteps is not None:
+            plain["training"]["timesteps"] = self.timesteps
+            plain["validation"]["every"] = max(self.timesteps // 5, 1)
+        try:
+            study = tune(parse(Experiment, plain, "command line"), self.trials, self.output)
+            command = shlex.join([*spelled("tune").split(), *sys.argv[1:]])
+            path = self.output / "best.yaml"
+            path.write_text(best_config(study, experiment, command))
+        except ValueError as error:
+            raise ConfigurationError(str(error)) from None
+        print(f"best return {study.best_value:.4g} with {study.best_params}; config in {path}")
+
+    def interrupted(self) -> str:
+        """Finished trials are kept."""
+        return "interrupted; the same command goes on"
 
 
 def suggest(trial: optuna.Trial, experiment: Experiment, folder: Path) -> Experiment:
@@ -115,34 +153,7 @@ def best_config(study: optuna.Study, experiment: Experiment, command: str) -> st
 
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
-    parser = argparse.ArgumentParser(
-        prog="python -m agents.tune",
-        description="Find an agent's hyper-parameters with Optuna.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    parser.add_argument("--config", required=True, help="the experiment to begin with")
-    parser.add_argument("--trials", type=int, default=30, help="of the study in all")
-    parser.add_argument("--timesteps", type=int, help="of a trial, instead of the config's")
-    parser.add_argument("--output", type=Path, required=True, help="folder of the study")
-    given = parser.parse_args()
-    try:
-        if given.trials < 1:
-            raise ConfigurationError(f"trials = {given.trials} is not allowed: it must be >= 1")
-        experiment = load_experiment(given.config)
-        plain = experiment.model_dump()
-        if given.timesteps is not None:
-            plain["training"]["timesteps"] = given.timesteps
-            plain["validation"]["every"] = max(given.timesteps // 5, 1)
-        study = tune(Experiment.model_validate(plain), given.trials, given.output)
-        command = shlex.join(["python", "-m", "agents.tune", *sys.argv[1:]])
-        path = given.output / "best.yaml"
-        path.write_text(best_config(study, experiment, command))
-    except (ConfigurationError, ValueError) as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on", file=sys.stderr)
-        sys.exit(130)
-    print(f"best return {study.best_value:.4g} with {study.best_params}; config in {path}")
+    start(Tune)
 
 
 if __name__ == "__main__":

@@ -8,17 +8,42 @@ For each setting and mode the training seed with the best validation return goes
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
-import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fusion_gym import zoo
 from fusion_gym.validation import ConfigurationError
 
-ZOO = Path(__file__).parent.parent / "fusion_gym" / "zoo"
+from .command_line import Command, spelled, start
+from .output.files import write
+
 LARGEST = 300_000  # bytes of a model
+
+
+@dataclass(frozen=True)
+class Zoo(Command):
+    """Put the benchmark's best agents into the model zoo, with their cards."""
+
+    results: Path = Path("results")
+    """Folder of the benchmark's JSON."""
+    work: Path = Path("runs/benchmark/full")
+    """Folder of its models."""
+    zoo: Path = Path(zoo.__file__).parent
+    """Folder of the model zoo."""
+
+    def run(self) -> None:
+        """Copy the best training seed of each setting and mode."""
+        found = best_agents(self.results)
+        if not found:
+            raise ConfigurationError(
+                f"results = {str(self.results)!r} is not allowed: it holds no agents"
+            )
+        for name, report in found.items():
+            add(name, report, self.work, self.zoo)
+            print(f"zoo:{name}")
 
 
 def best_agents(results: Path) -> dict[str, dict[str, Any]]:
@@ -33,29 +58,29 @@ def best_agents(results: Path) -> dict[str, dict[str, Any]]:
     return found
 
 
-def add(name: str, report: dict[str, Any], work: Path, zoo: Path) -> None:
+def add(name: str, report: dict[str, Any], work: Path, folder: Path) -> None:
     """Copy a model and write its card.
 
     Raises:
         ConfigurationError: there is no such model, or it is too large.
     """
-    folder = work / report["setting"] / f"{report['mode']}_{report['training_seed']}"
-    model = folder / "best_model.zip"
+    seed = f"{report['mode']}_{report['training_seed']}"
+    model = work / report["setting"] / seed / "best_model.zip"
     if not model.exists():
         raise ConfigurationError(f"work = {str(work)!r} is not allowed: {model} is missing")
     if model.stat().st_size > LARGEST:
         raise ConfigurationError(
             f"{model} has {model.stat().st_size} bytes: it must have at most {LARGEST}"
         )
-    zoo.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(model, zoo / f"{name}.zip")
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(model, folder / f"{name}.zip")
     training = report["training"] | {"output": f"runs/{name}"}
     card = {
         "env": report["env"],
         "options": report["options"],
         "mode": report["mode"],
         "training": training,
-        "command": f"python -m agents.benchmark --envs {report['setting']} --modes "
+        "command": f"{spelled('benchmark')} --envs {report['setting']} --modes "
         f"{report['mode']}, training seed {report['training_seed']}",
         "test": {
             "episodes": report["episodes"],
@@ -64,31 +89,12 @@ def add(name: str, report: dict[str, Any], work: Path, zoo: Path) -> None:
             "points": report["points"],
         },
     }
-    (zoo / f"{name}.json").write_text(json.dumps(card, indent=1) + "\n")
+    write(folder / f"{name}.json", card)
 
 
 def main() -> None:
-    """Entry point."""
-    parser = argparse.ArgumentParser(
-        prog="python -m agents.zoo",
-        description="Put the benchmark's best agents into the model zoo.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    parser.add_argument("--results", type=Path, default=Path("results"))
-    parser.add_argument("--work", type=Path, default=Path("runs/benchmark/full"))
-    parser.add_argument("--zoo", type=Path, default=ZOO)
-    given = parser.parse_args()
-    try:
-        found = best_agents(given.results)
-        if not found:
-            raise ConfigurationError(
-                f"results = {str(given.results)!r} is not allowed: it holds no agents"
-            )
-        for name, report in found.items():
-            add(name, report, given.work, given.zoo)
-            print(f"zoo:{name}")
-    except ConfigurationError as error:
-        sys.exit(f"error: {error}")
+    """Entry point; exit status 130 after an interrupt."""
+    start(Zoo)
 
 
 if __name__ == "__main__":

@@ -18,13 +18,19 @@ import yaml
 from stable_baselines3 import PPO
 
 import fusion_gym
-from agents import demo, evaluate, monitor, reproduce, train
-from agents.config import load_comparison, load_experiment, load_sweep
-from agents.constraint import score
+from agents import demo, evaluate, reproduce
+from agents.command_line import read
+from agents.suite.sweep import Comparison, Sweep
+from agents.training import monitor
+from agents.training import run as train
+from agents.training.algorithms import TABLE
+from agents.training.checked import load
+from agents.training.config import Experiment
+from agents.training.constraint import score
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.metrics import summarise
-from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
@@ -60,7 +66,7 @@ def small_config(folder: Path, kind: str = "ppo", **changes: Any) -> Path:
         "validation": {"every": 512, "episodes": 4},
         "output": str(folder / "run"),
     }
-    if kind in train.DISCRETE_ONLY:
+    if TABLE[kind].discrete_only:
         content["environment"]["options"]["action"] = "discrete"
     path = folder / "config.yaml"
     path.write_text(yaml.safe_dump(content | changes))
@@ -69,9 +75,9 @@ def small_config(folder: Path, kind: str = "ppo", **changes: Any) -> Path:
 
 @pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
 def test_committed_experiments_are_valid(path: Path) -> None:
-    experiment = load_experiment(path)
+    experiment = load(Experiment, path)
     task = fusion_gym.make_task(experiment.environment.id, **experiment.environment.options)
-    needed = experiment.algorithm.name in train.DISCRETE_ONLY and task.access != "single"
+    needed = TABLE[experiment.algorithm.name].discrete_only and task.access != "single"
     assert needed == (task.action == "discrete")
 
 
@@ -80,13 +86,13 @@ def test_committed_sweep_and_comparison_name_policies_that_exist() -> None:
         ("tobit_oscillator", ENV),
         ("biased", "fusion_gym/BiasedOscillator-v0"),
     ):
-        sweep = load_sweep(CONFIGS / f"{name}_sweep.yaml")
+        sweep = load(Sweep, CONFIGS / f"{name}_sweep.yaml")
         task = fusion_gym.make_task(env_id)
         assert len(sweep.policies) == len(set(sweep.policies)) > 50
         for policy in sweep.policies:
             make_policy(policy, task)
     for file in CONFIGS.glob("*_reproduce.yaml"):
-        comparison = load_comparison(file)
+        comparison = load(Comparison, file)
         for row in comparison.rows:
             env_id = row.environment or comparison.environment
             make_policy(row.policy, fusion_gym.make_task(env_id, **row.options))
@@ -108,22 +114,22 @@ def test_a_config_that_is_not_allowed_names_the_field(
     tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ConfigurationError, match="is not allowed") as error:
-        load_experiment(small_config(tmp_path, **changes))
+        load(Experiment, small_config(tmp_path, **changes))
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
 def test_a_config_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"absent\.yaml"):
-        load_experiment(tmp_path / "absent.yaml")
+        load(Experiment, tmp_path / "absent.yaml")
     (tmp_path / "broken.yaml").write_text("a: [1,")
     with pytest.raises(ConfigurationError, match="no YAML"):
-        load_experiment(tmp_path / "broken.yaml")
+        load(Experiment, tmp_path / "broken.yaml")
 
 
 @pytest.mark.parametrize("algorithm", list(SMALL))
 def test_training_writes_its_results_and_resumes(tmp_path: Path, algorithm: str) -> None:
-    experiment = load_experiment(small_config(tmp_path, algorithm))
+    experiment = load(Experiment, small_config(tmp_path, algorithm))
     summary = train.train(experiment)
     folder = Path(experiment.output)
     assert summary["finished"]
@@ -152,19 +158,20 @@ def test_training_writes_its_results_and_resumes(tmp_path: Path, algorithm: str)
 def test_dqn_needs_the_discrete_action(tmp_path: Path) -> None:
     config = small_config(tmp_path, "dqn", environment={"id": ENV, "options": {}})
     with pytest.raises(ConfigurationError, match="action: discrete"):
-        train.train(load_experiment(config))
+        train.train(load(Experiment, config))
 
 
 def test_training_to_a_target_rate_moves_the_price(tmp_path: Path) -> None:
     """A target far above what the agent sends makes tokens cheaper, one far below dearer."""
     prices = {}
     for target in (0.001, 1.0):
-        experiment = load_experiment(
+        experiment = load(
+            Experiment,
             small_config(
                 tmp_path,
                 training={"timesteps": 2048, "num_envs": 8, "target_rate": target},
                 output=str(tmp_path / f"run{target}"),
-            )
+            ),
         )
         train.train(experiment)
         model = PPO.load(tmp_path / f"run{target}" / "final_model.zip")
@@ -181,7 +188,7 @@ def test_validation_counts_episodes_by_their_price(tmp_path: Path) -> None:
     content["environment"]["options"] |= {"cost_weight": "random", "price_range": [0.01, 1.0]}
     content["training"]["price_exponent"] = 1.0
     path.write_text(yaml.safe_dump(content))
-    train.train(load_experiment(path), quiet=True)
+    train.train(load(Experiment, path), quiet=True)
     record = monitor.read_records(tmp_path / "run")[-1]
     task = fusion_gym.make_task(ENV, **content["environment"]["options"])
     batch = EpisodeBatch(task, 4)
@@ -211,7 +218,7 @@ def test_a_target_rate_needs_a_fixed_price(tmp_path: Path) -> None:
         training={"timesteps": 64, "num_envs": 8, "target_rate": 0.1},
     )  # fmt: skip
     with pytest.raises(ConfigurationError, match=r"target_rate = 0.1 is not allowed"):
-        train.train(load_experiment(config))
+        train.train(load(Experiment, config))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -238,13 +245,17 @@ def test_an_interrupted_training_loses_nothing(tmp_path: Path, number: signal.Si
     assert len(monitor.read_records(folder)) > records
 
 
-def run_evaluation(*arguments: str) -> dict[str, Any]:
-    return evaluate.evaluate(evaluate.parser().parse_args(list(arguments)))
+def run_evaluation(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> dict[str, Any]:
+    monkeypatch.setattr(sys, "argv", ["program", *arguments])
+    return evaluate.evaluate(read(evaluate.Evaluate))
 
 
-def test_evaluation_writes_the_promised_json(tmp_path: Path) -> None:
+def test_evaluation_writes_the_promised_json(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = tmp_path / "deep" / "result.json"
     report = run_evaluation(
+        monkeypatch,
         *("--env", ENV, "--set", "filter=tobit", "horizon=20", "--set", "tokens=unlimited"),
         *("--policies", "always", "random:rate=0.5", "--episodes", "30", "--seed", "3"),
         *("--reference", "always", "--json", str(file)),
@@ -273,7 +284,7 @@ def test_evaluation_writes_the_promised_json(tmp_path: Path) -> None:
 def test_evaluation_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = str(tmp_path / "result.json")
     common = ["--env", ENV, "--set", "horizon=10", "--episodes", "5", "--json", file]
-    first = run_evaluation(*common, "--policies", "always", "never")
+    first = run_evaluation(monkeypatch, *common, "--policies", "always", "never")
     ran: list[int] = []
 
     def counted(results: Any) -> dict[str, Any]:
@@ -281,11 +292,13 @@ def test_evaluation_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         return summarise(results)
 
     monkeypatch.setattr(evaluate, "summarise", counted)
-    second = run_evaluation(*common, "--resume", "--policies", "always", "never", "round_robin")
+    second = run_evaluation(
+        monkeypatch, *common, "--resume", "--policies", "always", "never", "round_robin"
+    )
     assert len(ran) == 1
     assert second["policies"]["always"] == first["policies"]["always"]
     with pytest.raises(ConfigurationError, match="another evaluation"):
-        run_evaluation(*common, "--seed", "1", "--resume", "--policies", "always")
+        run_evaluation(monkeypatch, *common, "--seed", "1", "--resume", "--policies", "always")
 
 
 @pytest.mark.parametrize(
@@ -336,7 +349,7 @@ def test_demo_from_baselines_to_figures(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_reproduce_prints_every_row() -> None:
-    comparison = load_comparison(CONFIGS / "tobit_oscillator_reproduce.yaml")
-    rows = reproduce.run(comparison, episodes=3, seed=0)
+    comparison = load(Comparison, CONFIGS / "tobit_oscillator_reproduce.yaml")
+    rows = reproduce.table(comparison, episodes=3, seed=0)
     assert [row[0] for row in rows] == [row.label for row in comparison.rows]
     assert all(len(row) == len(reproduce.COLUMNS) for row in rows)

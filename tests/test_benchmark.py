@@ -13,14 +13,16 @@ import pytest
 import yaml
 
 import fusion_gym
-from agents import benchmark, jobs, report, solved, tune, zoo
-from agents.arrays import load_results, save_results
-from agents.config import PPOConfig
-from agents.suite import Choices, Family, Range, Tuning, load_suite
-from agents.tuning import tune as tune_family
-from agents.verdict import judge
+from agents import benchmark, report, solved, tune, zoo
+from agents.output.files import load_results, save_results
+from agents.suite import jobs
+from agents.suite.config import Choices, Family, Range, Tuning, load_suite
+from agents.suite.tuning import suggest
+from agents.suite.tuning import tune as tune_family
+from agents.suite.verdict import judge
+from agents.training.algorithms import PPOConfig
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.periodic_optimum import Schedule
 from fusion_gym.validation import ConfigurationError
 
@@ -149,7 +151,7 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
                 make_policy(name, task)
             for family in suite.families_of(setting):
                 trial = optuna.create_study().ask()
-                make_policy(benchmark_text(trial, family, task.sensors), task)
+                make_policy(suggest(trial, family, task.sensors), task)
             if setting.genie is not None:
                 fusion_gym.make_task(
                     setting.environment.id, **(setting.environment.options | setting.genie.options)
@@ -178,12 +180,6 @@ def test_trainings_of_the_committed_suite(tmp_path: Path) -> None:
             for key, value in setting.algorithm.items():
                 if key != "batch_size":
                     assert getattr(algorithm, key) == value
-
-
-def benchmark_text(trial: optuna.Trial, family: Family, sensors: int) -> str:
-    from agents.tuning import suggest
-
-    return suggest(trial, family, sensors)
 
 
 def test_tuned_policies_are_a_curve() -> None:
@@ -215,7 +211,7 @@ def test_tuning_begins_with_values_that_all_sensors_share(monkeypatch: pytest.Mo
         asked.append(text)
         return make_policy(text, task)
 
-    monkeypatch.setattr("agents.tuning.make_policy", spy)
+    monkeypatch.setattr("agents.suite.tuning.make_policy", spy)
     tune_family(task, family, Tuning(trials=24, episodes=2, kept=5))
     assert len(asked) == 24
     shared = [text for text in asked[:8] if len(set(thresholds(text))) == 1]
@@ -325,6 +321,7 @@ def test_the_benchmark_refuses_with_one_line(
     config = ["--config", str(small_suite(tmp_path)), "--results", str(tmp_path / "none")]
     with pytest.raises(SystemExit) as caught:
         run_main(monkeypatch, benchmark, *config, *arguments)
+    assert str(caught.value).startswith("error: ")
     assert message in str(caught.value)
 
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from agents.config import Experiment, parse
-from agents.models import make_model
+from agents.training.checked import parse
+from agents.training.config import Experiment
+from agents.training.models import make_model
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import ConfigurationError

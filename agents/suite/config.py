@@ -7,19 +7,9 @@ from typing import Any, Literal
 
 import pydantic
 
-from agents.config import (
-    A2CConfig,
-    DQNConfig,
-    EnvironmentConfig,
-    MaskablePPOConfig,
-    Positive,
-    PPOConfig,
-    Rate,
-    RecurrentPPOConfig,
-    Share,
-    parse,
-    read_yaml,
-)
+from ..training.algorithms import AlgorithmConfig, AnyAlgorithm, settings
+from ..training.checked import Positive, Rate, Share, Strict, parse, read_yaml
+from ..training.config import EnvironmentConfig
 
 Mode = Literal["sensors", "centre", "local"]
 Knowledge = Literal["coordinator", "own", "centre", "clock"]
@@ -31,11 +21,7 @@ COMPARABLE: dict[Mode, tuple[Knowledge, ...]] = {
 }
 
 
-class _Strict(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
-
-
-class Range(_Strict):
+class Range(Strict):
     """A parameter between ``low`` and ``high``, in the logarithm, of one value or one a sensor."""
 
     low: Rate
@@ -50,13 +36,13 @@ class Range(_Strict):
         return self
 
 
-class Choices(_Strict):
+class Choices(Strict):
     """A parameter with few values."""
 
     values: tuple[Any, ...] = pydantic.Field(min_length=1)
 
 
-class Family(_Strict):
+class Family(Strict):
     """A rule with parameters to tune; ``knows`` says with which agents it is compared.
 
     ``own``: a sensor's own signals. ``centre``: what the centre knows beforehand. ``clock``:
@@ -69,7 +55,7 @@ class Family(_Strict):
     parameters: dict[str, Range | Choices]
 
 
-class Tuning(_Strict):
+class Tuning(Strict):
     """One budget of trials for every rule, on seeds that no test uses."""
 
     trials: Positive = 40
@@ -78,21 +64,21 @@ class Tuning(_Strict):
     kept: Positive = 14
 
 
-class Genie(_Strict):
+class Genie(Strict):
     """A system that always receives, with these options changed: a lower bound of the error."""
 
     options: dict[str, Any]
     assumes: str
 
 
-class Hindsight(_Strict):
+class Hindsight(Strict):
     """What a clairvoyant would do at some prices; ``width`` is that of its beam search."""
 
     prices: tuple[Rate, ...] = pydantic.Field(min_length=1)
     width: Positive = 32
 
 
-class Setting(_Strict):
+class Setting(Strict):
     """One environment in one setting; ``families`` are labels, all of them by default.
 
     ``informed`` are policies that know the model and all new signals, ``references`` computed
@@ -110,12 +96,12 @@ class Setting(_Strict):
     references: tuple[str, ...] = ()
     longer: float = pydantic.Field(default=1.0, gt=0)
     price_exponent: Share | None = None
-    algorithm: dict[str, Any] = {}
+    algorithm: dict[str, Any] = pydantic.Field(default_factory=dict)
     genie: Genie | None = None
     hindsight: Hindsight | None = None
 
 
-class Suite(_Strict):
+class Suite(Strict):
     """The whole benchmark."""
 
     episodes: Positive = 1000
@@ -128,19 +114,17 @@ class Suite(_Strict):
     hindsight_episodes: Positive = 100
     modes: tuple[Mode, ...] = ("sensors", "centre", "local")
     tuning: Tuning = Tuning()
-    algorithm: PPOConfig | MaskablePPOConfig | RecurrentPPOConfig | A2CConfig | DQNConfig = (
-        pydantic.Field(discriminator="name")
-    )
+    algorithm: AnyAlgorithm
     families: tuple[Family, ...]
     settings: tuple[Setting, ...]
 
-    def algorithm_of(self, setting: Setting) -> Any:
+    def algorithm_of(self, setting: Setting) -> AlgorithmConfig:
         """The setting's algorithm, checked again.
 
         Raises:
-            pydantic.ValidationError: a hyper-parameter that is unknown or not allowed.
+            ValueError: a hyper-parameter that is unknown or not allowed.
         """
-        return type(self.algorithm).model_validate(self.algorithm.model_dump() | setting.algorithm)
+        return settings(self.algorithm.model_dump() | setting.algorithm)
 
     def families_of(self, setting: Setting) -> list[Family]:
         """The setting's baselines."""

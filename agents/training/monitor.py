@@ -15,13 +15,15 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
 
-from agents.config import Experiment
-from agents.constraint import score
 from fusion_gym.arrays import Array
+from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.evaluation.episodes import begin, run_episodes
+from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.model import ModelPolicy
+
+from .config import Experiment
+from .constraint import score
 
 
 class Interrupt:
@@ -131,7 +133,8 @@ class Progress(BaseCallback):
         if exponent == 0.0:
             return np.ones(1)
         episodes, first = self.experiment.validation.episodes, self.experiment.validation.seed
-        return self.task.reward.price.scale(begin(self.task, episodes, first).price, exponent)
+        batch = EpisodeBatch.seeded(self.task, episodes, first)
+        return self.task.reward.price.scale(batch.price, exponent)
 
     def save(self) -> None:
         """Write the checkpoint, with the replay buffer where there is one."""

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from agents.arrays import save_results
-from agents.config import EnvironmentConfig, Experiment, TrainingConfig, ValidationConfig
-from agents.evaluate import write
-from agents.suite import Mode, Setting, Suite
-from agents.train import train
-from agents.tuning import tune
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.hindsight import run_hindsight
 from fusion_gym.evaluation.metrics import robust_summary, summarise
-from fusion_gym.policies.hindsight import run_hindsight
-from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.registry import make_policy
+
+from ..output.files import save_results, write
+from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, ValidationConfig
+from ..training.run import train
+from .config import Mode, Setting, Suite
+from .tuning import tune
 
 
 @dataclass(frozen=True)

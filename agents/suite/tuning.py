@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import optuna
 
-from agents.suite import Choices, Family, Range, Tuning
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
+
+from .config import Choices, Family, Range, Tuning
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 

@@ -6,13 +6,14 @@ import numpy as np
 import torch
 from gymnasium.spaces import Discrete, MultiBinary
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.utils import LinearSchedule
 
-from agents.config import Experiment
 from fusion_gym.arrays import Array
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.policies.model import ALGORITHMS, tag_model
+from fusion_gym.policies.model import tag_model
 from fusion_gym.validation import ConfigurationError
+
+from .algorithms import TABLE
+from .config import Experiment
 
 
 def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
@@ -21,24 +22,12 @@ def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
     Raises:
         ConfigurationError: an ``initial_rate`` that the action space does not allow.
     """
-    settings = experiment.algorithm.model_dump()
-    name, network = settings.pop("name"), settings.pop("network")
-    end, memory = settings.pop("learning_rate_end"), settings.pop("memory", None)
-    rate = settings.pop("initial_rate", None)
-    if end is not None:
-        settings["learning_rate"] = LinearSchedule(settings["learning_rate"], end, 1.0)
-    activation = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[network["activation"]]
-    shape = {"net_arch": list(network["hidden"]), "activation_fn": activation}
-    if memory is not None:
-        shape["lstm_hidden_size"] = memory
-    model = ALGORITHMS[name](
-        "MlpPolicy" if memory is None else "MlpLstmPolicy",
-        env,
-        seed=experiment.training.seed,
-        device="cpu",
-        policy_kwargs=shape,
-        **settings,
+    settings = experiment.algorithm
+    row = TABLE[settings.name]
+    model = row.model(
+        row.policy, env, seed=experiment.training.seed, device="cpu", **settings.arguments()
     )
+    rate = getattr(settings, "initial_rate", None)
     if rate is not None:
         _begin_at(model, env, rate)
     tag_model(model, env.task, local=experiment.environment.local)
@@ -57,7 +46,7 @@ def initial_logits(env: FusionSB3VecEnv, rate: float) -> Array:
     if isinstance(space, MultiBinary):
         return np.full(sensors, odds)
     assert isinstance(space, Discrete)
-    if env.view is not None:
+    if env.view.knowledge == "own":
         return np.array([0.0, odds])
     if env.task.access == "single":
         if sensors * rate >= 1.0:

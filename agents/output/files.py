@@ -1,15 +1,25 @@
-"""Episode results on disk: what a verdict needs of a policy, beside the JSON that people read."""
+"""Results on disk: JSON for readers, and episodes for a verdict."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fusion_gym.evaluation.episodes import EpisodeResults
 
 FIELDS = tuple(EpisodeResults.__dataclass_fields__)
+
+
+def write(path: Path, report: Mapping[str, Any]) -> None:
+    """Replace a JSON file in one move, so that an interrupt never leaves half of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".part")
+    partial.write_text(json.dumps(report, indent=1) + "\n")
+    partial.replace(path)
 
 
 def save_results(path: Path, results: Mapping[str, EpisodeResults]) -> None:

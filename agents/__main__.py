@@ -1,0 +1,49 @@
+"""All commands under one name: ``fusion-gym COMMAND``, which is ``python -m agents.COMMAND``."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import sys
+from pathlib import Path
+
+from fusion_gym.validation import ConfigurationError, choice
+
+COMMANDS = (
+    *("train", "evaluate", "compare", "tune", "benchmark", "report", "reproduce", "solved"),
+    *("demo", "zoo"),
+)
+
+
+def usage() -> str:
+    """Every command with the first sentence of its module."""
+    lines = ["usage: fusion-gym COMMAND [OPTIONS]", ""]
+    for name in COMMANDS:
+        source = Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8")
+        sentence = (ast.get_docstring(ast.parse(source)) or "").splitlines()[0]
+        lines.append(f"  {name:<10} {sentence}")
+    return "\n".join([*lines, "", "fusion-gym COMMAND --help shows the options of a command."])
+
+
+def main() -> None:
+    """Entry point of ``fusion-gym``; the commands need the packages of the extra ``agents``."""
+    name = sys.argv[1] if sys.argv[1:] else "--help"
+    if name in ("-h", "--help"):
+        print(usage())
+        return
+    try:
+        module = importlib.import_module(f".{choice('command', name, COMMANDS)}", __package__)
+    except ConfigurationError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except ModuleNotFoundError as error:
+        missing = error.name or str(error)
+        if missing.partition(".")[0] in ("fusion_gym", "agents"):
+            raise
+        sys.exit(f"error: {missing} is missing: pip install fusion-gym[agents]")
+    del sys.argv[1]  # as python -m agents.COMMAND has it
+    module.main()
+
+
+if __name__ == "__main__":
+    main()

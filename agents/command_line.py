@@ -1,0 +1,95 @@
+"""How every command reads its options, reports an error and ends."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import itertools
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import tyro
+
+from fusion_gym.validation import ConfigurationError
+
+Words = tuple[tuple[str, ...], ...]  # of an option that may be given several times
+_Kind = TypeVar("_Kind", bound="Command")
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command: its fields are its options, its docstring and theirs are its help."""
+
+    def run(self) -> None:
+        """Do the work.
+
+        Raises:
+            ConfigurationError: anything that is not allowed.
+            KeyboardInterrupt: the work was interrupted.
+        """
+        raise NotImplementedError
+
+    def interrupted(self) -> str:
+        """What to say after an interrupt."""
+        return "interrupted"
+
+
+def spelled(command: str) -> str:
+    """A command as the user types it: ``fusion-gym NAME`` or ``python -m agents.NAME``."""
+    if Path(sys.argv[0]).stem == "fusion-gym":
+        return f"fusion-gym {command}"
+    return f"python -m {__package__}.{command}"
+
+
+def read(kind: type[_Kind]) -> _Kind:
+    """The command with the options of the command line.
+
+    Raises:
+        SystemExit: help was asked for (status 0), or an option is not understood (2, after one
+            line that says which).
+    """
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                kind,
+                prog=spelled(kind.__name__.lower()),
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    except SystemExit as end:
+        if end.code:
+            print(f"error: {_essence(said.getvalue())}", file=sys.stderr)
+        raise
+
+
+def start(kind: type[Command]) -> None:
+    """Read the command and do it.
+
+    Raises:
+        SystemExit: an error (status 1, or 2 for an option that is not understood; one line says
+            what), or an interrupt (130).
+    """
+    command = read(kind)
+    try:
+        command.run()
+    except ConfigurationError as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        print(command.interrupted(), file=sys.stderr)
+        sys.exit(130)
+
+
+def _essence(message: str) -> str:
+    """What tyro says below its title and above the next rule, as one line."""
+    lines = [re.sub(r"\x1b\[[\d;]*m", "", line).strip("│ ") for line in message.splitlines()[1:]]
+    body = itertools.dropwhile(_is_rule, lines)
+    return " ".join(itertools.takewhile(lambda line: not _is_rule(line), body)).removeprefix(
+        "Error parsing "
+    )
+
+
+def _is_rule(line: str) -> bool:
+    return not line.strip("─-╰╯ ")

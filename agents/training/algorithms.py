@@ -1,0 +1,148 @@
+"""Every algorithm is one row of a table: its class, its settings, what it asks for.
+
+Settings carry the names that Stable-Baselines3 and sb3-contrib give them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import pydantic
+import torch
+from sb3_contrib import MaskablePPO, RecurrentPPO
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import LinearSchedule
+
+from fusion_gym.policies.model import ALGORITHMS
+from fusion_gym.validation import choice
+
+from .checked import Positive, Rate, Share, Strict
+
+# Share of the steps in which the untrained policy lets every sensor request; by default one half.
+# Where that is far more than the tokens pay for, asking for less changes nothing (another sensor's
+# request is granted instead), and a training can stay there for long.
+InitialRate = Annotated[float | None, pydantic.Field(gt=0, lt=1)]
+
+
+class NetworkConfig(Strict):
+    """The agent's networks."""
+
+    hidden: tuple[Positive, ...] = (64, 64)
+    activation: Literal["tanh", "relu"] = "tanh"
+
+
+class AlgorithmConfig(Strict):
+    """What every algorithm has; ``learning_rate_end`` makes the rate fall linearly to it."""
+
+    name: str
+    learning_rate: Rate = 1e-3
+    learning_rate_end: Rate | None = None
+    gamma: Share = 0.97
+    network: NetworkConfig = NetworkConfig()
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of the algorithm's class."""
+        found = self.model_dump(exclude={"name", "learning_rate_end", "network"})
+        if self.learning_rate_end is not None:
+            found["learning_rate"] = LinearSchedule(self.learning_rate, self.learning_rate_end, 1.0)
+        activation = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[self.network.activation]
+        shape = {"net_arch": list(self.network.hidden), "activation_fn": activation}
+        return found | {"policy_kwargs": shape}
+
+
+class A2CConfig(AlgorithmConfig):
+    """A2C, and what PPO has in common with it."""
+
+    gae_lambda: Share = 0.9
+    ent_coef: float = 0.0
+    vf_coef: float = 0.5
+    max_grad_norm: Rate = 0.5
+    initial_rate: InitialRate = None
+    n_steps: Positive = 8
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of the algorithm's class; the initial rate is set on the finished model."""
+        found = super().arguments()
+        del found["initial_rate"]
+        return found
+
+
+class PPOConfig(A2CConfig):
+    """PPO, also the one that cannot choose what the tokens do not allow (``maskable_ppo``)."""
+
+    n_steps: Positive = 64
+    batch_size: Positive = 4096
+    n_epochs: Positive = 4
+    clip_range: Rate = 0.2
+
+
+class RecurrentPPOConfig(PPOConfig):
+    """PPO with a memory, for modes that hide the sensors' signals."""
+
+    memory: Positive = 64
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of the algorithm's class; the memory is the size of its policy's LSTM."""
+        found = super().arguments()
+        found["policy_kwargs"]["lstm_hidden_size"] = found.pop("memory")
+        return found
+
+
+class DQNConfig(AlgorithmConfig):
+    """DQN."""
+
+    buffer_size: Positive = 500_000
+    batch_size: Positive = 1024
+    learning_starts: Positive = 20_000
+    train_freq: Positive = 4
+    gradient_steps: Positive = 4
+    target_update_interval: Positive = 10_000
+    exploration_fraction: Share = 0.2
+    exploration_final_eps: Share = 0.02
+    max_grad_norm: Rate = 10.0
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """A row: the class, its settings, its kind of policy, whether it knows Discrete actions only.
+
+    RecurrentPPO accepts MultiBinary actions and then fails on them while it trains.
+    """
+
+    model: type[BaseAlgorithm]
+    config: type[AlgorithmConfig]
+    policy: str = "MlpPolicy"
+    discrete_only: bool = False
+
+
+TABLE = {
+    "a2c": Algorithm(A2C, A2CConfig),
+    "dqn": Algorithm(DQN, DQNConfig, discrete_only=True),
+    "maskable_ppo": Algorithm(MaskablePPO, PPOConfig),
+    "ppo": Algorithm(PPO, PPOConfig),
+    "recurrent_ppo": Algorithm(RecurrentPPO, RecurrentPPOConfig, "MlpLstmPolicy", True),
+}
+# Saved models carry the name, and the library loads them by it.
+ALGORITHMS.update((name, row.model) for name, row in TABLE.items())
+
+
+def settings(content: Any) -> AlgorithmConfig:
+    """The settings of an algorithm, as the class that the table has for its name.
+
+    Raises:
+        ValueError: no settings, an unknown name or setting, or a value that is not allowed.
+    """
+    if isinstance(content, AlgorithmConfig):
+        return content
+    if not isinstance(content, Mapping):
+        raise ValueError("it must be a name and settings")
+    name = choice("name", content.get("name"), TABLE)
+    return TABLE[name].config.model_validate(content)
+
+
+AnyAlgorithm = Annotated[
+    pydantic.SerializeAsAny[AlgorithmConfig], pydantic.BeforeValidator(settings)
+]

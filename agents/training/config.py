@@ -1,0 +1,56 @@
+"""A training as typed YAML."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pydantic
+
+from .algorithms import AnyAlgorithm
+from .checked import Positive, Share, Strict
+
+
+class EnvironmentConfig(Strict):
+    """A registered environment and the options of ``gym.make`` that differ from its defaults.
+
+    ``local`` trains one policy that every sensor runs by itself, on what it sees by itself.
+    """
+
+    id: str
+    options: dict[str, Any] = pydantic.Field(default_factory=dict)
+    local: bool = False
+
+
+class TrainingConfig(Strict):
+    """How long, with how many runs side by side, from which seed, on how many threads.
+
+    ``target_rate`` trains to an average rate of transmissions per sensor and step: the price of a
+    token starts at the environment's ``cost_weight`` and is adapted. ``price_exponent`` is for a
+    price that is drawn: episodes count by (middle of the range / price)^exponent, in training and
+    in validation, so that an agent does not neglect the low prices.
+    """
+
+    timesteps: Positive
+    num_envs: Positive = 256
+    seed: int = pydantic.Field(default=0, ge=0)
+    threads: Positive = 1
+    target_rate: float | None = pydantic.Field(default=None, gt=0, le=1)
+    price_exponent: Share = 0.0
+
+
+class ValidationConfig(Strict):
+    """Evaluation during training, on seeds that neither training nor a test uses."""
+
+    every: Positive = 500_000
+    episodes: Positive = 256
+    seed: int = pydantic.Field(default=500_000_000, ge=0)
+
+
+class Experiment(Strict):
+    """One training: environment, algorithm, length, validation, and where results go."""
+
+    environment: EnvironmentConfig
+    algorithm: AnyAlgorithm
+    training: TrainingConfig
+    validation: ValidationConfig = ValidationConfig()
+    output: str
