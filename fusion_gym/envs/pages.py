@@ -34,8 +34,6 @@ A star marks what only the sensors know: `information="centre"` leaves it out. T
 tells what a sensor that decides by itself sees of these entries."""
 
 _PAGE = """\
-{title}
-
 {description}
 
 ## Action space
@@ -64,9 +62,9 @@ Truncation after `horizon` steps, here {horizon}, never termination. `max_episod
 earlier without changing any scale.
 
 ## Info
-`cost` = `cost_tokens` (tokens spent, never negative), `rewards` (its terms {terms}),
-`granted` and `denied` (one flag a sensor), `squared_error` (one number a state), `diverged` (a
-squared error above 100 times its open-loop mean, or not finite).
+`cost` = `cost_tokens` (tokens spent, never negative), `rewards` (its terms
+{terms}), `granted` and `denied` (one flag a sensor), `squared_error` (one
+number a state), `diverged` (a squared error above 100 times its open-loop mean, or not finite).
 
 ## Arguments
 The fields of `{options}`, of which `fusion_gym.make_task` also takes an object.
@@ -98,11 +96,10 @@ def page(env_id: str, task: Task | None = None) -> str:
     kind = options_of(env_id)
     task = make_task(env_id) if task is None else task
     system, view = task.system, make_view(task)
-    title, *description = _paragraphs(kind) or [env_id]
+    description = _paragraphs(kind) or [env_id]
     versions = [text for text in description if re.match(r"v\d+: ", text)]
     weights = task.reward.state_weights[:, 0]
     return _PAGE.format(
-        title=title,
         description="\n\n".join(text for text in description if text not in versions),
         actions=view.actions,
         entries=len(view.names),
@@ -200,9 +197,12 @@ def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
 
 def _arguments(kind: type[CommonOptions]) -> str:
     """The options with their defaults: the environment's own, then those that all have."""
+    chosen = kind()
     common = {field.name for field in fields(CommonOptions)}
     ordered = sorted(fields(kind), key=lambda field: field.name in common)
-    return "\n".join(f"    {field.name} = {_short(field.default)}" for field in ordered)
+    return "\n".join(
+        f"    {field.name} = {_short(getattr(chosen, field.name))}" for field in ordered
+    )
 
 
 def _short(value: Any) -> str:
