@@ -17,9 +17,9 @@ from fusion_gym.core.access import access_mask, first_request
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.policies.make import make_policy
-from fusion_gym.systems.tobit.assumed_density import AssumedDensityFilter
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.systems.tobit.sensors import CensoredSensors
+from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
 from fusion_gym.validation import ConfigurationError
 
 OSCILLATOR = "fusion_gym/BiasedOscillator-v0"

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.fusion.feedback import FeedbackFusion
-from fusion_gym.systems.tobit.assumed_density import AssumedDensityFilter
 from fusion_gym.systems.tobit.filters import Expectation, NodeFilter, Plan
 from fusion_gym.systems.tobit.sensors import CensoredSensors
+from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
 
 
 class Outlook(NamedTuple):

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 from fusion_gym.core.options import CommonOptions, arrival_order, plain
 from fusion_gym.fusion.federated import FederatedFusion
 from fusion_gym.fusion.feedback import INTERSECTION_RULES, FeedbackFusion, IntersectionFusion
-from fusion_gym.systems.tobit.assumed_density import AssumedDensityFilter
 from fusion_gym.systems.tobit.centre import FeedbackCentre, SequentialCentre
 from fusion_gym.systems.tobit.filters import NodeFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
+from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
 from fusion_gym.validation import ConfigurationError, choice
 
 

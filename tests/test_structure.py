@@ -1,0 +1,95 @@
+"""The house keeps its arrows: imports run one way, without circles, and rooms stay small."""
+
+from __future__ import annotations
+
+import ast
+import functools
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+# Each room may import from the floors below its own, and from itself.
+FLOORS = {
+    "arrays": 0,
+    "gaussian": 0,
+    "linalg": 0,
+    "validation": 0,
+    "core": 1,
+    "fusion": 1,
+    "systems": 2,
+    "envs": 3,
+    "solvers": 3,
+    "zoo": 3,
+    "policies": 4,
+    "evaluation": 5,
+}
+TOOLS = {f"fusion_gym.{name}" for name, floor in FLOORS.items() if floor == 0}
+
+
+@functools.cache
+def modules() -> dict[str, Path]:
+    """Every module of the library by its dotted name."""
+    files = (ROOT / "fusion_gym").rglob("*.py")
+    named = {".".join(p.relative_to(ROOT).with_suffix("").parts): p for p in files}
+    return {name.removesuffix(".__init__"): path for name, path in named.items()}
+
+
+@functools.cache
+def imports(module: str) -> frozenset[str]:
+    """The library's modules that a module imports, wherever in its text."""
+    every, found = modules(), set()
+    for node in ast.walk(ast.parse(every[module].read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            assert node.level == 0, f"{module} has a relative import"
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                found.add(inner if inner in every else node.module)
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return frozenset(found & every.keys())
+
+
+@functools.cache
+def reached(module: str) -> set[str]:
+    """All that a module imports, directly or not, and itself."""
+    seen: set[str] = set()
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name not in seen:
+            seen.add(name)
+            waiting += imports(name)
+    return seen
+
+
+def floor(module: str) -> int | None:
+    parts = module.split(".")
+    return FLOORS[parts[1]] if len(parts) > 1 else None
+
+
+@pytest.mark.parametrize("module", [name for name in modules() if floor(name) is not None])
+def test_imports_run_downwards(module: str) -> None:
+    room, own = module.split(".")[1], floor(module)
+    for other in imports(module):
+        below = floor(other)
+        assert below is not None, f"{module} imports the whole package"
+        assert own is not None
+        same = other.split(".")[1] == room or own == below == 0
+        assert same or below < own, f"{module} imports {other}"
+        if room == "systems" and other.startswith("fusion_gym.systems."):
+            families = [name.split(".")[2] for name in (module, other) if name.count(".") > 2]
+            assert len(set(families)) <= 1, f"{module} imports {other} of another family"
+
+
+def test_there_are_no_circles() -> None:
+    for module in modules():
+        for other in imports(module):
+            assert module not in reached(other), f"{module} and {other} import each other"
+
+
+def test_a_newcomer_reads_fifteen_files_for_the_oscillator() -> None:
+    files = reached("fusion_gym.systems.tobit.oscillator") - TOOLS
+    assert len(files) <= 15, sorted(files)
+    own = [name for name in files if name.startswith("fusion_gym.systems.tobit.")]
+    assert len(own) > len(files) / 2
