@@ -11,11 +11,10 @@ import pytest
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.lookahead import Lookahead
-from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 TOBIT = "fusion_gym/TobitOscillator-v0"
@@ -63,9 +62,9 @@ def test_the_true_state_does_not_matter() -> None:
     first = policy(batch.signals())
     assert first.any()
     assert not first.all()
-    moved = dataclasses.replace(batch.state, truth=batch.state.truth + 7.0)
-    signals = dict(batch.signals()) | {"state": moved}
-    np.testing.assert_array_equal(policy(Signals(signals)), first)
+    batch.state = dataclasses.replace(batch.state, truth=batch.state.truth + 7.0)
+    assert np.isnan(batch.signals()["model"].truth).all()
+    np.testing.assert_array_equal(policy(batch.signals()), first)
 
 
 def test_its_limits() -> None:
@@ -109,5 +108,5 @@ def test_what_cannot_be_is_refused() -> None:
     centre = fusion_gym.make_task(TOBIT, information="centre")
     with pytest.raises(ConfigurationError, match="information = 'centre'"):
         make_policy("lookahead", centre)
-    with pytest.raises(LookupError, match="'state'"):
-        played(centre).signals()["state"]
+    with pytest.raises(LookupError, match="'model'"):
+        played(centre).signals()["model"]

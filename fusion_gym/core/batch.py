@@ -22,7 +22,7 @@ _LONGEST_BLOCK = 256  # steps of noise that are drawn and kept at a time
 class Outcome(NamedTuple):
     """What one step brought, batch axis last.
 
-    ``reward`` (N,) is ``reward_error`` + ``reward_cost``; ``cost`` (N,) the tokens spent;
+    ``reward`` (N,) is ``reward_error`` + ``reward_communication``; ``cost`` (N,) the tokens spent;
     ``requested``, ``granted`` (sensors, N) bool; ``squared_error`` (n, N) of the fused estimate;
     ``diverged`` (N,) bool, whether some state's squared error is not finite or above the task's
     ``divergence_level``; ``truncated`` (N,) bool.
@@ -30,7 +30,7 @@ class Outcome(NamedTuple):
 
     reward: Array
     reward_error: Array
-    reward_cost: Array
+    reward_communication: Array
     cost: Array
     requested: NDArray[np.bool_]
     granted: NDArray[np.bool_]
@@ -70,6 +70,14 @@ class EpisodeBatch:
         self._ring = np.zeros((self._block, self._channels, num_envs))
         self._cursor = 0
         self._block_start = np.zeros(num_envs, dtype=np.int64)
+
+    @classmethod
+    def seeded(cls, task: Task, episodes: int, seed: int) -> EpisodeBatch:
+        """Episodes with the seeds ``seed``, ``seed + 1``, … side by side, at their first sensing."""
+        batch = cls(task, episodes)
+        batch.seed(np.arange(episodes), [seed + i for i in range(episodes)])
+        batch.reset()
+        return batch
 
     def seed(self, runs: NDArray[np.int64], seeds: Sequence[int | None]) -> None:
         """Give these runs new generators; ``None`` keeps a run's generator if it has one."""
@@ -133,7 +141,9 @@ class EpisodeBatch:
         mean, covariance = system.fused(state)
         error = system.truth(state) - mean
         squared_error = error * error
-        reward_error, reward_cost = task.reward.terms(squared_error, covariance, spent, self.price)
+        reward_error, reward_communication = task.reward.terms(
+            squared_error, covariance, spent, self.price
+        )
         self.tokens = tokens
         self.steps = self.steps + 1
         truncated = self.steps >= self._limit
@@ -145,9 +155,9 @@ class EpisodeBatch:
         self.state = system.sense(state, self.noise())
         self.finished = truncated.copy()
         return Outcome(
-            reward=reward_error + reward_cost,
+            reward=reward_error + reward_communication,
             reward_error=reward_error,
-            reward_cost=reward_cost,
+            reward_communication=reward_communication,
             cost=spent,
             requested=requests,
             granted=granted,
@@ -185,10 +195,11 @@ class EpisodeBatch:
         To the system's own it adds ``tokens`` (N,), ``token_cost`` (sensors, 1), ``price`` (N,) of
         a token, ``step`` (N,),
         the steps taken in the episode, ``start`` (N,) bool, ``admitted`` and
-        ``grantable`` (sensors, N) bool, ``observation`` (N, entries), and the system's ``state``,
-        which only a policy that plans with the system's own methods has a use for.
+        ``grantable`` (sensors, N) bool, ``observation`` (N, entries), and ``model``, the system's
+        state without what no policy may know, for policies that plan with the system's own moves.
         """
-        values = dict(self.task.system.read(self.state))
+        system, state = self.task.system, self.state
+        values = dict(system.read(state))
         values |= {
             "tokens": self.tokens,
             "token_cost": self.task.bucket.cost,
@@ -198,7 +209,7 @@ class EpisodeBatch:
             "admitted": self.admitted,
             "grantable": self.grantable,
             "observation": self.observe,
-            "state": self.state,
+            "model": lambda: system.visible(state),
         }
         return Signals(values, self.task.hidden_signals)
 

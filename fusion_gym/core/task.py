@@ -118,7 +118,7 @@ class Task:
         """Names of the system's signals that the information mode withholds."""
         signals = self.system.signals
         hidden = (s.name for s in signals if not covers(self.knowledge, s.knowledge))
-        return (*hidden, *(() if self.knowledge == "coordinator" else ("state",)))
+        return (*hidden, *(() if self.knowledge == "coordinator" else ("model",)))
 
 
 def make_bucket(chosen: CommonOptions, sensors: int) -> TokenBucket:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from itertools import product
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_gym import validation
-from fusion_gym.arrays import Array
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests
+from fusion_gym.policies.planning import Model, transmission_sets
 from fusion_gym.validation import ConfigurationError
 
 
@@ -25,15 +24,16 @@ class Lookahead:
     distance over ``steps`` times, with no noise and no further transmission in between. It asks
     for the set with the least of that sum plus ``price`` for each token spent.
 
-    It uses the task's model through the system itself (``deliver``, and ``sense`` with zero
-    noise), so it works for every system; exact for linear systems, plausible for others. It looks
-    at no true state: only the fused estimates of the states it makes up are read. This is neither
-    an optimum nor a bound, but a policy that knows the model.
+    It uses the task's model through the system itself (:class:`Model`), so it works for every
+    system; exact for linear systems, plausible for others. Every set of sensors is weighed, at
+    most 2^12. This is neither an optimum nor a bound, but a policy that knows the model.
 
     Raises:
-        ConfigurationError: fewer than one step, a negative price, or information other than
-            "sensors".
+        ConfigurationError: fewer than one step, a negative price, information other than
+            "sensors", or more than 12 sensors that may transmit at once.
     """
+
+    knowledge: ClassVar[Knowledge] = "coordinator"
 
     def __init__(self, task: Task, price: float = 0.01, steps: int = 4) -> None:
         self.steps = validation.integer("steps", steps, at_least=1)
@@ -44,38 +44,22 @@ class Lookahead:
                 "must be 'sensors', for it weighs the new measurements"
             )
         self._task = task
-        single = task.access == "single"
-        patterns = np.array(list(product((False, True), repeat=task.sensors)))
-        self._patterns = patterns[patterns.sum(1) <= 1] if single else patterns
+        self._sets = transmission_sets(task, "policy 'lookahead'")
 
-    def reset(self, num_envs: int, seed: int = 0) -> None:
+    def reset(self, runs: int, seed: int = 0) -> None:
         """Nothing to forget."""
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
-        state: Any = signals["state"]
-        tokens, step, admitted = signals["tokens"], signals["step"], signals["admitted"]
-        runs = len(tokens)
-        best = self._expect(state, np.ones((self._task.sensors, runs), dtype=np.bool_))
-        cost = np.full((len(self._patterns), runs), np.inf)
-        for place, pattern in enumerate(self._patterns):
-            wanted = np.broadcast_to(pattern[:, None], (self._task.sensors, runs)) & admitted
-            granted, spent, _ = self._task.bucket.grant(tokens, wanted, step)
-            distance = self._expect(state, granted) - best
+        model = Model(self._task, signals)
+        everyone = np.ones((self._task.sensors, model.runs), dtype=np.bool_)
+        best = model.fused_means(everyone, self.steps)
+        cost = np.full((len(self._sets), model.runs), np.inf)
+        for place, chosen in enumerate(self._sets[:, :, None]):
+            granted, spent, _ = model.grant(chosen & everyone)
+            distance = model.fused_means(granted, self.steps) - best
             weights = self._task.reward.state_weights
             cost[place] = (weights * (distance * distance).sum(0)).sum(0) + self.price * spent
             # What the network would deny is no choice of its own.
-            cost[place, (granted != pattern[:, None]).any(0)] = np.inf
-        return np.ascontiguousarray(self._patterns[cost.argmin(0)].T)
-
-    def _expect(self, state: Any, granted: NDArray[np.bool_]) -> Array:
-        """Fused means (steps, n, N) after these grants, then without noise or transmissions."""
-        system = self._task.system
-        silence = np.zeros_like(granted)
-        still = np.zeros((system.noise_channels, granted.shape[1]))
-        delivered = system.deliver(state, granted)
-        means = [system.fused(delivered)[0]]
-        for _ in range(self.steps - 1):
-            delivered = system.deliver(system.sense(delivered, still), silence)
-            means.append(system.fused(delivered)[0])
-        return np.stack(means)
+            cost[place, (granted != chosen).any(0)] = np.inf
+        return np.ascontiguousarray(self._sets[cost.argmin(0)].T)

@@ -286,11 +286,13 @@ class MarkovJumpCentralSystem:
         """The centre updates with the samples that were granted, all at once."""
         _sensed(state)
         taken = granted & self.sensors.sampled(state.time)
-        belief = self.estimator.update(state.belief, state.measurement, taken, state.time)
+        # What is not taken counts for nothing, and may be no number where it is not visible.
+        measurement = np.where(taken, state.measurement, state.held)
+        belief = self.estimator.update(state.belief, measurement, taken, state.time)
         mean, covariance = self.estimator.estimate(belief)
         return replace(
             state,
-            held=np.where(taken, state.measurement, state.held),
+            held=measurement,
             age=np.where(taken, 0.0, state.age),
             belief=belief,
             mean=mean,

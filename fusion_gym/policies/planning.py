@@ -1,0 +1,77 @@
+"""What a reference may plan with: the task's model from the present on, without what is hidden."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym.arrays import Array
+from fusion_gym.core.system import Signals
+from fusion_gym.core.task import Task
+from fusion_gym.core.token_bucket import Grants
+from fusion_gym.validation import ConfigurationError
+
+_MOST_SENSORS = 12
+
+
+def transmission_sets(task: Task, wanted_by: str) -> NDArray[np.bool_]:
+    """Every set of sensors that may transmit in one step, (sets, sensors) bool, silence first.
+
+    Raises:
+        ConfigurationError: more than 12 sensors, unless only one transmits at a time: there are
+            2^sensors sets, and each is weighed at every step.
+    """
+    if task.access == "single":
+        nobody = np.zeros((1, task.sensors), dtype=np.bool_)
+        return np.concatenate((nobody, np.eye(task.sensors, dtype=np.bool_)[::-1]))
+    if task.sensors > _MOST_SENSORS:
+        raise ConfigurationError(
+            f"sensors = {task.sensors} is not allowed with {wanted_by}: it must be at most "
+            f"{_MOST_SENSORS}, for all 2^{task.sensors} sets of sensors would be weighed"
+        )
+    return np.array(list(product((False, True), repeat=task.sensors)))
+
+
+class Model:
+    """The task's own moves from the signals of one step on, for N runs.
+
+    It knows what a coordinator knows: all new measurements, what the nodes and the centre hold,
+    the tokens. It has neither the true state nor what the channel is about to lose.
+
+    ``arrival`` (sensors, N) is the probability that a packet sent now arrives; None: surely.
+    """
+
+    def __init__(self, task: Task, signals: Signals) -> None:
+        self._task, self._state, self._step = task, signals["model"], signals["step"]
+        self._tokens, self._admitted = signals["tokens"], signals["admitted"]
+        told = getattr(task.system, "arrival_probability", None)
+        self.arrival: Array | None = None if told is None else told(self._state)
+
+    @property
+    def runs(self) -> int:
+        """Number N of runs."""
+        return len(self._tokens)
+
+    def grant(self, requests: NDArray[np.bool_]) -> Grants:
+        """What the network would answer to requests (sensors, N) now.
+
+        With ``access="single"`` there must be at most one a run.
+        """
+        return self._task.bucket.grant(self._tokens, requests & self._admitted, self._step)
+
+    def fused_means(self, arriving: NDArray[np.bool_], steps: int) -> Array:
+        """Fused means (steps, n, N) if these packets (sensors, N) arrive now.
+
+        After that nothing is transmitted and no noise acts: the expectation of a linear system.
+        """
+        system = self._task.system
+        silence = np.zeros_like(arriving)
+        still = np.zeros((system.noise_channels, self.runs))
+        delivered = system.deliver(self._state, arriving)
+        means = [system.fused(delivered)[0]]
+        for _ in range(steps - 1):
+            delivered = system.deliver(system.sense(delivered, still), silence)
+            means.append(system.fused(delivered)[0])
+        return np.stack(means)
