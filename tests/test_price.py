@@ -10,7 +10,7 @@ import pytest
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
@@ -43,7 +43,7 @@ def test_the_price_shifts_no_noise() -> None:
         requests = np.ones((3, 3), dtype=np.bool_)
         before, after = plain.step(requests), priced.step(requests)
         np.testing.assert_array_equal(before.squared_error, after.squared_error)
-        np.testing.assert_allclose(after.reward_cost, -priced.price * after.cost)
+        np.testing.assert_allclose(after.reward_communication, -priced.price * after.cost)
     for batch in (plain, priced):
         batch.reset(np.array([1]))
     outcomes = [batch.step(np.ones((3, 3), dtype=np.bool_)) for batch in (plain, priced)]

@@ -165,7 +165,7 @@ def step_infos(outcome: Outcome) -> Infos:
     return {
         "cost": outcome.cost,
         "cost_tokens": outcome.cost,
-        "rewards": {"error": outcome.reward_error, "cost": outcome.reward_cost},
+        "rewards": {"error": outcome.reward_error, "communication": outcome.reward_communication},
         "granted": outcome.granted.T,
         "denied": (outcome.requested & ~outcome.granted).T,
         "squared_error": outcome.squared_error.T,
@@ -179,7 +179,7 @@ def reset_infos(task: Task, num_envs: int) -> Infos:
     return {
         "cost": np.zeros(num_envs),
         "cost_tokens": np.zeros(num_envs),
-        "rewards": {"error": np.zeros(num_envs), "cost": np.zeros(num_envs)},
+        "rewards": {"error": np.zeros(num_envs), "communication": np.zeros(num_envs)},
         "granted": np.zeros((num_envs, sensors), dtype=np.bool_),
         "denied": np.zeros((num_envs, sensors), dtype=np.bool_),
         "squared_error": np.zeros((num_envs, states)),
