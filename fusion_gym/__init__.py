@@ -5,12 +5,15 @@ Importing the package registers its environments with Gymnasium.
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 from fusion_gym.envs.registration import make_task, register
+from fusion_gym.policies.registry import make_policy, policy_names, register_policy
 from fusion_gym.validation import ConfigurationError
 
 if TYPE_CHECKING:
+    from fusion_gym import evaluation, zoo
     from fusion_gym.envs.parallel import FusionParallelEnv, parallel_env
     from fusion_gym.envs.sb3 import FusionSB3VecEnv, make_sb3_vec_env
 
@@ -19,10 +22,15 @@ __all__ = [
     "ConfigurationError",
     "FusionParallelEnv",
     "FusionSB3VecEnv",
+    "evaluation",
+    "make_policy",
     "make_sb3_vec_env",
     "make_task",
     "parallel_env",
+    "policy_names",
     "register",
+    "register_policy",
+    "zoo",
 ]
 
 register()
@@ -38,4 +46,6 @@ def __getattr__(name: str) -> Any:
         from fusion_gym.envs import parallel
 
         return getattr(parallel, name)
+    if name in ("evaluation", "zoo"):
+        return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

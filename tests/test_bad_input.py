@@ -13,8 +13,7 @@ from gymnasium.error import ResetNeeded
 import fusion_gym
 from fusion_gym import ConfigurationError, make_sb3_vec_env, make_task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.make import make_policy
-from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.registry import make_policy, make_rule
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
 
@@ -143,8 +142,8 @@ def test_number_of_environments(num_envs: Any) -> None:
             lambda: make_vector().reset(options={"reset_masks": 1}),
             ("'reset_masks'", "did you mean 'reset_mask'"),
         ),
-        (lambda: run_episodes(make_task(ENV_ID), make_trigger("never"), 0, 1), ("episodes = 0",)),
-        (lambda: run_episodes(make_task(ENV_ID), make_trigger("never"), 5, -1), ("seed = -1",)),
+        (lambda: run_episodes(make_task(ENV_ID), make_rule("never"), 0, 1), ("episodes = 0",)),
+        (lambda: run_episodes(make_task(ENV_ID), make_rule("never"), 5, -1), ("seed = -1",)),
     ],
     ids=lambda value: value[0] if isinstance(value, tuple) else "call",
 )
@@ -189,7 +188,7 @@ def test_policies(spec: str, parts: tuple[str, ...]) -> None:
 
 
 def test_a_model_is_no_trigger() -> None:
-    refused(lambda: make_trigger("model:agent.zip"), ConfigurationError, ("'model",))
+    refused(lambda: make_rule("model:agent.zip"), ConfigurationError, ("'model",))
 
 
 BAD_BINARY: list[tuple[Any, tuple[str, ...]]] = [

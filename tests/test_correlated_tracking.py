@@ -22,7 +22,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import Signals
 from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.base import Policy
-from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.registry import make_rule
 from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
 
 build = partial(make_task, "fusion_gym/CorrelatedTracking-v0")
@@ -193,7 +193,7 @@ class Run:
 @cache
 def run(policy: str = "event", episodes: int = 80, horizon: int = 600, **options: Any) -> Run:
     task = build(horizon=horizon, track_actual=True, **options)
-    chosen: Policy = EVENT if policy == "event" else make_trigger(policy)
+    chosen: Policy = EVENT if policy == "event" else make_rule(policy)
     batch = EpisodeBatch(task, episodes)
     batch.seed(np.arange(episodes), list(range(9000, 9000 + episodes)))
     batch.reset()

@@ -23,8 +23,8 @@ from fusion_gym.evaluation.envelope import compare_with_envelope, lower_envelope
 from fusion_gym.evaluation.episodes import EpisodeResults, record_episode, run_episodes
 from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.evaluation.metrics import paired_difference, summarise
-from fusion_gym.policies.make import make_policy
 from fusion_gym.policies.model import tag_model
+from fusion_gym.policies.registry import make_policy
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
 OPTIONS: dict[str, Any] = {"horizon": 12, "token_cost": (3.0, 2.0, 1.0), "token_rate": 2.0}

@@ -14,7 +14,7 @@ import fusion_gym
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.fusion.federated import FederatedFusion
 from fusion_gym.fusion.feedback import FeedbackFusion, IntersectionFusion
-from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]

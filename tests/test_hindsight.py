@@ -15,8 +15,9 @@ from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.hindsight import find_schedules, run_hindsight
-from fusion_gym.policies.make import make_policy
+from fusion_gym.evaluation.hindsight import run_hindsight
+from fusion_gym.policies.hindsight import find_schedules
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 REMOTE = "fusion_gym/RemoteEstimation-v0"

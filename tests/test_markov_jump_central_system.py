@@ -20,8 +20,7 @@ from fusion_gym.envs.registered import MarkovJumpTrackingEnv
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.views import SensorView
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.registry import make_policy
-from fusion_gym.policies.registry import make_rule
+from fusion_gym.policies.registry import make_policy, make_rule
 from fusion_gym.policies.rules.random import Random
 from fusion_gym.validation import ConfigurationError
 

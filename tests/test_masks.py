@@ -15,8 +15,8 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.envs.views import CoordinatorView
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.make import make_policy
 from fusion_gym.policies.model import ModelPolicy, tag_model
+from fusion_gym.policies.registry import make_policy
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
 BIASED = "fusion_gym/BiasedOscillator-v0"

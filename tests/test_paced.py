@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import ConfigurationError, make_task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.make import make_policy
-from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.registry import make_policy, make_rule
 from fusion_gym.policies.rules.paced import Paced
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
@@ -106,7 +105,7 @@ def test_staggered_sensors_of_one_rate_are_even_together(
 def test_one_over_a_period_is_periodic_but_for_the_phase(period: int, staggered: bool) -> None:
     sensors = 3
     paced = requests(Paced(1 / period, staggered), sensors)
-    periodic = requests(make_trigger(f"periodic:period={period},staggered={staggered}"), sensors)
+    periodic = requests(make_rule(f"periodic:period={period},staggered={staggered}"), sensors)
     for one, other in zip(paced, periodic, strict=True):
         shift = (np.flatnonzero(other)[0] - np.flatnonzero(one)[0]) % period
         kept = LENGTH - period

@@ -18,8 +18,8 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies import periodic_optimum
-from fusion_gym.policies.make import make_policy
 from fusion_gym.policies.periodic_optimum import PeriodicOptimum, steady_traces
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.random import Random
 from fusion_gym.systems.markov_jump.system import MarkovJumpSystem
 from fusion_gym.validation import ConfigurationError

@@ -17,7 +17,7 @@ from fusion_gym.envs.registered import RemoteEstimationEnv, RemoteEstimationVect
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.optimal import OptimalPolicy
-from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.registry import make_rule
 from fusion_gym.solvers.joint import JointProblem, solve_joint_average
 from fusion_gym.solvers.single import SourceProblem, solve_average
 from fusion_gym.solvers.task import solve_task, source_problems
@@ -130,7 +130,7 @@ def test_sources_have_the_stated_law_whatever_is_sent() -> None:
     task = build(coefficient=0.9, noise_deviation=2.0, initial_deviation=5.0, horizon=40)
     truths = []
     for policy in ("never", "always"):
-        batch, chosen = EpisodeBatch(task, 4000), make_trigger(policy)
+        batch, chosen = EpisodeBatch(task, 4000), make_rule(policy)
         batch.seed(np.arange(4000), list(range(4000)))
         batch.reset()
         path = [task.system.truth(batch.state)[0]]
@@ -154,7 +154,7 @@ def test_knowledge_of_the_channel_is_one_step_late() -> None:
     names = list(batch.layout.names)
     assert names == ["error[0]", "age[0]", "channel[0,bad]", "channel[0,good]", "tokens"]
     assert (batch.signals()["channel_state"] == 0).all()
-    always, known, arrived = make_trigger("always"), [], []
+    always, known, arrived = make_rule("always"), [], []
     for _ in range(100):
         signals = batch.signals()
         known.append(signals["channel_state"][0])
@@ -183,7 +183,7 @@ def test_triggers_and_observations(options: dict[str, Any]) -> None:
         assert ("error[0]" in batch.layout.names) == (information == "sensors")
         for name in shown:
             spec = name + (",decay=0.1,divisor=5,initial=1" if "dynamic" in name else "")
-            policy, asked = make_trigger(spec), 0
+            policy, asked = make_rule(spec), 0
             policy.reset(8)
             for _ in range(40):
                 found = policy(batch.signals())
@@ -271,7 +271,7 @@ def test_nothing_beats_the_optimal_policy_and_rules_on_age_cost_far_more() -> No
     best = simulate(task, OptimalPolicy(task)).returns
 
     def ratio(spec: str) -> float:
-        return float(simulate(task, make_trigger(spec)).returns.mean() / best.mean())
+        return float(simulate(task, make_rule(spec)).returns.mean() / best.mean())
 
     thresholds = {k: ratio(f"innovation_threshold:threshold={k}") for k in (1.4, 1.72, 2.1)}
     assert min(thresholds.values()) == thresholds[1.72] > 0.999

@@ -16,8 +16,7 @@ from fusion_gym import ConfigurationError, make_task
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.policies.make import make_policy
-from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.registry import make_policy, make_rule
 from fusion_gym.policies.rules.stochastic_event import StochasticEvent
 from fusion_gym.systems.tobit.filters import KalmanFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -319,7 +318,7 @@ def test_the_probability_of_silence(whitened: bool) -> None:
     runs, steps, weights = 500, 130, np.array([0.3, 1.0, 2.5])
     innovation = np.array([[1.0, -0.5], [0.4, 0.9], [0.0, 0.6]])
     scale = np.array([[2.0, 0.5], [1.0, 1.5], [0.3, 0.7]])
-    policy = make_trigger(f"stochastic_event:weight=0.3/1/2.5,whitened={whitened}")
+    policy = make_rule(f"stochastic_event:weight=0.3/1/2.5,whitened={whitened}")
     policy.reset(runs, 7)
     repeat = np.ones(runs)
     signals = signals_of(innovation[..., None] * repeat, scale[..., None] * repeat)
@@ -342,7 +341,7 @@ def test_the_probability_of_silence(whitened: bool) -> None:
 def test_no_weight_never_requests_and_all_weight_always() -> None:
     innovation = np.random.default_rng(0).normal(size=(3, 2, 200))
     for weight, answer in ((0, False), (1e12, True)):
-        policy = make_trigger(f"stochastic_event:weight={weight}")
+        policy = make_rule(f"stochastic_event:weight={weight}")
         assert all((policy(signals_of(innovation)) == answer).all() for _ in range(70))
     for weight, rate in ((1e-14, 0.0), (1e14, 1.0)):
         assert evaluate(task_of(ROTATION, weight), episodes=20).rate.mean() == rate

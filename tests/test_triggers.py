@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from fusion_gym import ConfigurationError, make_task
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.policies.make import make_policy
-from fusion_gym.policies.registry import TRIGGERS, make_trigger, parse_settings, parse_value
+from fusion_gym.core.knowledge import covers
+from fusion_gym.policies.registry import make_policy, make_rule, policy_names
+from fusion_gym.policies.settings import parse_settings, parse_value
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
 SENSORS = 3
@@ -107,7 +108,7 @@ def test_dynamic_event(text: str, sigma: Any, decay: Any, divisor: Any, initial:
 
 def test_dynamic_event_error_is_zero_after_a_request() -> None:
     """η' = λ η + σ whatever was measured, where a request was made; less |ε| where none was."""
-    policy: Any = make_trigger("dynamic_event:threshold=1,decay=0.5,divisor=2,initial=4")
+    policy: Any = make_rule("dynamic_event:threshold=1,decay=0.5,divisor=2,initial=4")
     policy.reset(1)
     signals = {
         "tokens": np.ones(1),
@@ -251,7 +252,7 @@ def test_triggers_against_their_rules(spec: str, rule: Rule) -> None:
 
 
 def test_equal_scores_go_to_the_sensor_that_was_silent_longer() -> None:
-    policy = make_trigger("innovation_threshold:threshold=1,at_most=2")
+    policy = make_rule("innovation_threshold:threshold=1,at_most=2")
     signals: Any = {
         "tokens": np.ones(2),
         "token_cost": np.ones((4, 1)),
@@ -321,7 +322,7 @@ def test_random_rate_and_stream() -> None:
     batch.reset()
     signals = batch.signals()
     rates = np.array([0.05, 0.5, 0.9])
-    policy = make_trigger("random:rate=0.05/0.5/0.9")
+    policy = make_rule("random:rate=0.05/0.5/0.9")
 
     def draw(seed: int) -> NDArray[np.bool_]:
         policy.reset(500, seed)
@@ -336,7 +337,7 @@ def test_random_rate_and_stream() -> None:
         correlation = np.corrcoef(first[:, one].ravel(), first[:, other].ravel())[0, 1]
         assert abs(correlation) < 0.02
     for rate, expected in ((0, False), (1, True)):
-        assert (make_trigger(f"random:rate={rate}")(signals) == expected).all()
+        assert (make_rule(f"random:rate={rate}")(signals) == expected).all()
 
 
 @pytest.mark.parametrize(
@@ -375,7 +376,7 @@ def test_parameters_come_from_the_text_then_the_scenario_then_the_trigger() -> N
     assert policy.divisor == (1, 2, 3)
     assert policy.decay == 0.4
     assert policy.scale == 1.0
-    plain: Any = make_trigger("dynamic_event")
+    plain: Any = make_rule("dynamic_event")
     assert (plain.threshold, plain.divisor) == ((0.1, 0.2, 0.3), 5.0)
 
 
@@ -391,11 +392,11 @@ LOOKS_AT = {
 LACKS = {"centre_variance": "greedy_variance", "local_variance": "local_variance"}
 
 
-@pytest.mark.parametrize("name", sorted(TRIGGERS))
+@pytest.mark.parametrize("name", policy_names("rule"))
 def test_what_the_centre_cannot_know_is_refused(name: str) -> None:
     task = make_task(ENV_ID, information="centre")
     if name not in LOOKS_AT | LACKS:
-        assert isinstance(make_policy(name, task), TRIGGERS[name])
+        assert covers("centre", make_policy(name, task).knowledge)
         return
     with pytest.raises(ConfigurationError) as caught:
         make_policy(name, task)

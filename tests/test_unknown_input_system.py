@@ -20,7 +20,7 @@ from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.fusion.covariance_intersection import (
     covariance_intersection_many,
 )
-from fusion_gym.policies.registry import make_trigger
+from fusion_gym.policies.registry import make_rule
 from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
 from fusion_gym.policies.rules.constant import Always, Never
 from fusion_gym.policies.rules.random import Random
@@ -190,7 +190,7 @@ def test_every_generic_policy_finds_its_signals() -> None:
             "adaptive_innovation",
             "round_robin",
         ):
-            found = run_episodes(task, make_trigger(spec, task.policy_defaults), 3, 0)
+            found = run_episodes(task, make_rule(spec, task.policy_defaults), 3, 0)
             assert 0.0 < found.rate.mean() <= 1.0, spec
         batch = EpisodeBatch(task, 4)
         batch.seed(np.arange(4), [1, 2, 3, 4])

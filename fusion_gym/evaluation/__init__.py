@@ -2,10 +2,11 @@
 
 from fusion_gym.evaluation.envelope import EnvelopePoint, compare_with_envelope, lower_envelope
 from fusion_gym.evaluation.episodes import EpisodeResults, Trajectory, record_episode, run_episodes
+from fusion_gym.evaluation.hindsight import run_hindsight
 from fusion_gym.evaluation.intervals import Interval, mean_interval
 from fusion_gym.evaluation.metrics import paired_difference, robust_summary, summarise
-from fusion_gym.policies.hindsight import Schedules, find_schedules, run_hindsight
-from fusion_gym.policies.make import make_policy
+from fusion_gym.policies.hindsight import Schedules, find_schedules
+from fusion_gym.policies.registry import make_policy
 
 __all__ = [
     "EnvelopePoint",

@@ -78,18 +78,10 @@ def run_episodes(
     return EpisodeResults(**joined, squared_error=np.asarray(error))
 
 
-def begin(task: Task, episodes: int, seed: int) -> EpisodeBatch:
-    """Episodes with the seeds ``seed``, ``seed + 1``, … side by side, at their first sensing."""
-    batch = EpisodeBatch(task, episodes)
-    batch.seed(np.arange(episodes), [seed + i for i in range(episodes)])
-    batch.reset()
-    return batch
-
-
 def _run_batch(
     task: Task, policy: Policy, episodes: int, seed: int, progress: Callable[[int], Any] | None
 ) -> EpisodeResults:
-    batch = begin(task, episodes, seed)
+    batch = EpisodeBatch.seeded(task, episodes, seed)
     policy.reset(episodes, seed)
     states, sensors, horizon = len(task.system.state_names), task.sensors, task.horizon
     mse, trace, nees = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
@@ -153,7 +145,7 @@ def record_episode(task: Task, policy: Policy, seed: int) -> Trajectory:
         LookupError: the policy looks at a signal that the task withholds.
     """
     validation.integer("seed", seed, at_least=0)
-    batch = begin(task, 1, seed)
+    batch = EpisodeBatch.seeded(task, 1, seed)
     policy.reset(1, seed)
     rows: dict[str, list[NDArray[Any]]] = {field.name: [] for field in fields(Trajectory)}
     for _ in range(task.horizon):

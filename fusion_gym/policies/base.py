@@ -1,13 +1,18 @@
-"""The one interface of every policy, and what the analytic ones share."""
+"""The one interface of every policy, and what the rules share."""
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_gym import validation
+from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import Signals
 
 Requests = NDArray[np.bool_]
@@ -17,12 +22,17 @@ PerSensor = float | tuple[float, ...]
 class Policy(Protocol):
     """From signals to requests, for N runs at once.
 
-    ``reset(num_envs, seed)`` comes before the first call; ``seed`` is for policies that draw.
-    A call takes the signals of one step and returns requests (sensors, N) bool. A run begins a
-    new episode wherever ``signals["start"]`` is true.
+    ``reset(runs, seed)`` comes before the first call; ``seed`` is for policies that draw. A call
+    takes the signals of one step and returns requests (sensors, N) bool. A run begins a new
+    episode wherever ``signals["start"]`` is true.
     """
 
-    def reset(self, num_envs: int, seed: int = 0) -> None:
+    @property
+    def knowledge(self) -> Knowledge:
+        """The least class of :mod:`fusion_gym.core.knowledge` that knows all that it looks at."""
+        ...
+
+    def reset(self, runs: int, seed: int = 0) -> None:
         """Forget everything."""
         ...
 
@@ -31,32 +41,43 @@ class Policy(Protocol):
         ...
 
 
-class Trigger:
+class Rule:
     """Base of the analytic policies: a dataclass of parameters, checked before anything runs."""
 
-    def reset(self, num_envs: int, seed: int = 0) -> None:
-        """Nothing to forget, unless a trigger with a memory says otherwise."""
+    @property
+    def knowledge(self) -> Knowledge:
+        """The least class that knows all that it looks at; every rule declares its own."""
+        raise TypeError(f"{type(self).__name__} does not say who knows what it looks at")
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            if check := field.metadata.get("check"):
+                check(field.name, getattr(self, field.name))
+        self.reset(0)
+
+    def column(self, name: str, sensors: int) -> Array:
+        """The parameter of this name as (sensors, 1): one number for all sensors, or one for each.
+
+        Raises:
+            ConfigurationError: another number of entries.
+        """
+        return validation.spread(name, getattr(self, name), (sensors,))[:, None]
+
+    def reset(self, runs: int, seed: int = 0) -> None:
+        """Nothing to forget, unless a rule with variables of its own says otherwise."""
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N) for these signals."""
         raise TypeError(f"{type(self).__name__} does not say what it requests")
 
 
-def shape_of(signals: Signals) -> tuple[int, int]:
-    """Number of sensors and of runs."""
-    return len(signals["token_cost"]), len(signals["tokens"])
+def parameter(default: Any, check: Callable[..., Any], **limits: float) -> Any:
+    """A rule's parameter: its default, and ``check(name, value, **limits)`` for every value."""
+    check = functools.partial(check, **limits)
+    return dataclasses.field(default=default, metadata={"check": check})
 
 
-def column(name: str, value: Any, sensors: int) -> NDArray[np.float64]:
-    """A parameter as (sensors, 1): one number for all sensors, or one for each.
-
-    Raises:
-        ConfigurationError: another number of entries.
-    """
-    return validation.spread(name, value, (sensors,))[:, None]
-
-
-def check_not_negative(name: str, value: Any) -> None:
+def not_negative(name: str, value: Any) -> None:
     """One number >= 0 or a sequence of them.
 
     Raises:
@@ -66,19 +87,40 @@ def check_not_negative(name: str, value: Any) -> None:
     validation.not_negative(name, value, given.shape if given.ndim == 1 else ())
 
 
-def check_at_most(value: int | None) -> None:
+def each_number(name: str, value: Any, **limits: float) -> None:
+    """One number within :func:`validation.number`'s limits or a sequence of them.
+
+    Raises:
+        ConfigurationError: anything else.
+    """
+    for entry in np.atleast_1d(np.asarray(value, dtype=object)):
+        validation.number(name, entry, **limits)
+
+
+def check_at_most(name: str, value: int | None) -> None:
     """How many sensors may be requested in a step: a whole number >= 1, or None for all.
 
     Raises:
         ConfigurationError: anything else.
     """
     if value is not None:
-        validation.integer("at_most", value, at_least=1)
+        validation.integer(name, value, at_least=1)
 
 
-def strongest(
-    score: NDArray[np.float64], wanted: Requests, at_most: int | None, age: NDArray[np.float64]
-) -> Requests:
+def shape_of(signals: Signals) -> tuple[int, int]:
+    """Number of sensors and of runs."""
+    return len(signals["token_cost"]), len(signals["tokens"])
+
+
+def surprise(signals: Signals, whitened: bool = False) -> Array:
+    """|ε|² (sensors, N) of the innovations ε, ``whitened``: in predicted standard deviations."""
+    innovation = signals["innovation"]
+    if whitened:
+        innovation = innovation / signals["innovation_deviation"]
+    return linalg.dot(innovation, innovation)
+
+
+def strongest(score: Array, wanted: Requests, at_most: int | None, age: Array) -> Requests:
     """Of the ``wanted`` (sensors, N) those ``at_most`` with the highest score in each run.
 
     Equal scores go to the sensor that was silent for longer, then to the first.

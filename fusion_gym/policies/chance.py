@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from fusion_gym.arrays import Array
 
 _BLOCK = 64  # steps drawn at a time
 
@@ -19,14 +20,14 @@ class Chance:
         self._stream = stream
         self.reset(0)
 
-    def reset(self, num_envs: int, seed: int = 0) -> None:
+    def reset(self, runs: int, seed: int = 0) -> None:
         """Begin again."""
-        runs = range(num_envs)
-        self._generators = [np.random.default_rng([seed + run, self._stream]) for run in runs]
-        self._drawn: NDArray[np.float64] | None = None
+        seeds = range(seed, seed + runs)
+        self._generators = [np.random.default_rng([seed, self._stream]) for seed in seeds]
+        self._drawn: Array | None = None
         self._used = 0
 
-    def draw(self, sensors: int, runs: int) -> NDArray[np.float64]:
+    def draw(self, sensors: int, runs: int) -> Array:
         """The numbers (sensors, N) of the next step."""
         if len(self._generators) != runs:
             self.reset(runs)

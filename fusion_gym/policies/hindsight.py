@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -21,11 +20,9 @@ from numpy.typing import NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array, take_runs
-from fusion_gym.core.reward import Price
-from fusion_gym.core.system import Signals
+from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.episodes import EpisodeResults, begin, run_episodes
-from fusion_gym.policies.base import Requests
+from fusion_gym.policies.planning import transmission_sets
 from fusion_gym.validation import ConfigurationError
 
 _CANDIDATES = 8192  # kept side by side, unless the width of one episode is larger
@@ -46,35 +43,22 @@ class Schedules:
     exact: NDArray[np.bool_]
 
 
-def run_hindsight(task: Task, price: float, width: int, episodes: int, seed: int) -> EpisodeResults:
-    """Episodes of a clairvoyant that knows all their noise, with the seeds of ``run_episodes``.
+def find_schedules(task: Task, price: float, width: int, episodes: int, seed: int) -> Schedules:
+    """For each of the ``episodes`` from ``seed`` on, the best schedule that a beam search finds.
 
-    For each episode it searches the schedule with the least error_weight · weighted squared error
-    plus ``price`` · tokens, summed over the episode, under the task's token bucket and access rule.
-    ``returns`` holds minus that sum, at ``price`` and not at the task's own price of a token.
-
-    The hindsight optimum, the least cost of all schedules, bounds every policy from below. This is
-    that optimum where the search dropped no candidate (:class:`Schedules`), which takes a short
-    horizon. Otherwise it is a schedule that a clairvoyant can achieve: an upper value of the
-    optimum and no bound. Neither says what a causal policy could reach: with the noise known,
-    transmissions are chosen whose noise happens to cancel the error, so that the error may lie
-    below the one that every measurement there is leaves to the best filter.
+    It looks for the least error_weight · weighted squared error plus ``price`` · tokens, summed
+    over the episode, under the task's token bucket and access rule, and keeps ``width``
+    candidates. The optimum, the least cost of all schedules, bounds every policy from below. What
+    is found is that optimum where the search dropped no candidate (:class:`Schedules`), which
+    takes a short horizon. Otherwise it is a schedule that a clairvoyant can achieve: an upper value
+    of the optimum and no bound. Neither says what a causal policy could reach: with the noise
+    known, transmissions are chosen whose noise happens to cancel the error, so that the error may
+    lie below the one that every measurement there is leaves to the best filter.
 
     Raises:
         ConfigurationError: a negative price, fewer than one candidate or episode, a negative seed,
-            or a task whose error is not the squared one.
-    """
-    found = find_schedules(task, price, width, episodes, seed)
-    priced = dataclasses.replace(task.reward, price=Price.create(price))
-    played = dataclasses.replace(task, reward=priced)
-    return run_episodes(played, _Replay(found.granted, seed), episodes, seed)
-
-
-def find_schedules(task: Task, price: float, width: int, episodes: int, seed: int) -> Schedules:
-    """The schedules that :func:`run_hindsight` plays; the same refusals.
-
-    Raises:
-        ConfigurationError: as :func:`run_hindsight`.
+            a task whose error is not the squared one, or more than 12 sensors that may transmit
+            at once.
     """
     validation.number("price", price, at_least=0.0)
     validation.integer("width", width, at_least=1)
@@ -95,22 +79,6 @@ def find_schedules(task: Task, price: float, width: int, episodes: int, seed: in
         cost=np.concatenate([part.cost for part in parts]),
         exact=np.concatenate([part.exact for part in parts]),
     )
-
-
-class _Replay:
-    """Requests what schedules (H, sensors, E) say, for episodes from the seed ``first`` on."""
-
-    def __init__(self, schedules: NDArray[np.bool_], first: int) -> None:
-        self._schedules, self._first = schedules, first
-
-    def reset(self, num_envs: int, seed: int = 0) -> None:
-        """Back to the start of the ``num_envs`` episodes from ``seed`` on."""
-        place = seed - self._first
-        self._coming = iter(self._schedules[..., place : place + num_envs])
-
-    def __call__(self, signals: Signals) -> Requests:
-        """Requests (sensors, N)."""
-        return next(self._coming)
 
 
 @dataclass(slots=True)
@@ -143,13 +111,11 @@ class _Search:
 
     def __init__(self, task: Task, price: float, width: int, episodes: int, seed: int) -> None:
         self._task, self._price, self._width, self._episodes = task, price, width, episodes
-        patterns = np.array(list(product((False, True), repeat=task.sensors)))
-        single = task.access == "single"
-        self._patterns = patterns[patterns.sum(1) <= 1] if single else patterns
+        self._patterns = transmission_sets(task, "a hindsight schedule")
         self._weights = task.reward.error_weight * task.reward.state_weights
         self._code_bits = int(task.horizon * len(self._patterns)).bit_length()
         self._memory = (1 << min(_REMEMBERED, 62 // self._code_bits) * self._code_bits) - 1
-        batch = begin(task, episodes, seed)
+        batch = EpisodeBatch.seeded(task, episodes, seed)
         self._state: Any = batch.state
         # Noise and access of all steps: nothing that the actions do changes them.
         self._noise, self._admitted = [], []

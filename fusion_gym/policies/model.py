@@ -16,6 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from fusion_gym import validation
+from fusion_gym.core.knowledge import Knowledge, least_covering
 from fusion_gym.core.reward import Price
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import ACTION_KINDS, Task
@@ -75,6 +76,9 @@ class ModelPolicy:
         self._task = _priced(task, price_range)
         self._view = make_view(self._task, local)
         self._memory: Any = None  # of a recurrent policy
+        self.knowledge: Knowledge = self._view.knowledge
+        if isinstance(model, RecurrentPPO) and self.knowledge != "centre":
+            self.knowledge = least_covering((self.knowledge, "own_memory"))
         span = self._task.reward.price.span
         self._price: float | None = None  # as the model sees it, in place of the task's own
         if price is None and span is not None and not self._shown:
@@ -90,7 +94,7 @@ class ModelPolicy:
             chosen = Price.create(price, span)
             self._price = float(chosen.encode(chosen.draw(np.zeros(1)))[0])
 
-    def reset(self, num_envs: int, seed: int = 0) -> None:
+    def reset(self, runs: int, seed: int = 0) -> None:
         """Forget the memory of a recurrent policy; draw from the stream of ``seed``."""
         self._memory = None
         if not self.deterministic:

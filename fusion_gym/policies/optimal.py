@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
+from fusion_gym.core.knowledge import Knowledge
+from fusion_gym.core.reward import Price
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests
@@ -14,16 +18,23 @@ class OptimalPolicy:
     """Requests as the solved optimum of a task does; it looks at errors, channels and tokens.
 
     ``criterion`` as in :func:`solve_task`: the exact optimum of an episode knows the steps that
-    are left, the stationary one does not. ``optimum`` holds the cost that it attains.
+    are left, the stationary one does not. ``price`` of a token stands for the task's own.
+    ``optimum`` holds the cost that it attains.
 
     Raises:
-        ConfigurationError: a task that is not solved here.
+        ConfigurationError: a task that is not solved here, or a negative price.
     """
 
-    def __init__(self, task: Task, criterion: str = "finite") -> None:
+    def __init__(self, task: Task, criterion: str = "finite", price: float | None = None) -> None:
+        if price is not None:
+            reward = dataclasses.replace(task.reward, price=Price.create(price))
+            task = dataclasses.replace(task, reward=reward)
         self.optimum = solve_task(task, criterion)
+        # Thresholds are each source's own; a table looks at both errors.
+        separate = self.optimum.threshold is not None
+        self.knowledge: Knowledge = "own" if separate else "coordinator"
 
-    def reset(self, num_envs: int, seed: int = 0) -> None:
+    def reset(self, runs: int, seed: int = 0) -> None:
         """Nothing to forget."""
 
     def __call__(self, signals: Signals) -> Requests:

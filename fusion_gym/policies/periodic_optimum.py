@@ -2,48 +2,35 @@
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
 import itertools
-import json
 import math
-import os
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-import fusion_gym
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import ConservativeSystem, Signals, System
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests
+from fusion_gym.policies.schedule_file import (
+    Patterns,
+    Schedule,
+    load_schedule,
+    schedule_key,
+    store_schedule,
+)
 from fusion_gym.validation import ConfigurationError
-
-Patterns = NDArray[np.bool_]
 
 _MOST = 200_000  # schedules that one search may compare
 _TOGETHER = 4096  # schedules side by side
 _LONGEST = 1000  # steps after which traces that have not settled are taken as they are
 _SETTLED = 1e-9  # relative change from one cycle to the next below which they have
-_FORMAT = 2  # of the cache
 AVERAGES = ("steady", "episode")
 
 _found: dict[str, Schedule] = {}
-
-
-class Schedule(NamedTuple):
-    """Requests (period, sensors) bool, row 0 for the first step of an episode, and their trace.
-
-    ``trace`` is the plain trace of the fused error's covariance, averaged over time.
-    """
-
-    requests: Patterns
-    trace: float
 
 
 class PeriodicOptimum:
@@ -76,6 +63,8 @@ class PeriodicOptimum:
             declares the contrary by a ``covariance_cycle`` that is not None).
     """
 
+    knowledge: ClassVar[Knowledge] = "clock"
+
     def __init__(
         self,
         task: Task,
@@ -105,7 +94,7 @@ class PeriodicOptimum:
         steps = task.horizon if average == "episode" else None
         self.schedule, self.trace = optimum(task.system, packets, period, cache, steps)
 
-    def reset(self, num_envs: int, seed: int = 0) -> None:
+    def reset(self, runs: int, seed: int = 0) -> None:
         """Nothing to forget."""
 
     def __call__(self, signals: Signals) -> Requests:
@@ -130,12 +119,12 @@ def optimum(
     Raises:
         ConfigurationError: the system's covariances depend on the data.
     """
-    key = _key(system, packets, period, steps)
+    key = schedule_key(system, packets, period, steps)
     if key not in _found:
-        stored = _load(cache, key, packets, (period, system.sensor_count))
+        stored = load_schedule(cache, key, packets, (period, system.sensor_count))
         _found[key] = _search(system, packets, period, steps) if stored is None else stored
     if cache is not None:
-        _store(cache, key, _found[key])
+        store_schedule(cache, key, _found[key])
     return _found[key]
 
 
@@ -231,85 +220,3 @@ def _cycle(system: System[Any]) -> int:
             "or UnknownInput-v0 with filter='random_walk' or 'predict'"
         )
     return int(cycle)
-
-
-# --- cache ---------------------------------------------------------------------------------------
-
-
-def _key(system: System[Any], packets: int, period: int, steps: int | None) -> str:
-    """Hash of the system's type and all its numbers, and of what is asked for."""
-    digest = hashlib.sha256()
-    asked = (_FORMAT, fusion_gym.__version__, packets, period, steps)
-    digest.update(repr(asked).encode())
-    _feed(digest, system)
-    return digest.hexdigest()
-
-
-def _feed(digest: Any, value: Any) -> None:
-    if dataclasses.is_dataclass(value):
-        digest.update(type(value).__qualname__.encode())
-        for field in dataclasses.fields(value):
-            digest.update(field.name.encode())
-            _feed(digest, getattr(value, field.name))
-    elif isinstance(value, np.ndarray):
-        digest.update(f"{value.shape}{value.dtype}".encode())
-        digest.update(np.ascontiguousarray(value).tobytes())
-    elif isinstance(value, (tuple, list)):
-        digest.update(f"[{len(value)}".encode())
-        for entry in value:
-            _feed(digest, entry)
-    else:
-        digest.update(f"{type(value).__name__}={value!r};".encode())
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """The file's entries; none if it is missing, broken or of another kind."""
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))["periodic_optimum"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
-    return entries if isinstance(entries, dict) else {}
-
-
-def _load(cache: str | None, key: str, packets: int, shape: tuple[int, int]) -> Schedule | None:
-    """The file's schedule, if it has one that can be true."""
-    if cache is None:
-        return None
-    entry = _read(Path(cache)).get(key)
-    if not isinstance(entry, dict):
-        return None
-    try:
-        requests = np.array(entry["requests"])
-        trace = validation.number("trace", entry["trace"], above=0.0)
-    except (TypeError, KeyError, ValueError):
-        return None
-    if requests.shape != shape or not np.isin(requests, (0, 1)).all() or requests.sum() != packets:
-        return None
-    return Schedule(requests.astype(np.bool_), trace)
-
-
-def _store(cache: str, key: str, schedule: Schedule) -> None:
-    """Put the schedule into the file, which is replaced as a whole or not at all.
-
-    Raises:
-        ConfigurationError: the file cannot be written.
-    """
-    path = Path(cache)
-    entry = {"requests": schedule.requests.astype(int).tolist(), "trace": schedule.trace}
-    entries = _read(path)
-    if entries.get(key) == entry:
-        return
-    text = json.dumps({"periodic_optimum": entries | {key: entry}}, indent=1) + "\n"
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name)
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
-            os.replace(name, path)
-        finally:
-            Path(name).unlink(missing_ok=True)
-    except OSError as error:
-        raise ConfigurationError(
-            f"cache = {cache!r} is not allowed: it must be a file that can be written ({error})"
-        ) from None

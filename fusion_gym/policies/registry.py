@@ -1,106 +1,216 @@
-"""Policies by name: ``NAME`` or ``NAME:key=value,key=value``."""
+"""Every policy by its name: rules, references that know the model, saved agents.
+
+A policy is asked for as ``NAME`` or ``NAME:key=value,key=value``, a saved agent as ``model:PATH``
+or ``zoo:NAME`` with settings behind a comma.
+"""
 
 from __future__ import annotations
 
-import ast
-import contextlib
-import dataclasses
-from typing import Any
+import importlib
+import inspect
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple, get_args
 
-from fusion_gym import validation
-from fusion_gym.policies.base import Policy, Trigger
-from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
-from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
-from fusion_gym.policies.rules.centre_variance import CentreVariance
-from fusion_gym.policies.rules.constant import Always, Never
-from fusion_gym.policies.rules.dynamic_event import DynamicEvent
-from fusion_gym.policies.rules.information_gain import InformationGain
-from fusion_gym.policies.rules.innovation_threshold import InnovationThreshold
-from fusion_gym.policies.rules.local_variance import LocalVariance
-from fusion_gym.policies.rules.paced import Paced
-from fusion_gym.policies.rules.periodic import Periodic, RoundRobin
-from fusion_gym.policies.rules.random import Random
-from fusion_gym.policies.rules.send_on_delta import SendOnDelta
-from fusion_gym.policies.rules.stochastic_event import StochasticEvent
-from fusion_gym.policies.rules.variance_threshold import VarianceThreshold
-from fusion_gym.validation import ConfigurationError
+import numpy as np
 
-TRIGGERS: dict[str, type[Trigger]] = {
-    "adaptive_innovation": AdaptiveInnovation,
-    "adaptive_threshold": AdaptiveThreshold,
-    "always": Always,
-    "centre_variance": CentreVariance,
-    "dynamic_event": DynamicEvent,
-    "information_gain": InformationGain,
-    "innovation_threshold": InnovationThreshold,
-    "local_variance": LocalVariance,
-    "never": Never,
-    "paced": Paced,
-    "periodic": Periodic,
-    "random": Random,
-    "round_robin": RoundRobin,
-    "send_on_delta": SendOnDelta,
-    "stochastic_event": StochasticEvent,
-    "variance_threshold": VarianceThreshold,
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.knowledge import KNOWLEDGE
+from fusion_gym.core.task import Task
+from fusion_gym.policies.base import Policy
+from fusion_gym.policies.settings import parse_settings
+from fusion_gym.validation import ConfigurationError, choice, keys
+
+Kind = Literal["rule", "reference", "agent"]
+Maker = Callable[..., Policy]
+
+
+class Row(NamedTuple):
+    """A policy's kind and its maker: a callable, or where to import it, as "module:attribute".
+
+    The maker takes the policy's parameters by name, and the task if it has a parameter ``task``.
+    A rule looks at signals alone, a reference takes the task and its model, an agent was trained;
+    an agent's first parameter is the text behind its name.
+    """
+
+    kind: Kind
+    maker: Maker | str
+
+
+_HERE = "fusion_gym.policies"
+_RULES = f"{_HERE}.rules"
+_ROWS: dict[str, Row] = {
+    "adaptive_innovation": Row("rule", f"{_RULES}.adaptive_innovation:AdaptiveInnovation"),
+    "adaptive_threshold": Row("rule", f"{_RULES}.adaptive_threshold:AdaptiveThreshold"),
+    "always": Row("rule", f"{_RULES}.constant:Always"),
+    "centre_variance": Row("rule", f"{_RULES}.centre_variance:CentreVariance"),
+    "dynamic_event": Row("rule", f"{_RULES}.dynamic_event:DynamicEvent"),
+    "information_gain": Row("rule", f"{_RULES}.information_gain:InformationGain"),
+    "innovation_threshold": Row("rule", f"{_RULES}.innovation_threshold:InnovationThreshold"),
+    "local_variance": Row("rule", f"{_RULES}.local_variance:LocalVariance"),
+    "lookahead": Row("reference", f"{_HERE}.lookahead:Lookahead"),
+    "model": Row("agent", f"{_HERE}.saved:saved_agent"),
+    "never": Row("rule", f"{_RULES}.constant:Never"),
+    "optimal": Row("reference", f"{_HERE}.optimal:OptimalPolicy"),
+    "paced": Row("rule", f"{_RULES}.paced:Paced"),
+    "periodic": Row("rule", f"{_RULES}.periodic:Periodic"),
+    "periodic_optimum": Row("reference", f"{_HERE}.periodic_optimum:PeriodicOptimum"),
+    "random": Row("rule", f"{_RULES}.random:Random"),
+    "round_robin": Row("rule", f"{_RULES}.periodic:RoundRobin"),
+    "send_on_delta": Row("rule", f"{_RULES}.send_on_delta:SendOnDelta"),
+    "stochastic_event": Row("rule", f"{_RULES}.stochastic_event:StochasticEvent"),
+    "variance_threshold": Row("rule", f"{_RULES}.variance_threshold:VarianceThreshold"),
+    "whittle": Row("reference", f"{_HERE}.whittle:WhittleIndex"),
+    "zoo": Row("agent", f"{_HERE}.saved:zoo_agent"),
 }
 
 
-def parse_value(text: str) -> Any:
-    """A number, true, false, none, inf, or a list as Python writes it; all else stays text.
+def register_policy(name: str, maker: Maker, kind: Kind = "rule") -> None:
+    """Make a policy of your own known by a name, wherever policies are named.
 
-    Values for several sensors may also be written with slashes: ``0.1/0.2/0.3``.
-    """
-    plain = {"true": True, "false": False, "none": None, "null": None}
-    if text.strip().lower() in plain:
-        return plain[text.strip().lower()]
-    if "/" in text:
-        parts = tuple(parse_value(part) for part in text.split("/"))
-        if all(isinstance(part, (int, float)) for part in parts):
-            return parts
-    for read in (ast.literal_eval, float):
-        with contextlib.suppress(ValueError, SyntaxError):
-            return read(text)
-    return text
-
-
-def parse_settings(kind: str, entries: list[str]) -> dict[str, Any]:
-    """``["key=value", …]`` as a dictionary, with :func:`parse_value`.
+    ``maker(**parameters)`` returns the policy, for example a class derived from
+    :class:`fusion_gym.policies.base.Rule`; if it has a parameter ``task`` it is given the task.
+    Its other parameters are those that ``name:key=value`` may set.
 
     Raises:
-        ConfigurationError: an entry without ``=``, or a key given twice.
+        ConfigurationError: a name that exists or cannot be written, or no callable.
     """
-    result: dict[str, Any] = {}
-    for entry in entries:
-        key, equals, value = entry.partition("=")
-        key = key.strip()
-        if not equals or not key:
-            raise ConfigurationError(f"{kind} {entry!r} is not allowed: write key=value")
-        if key in result:
-            raise ConfigurationError(f"{kind} {key!r} is given twice")
-        result[key] = parse_value(value)
-    return result
-
-
-def make_trigger(spec: str, defaults: dict[str, dict[str, Any]] | None = None) -> Policy:
-    """The analytic policy that ``NAME`` or ``NAME:key=value,key=value`` stands for.
-
-    ``defaults`` are a scenario's own parameters by policy name
-    (:attr:`fusion_gym.envs.Task.policy_defaults`); what the text says goes before them.
-
-    Raises:
-        ConfigurationError: an unknown policy or parameter, or a value that is not allowed.
-    """
-    name, _, text = spec.partition(":")
-    if name == "model":
+    if not isinstance(name, str) or not name.isidentifier():
         raise ConfigurationError(
-            f"policy {spec!r} is no analytic trigger: use fusion_gym.policies.make.make_policy"
+            f"name = {name!r} is not allowed: it must be a word of letters, digits and '_'"
         )
-    validation.keys("policy", [name], [*TRIGGERS, "model"])
-    kind = TRIGGERS[name]
-    parameters = parse_settings(f"parameter of policy {name!r}", text.split(",") if text else [])
-    known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
-    validation.keys(f"parameter of policy {name!r}", parameters, known)
+    if name in _ROWS:
+        raise ConfigurationError(f"name = {name!r} is not allowed: there is a policy of that name")
+    choice("kind", kind, get_args(Kind))
+    _parameters(name, maker)
+    _ROWS[name] = Row(kind, maker)
+
+
+def policy_names(kind: Kind | None = None) -> list[str]:
+    """Names of all policies, or of those of a kind: "rule", "reference" or "agent".
+
+    Raises:
+        ConfigurationError: an unknown kind.
+    """
+    if kind is not None:
+        choice("kind", kind, get_args(Kind))
+    return sorted(name for name, row in _ROWS.items() if kind in (None, row.kind))
+
+
+def policy_parameters(name: str) -> dict[str, Any]:
+    """The parameters that ``name:key=value`` may set, with their defaults.
+
+    Raises:
+        ConfigurationError: an unknown policy.
+    """
+    return {key: found.default for key, found in _parameters(name, _maker(name)).items()}
+
+
+def make_policy(spec: str, task: Task) -> Policy:
+    """The policy that ``NAME`` or ``NAME:key=value,…`` names, tried out on one run of the task.
+
+    Parameters that the text does not set are the task's own (``task.policy_defaults``) or the
+    maker's.
+
+    Raises:
+        ConfigurationError: an unknown policy or parameter, a value that is not allowed, a model
+            that cannot be read or was trained for another observation layout, or a policy that
+            looks at signals which the task withholds.
+    """
+    policy = _make(spec, task.policy_defaults, task)
+    if _ROWS[spec.partition(":")[0]].kind != "agent":  # loading it has checked all that it sees
+        _try_out(spec, policy, task)
+    return policy
+
+
+def make_rule(spec: str, defaults: dict[str, dict[str, Any]] | None = None) -> Policy:
+    """The rule that ``NAME`` or ``NAME:key=value,…`` names, for no task in particular.
+
+    ``defaults`` are a scenario's own parameters by policy name.
+
+    Raises:
+        ConfigurationError: an unknown rule or parameter, or a value that is not allowed.
+    """
+    name = spec.partition(":")[0]
+    if name in _ROWS and _ROWS[name].kind != "rule":
+        raise ConfigurationError(f"policy {spec!r} is no rule: make_policy makes it for a task")
+    return _make(spec, defaults or {}, None)
+
+
+def _make(spec: str, defaults: dict[str, dict[str, Any]], task: Task | None) -> Policy:
+    name, _, text = spec.partition(":")
+    maker = _maker(name)
+    known = _parameters(name, maker)
+    given: dict[str, Any] = {}
+    if _ROWS[name].kind == "agent":
+        key, (value, *entries) = next(iter(known)), text.split(",")
+        given[key] = value.removeprefix(f"{key}=")
+    else:
+        entries = text.split(",") if text else []
+    settings = parse_settings(f"parameter of policy {name!r}", entries)
+    keys(f"parameter of policy {name!r}", settings, known.keys() - given.keys())
+    given |= defaults.get(name, {}) | settings
+    missing = [key for key, found in known.items() if found.default is found.empty]
+    for key in missing:
+        if key not in given:
+            raise ConfigurationError(f"policy {spec!r} needs a parameter {key!r}: write {key}=…")
+    if "task" in inspect.signature(maker).parameters:
+        given["task"] = task
     try:
-        return kind(**((defaults or {}).get(name, {}) | parameters))
+        policy = maker(**given)
     except ConfigurationError as error:
         raise ConfigurationError(f"policy {spec!r}: {error}") from None
+    declared = getattr(policy, "knowledge", None)
+    if declared not in KNOWLEDGE:
+        raise ConfigurationError(
+            f"policy {spec!r} has knowledge = {declared!r}: it must declare who knows what it "
+            f"looks at, one of {', '.join(map(repr, KNOWLEDGE))}"
+        )
+    return policy
+
+
+def _maker(name: str) -> Maker:
+    keys("policy", [name], _ROWS)
+    maker = _ROWS[name].maker
+    if isinstance(maker, str):
+        module, _, attribute = maker.partition(":")
+        found: Maker = getattr(importlib.import_module(module), attribute)
+        return found
+    return maker
+
+
+def _parameters(name: str, maker: Maker) -> dict[str, inspect.Parameter]:
+    """All but the task, in the maker's order.
+
+    Raises:
+        ConfigurationError: no callable whose parameters have names.
+    """
+    try:
+        found = inspect.signature(maker).parameters
+    except (TypeError, ValueError):
+        found = None
+    if found is None or any(
+        p.kind not in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) for p in found.values()
+    ):
+        raise ConfigurationError(
+            f"maker = {maker!r} of policy {name!r} is not allowed: it must be a callable with "
+            "named parameters that returns a policy"
+        )
+    return {key: parameter for key, parameter in found.items() if key != "task"}
+
+
+def _try_out(spec: str, policy: Policy, task: Task) -> None:
+    """One call on one run, so that a misfit is told before anything long begins."""
+    batch = EpisodeBatch(task, 1)
+    batch.reset()
+    policy.reset(1)
+    try:
+        requests = policy(batch.signals())
+    except (LookupError, ValueError) as error:
+        raise ConfigurationError(f"policy {spec!r}: {error.args[0]}") from None
+    policy.reset(1)
+    shape, kind = np.shape(requests), np.asarray(requests).dtype
+    if shape != (task.sensors, 1) or kind != np.bool_:
+        raise ConfigurationError(
+            f"policy {spec!r} requests with an array of {kind} {shape}: it must be bool "
+            f"({task.sensors}, 1), sensors and runs"
+        )

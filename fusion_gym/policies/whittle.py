@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests, check_at_most, strongest
@@ -36,15 +37,17 @@ class WhittleIndex:
     """
 
     def __init__(self, task: Task, price: float | None = None, at_most: int | None = None) -> None:
-        check_at_most(at_most)
+        check_at_most("at_most", at_most)
         problems = source_problems(task)
         self._at_most = 1 if at_most is None and task.access == "single" else at_most
         fixed = task.reward.price.fixed if price is None else price
         self._price = validation.number("price", fixed, at_least=0.0)
         self._cost = task.bucket.cost
         self._tables = [index_table(number, problem) for number, problem in enumerate(problems)]
+        # Without a limit each source decides by itself, whatever access does with the requests.
+        self.knowledge: Knowledge = "own" if self._at_most is None else "coordinator"
 
-    def reset(self, num_envs: int, seed: int = 0) -> None:
+    def reset(self, runs: int, seed: int = 0) -> None:
         """Nothing to forget."""
 
     def __call__(self, signals: Signals) -> Requests:

@@ -5,22 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import Signals
-from fusion_gym.policies.base import (
-    PerSensor,
-    Requests,
-    Trigger,
-    check_not_negative,
-    column,
-    shape_of,
-)
+from fusion_gym.policies.base import PerSensor, Requests, Rule, not_negative, parameter, surprise
 
 
 @dataclass
-class AdaptiveInnovation(Trigger):
+class AdaptiveInnovation(Rule):
     """Request when |ε|² >= a exp(-(b + c |ε at the last request|)), with ε the innovation.
 
     ``threshold`` a is in squared units of the measurement, ``offset`` b without unit,
@@ -29,36 +22,36 @@ class AdaptiveInnovation(Trigger):
     ``sensitivity=0`` is a fixed threshold, ``threshold=0`` requests always.
 
     The rule decides at the sensor, so a request moves the threshold whether or not the network
-    grants it; in the paper every request is granted. The printed exponent -b + c |ε| contradicts
-    the text, which wants a decreasing function.
+    grants it: what it remembers may be a measurement that was never delivered. In the paper every
+    request is granted. The printed exponent -b + c |ε| contradicts the text, which wants a
+    decreasing function.
 
     Source: adaptive_innovation, equations (9)-(11), defaults of Section 6.
     """
 
-    threshold: PerSensor = 0.6
-    offset: PerSensor = 0.2
-    sensitivity: PerSensor = 0.9
+    threshold: PerSensor = parameter(0.6, not_negative)
+    offset: PerSensor = parameter(0.2, not_negative)
+    sensitivity: PerSensor = parameter(0.9, not_negative)
 
-    def __post_init__(self) -> None:
-        for name in ("threshold", "offset", "sensitivity"):
-            check_not_negative(name, getattr(self, name))
-        self.reset(0)
+    @property
+    def knowledge(self) -> Knowledge:
+        """A sensor's own measurement, and its size at the last request unless that is ignored."""
+        return "own_memory" if np.any(np.asarray(self.sensitivity) > 0.0) else "own"
 
-    def reset(self, num_envs: int, seed: int = 0) -> None:
+    def reset(self, runs: int, seed: int = 0) -> None:
         """Forget the last requested innovations."""
-        self._last: NDArray[np.float64] | None = None
+        self._last: Array | None = None
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
-        sensors, runs = shape_of(signals)
-        innovation = signals["innovation"]
-        squared = linalg.dot(innovation, innovation)
+        squared = surprise(signals)
+        sensors = len(squared)
         if self._last is None:
-            self._last = np.zeros((sensors, runs))
+            self._last = np.zeros(squared.shape)
         last = np.where(signals["start"], 0.0, self._last)
-        exponent = column("sensitivity", self.sensitivity, sensors) * last
-        exponent += column("offset", self.offset, sensors)
-        threshold = column("threshold", self.threshold, sensors) * np.exp(-exponent)
+        exponent = self.column("sensitivity", sensors) * last
+        exponent += self.column("offset", sensors)
+        threshold = self.column("threshold", sensors) * np.exp(-exponent)
         request: Requests = squared >= threshold
         self._last = np.where(request, np.sqrt(squared), last)
         return request

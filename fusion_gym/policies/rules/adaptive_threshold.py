@@ -5,23 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import Signals
-from fusion_gym.policies.base import (
-    PerSensor,
-    Requests,
-    Trigger,
-    check_not_negative,
-    column,
-    shape_of,
-)
+from fusion_gym.policies.base import PerSensor, Requests, Rule, not_negative, parameter, shape_of
 from fusion_gym.validation import ConfigurationError
 
 
 @dataclass
-class AdaptiveThreshold(Trigger):
+class AdaptiveThreshold(Rule):
     """Request when |σ|² > ρ, with σ the measurement minus the last delivered one.
 
     The threshold follows ρ' = ρ̄ + |σ|²/(λ + |σ|²) (ρ - ρ̄) in every step, with σ before the
@@ -42,22 +36,27 @@ class AdaptiveThreshold(Trigger):
     rho_bar: PerSensor = 0.05
     rho_initial: PerSensor = 0.01
     adaptation: PerSensor = 0.01
-    scale: float = 1.0
+    scale: float = parameter(1.0, validation.number, at_least=0.0)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_thresholds(self.rho_bar, self.rho_initial, self.adaptation)
-        validation.number("scale", self.scale, at_least=0.0)
-        self.reset(0)
 
-    def reset(self, num_envs: int, seed: int = 0) -> None:
+    @property
+    def knowledge(self) -> Knowledge:
+        """A sensor's own measurement, and what it did not send unless the threshold is constant."""
+        initial, limit = np.asarray(self.rho_initial), np.asarray(self.rho_bar)
+        return "own" if self.scale == 0.0 or bool(np.all(initial == limit)) else "own_memory"
+
+    def reset(self, runs: int, seed: int = 0) -> None:
         """Forget the thresholds."""
-        self._rho: NDArray[np.float64] | None = None
+        self._rho: Array | None = None
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
         sensors, runs = shape_of(signals)
-        limit = self.scale * column("rho_bar", self.rho_bar, sensors)
-        initial = self.scale * column("rho_initial", self.rho_initial, sensors)
+        limit = self.scale * self.column("rho_bar", sensors)
+        initial = self.scale * self.column("rho_initial", sensors)
         start = signals["start"]
         if self._rho is None:
             self._rho, start = np.empty((sensors, runs)), np.ones(runs, dtype=np.bool_)
@@ -65,7 +64,7 @@ class AdaptiveThreshold(Trigger):
         difference = signals["measurement"] - signals["held"]
         squared = linalg.dot(difference, difference)
         request: Requests = squared > rho
-        share = squared / (column("adaptation", self.adaptation, sensors) + squared)
+        share = squared / (self.column("adaptation", sensors) + squared)
         self._rho = limit + share * (rho - limit)
         return request
 
@@ -77,7 +76,7 @@ def check_thresholds(rho_bar: PerSensor, rho_initial: PerSensor, adaptation: Per
         ConfigurationError: anything else.
     """
     for name, value in (("rho_bar", rho_bar), ("rho_initial", rho_initial)):
-        check_not_negative(name, value)
+        not_negative(name, value)
     if np.any(np.asarray(rho_bar) > 1.0):
         raise ConfigurationError(f"rho_bar = {rho_bar!r} is not allowed: it must be >= 0 and <= 1")
     try:

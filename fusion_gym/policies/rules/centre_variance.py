@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from fusion_gym import validation
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import Signals
-from fusion_gym.policies.base import Requests, Trigger, check_at_most, strongest
+from fusion_gym.policies.base import Requests, Rule, check_at_most, parameter, strongest
 
 
 @dataclass
-class CentreVariance(Trigger):
+class CentreVariance(Rule):
     """Request the fewest sensors, chosen greedily, that bring the centre's trace below a threshold.
 
     The trace is that of the fused covariance after the step, in squared units of the state. If it
@@ -25,12 +27,9 @@ class CentreVariance(Trigger):
     variance-based triggering", IEEE Trans. Automatic Control 59, 2014; the choice is ours.
     """
 
-    threshold: float = 1.6
-    at_most: int | None = None
-
-    def __post_init__(self) -> None:
-        validation.number("threshold", self.threshold, at_least=0.0)
-        check_at_most(self.at_most)
+    threshold: float = parameter(1.6, validation.number, at_least=0.0)
+    at_most: int | None = parameter(None, check_at_most)
+    knowledge: ClassVar[Knowledge] = "centre"
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""

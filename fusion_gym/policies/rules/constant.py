@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import Signals
-from fusion_gym.policies.base import Requests, Trigger, shape_of
+from fusion_gym.policies.base import Requests, Rule, shape_of
 
 
 @dataclass
-class Always(Trigger):
+class Always(Rule):
     """Every sensor requests at every step."""
+
+    knowledge: ClassVar[Knowledge] = "clock"
 
     def __call__(self, signals: Signals) -> Requests:
         """All true, (sensors, N)."""
@@ -20,8 +24,10 @@ class Always(Trigger):
 
 
 @dataclass
-class Never(Trigger):
+class Never(Rule):
     """No sensor ever requests."""
+
+    knowledge: ClassVar[Knowledge] = "clock"
 
     def __call__(self, signals: Signals) -> Requests:
         """All false, (sensors, N)."""

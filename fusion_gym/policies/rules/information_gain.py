@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from fusion_gym import validation
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import Signals
-from fusion_gym.policies.base import Requests, Trigger, check_at_most, strongest
+from fusion_gym.policies.base import Requests, Rule, check_at_most, parameter, strongest
 
 
 @dataclass
-class InformationGain(Trigger):
+class InformationGain(Rule):
     """Request where the relative reduction of the fused trace per token is >= ``threshold``.
 
     The reduction is that of a delivery from this sensor alone, relative to the trace without any
@@ -18,12 +20,9 @@ class InformationGain(Trigger):
     most per token are taken (None: all that reach the threshold).
     """
 
-    threshold: float = 0.05
-    at_most: int | None = 1
-
-    def __post_init__(self) -> None:
-        validation.number("threshold", self.threshold, at_least=0.0)
-        check_at_most(self.at_most)
+    threshold: float = parameter(0.05, validation.number, at_least=0.0)
+    at_most: int | None = parameter(1, check_at_most)
+    knowledge: ClassVar[Knowledge] = "centre"
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""

@@ -6,22 +6,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fusion_gym import linalg, validation
+from fusion_gym import validation
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import Signals
 from fusion_gym.policies.base import (
     PerSensor,
     Requests,
-    Trigger,
+    Rule,
     check_at_most,
-    check_not_negative,
-    column,
-    shape_of,
+    not_negative,
+    parameter,
     strongest,
+    surprise,
 )
 
 
 @dataclass
-class InnovationThreshold(Trigger):
+class InnovationThreshold(Rule):
     """Request when the innovation's norm is at least ``threshold``.
 
     The norm is Euclidean in the unit of the measurement, or, with ``whitened``, of the innovation
@@ -33,20 +34,17 @@ class InnovationThreshold(Trigger):
     Automatic Control 58, 2013 (there with the maximum norm of the whitened innovation).
     """
 
-    threshold: PerSensor = 1.0
-    whitened: bool = False
-    at_most: int | None = None
+    threshold: PerSensor = parameter(1.0, not_negative)
+    whitened: bool = parameter(False, validation.boolean)
+    at_most: int | None = parameter(None, check_at_most)
 
-    def __post_init__(self) -> None:
-        check_not_negative("threshold", self.threshold)
-        validation.boolean("whitened", self.whitened)
-        check_at_most(self.at_most)
+    @property
+    def knowledge(self) -> Knowledge:
+        """A sensor's own measurement; with ``at_most`` all of them, for the largest is sent."""
+        return "own" if self.at_most is None else "coordinator"
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
-        innovation = signals["innovation"]
-        if self.whitened:
-            innovation = innovation / signals["innovation_deviation"]
-        norm = np.sqrt(linalg.dot(innovation, innovation))
-        wanted = norm >= column("threshold", self.threshold, shape_of(signals)[0])
+        norm = np.sqrt(surprise(signals, self.whitened))
+        wanted = norm >= self.column("threshold", len(norm))
         return strongest(norm, wanted, self.at_most, signals["age"])

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from fusion_gym import validation
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import Signals
-from fusion_gym.policies.base import PerSensor, Requests, Trigger, column
+from fusion_gym.policies.base import PerSensor, Requests, Rule, each_number, parameter
 
 
 @dataclass
-class LocalVariance(Trigger):
+class LocalVariance(Rule):
     """Request where the trace of the node's own error covariance is at least ``reference`` + ``m``.
 
     Both are in squared units of the state; ``m`` may have any sign. ``reference`` is the trace
@@ -21,18 +23,12 @@ class LocalVariance(Trigger):
     Source: markov_jump, equation (33).
     """
 
-    m: PerSensor = 0.9
-    reference: float = 0.0
-
-    def __post_init__(self) -> None:
-        if isinstance(self.m, (tuple, list)):
-            validation.array("m", self.m, (None,))
-        else:
-            validation.number("m", self.m)
-        validation.number("reference", self.reference, at_least=0.0)
+    m: PerSensor = parameter(0.9, each_number)
+    reference: float = parameter(0.0, validation.number, at_least=0.0)
+    knowledge: ClassVar[Knowledge] = "centre"
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
         variance = signals["local_variance"]
-        result: Requests = variance >= self.reference + column("m", self.m, len(variance))
+        result: Requests = variance >= self.reference + self.column("m", len(variance))
         return result

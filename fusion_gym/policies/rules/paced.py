@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from fusion_gym import validation
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import Signals
-from fusion_gym.policies.base import PerSensor, Requests, Trigger, column, shape_of
+from fusion_gym.policies.base import PerSensor, Requests, Rule, each_number, parameter, shape_of
 
 # A pace that comes up at a step may be computed a rounding below it: 49 · (1/49) < 1.
 _ROUNDING = 1e-9
 
 
 @dataclass
-class Paced(Trigger):
+class Paced(Rule):
     """Each sensor requests at ``rate``, its requests spread as evenly as possible.
 
     A sensor requests at step t, counted from 0, where ⌊(t + 1) r + φ⌋ > ⌊t r + φ⌋ with its rate r
@@ -27,18 +29,14 @@ class Paced(Trigger):
     rate has to beat.
     """
 
-    rate: PerSensor = 0.2
-    staggered: bool = True
-
-    def __post_init__(self) -> None:
-        for rate in np.atleast_1d(np.asarray(self.rate, dtype=object)):
-            validation.number("rate", rate, at_least=0.0, at_most=1.0)
-        validation.boolean("staggered", self.staggered)
+    rate: PerSensor = parameter(0.2, each_number, at_least=0.0, at_most=1.0)
+    staggered: bool = parameter(True, validation.boolean)
+    knowledge: ClassVar[Knowledge] = "clock"
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
         sensors, _ = shape_of(signals)
-        rate, step = column("rate", self.rate, sensors), signals["step"]
+        rate, step = self.column("rate", sensors), signals["step"]
         phase = np.full((sensors, 1), _ROUNDING)
         if self.staggered:
             phase += np.arange(sensors)[:, None] / sensors

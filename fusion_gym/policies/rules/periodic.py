@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from fusion_gym import validation
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import Signals
-from fusion_gym.policies.base import Requests, Trigger, shape_of
+from fusion_gym.policies.base import Requests, Rule, parameter, shape_of
 
 
 @dataclass
-class Periodic(Trigger):
+class Periodic(Rule):
     """Every sensor requests once in ``period`` steps.
 
     ``staggered`` spreads the sensors over the period; otherwise all request together.
     """
 
-    period: int = 4
-    staggered: bool = True
-
-    def __post_init__(self) -> None:
-        validation.integer("period", self.period, at_least=1)
-        validation.boolean("staggered", self.staggered)
+    period: int = parameter(4, validation.integer, at_least=1)
+    staggered: bool = parameter(True, validation.boolean)
+    knowledge: ClassVar[Knowledge] = "clock"
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
@@ -33,13 +32,11 @@ class Periodic(Trigger):
 
 
 @dataclass
-class RoundRobin(Trigger):
+class RoundRobin(Rule):
     """One sensor after another, the next one every ``period`` steps."""
 
-    period: int = 1
-
-    def __post_init__(self) -> None:
-        validation.integer("period", self.period, at_least=1)
+    period: int = parameter(1, validation.integer, at_least=1)
+    knowledge: ClassVar[Knowledge] = "clock"
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""

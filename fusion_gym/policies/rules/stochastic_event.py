@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
-from fusion_gym import linalg, validation
+from fusion_gym import validation
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import Signals
-from fusion_gym.policies.base import (
-    PerSensor,
-    Requests,
-    Trigger,
-    check_not_negative,
-    column,
-    shape_of,
-)
+from fusion_gym.policies.base import PerSensor, Requests, Rule, not_negative, parameter, surprise
 from fusion_gym.policies.chance import Chance
 
 _STREAM = 0x73746F6368  # keeps the draws apart from the noise of the same seed
 
 
 @dataclass
-class StochasticEvent(Trigger):
+class StochasticEvent(Rule):
     """Each sensor stays silent with probability exp(-weight · |z|² / 2), z its innovation.
 
     ``weight`` >= 0 is the paper's Z, here a multiple of the identity for each sensor, in the
@@ -38,24 +33,20 @@ class StochasticEvent(Trigger):
     60(10), 2015, the closed-loop schedule.
     """
 
-    weight: PerSensor = 1.0
-    whitened: bool = False
+    weight: PerSensor = parameter(1.0, not_negative)
+    whitened: bool = parameter(False, validation.boolean)
+    knowledge: ClassVar[Knowledge] = "own"
 
     def __post_init__(self) -> None:
-        check_not_negative("weight", self.weight)
-        validation.boolean("whitened", self.whitened)
         self._chance = Chance(_STREAM)
+        super().__post_init__()
 
-    def reset(self, num_envs: int, seed: int = 0) -> None:
+    def reset(self, runs: int, seed: int = 0) -> None:
         """Begin again: run i draws from a stream of its own, that of ``seed + i``."""
-        self._chance.reset(num_envs, seed)
+        self._chance.reset(runs, seed)
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
-        sensors, runs = shape_of(signals)
-        innovation = signals["innovation"]
-        if self.whitened:
-            innovation = innovation / signals["innovation_deviation"]
-        weight = column("weight", self.weight, sensors)
-        silence = np.exp(-0.5 * weight * linalg.dot(innovation, innovation))
-        return self._chance.draw(sensors, runs) >= silence
+        squared = surprise(signals, self.whitened)
+        silence = np.exp(-0.5 * self.column("weight", len(squared)) * squared)
+        return self._chance.draw(*squared.shape) >= silence

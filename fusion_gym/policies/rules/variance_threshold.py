@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
 
 from fusion_gym import validation
+from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import Signals
-from fusion_gym.policies.base import Requests, Trigger, check_at_most, shape_of, strongest
+from fusion_gym.policies.base import Requests, Rule, check_at_most, parameter, strongest
 
 
 @dataclass
-class VarianceThreshold(Trigger):
+class VarianceThreshold(Rule):
     """Request when the fused covariance without any transmission would have a trace >= threshold.
 
     ``threshold`` is in squared units of the state. The ``at_most`` sensors that would reduce the
@@ -20,16 +24,12 @@ class VarianceThreshold(Trigger):
     triggering", IEEE Trans. Automatic Control 59, 2014.
     """
 
-    threshold: float = 0.1
-    at_most: int | None = 1
-
-    def __post_init__(self) -> None:
-        validation.number("threshold", self.threshold, at_least=0.0)
-        check_at_most(self.at_most)
+    threshold: float = parameter(0.1, validation.number, at_least=0.0)
+    at_most: int | None = parameter(1, check_at_most)
+    knowledge: ClassVar[Knowledge] = "centre"
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
-        due = (signals["silent_variance"] >= self.threshold)[None].repeat(
-            shape_of(signals)[0], axis=0
-        )
-        return strongest(signals["variance_reduction"], due, self.at_most, signals["age"])
+        reduction = signals["variance_reduction"]
+        due = np.broadcast_to(signals["silent_variance"] >= self.threshold, reduction.shape)
+        return strongest(reduction, due, self.at_most, signals["age"])

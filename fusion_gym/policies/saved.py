@@ -1,0 +1,31 @@
+"""Saved agents as policies, by their file or by their name in the model zoo."""
+
+from __future__ import annotations
+
+from fusion_gym import zoo
+from fusion_gym.core.task import Task
+from fusion_gym.policies.base import Policy
+
+
+def saved_agent(
+    task: Task, path: str, deterministic: bool = True, price: float | None = None
+) -> Policy:
+    """The agent saved at ``path``; torch is imported only here.
+
+    Raises:
+        ConfigurationError: as :func:`fusion_gym.policies.model.load_model_policy`.
+    """
+    from fusion_gym.policies.model import load_model_policy
+
+    return load_model_policy(path, task, deterministic, price)
+
+
+def zoo_agent(
+    task: Task, name: str, deterministic: bool = True, price: float | None = None
+) -> Policy:
+    """The agent of this name in :mod:`fusion_gym.zoo`.
+
+    Raises:
+        ConfigurationError: no agent of that name, or one that does not fit the task.
+    """
+    return saved_agent(task, zoo.model_path(name), deterministic, price)

@@ -1,0 +1,46 @@
+"""Settings as a command line writes them: ``key=value,key=value``."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+from collections.abc import Iterable
+from typing import Any
+
+from fusion_gym.validation import ConfigurationError
+
+
+def parse_value(text: str) -> Any:
+    """A number, true, false, none, inf, or a list as Python writes it; all else stays text.
+
+    Values for several sensors may also be written with slashes: ``0.1/0.2/0.3``.
+    """
+    plain = {"true": True, "false": False, "none": None, "null": None}
+    if text.strip().lower() in plain:
+        return plain[text.strip().lower()]
+    if "/" in text:
+        parts = tuple(parse_value(part) for part in text.split("/"))
+        if all(isinstance(part, (int, float)) for part in parts):
+            return parts
+    for read in (ast.literal_eval, float):
+        with contextlib.suppress(ValueError, SyntaxError):
+            return read(text)
+    return text
+
+
+def parse_settings(kind: str, entries: Iterable[str]) -> dict[str, Any]:
+    """``["key=value", …]`` as a dictionary, with :func:`parse_value`.
+
+    Raises:
+        ConfigurationError: an entry without ``=``, or a key given twice.
+    """
+    result: dict[str, Any] = {}
+    for entry in entries:
+        key, equals, value = entry.partition("=")
+        key = key.strip()
+        if not equals or not key:
+            raise ConfigurationError(f"{kind} {entry!r} is not allowed: write key=value")
+        if key in result:
+            raise ConfigurationError(f"{kind} {key!r} is given twice")
+        result[key] = parse_value(value)
+    return result
