@@ -14,16 +14,27 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.optimize import LinearConstraint, minimize, minimize_scalar
 
-from fusion_gym.fusion.covariance_intersection import (
+from fusion_gym.fusion.intersection import (
     covariance_intersection,
-    covariance_intersection_many,
     inverse_covariance_intersection,
 )
-from fusion_gym.fusion.information import InformationFusion
+from fusion_gym.fusion.rules import Fused, InformationFusion
+from fusion_gym.fusion.several import covariance_intersection_many
 
 Array = NDArray[np.float64]
 RULES = {"ci": covariance_intersection, "ici": inverse_covariance_intersection}
 KINDS = ("alike", "crossed", "dominated", "scaled")
+
+
+def parts(fused: Fused) -> tuple[Array, Array, Array, Array]:
+    """Mean, covariance, weights and gains."""
+    assert fused.weights is not None
+    return fused.mean, fused.covariance, fused.weights, fused.gains
+
+
+def many(means: Array, covariances: Array, active: Any = None) -> tuple[Array, Array, Array]:
+    """Mean, covariance and weights of covariance intersection of several at once."""
+    return parts(covariance_intersection_many(means, covariances, active))[:3]
 
 
 def estimates(kind: str, count: int, size: int, runs: int, seed: int = 0) -> tuple[Array, Array]:
@@ -71,7 +82,7 @@ def test_the_trace_is_optimal_and_the_formulas_hold(rule: str, size: int, kind: 
     fused = RULES[rule](mean[0], covariance[0], mean[1], covariance[1])
     for run in range(runs):
         a, b, p = covariance[0, :, :, run], covariance[1, :, :, run], fused.covariance[..., run]
-        weight = fused.weight[run]
+        weight = fused.weights[0, run]
         best = smallest_trace(rule, a, b)
         assert best * (1 - 1e-8) <= np.trace(p) <= best * (1 + 1e-6)
         unit = np.sqrt(np.diag(a))
@@ -84,7 +95,7 @@ def test_the_trace_is_optimal_and_the_formulas_hold(rule: str, size: int, kind: 
         else:
             inside = (1 - weight) * inside
         gain = (p @ inside) / unit[:, None] * unit
-        got = fused.gain_second[..., run] / unit[:, None] * unit
+        got = fused.gains[1][..., run] / unit[:, None] * unit
         np.testing.assert_allclose(got, gain, atol=1e-6 * max(1.0, np.abs(gain).max()))
 
 
@@ -95,11 +106,10 @@ def test_gains_add_up_to_one_and_make_the_mean(rule: str, kind: str) -> None:
     mean *= np.sqrt(covariance[0].diagonal().T)  # in the units of each state
     fused = RULES[rule](mean[0], covariance[0], mean[1], covariance[1])
     unit = np.sqrt(covariance[0].diagonal().T)
-    total = (fused.gain_first + fused.gain_second) / unit[:, None] * unit
+    total = (fused.gains[0] + fused.gains[1]) / unit[:, None] * unit
     np.testing.assert_allclose(total - np.eye(3)[:, :, None], 0.0, atol=1e-12)
     first, second = (
-        np.einsum("ijN,jN->iN", gain, value)
-        for gain, value in zip((fused.gain_first, fused.gain_second), mean, strict=True)
+        np.einsum("ijN,jN->iN", gain, value) for gain, value in zip(fused.gains, mean, strict=True)
     )
     np.testing.assert_allclose(fused.mean / unit, (first + second) / unit, atol=1e-9)
     same = RULES[rule](mean[0], covariance[0], mean[0], covariance[1])
@@ -112,7 +122,7 @@ def test_equal_covariances_are_kept_and_the_means_averaged(rule: str, scale: flo
     covariance = scale * np.array([[2.0, 0.6], [0.6, 0.5]])[:, :, None]
     mean = np.array([[1.0], [0.0]])
     fused = RULES[rule](mean, covariance, -mean, covariance)
-    assert fused.weight.tolist() == [0.5]
+    assert fused.weights[0].tolist() == [0.5]
     np.testing.assert_allclose(fused.covariance, covariance, rtol=1e-12)
     np.testing.assert_allclose(fused.mean, 0.0, atol=1e-12)
 
@@ -126,9 +136,9 @@ def test_a_worse_estimate_is_dropped_whichever_side_it_is_on(rule: str) -> None:
         np.testing.assert_allclose(fused.covariance, covariance[0], rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(fused.mean, mean[0], rtol=1e-9, atol=1e-12)
     # CI weighs the information that it keeps, ICI the covariance that it takes off.
-    assert np.all(good_first.weight == (1.0 if rule == "ci" else 0.0))
-    assert np.all(good_second.weight == (0.0 if rule == "ci" else 1.0))
-    assert np.all(good_first.gain_second == 0.0)
+    assert np.all(good_first.weights[0] == (1.0 if rule == "ci" else 0.0))
+    assert np.all(good_second.weights[0] == (0.0 if rule == "ci" else 1.0))
+    assert np.all(good_first.gains[1] == 0.0)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -140,7 +150,7 @@ def test_a_covariance_that_is_none_spoils_only_its_own_lane(rule: str) -> None:
         warnings.simplefilter("error")
         spoiled = RULES[rule](mean[0], covariance[0], mean[1], covariance[1])
     assert np.all(np.isnan(spoiled.covariance[..., 1]))
-    for one, other in zip(spoiled, clean, strict=True):
+    for one, other in zip(parts(spoiled), parts(clean), strict=True):
         assert np.array_equal(one[..., [0, 2]], other[..., [0, 2]])
 
 
@@ -154,18 +164,16 @@ def test_a_lane_is_the_same_alone_and_in_a_batch(kind: str) -> None:
                 mean[0][:, one], covariance[0][..., one], mean[1][:, one], covariance[1][..., one]
             )
             batch = rule(mean[0], covariance[0], mean[1], covariance[1])
-            for single, many in zip(alone, batch, strict=True):
-                np.testing.assert_allclose(single, many[..., one], rtol=1e-9, atol=0.0)
-        single_many = covariance_intersection_many(mean[..., one], covariance[..., one])
-        for single, many in zip(
-            single_many, covariance_intersection_many(mean, covariance), strict=True
-        ):
-            np.testing.assert_allclose(single, many[..., one], rtol=1e-9, atol=0.0)
+            for single, batched in zip(parts(alone), parts(batch), strict=True):
+                np.testing.assert_allclose(single, batched[..., one], rtol=1e-9, atol=0.0)
+        single_many = many(mean[..., one], covariance[..., one])
+        for single, batched in zip(single_many, many(mean, covariance), strict=True):
+            np.testing.assert_allclose(single, batched[..., one], rtol=1e-9, atol=0.0)
 
 
 def actual(fused: Any, first: Array, second: Array, cross: Array) -> Array:
     """The covariance (n, n) of K e_A + L e_B for errors with this cross-covariance."""
-    k, other = fused.gain_first[..., 0], fused.gain_second[..., 0]
+    k, other = fused.gains[0][..., 0], fused.gains[1][..., 0]
     mixed = k @ cross @ other.T
     return k @ first @ k.T + other @ second @ other.T + mixed + mixed.T
 
@@ -210,7 +218,7 @@ def test_inverse_covariance_intersection_bounds_common_information(factors: Arra
     second = np.linalg.inv(np.linalg.inv(own_second) + common)
     cross = first @ common @ second
     fused = fuse_one("ici", first, second)
-    conservative, weight = fused.covariance[..., 0], fused.weight[0]
+    conservative, weight = fused.covariance[..., 0], fused.weights[0, 0]
     real = actual(fused, first, second, cross)
     assert overconfidence(conservative, real) <= 1 + 1e-7
     spread = np.linalg.inv(weight * first + (1 - weight) * second) @ conservative
@@ -240,10 +248,10 @@ def test_information_fusion_does_not_bound_a_shared_prior() -> None:
     """Two copies of one estimate count twice; covariance intersection keeps what one says."""
     mean, covariance = estimates("alike", 1, 3, 5)
     twice_mean, twice = np.repeat(mean, 2, axis=0), np.repeat(covariance, 2, axis=0)
-    summed_mean, summed = InformationFusion().fuse(twice_mean, twice)
-    np.testing.assert_allclose(summed, covariance[0] / 2, rtol=1e-9)
-    np.testing.assert_allclose(summed_mean, mean[0], rtol=1e-9)
-    _, kept, _ = covariance_intersection_many(twice_mean, twice)
+    summed = InformationFusion().fuse(twice_mean, twice)
+    np.testing.assert_allclose(summed.covariance, covariance[0] / 2, rtol=1e-9)
+    np.testing.assert_allclose(summed.mean, mean[0], rtol=1e-9)
+    _, kept, _ = many(twice_mean, twice)
     np.testing.assert_allclose(kept, covariance[0], rtol=1e-9)
 
 
@@ -251,7 +259,8 @@ def test_information_fusion_does_not_bound_a_shared_prior() -> None:
 def test_information_fusion_is_the_optimum_for_independent_errors(kind: str) -> None:
     """Three estimates as measurements of one state: weighted least squares says the same."""
     mean, covariance = estimates(kind, 3, 2, 6)
-    fused_mean, fused = InformationFusion().fuse(mean, covariance)
+    result = InformationFusion().fuse(mean, covariance)
+    fused_mean, fused = result.mean, result.covariance
     design = np.tile(np.eye(2), (3, 1))
     for run in range(6):
         whiten = np.zeros((6, 6))
@@ -285,7 +294,9 @@ def test_the_inverse_form_has_its_own_weight() -> None:
     mean, covariance = estimates("alike", 2, 3, 50)
     ci, ici = (rule(mean[0], covariance[0], mean[1], covariance[1]) for rule in RULES.values())
     loss = [
-        np.trace(combined("ici", ci.weight[run], covariance[0, ..., run], covariance[1, ..., run]))
+        np.trace(
+            combined("ici", ci.weights[0, run], covariance[0, ..., run], covariance[1, ..., run])
+        )
         / np.trace(ici.covariance[..., run])
         for run in range(50)
     ]
@@ -324,7 +335,7 @@ def slsqp_trace(covariance: Array) -> float:
 def test_many_estimates_reach_the_optimum(count: int, size: int, kind: str) -> None:
     runs = 5
     mean, covariance = estimates(kind, count, size, runs)
-    fused_mean, fused, weights = covariance_intersection_many(mean, covariance)
+    fused_mean, fused, weights = many(mean, covariance)
     assert np.all(weights >= 0.0)
     np.testing.assert_allclose(weights.sum(0), 1.0, rtol=1e-12)
     for run in range(runs):
@@ -345,7 +356,7 @@ def test_many_estimates_reach_the_optimum(count: int, size: int, kind: str) -> N
 def test_the_gap_closes_in_every_lane(count: int, size: int, kind: str) -> None:
     """Many lanes, so that the few on which Newton's direction leaves the simplex are among them."""
     mean, covariance = estimates(kind, count, size, runs=300, seed=5)
-    _, fused, _ = covariance_intersection_many(mean, covariance)
+    _, fused, _ = many(mean, covariance)
     units = np.einsum("iiN->iN", fused) ** 0.5
     scaled = covariance / units[:, None] / units
     information = np.linalg.inv(np.moveaxis(scaled, -1, 1))
@@ -359,10 +370,10 @@ def test_the_gap_closes_in_every_lane(count: int, size: int, kind: str) -> None:
 def test_of_two_estimates_the_many_form_is_the_pair(size: int, kind: str) -> None:
     mean, covariance = estimates(kind, 2, size, 60)
     pair = covariance_intersection(mean[0], covariance[0], mean[1], covariance[1])
-    _, fused, weights = covariance_intersection_many(mean, covariance)
+    _, fused, weights = many(mean, covariance)
     wanted = np.einsum("iiN->N", pair.covariance)
     np.testing.assert_allclose(np.einsum("iiN->N", fused), wanted, rtol=1e-6)
-    np.testing.assert_allclose(weights[0], pair.weight, atol=2e-3)
+    np.testing.assert_allclose(weights[0], pair.weights[0], atol=2e-3)
 
 
 def test_inactive_estimates_are_not_read() -> None:
@@ -370,11 +381,11 @@ def test_inactive_estimates_are_not_read() -> None:
     active = np.array([[1, 1, 0, 0], [0, 1, 1, 0], [1, 0, 0, 0], [1, 1, 0, 0]], dtype=np.bool_)
     dirty_mean = np.where(active[:, None], mean, np.nan)
     dirty = np.where(active[:, None, None], covariance, np.nan)
-    fused_mean, fused, weights = covariance_intersection_many(dirty_mean, dirty, active)
+    fused_mean, fused, weights = many(dirty_mean, dirty, active)
     assert np.all(weights[~active] == 0.0)
     for run in (0, 1, 2):
         kept, one = active[:, run], slice(run, run + 1)
-        wanted = covariance_intersection_many(mean[kept][..., one], covariance[kept][..., one])
+        wanted = many(mean[kept][..., one], covariance[kept][..., one])
         np.testing.assert_allclose(fused_mean[:, one], wanted[0], rtol=1e-9)
         np.testing.assert_allclose(fused[..., one], wanted[1], rtol=1e-9)
         np.testing.assert_allclose(weights[kept][:, one], wanted[2], rtol=1e-9)
@@ -416,7 +427,7 @@ def test_the_gap_closes_for_alike_and_for_extreme_estimates(
     covariance = np.einsum("sikN,sjkN->sijN", factor, factor)
     covariance += 1e-6 * np.einsum("siiN->sN", covariance)[:, None, None] * np.eye(size)[..., None]
     mean = generator.normal(size=(count, size, runs))
-    _, fused, weights = covariance_intersection_many(mean, covariance)
+    _, fused, weights = many(mean, covariance)
     assert np.all(weights >= 0.0)
     np.testing.assert_allclose(weights.sum(0), 1.0, rtol=1e-12)
     if count > 2:
@@ -425,7 +436,7 @@ def test_the_gap_closes_for_alike_and_for_extreme_estimates(
     assert np.all(np.einsum("iiN->N", fused) <= alone.min(0) * (1 + 1e-9))
     for run in (0, runs - 1):
         one = slice(run, run + 1)
-        single = covariance_intersection_many(mean[..., one], covariance[..., one])
+        single = many(mean[..., one], covariance[..., one])
         np.testing.assert_array_equal(single[1], fused[..., one])
         np.testing.assert_array_equal(single[2], weights[:, one])
 
@@ -441,7 +452,7 @@ def test_the_optimum_of_a_general_purpose_optimiser(
     count: int, size: int, kind: str, seed: int
 ) -> None:
     mean, covariance = estimates(kind, count, size, 1, seed)
-    _, fused, _ = covariance_intersection_many(mean, covariance)
+    _, fused, _ = many(mean, covariance)
     assert np.trace(fused[..., 0]) <= slsqp_trace(covariance[..., 0]) * (1 + 1.1e-6)
 
 
@@ -453,7 +464,7 @@ def test_lanes_of_every_number_of_active_estimates_stand_side_by_side() -> None:
     covariance[1, 2, 2, ::10] = -1.0
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        batch = covariance_intersection_many(mean, covariance, active)
+        batch = many(mean, covariance, active)
     broken = ~active.any(0) | (active[1] & (np.arange(120) % 10 == 0))
     assert np.array_equal(np.isnan(batch[1]).all((0, 1)), broken)
     assert np.array_equal(np.isnan(batch[0]).all(0), broken)
@@ -462,16 +473,16 @@ def test_lanes_of_every_number_of_active_estimates_stand_side_by_side() -> None:
     assert np.all(batch[2][~active] == 0.0)
     for run in range(120):
         one = slice(run, run + 1)
-        alone = covariance_intersection_many(mean[..., one], covariance[..., one], active[:, one])
-        for single, many in zip(alone, batch, strict=True):
-            np.testing.assert_array_equal(single, many[..., one])
+        alone = many(mean[..., one], covariance[..., one], active[:, one])
+        for single, batched in zip(alone, batch, strict=True):
+            np.testing.assert_array_equal(single, batched[..., one])
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
 def test_identical_estimates_are_kept(count: int) -> None:
     _, covariance = estimates("alike", 1, 3, 10)
     mean = np.zeros((count, 3, 10))
-    _, fused, weights = covariance_intersection_many(mean, np.repeat(covariance, count, axis=0))
+    _, fused, weights = many(mean, np.repeat(covariance, count, axis=0))
     np.testing.assert_allclose(fused, covariance[0], rtol=1e-9)
     np.testing.assert_allclose(weights.sum(0), 1.0, rtol=1e-12)
 
@@ -482,7 +493,7 @@ def test_a_weight_that_is_almost_one_is_found(count: int) -> None:
     covariance = np.stack([np.eye(3) * 1e8] * count)[..., None]
     covariance[0] = np.diag([1.0, 1.0, 1.5e8])[..., None]
     covariance[2, 0, 0] = 2e8
-    _, fused, weights = covariance_intersection_many(np.zeros((count, 3, 1)), covariance)
+    _, fused, weights = many(np.zeros((count, 3, 1)), covariance)
     assert np.trace(fused[..., 0]) <= slsqp_trace(covariance[..., 0]) * (1 + 1.1e-6)
     assert gap(covariance, fused)[0] <= 1.1e-6
     assert np.all(weights >= 0.0)

@@ -10,9 +10,9 @@ from filterpy.kalman import KalmanFilter as FilterPyFilter
 from numpy.typing import NDArray
 
 from fusion_gym import ConfigurationError
-from fusion_gym.fusion.federated import FederatedFusion
+from fusion_gym.fusion.rules import InformationFusion
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.tobit.centre import FeedbackCentre
+from fusion_gym.systems.tobit.centre import Feedback, FeedbackCentre
 from fusion_gym.systems.tobit.filters import KalmanFilter, NodeFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredSystem
@@ -37,7 +37,11 @@ def nodes(generator: np.random.Generator, sensors: int, states: int, runs: int) 
 @pytest.mark.parametrize("states", [1, 2, 3, 5])
 def test_fusion_is_the_information_weighted_sum(sensors: int, states: int) -> None:
     mean, covariance = nodes(np.random.default_rng(states), sensors, states, runs=9)
-    fused_mean, fused = FederatedFusion.create(None, sensors).fuse(mean, covariance)
+    result = InformationFusion().fuse(mean, covariance)
+    fused_mean, fused = result.mean, result.covariance
+    np.testing.assert_allclose(
+        np.einsum("sijN,sjN->iN", result.gains, mean), fused_mean, rtol=1e-9, atol=1e-9
+    )
     for run in range(9):
         information = [np.linalg.inv(covariance[s, :, :, run]) for s in range(sensors)]
         wanted = np.linalg.inv(np.sum(information, axis=0))
@@ -46,27 +50,18 @@ def test_fusion_is_the_information_weighted_sum(sensors: int, states: int) -> No
         np.testing.assert_allclose(fused_mean[:, run], wanted @ weighted, rtol=1e-9, atol=1e-9)
 
 
-def test_shares_do_not_enter_the_fusion_itself() -> None:
-    mean, covariance = nodes(np.random.default_rng(1), 3, 2, runs=4)
-    equal = FederatedFusion.create(EQUAL, 3).fuse(mean, covariance)
-    unequal = FederatedFusion.create(UNEQUAL, 3).fuse(mean, covariance)
-    assert np.array_equal(equal[0], unequal[0])
-    assert np.array_equal(equal[1], unequal[1])
-
-
 @pytest.mark.parametrize("share", [None, UNEQUAL, (0.98, 0.01, 0.01)])
 def test_what_is_distributed_fuses_to_what_it_was(share: Any) -> None:
     generator = np.random.default_rng(2)
     mean, covariance = (value[0] for value in nodes(generator, 1, 3, runs=5))
-    fusion = FederatedFusion.create(share, 3)
-    given_mean, given = fusion.distribute(mean, covariance)
+    given_mean, given = Feedback.in_shares(share, 3).distribute(mean, covariance)
     weights = EQUAL if share is None else share
     for sensor, weight in enumerate(weights):
         np.testing.assert_allclose(given[sensor], covariance / weight, rtol=1e-15)
         assert np.array_equal(given_mean[sensor], mean)
-    back_mean, back = fusion.fuse(given_mean, given)
-    np.testing.assert_allclose(back, covariance, rtol=1e-9)
-    np.testing.assert_allclose(back_mean, mean, rtol=1e-9)
+    back = InformationFusion().fuse(given_mean, given)
+    np.testing.assert_allclose(back.covariance, covariance, rtol=1e-9)
+    np.testing.assert_allclose(back.mean, mean, rtol=1e-9)
 
 
 def make_system(kind: Any, share: Any) -> CensoredSystem:
@@ -77,7 +72,7 @@ def make_system(kind: Any, share: Any) -> CensoredSystem:
     return CensoredSystem(
         plant=plant,
         model=plant,
-        centre=FeedbackCentre(node_filter, FederatedFusion.create(share, 3)),
+        centre=FeedbackCentre(node_filter, InformationFusion(), Feedback.in_shares(share, 3)),
         random_start=False,
         state_names=("x1", "x2"),
         scale=np.ones(2),
@@ -126,11 +121,11 @@ def test_inflating_only_the_fused_covariance_is_not_centralised() -> None:
     prior, weight = 0.4 * np.eye(2), 1 / 3
     predicted = TRANSITION @ prior @ TRANSITION.T + PROCESS
     careless = TRANSITION @ (prior / weight) @ TRANSITION.T + PROCESS
-    careless_mean, careless_fused = FederatedFusion.create(None, 3).fuse(
+    fused = InformationFusion().fuse(
         np.zeros((3, 2, 1)), np.broadcast_to(careless[..., None], (3, 2, 2, 1))
     )
-    assert np.all(careless_mean == 0.0)
-    assert np.trace(careless_fused[..., 0]) < np.trace(predicted) - 0.05
+    assert np.all(fused.mean == 0.0)
+    assert np.trace(fused.covariance[..., 0]) < np.trace(predicted) - 0.05
 
 
 @pytest.mark.parametrize(
@@ -148,7 +143,7 @@ def test_inflating_only_the_fused_covariance_is_not_centralised() -> None:
 )
 def test_bad_shares_are_refused(share: Any, reason: str) -> None:
     with pytest.raises(ConfigurationError) as refused:
-        FederatedFusion.create(share, 3)
+        Feedback.in_shares(share, 3)
     message = str(refused.value)
     assert message.startswith("information_shares = ")
     assert reason in message
@@ -156,4 +151,6 @@ def test_bad_shares_are_refused(share: Any, reason: str) -> None:
 
 
 def test_equal_shares_are_the_default() -> None:
-    assert FederatedFusion.create(None, 4).share.tolist() == [[0.25]] * 4
+    share = Feedback.in_shares(None, 4).share
+    assert share is not None
+    assert share.tolist() == [[0.25]] * 4

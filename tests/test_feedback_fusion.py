@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 import fusion_gym
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.fusion.federated import FederatedFusion
-from fusion_gym.fusion.feedback import FeedbackFusion, IntersectionFusion
+from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
@@ -22,6 +21,7 @@ TOBIT = "fusion_gym/TobitOscillator-v0"
 BIASED = "fusion_gym/BiasedOscillator-v0"
 TRACKING = "fusion_gym/BiasedTracking-v0"
 CORRELATED = "fusion_gym/CorrelatedTracking-v0"
+STRUCTURE = Structure("all nodes start from the same prediction", ("information shares",))
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -50,12 +50,14 @@ def test_the_fused_covariance_bounds_the_error(rule: str, sensors: int, seed: in
     """Errors e_i = (I - K_i H_i) e - K_i v_i share the prior's; the fused weights come from runs
     in which each node's mean is a unit vector."""
     prior, gains, posteriors = node_posteriors(seed, sensors)
-    fusion = IntersectionFusion.create(rule, sensors)
+    fusion = choose_rule(rule, STRUCTURE, sensors)
     covariance = np.stack(posteriors)[..., None].repeat(2 * sensors, axis=-1)
     mean = np.zeros((sensors, 2, 2 * sensors))
     for node in range(sensors):
         mean[node, :, 2 * node : 2 * node + 2] = np.eye(2)
-    weights, fused = fusion.fuse(mean, covariance)
+    result = fusion.fuse(mean, covariance)
+    weights, fused = result.mean, result.covariance
+    np.testing.assert_allclose(np.concatenate(result.gains[..., 0], -1), weights, atol=1e-9)
     actual = np.zeros((2, 2))
     for i in range(sensors):
         for j in range(sensors):
@@ -73,10 +75,11 @@ def test_the_fused_covariance_bounds_the_error(rule: str, sensors: int, seed: in
 @pytest.mark.parametrize("rule", ["ci", "sci", "sici"])
 def test_a_single_delivery_is_taken_as_it_is(rule: str, seed: int) -> None:
     prior, _, posteriors = node_posteriors(seed, 3)
-    fusion = IntersectionFusion.create(rule, 3, (2, 0, 1) if rule != "ci" else None)
+    fusion = choose_rule(rule, STRUCTURE, 3, (2, 0, 1) if rule != "ci" else None)
     covariance = np.stack((prior, posteriors[1], prior))[..., None]
     mean = np.array([[1.0, 2.0], [-3.0, 0.5], [1.0, 2.0]])[..., None]
-    fused_mean, fused = fusion.fuse(mean, covariance)
+    result = fusion.fuse(mean, covariance)
+    fused_mean, fused = result.mean, result.covariance
     np.testing.assert_allclose(np.trace(fused[..., 0]), np.trace(posteriors[1]), rtol=2e-6)
     # The trace is flat where the posterior nearly equals the prior: its optimum is what counts.
     assert np.trace(fused[..., 0]) <= np.trace(prior) * (1 + 1e-9)
@@ -87,21 +90,17 @@ def test_a_single_delivery_is_taken_as_it_is(rule: str, seed: int) -> None:
 @pytest.mark.parametrize("rule", ["federated", "ci", "ici", "sci", "sici"])
 def test_deliveries_of_each_node_alone(rule: str) -> None:
     """``fuse_alone`` against ``fuse`` of the covariances that it stands for."""
-    fusion: FeedbackFusion = (
-        FederatedFusion.create(None, 2)
-        if rule == "federated"
-        else IntersectionFusion.create(rule, 2)
-    )
+    fusion = choose_rule(rule, STRUCTURE, 2)
     generator = np.random.default_rng(3)
     silent = np.stack([positive_definite(generator, 3) for _ in range(2)])[..., None]
     delivered = 0.3 * silent
     nobody, alone = fusion.fuse_alone(silent, delivered)
     zero = np.zeros((2, 3, 1))
-    np.testing.assert_allclose(nobody, fusion.fuse(zero, silent)[1], rtol=1e-9)
+    np.testing.assert_allclose(nobody, fusion.fuse(zero, silent).covariance, rtol=1e-9)
     for node in range(2):
         chosen = silent.copy()
         chosen[node] = delivered[node]
-        np.testing.assert_allclose(alone[node], fusion.fuse(zero, chosen)[1], rtol=1e-9)
+        np.testing.assert_allclose(alone[node], fusion.fuse(zero, chosen).covariance, rtol=1e-9)
 
 
 def results(env_id: str, policy: str, **options: Any) -> EpisodeResults:

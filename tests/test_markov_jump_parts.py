@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from reference_markov_jump import PAPER, Dense, best_weights, random_model
 
-from fusion_gym.fusion.matrix_weighted import IntersectionOfCopies, MatrixWeightedFusion
-from fusion_gym.fusion.sequential import SequentialFusion
+from fusion_gym.fusion.rules import MatrixWeightedFusion
+from fusion_gym.fusion.table import RULES
 from fusion_gym.systems.markov_jump.lag_errors import LagRecursion
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
@@ -215,7 +215,7 @@ def compare(model: dict[str, Any], pattern: NDArray[np.bool_], tolerance: float 
     for time, sent in enumerate(pattern):
         place = recursion.filters.at(np.full(runs, time))
         joint = recursion.offer(lags, place).joint(sent)
-        _, fused = fusion.fuse(np.zeros((len(sent), n, runs)), joint)
+        fused = fusion.fuse(np.zeros((len(sent), n, runs)), joint).covariance
         for run, other in enumerate(dense):
             expected = other.copies(sent[:, run])
             found = joint[..., run].transpose(0, 2, 1, 3).reshape(expected.shape)
@@ -295,7 +295,8 @@ def test_weights_are_optimal_for_a_regular_joint_covariance(
     joint = random_joint(seed, sensors, n, 3, sensors * n + 2)
     joint *= (units[:, None] * units)[..., None]
     means = np.random.default_rng(seed).normal(size=(sensors, n, 3)) * units[:, None]
-    mean, covariance = MatrixWeightedFusion().fuse(means, joint)
+    fused = MatrixWeightedFusion().fuse(means, joint)
+    mean, covariance = fused.mean, fused.covariance
     e = np.kron(np.ones((sensors, 1)), np.eye(n))
     scale = np.kron(np.ones(sensors), units)
     for run in range(3):
@@ -312,7 +313,7 @@ def test_weights_are_optimal_for_a_regular_joint_covariance(
 def test_singular_joint_covariances_agree_with_pseudo_inverses(rank: int) -> None:
     joint = random_joint(rank, 3, 2, 50, rank)
     weights = MatrixWeightedFusion().weights(joint)
-    _, covariance = MatrixWeightedFusion().fuse(np.zeros((3, 2, 50)), joint)
+    covariance = MatrixWeightedFusion().fuse(np.zeros((3, 2, 50)), joint).covariance
     whole = np.eye(2)[..., None].repeat(50, 2)
     np.testing.assert_allclose(weights.sum(0), whole, atol=1e-12 * np.abs(weights).max())
     for run in range(50):
@@ -326,22 +327,22 @@ def test_an_estimate_that_comes_twice_changes_nothing() -> None:
     pair = MatrixWeightedFusion().fuse(means, joint)
     for order in ([0, 1, 1], [0, 0, 1], [1, 0, 1], [1, 1, 0, 0]):
         many = MatrixWeightedFusion().fuse(means[order], joint[np.ix_(order, order)])
-        for found, expected in zip(many, pair, strict=True):
-            np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(many.mean, pair.mean, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(many.covariance, pair.covariance, rtol=1e-9, atol=1e-9)
 
 
 def test_intersection_is_never_better_than_matrix_weights() -> None:
     joint = random_joint(7, 3, 2, 200, 8)
     means = np.random.default_rng(1).normal(size=(3, 2, 200))
-    best = np.einsum("iir->r", MatrixWeightedFusion().fuse(means, joint)[1])
-    for rule in (None, SequentialFusion("ci"), SequentialFusion("ici")):
-        _, claimed = IntersectionOfCopies(rule).fuse(means, joint)
-        if rule is None or rule.rule == "ci":
+    best = np.einsum("iir->r", MatrixWeightedFusion().fuse(means, joint).covariance)
+    for name in ("ci", "sci", "sici"):
+        claimed = RULES[name].make(None).fuse(means, joint).covariance
+        if name != "sici":
             assert (np.einsum("iir->r", claimed) >= best * (1 - 1e-5)).all()
         assert np.isfinite(claimed).all()
-    one, alone = IntersectionOfCopies().fuse(means[:1], joint[:1, :1])
-    np.testing.assert_allclose(one, means[0], rtol=1e-9)
-    np.testing.assert_allclose(alone, joint[0, 0], rtol=1e-9)
+    alone = RULES["ci"].make(None).fuse(means[:1], joint[:1, :1])
+    np.testing.assert_allclose(alone.mean, means[0], rtol=1e-9)
+    np.testing.assert_allclose(alone.covariance, joint[0, 0], rtol=1e-9)
 
 
 # --- bad input -----------------------------------------------------------------------------------

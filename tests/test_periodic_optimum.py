@@ -50,7 +50,7 @@ def recursion_traces(schedules: NDArray[np.bool_], steps: int, last: int) -> Arr
         sent = schedules[(time - 1) % len(schedules)]
         if time > steps - last:
             offer = recursion.offer(lags, place)
-            total += linalg.trace(system.fusion.fuse(means, offer.joint(sent))[1])
+            total += linalg.trace(system.fusion.fuse(means, offer.joint(sent)).covariance)
     return total / last
 
 

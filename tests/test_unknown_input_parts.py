@@ -17,9 +17,7 @@ from scipy.linalg import null_space
 
 from fusion_gym import linalg
 from fusion_gym.core.system import Signals
-from fusion_gym.fusion.covariance_intersection import (
-    covariance_intersection_many,
-)
+from fusion_gym.fusion.several import CovarianceIntersection, covariance_intersection_many
 from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
 from fusion_gym.systems.unknown_input.bound_filter import BoundTables
 from fusion_gym.systems.unknown_input.filters import RandomWalkInputFilter
@@ -280,6 +278,7 @@ def test_tracked_weights_give_covariance_intersection_and_reach_its_optimum(
     weights = np.full((nodes, 3), 1.0 / nodes)
     for _ in range(40):
         fused = tracked_intersection(mean, covariance, weights)
+        assert fused.weights is not None
         weights = fused.weights
     np.testing.assert_allclose(weights.sum(0), 1.0, rtol=1e-12)
     assert (weights >= 0).all()
@@ -289,7 +288,7 @@ def test_tracked_weights_give_covariance_intersection_and_reach_its_optimum(
         np.testing.assert_allclose(fused.covariance[..., run], total, rtol=1e-7)
         vector = sum(weights[i, run] * inverses[i] @ mean[i, :, run] for i in range(nodes))
         np.testing.assert_allclose(fused.mean[:, run], total @ vector, rtol=1e-6, atol=1e-9)
-    optimum = linalg.trace(covariance_intersection_many(mean, covariance)[1])
+    optimum = linalg.trace(covariance_intersection_many(mean, covariance).covariance)
     ratio = linalg.trace(fused.covariance) / optimum
     assert (ratio >= 1 - 1e-6).all()
     assert (ratio <= 1.02).all()
@@ -298,15 +297,15 @@ def test_tracked_weights_give_covariance_intersection_and_reach_its_optimum(
 def test_state_and_input_are_fused_apart() -> None:
     covariance = random_covariances(20, (3,), 5, 4)
     mean = np.random.default_rng(21).normal(size=(3, 5, 4))
-    fusion = NodeFusion("exact_ci", 4)
-    fused = fusion.fuse(mean, covariance, fusion.start(3, 4))
+    fused = NodeFusion(CovarianceIntersection(), 4).fuse(mean, covariance)
     state = covariance_intersection_many(mean[:, :4], covariance[:, :4, :4])
-    np.testing.assert_allclose(fused.mean[:4], state[0], rtol=1e-12)
-    np.testing.assert_allclose(fused.covariance[:4, :4], state[1], rtol=1e-12)
+    np.testing.assert_allclose(fused.mean[:4], state.mean, rtol=1e-12)
+    np.testing.assert_allclose(fused.covariance[:4, :4], state.covariance, rtol=1e-12)
     best = covariance[:, 4, 4].argmin(0)
     np.testing.assert_allclose(fused.mean[4], mean[best, 4, np.arange(4)])
     np.testing.assert_allclose(fused.covariance[4, 4], covariance[:, 4, 4].min(0))
     assert not fused.covariance[:4, 4].any()
+    np.testing.assert_allclose(np.einsum("lijN,ljN->iN", fused.gains, mean), fused.mean, rtol=1e-9)
 
 
 # --- trigger -------------------------------------------------------------------------------------

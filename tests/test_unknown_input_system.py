@@ -17,9 +17,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registered import UnknownInputEnv, UnknownInputVectorEnv
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.fusion.covariance_intersection import (
-    covariance_intersection_many,
-)
+from fusion_gym.fusion.several import covariance_intersection_many
 from fusion_gym.policies.registry import make_rule
 from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
 from fusion_gym.policies.rules.constant import Always, Never
@@ -129,7 +127,8 @@ def test_library_and_plain_loop_walk_the_same_trajectories(kind: str, hold: floa
         # The centre: covariance intersection of what the loop has, state and input apart.
         columns = np.ascontiguousarray(np.moveaxis(covariance, 0, -1))
         others = np.ascontiguousarray(np.moveaxis(mean, 0, -1))
-        x, p, _ = covariance_intersection_many(others[:, :4], columns[:, :4, :4])
+        joined = covariance_intersection_many(others[:, :4], columns[:, :4, :4])
+        x, p = joined.mean, joined.covariance
         np.testing.assert_allclose(fused_covariances[:, :4, :4, run].transpose(1, 2, 0), p, 1e-4)
         np.testing.assert_allclose(fused_means[:, :4, run].T, x, rtol=1e-2, atol=1e-2)
         least = columns[:, 4, 4].min(0)

@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fusion_gym import validation
 from fusion_gym.core.system import System
-from fusion_gym.validation import ConfigurationError
 
 
 @dataclass(frozen=True)
@@ -59,20 +57,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain(entry) for entry in value]
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
-
-
-def arrival_order(value: ArrayLike | None, sensors: int) -> tuple[int, ...] | None:
-    """The option ``order``: a permutation of the sensors 0 to l - 1, or ``None``.
-
-    Raises:
-        ConfigurationError: not a permutation.
-    """
-    if value is None:
-        return None
-    given = validation.array("order", value, (sensors,))
-    if sorted(given.tolist()) != list(range(sensors)):
-        raise ConfigurationError(
-            f"order = {value!r} is not allowed: it must hold each of the sensors 0 to "
-            f"{sensors - 1} once"
-        )
-    return tuple(int(sensor) for sensor in given)

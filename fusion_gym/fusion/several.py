@@ -1,12 +1,13 @@
 """Covariance intersection of several estimates at once, batch axis last.
 
 The trace of the fused covariance is a convex function of the weights. Most lanes need no search:
-one estimate alone is the best, or only two take part (:mod:`fusion_gym.fusion.diagonal`). The
-others take Newton steps on the simplex of weights.
+one estimate alone is the best, or only two take part (:mod:`fusion_gym.fusion.intersection`).
+The others take Newton steps on the simplex of weights.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,17 +15,50 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.fusion.diagonal import best_weight, diagonalise
+from fusion_gym.fusion.intersection import best_of_pair
+from fusion_gym.fusion.rules import Fused, FusionRule, own_covariances
 
 _GAP = 1e-6  # relative optimality gap at which the search ends
 _STEPS = 100  # cap of its steps; most lanes need four, ill-conditioned ones up to about thirty
 _RIDGE = 1e-10  # keeps the curvature invertible where estimates are alike
 
 
+@dataclass(frozen=True)
+class CovarianceIntersection(FusionRule):
+    """All estimates at once, by :func:`covariance_intersection_many`.
+
+    Like its sequential form it bounds the actual covariance for every correlation of the errors.
+    Where ``active`` leaves one estimate alone it is taken as it is.
+    """
+
+    def fuse(
+        self, means: Array, covariance: Array, active: NDArray[np.bool_] | None = None
+    ) -> Fused:
+        """See :class:`~fusion_gym.fusion.rules.FusionRule`."""
+        own = own_covariances(covariance)
+        if active is None:
+            return covariance_intersection_many(means, own)
+        first = active.argmax(0)
+        mean = np.take_along_axis(means, first[None, None], 0)[0]
+        fused = np.take_along_axis(own, first[None, None, None], 0)[0]
+        weights = (np.arange(len(means))[:, None] == first) * 1.0
+        lanes = np.flatnonzero(active.sum(0) != 1)
+        part = covariance_intersection_many(_of(means, lanes), _of(own, lanes), _of(active, lanes))
+        mean[:, lanes], fused[..., lanes] = part.mean, part.covariance
+        weights[:, lanes] = part.weights
+
+        def gains() -> Array:
+            every: Array = weights[:, None, None] * linalg.identity(len(mean))
+            every[..., lanes] = part.gains
+            return every
+
+        return Fused(mean, fused, gains, weights)
+
+
 @np.errstate(all="ignore")
 def covariance_intersection_many(
     means: Array, covariances: Array, active: NDArray[np.bool_] | None = None
-) -> tuple[Array, Array, Array]:
+) -> Fused:
     """Covariance intersection of l estimates at once, of the smallest trace.
 
     P = (Σ w_i P_i⁻¹)⁻¹ and x = P Σ w_i P_i⁻¹ x_i with w_i >= 0 and Σ w_i = 1: a bound for every
@@ -38,11 +72,11 @@ def covariance_intersection_many(
             the weight 0.
 
     Returns:
-        Mean (n, N), covariance (n, n, N) and weights (l, N). The search ends at a gap of a
-        relative 1e-6, or after 100 steps of a lane (each lowers the trace or shortens the one
-        before). Where two estimates take part the trace is within a relative 1e-6 of the optimum.
-        In a lane without active estimates, which is for the caller to avoid, and in one with a
-        covariance that is not positive definite, mean and covariance are NaN.
+        The fused estimate with its weights w (l, N). The search ends at a gap of a relative 1e-6,
+        or after 100 steps of a lane (each lowers the trace or shortens the one before). Where two
+        estimates take part the trace is within a relative 1e-6 of the optimum. In a lane without
+        active estimates, and in one with a covariance that is not positive definite, mean and
+        covariance are NaN.
 
     The multiplicative update w_i <- w_i sqrt(tr(P Y_i P)) has the same optimum, but where
     estimates are alike thousands of its steps do not reach it. Newton's need four to thirty.
@@ -57,7 +91,9 @@ def covariance_intersection_many(
     pairs = open_lanes & (chosen.sum(0) == 2)
     lanes = np.flatnonzero(pairs)
     if lanes.size:
-        weights[:, lanes], fused[..., lanes] = _pair(covariances, chosen, lanes)
+        weights[:, lanes], fused[..., lanes] = best_of_pair(
+            _of(covariances, lanes), _of(chosen, lanes)
+        )
     lanes = np.flatnonzero(open_lanes & ~pairs)
     if lanes.size:
         taking_part = _of(chosen, lanes)
@@ -68,7 +104,12 @@ def covariance_intersection_many(
     vector = np.zeros_like(means[0])
     for weight, one, mean, takes_part in zip(weights, information, means, chosen, strict=True):
         vector += weight * linalg.matvec(one, np.where(takes_part, mean, 0.0))
-    return linalg.matvec(fused, vector), fused, weights
+    return Fused(
+        linalg.matvec(fused, vector),
+        fused,
+        lambda: linalg.matmul(fused, weights[:, None, None] * information),
+        weights,
+    )
 
 
 def _informations(covariances: Array, chosen: NDArray[np.bool_]) -> Array:
@@ -127,28 +168,7 @@ def _gain(information: Array, fused: Array) -> Array:
     """tr(P Y_i P) (l, N), by which the trace of P falls with each weight."""
     square = linalg.matmul(fused, fused)
     product = information * square
-    return _total(product.reshape(len(information), -1, product.shape[-1]))
-
-
-def _pair(
-    covariances: Array, chosen: NDArray[np.bool_], lanes: NDArray[np.intp]
-) -> tuple[Array, Array]:
-    """Weights (l, M) and covariance (n, n, M) in the lanes where two estimates take part."""
-    taking_part = _of(chosen, lanes)
-    first = taking_part.argmax(0)
-    second = len(taking_part) - 1 - taking_part[::-1].argmax(0)
-    a, b = (
-        np.take_along_axis(_of(covariances, lanes), which[None, None, None], 0)[0]
-        for which in (first, second)
-    )
-    pair = diagonalise(a, b)
-    d = pair.ratio
-    share = best_weight(pair.power * d, np.ones_like(d), d)
-    scaled = pair.basis * np.sqrt(d / (share * d + (1.0 - share)))[:, None]
-    weights = np.zeros(taking_part.shape)
-    inside = np.arange(lanes.size)
-    weights[first, inside], weights[second, inside] = share, 1.0 - share
-    return weights, linalg.matmul(linalg.transpose(scaled), scaled)
+    return _total(product.reshape(len(information), len(square) ** 2, -1))
 
 
 def _search(information: Array, start: Array) -> tuple[Array, Array]:

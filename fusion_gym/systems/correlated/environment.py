@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.core.options import CommonOptions, Scenario, arrival_order
-from fusion_gym.fusion.parallel import ParallelFusion
-from fusion_gym.fusion.sequential import SequentialFusion
+from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.correlated.filters import JointErrorCovariance, RobustKalmanFilter
 from fusion_gym.systems.correlated.sensors import CorrelatedSensors
 from fusion_gym.systems.correlated.system import CorrelatedTrackingSystem
@@ -23,6 +22,7 @@ from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.validation import ConfigurationError
 
 _T = 0.01  # the paper's sampling time
+_STRUCTURE = Structure(common="all contain the same process noise", prediction=True)
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def build(chosen: CorrelatedTrackingOptions) -> Scenario:
     system = CorrelatedTrackingSystem(
         plant=plant,
         filter=RobustKalmanFilter(sensors),
-        fusion=_fusion(chosen, sensors.count),
+        fusion=choose_rule(chosen.fusion, _STRUCTURE, sensors.count, chosen.order),
         noise_scale=_noise_scale(chosen.noise_scale),
         state_names=_state_names(plant.size),
         state_weights=weights,
@@ -132,31 +132,6 @@ def _noise_scale(value: float | str) -> float | None:
             f"noise_scale = {value!r} is not allowed: it must be a number > 0 and <= 1, or 'random'"
         )
     return validation.number("noise_scale", value, above=0.0, at_most=1.0)
-
-
-def _fusion(chosen: CorrelatedTrackingOptions, sensors: int) -> SequentialFusion | ParallelFusion:
-    kind = chosen.fusion
-    if kind in ("information", "federated"):
-        raise ConfigurationError(
-            f"fusion = {kind!r} is not allowed: it must be one of 'sici', 'sci', 'ci', for the "
-            "errors of these estimates are correlated (all contain the same process noise), and "
-            "adding their information would count it several times"
-        )
-    kind = validation.choice("fusion", kind, ("sici", "sci", "ci", "ici"))
-    if kind in ("ci", "ici") and chosen.order is not None:
-        raise ConfigurationError(
-            f"order = {chosen.order!r} is not allowed with fusion={kind!r}: it belongs to the "
-            "sequential rules 'sici' and 'sci'"
-        )
-    if kind == "ici" and sensors != 1:
-        raise ConfigurationError(
-            f"fusion = 'ici' is not allowed with {sensors} sensors: it joins two estimates, and "
-            "the centre's prediction is one of them; it must be 'sici' (two at a time) for more"
-        )
-    if kind == "ci":
-        return ParallelFusion()
-    order = arrival_order(chosen.order, sensors)
-    return SequentialFusion("ci" if kind == "sci" else "ici", order)
 
 
 def _trigger(chosen: CorrelatedTrackingOptions, sensors: int) -> dict[str, tuple[float, ...]]:

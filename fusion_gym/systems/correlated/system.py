@@ -16,8 +16,7 @@ from scipy.special import ndtr
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
-from fusion_gym.fusion.parallel import ParallelFusion
-from fusion_gym.fusion.sequential import SequentialFusion
+from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.systems.correlated.filters import (
     JointErrorCovariance,
     RobustKalmanFilter,
@@ -89,7 +88,7 @@ class CorrelatedTrackingSystem:
 
     plant: LinearPlant
     filter: RobustKalmanFilter
-    fusion: SequentialFusion | ParallelFusion
+    fusion: FusionRule
     noise_scale: float | None
     state_names: tuple[str, ...]
     state_weights: Array
@@ -242,7 +241,7 @@ class CorrelatedTrackingSystem:
         correction = linalg.matvec(plan.gain, state.measurement - state.expected)
         mean[1:] += np.where(grant, correction, 0.0)
         np.copyto(covariance[1:], plan.delivered_covariance, where=grant[:, None])
-        fused = self.fusion.fuse(mean[0], covariance[0], mean[1:], covariance[1:], granted)
+        fused = self.fusion.fuse(mean, covariance, _with_prediction(granted))
         mean[0], covariance[0] = fused.mean, fused.covariance
         joint = state.joint
         if self.joint is not None and joint is not None:
@@ -336,16 +335,20 @@ class CorrelatedTrackingSystem:
         return (self.state_weights[:, None] * linalg.diagonal(covariance)).sum(-2)
 
     def _variance_reduction(self, state: CorrelatedTrackingState, plan: RobustPlan) -> Array:
-        mean, covariance = state.prior_mean, state.prior_covariance
+        covariance = np.concatenate((state.prior_covariance[:1], plan.delivered_covariance))
         silent = self._weighted_trace(covariance[0])
         result = np.empty((self.sensor_count, len(silent)))
         for sensor in range(self.sensor_count):
             alone = np.zeros(result.shape, dtype=np.bool_)
             alone[sensor] = True
-            delivered = plan.delivered_covariance
-            fused = self.fusion.fuse(mean[0], covariance[0], mean[1:], delivered, alone)
+            fused = self.fusion.fuse(state.prior_mean, covariance, _with_prediction(alone))
             result[sensor] = silent - self._weighted_trace(fused.covariance)
         return result
+
+
+def _with_prediction(granted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Who takes part in the fusion (l + 1, N): the centre's prediction always does."""
+    return np.concatenate((np.ones_like(granted[:1]), granted))
 
 
 def _deviation(covariance: Array) -> Array:

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.core.options import CommonOptions, Scenario
-from fusion_gym.fusion.matrix_weighted import IntersectionOfCopies, MatrixWeightedFusion
-from fusion_gym.fusion.sequential import SequentialFusion
+from fusion_gym.fusion.rules import FusionRule
+from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.markov_jump.central_system import MarkovJumpCentralSystem
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
@@ -21,6 +21,7 @@ from fusion_gym.systems.markov_jump.system import MarkovJumpSystem
 from fusion_gym.validation import ConfigurationError
 
 _T = 0.5  # the paper's sampling time in seconds
+_STRUCTURE = Structure(common="all contain the same process noise", holds=("joint covariance",))
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,6 @@ def build(chosen: MarkovJumpTrackingOptions) -> Scenario:
     """
     horizon = validation.integer("horizon", chosen.horizon, at_least=1)
     where = validation.choice("filter", chosen.filter, ("local", "centralised", "imm"))
-    fusion = _fusion(chosen.fusion, where)
     plant = MarkovJumpPlant.create(
         chosen.transitions,
         chosen.process_gains,
@@ -112,6 +112,7 @@ def build(chosen: MarkovJumpTrackingOptions) -> Scenario:
         else validation.not_negative("state_weights", chosen.state_weights, (plant.size,))
     )
     names = _state_names(plant.size)
+    fusion = _fusion(chosen.fusion, where, sensors.count)
     if fusion is None:
         central = MarkovJumpCentralSystem.create(
             plant, sensors, where == "imm", names, weights, horizon
@@ -123,7 +124,7 @@ def build(chosen: MarkovJumpTrackingOptions) -> Scenario:
     return Scenario(chosen, system, system.state_weights, defaults)
 
 
-def _fusion(kind: str | None, where: str) -> MatrixWeightedFusion | IntersectionOfCopies | None:
+def _fusion(kind: str | None, where: str, sensors: int) -> FusionRule | None:
     """The rule that joins the nodes' estimates; None where the centre takes the measurements."""
     if where != "local":
         if kind is not None:
@@ -133,23 +134,7 @@ def _fusion(kind: str | None, where: str) -> MatrixWeightedFusion | Intersection
                 "belongs to filter='local'"
             )
         return None
-    kind = "matrix" if kind is None else kind
-    if kind in ("information", "federated"):
-        why = (
-            "the errors of the centre's copies are correlated (all contain the same process noise)"
-            if kind == "information"
-            else "nothing is fed back to the nodes, and their errors are correlated"
-        )
-        raise ConfigurationError(
-            f"fusion = {kind!r} is not allowed: it must be one of 'matrix', 'ci', 'sci', 'sici', "
-            f"for {why}"
-        )
-    kind = validation.choice("fusion", kind, ("matrix", "ci", "sci", "sici"))
-    if kind == "matrix":
-        return MatrixWeightedFusion()
-    if kind == "ci":
-        return IntersectionOfCopies()
-    return IntersectionOfCopies(SequentialFusion("ici" if kind == "sici" else "ci"))
+    return choose_rule("matrix" if kind is None else kind, _STRUCTURE, sensors)
 
 
 def _state_names(size: int) -> tuple[str, ...]:

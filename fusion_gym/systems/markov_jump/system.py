@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
-from fusion_gym.fusion.matrix_weighted import IntersectionOfCopies, MatrixWeightedFusion
+from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
 from fusion_gym.systems.markov_jump.lag_errors import LagRecursion, Offer
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
@@ -45,7 +45,7 @@ class MarkovJumpSystem:
     model: AugmentedModel
     filters: LocalFilters
     recursion: LagRecursion
-    fusion: MatrixWeightedFusion | IntersectionOfCopies
+    fusion: FusionRule
     state_names: tuple[str, ...]
     state_weights: Array
     magnitude: Array
@@ -56,7 +56,7 @@ class MarkovJumpSystem:
         cls,
         plant: MarkovJumpPlant,
         sensors: FadingSensors,
-        fusion: MatrixWeightedFusion | IntersectionOfCopies,
+        fusion: FusionRule,
         state_names: tuple[str, ...],
         state_weights: Array | None,
         horizon: int,
@@ -219,9 +219,7 @@ class MarkovJumpSystem:
         lags = self.recursion.predict(state.lags, state.sent, before)
         offer = self.recursion.offer(lags, place)
         nobody = np.zeros(state.sent.shape, dtype=np.bool_)
-        prior_mean, prior_covariance = self.fusion.fuse(
-            self._collapse(copy_mean), offer.joint(nobody)
-        )
+        silent = self.fusion.fuse(self._collapse(copy_mean), offer.joint(nobody))
         return replace(
             state,
             time=time,
@@ -236,8 +234,8 @@ class MarkovJumpSystem:
             age=state.age + 1.0,
             lags=lags,
             offer=offer,
-            prior_mean=prior_mean,
-            prior_covariance=prior_covariance,
+            prior_mean=silent.mean,
+            prior_covariance=silent.covariance,
         )
 
     def deliver(self, state: MarkovJumpState, granted: NDArray[np.bool_]) -> MarkovJumpState:
@@ -247,9 +245,7 @@ class MarkovJumpSystem:
         """
         grant = granted[:, None]
         copy_mean = np.where(grant, state.node_mean, state.copy_mean)
-        mean, covariance = self.fusion.fuse(
-            self._collapse(copy_mean), _sensed(state).joint(granted)
-        )
+        fused = self.fusion.fuse(self._collapse(copy_mean), _sensed(state).joint(granted))
         return replace(
             state,
             copy_mean=copy_mean,
@@ -257,8 +253,8 @@ class MarkovJumpSystem:
             held=np.where(grant, self._collapse(state.node_mean), state.held),
             age=np.where(granted, 0.0, state.age),
             sent=granted.copy(),
-            mean=mean,
-            covariance=covariance,
+            mean=fused.mean,
+            covariance=fused.covariance,
         )
 
     def read(self, state: MarkovJumpState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
@@ -309,7 +305,7 @@ class MarkovJumpSystem:
         """
         local = self.recursion.local[..., -self.filters.period :]
         means = np.zeros((self.sensor_count, self.plant.size, self.filters.period))
-        return linalg.trace(MatrixWeightedFusion().fuse(means, local)[1])
+        return linalg.trace(MatrixWeightedFusion().fuse(means, local).covariance)
 
     def _collapse(self, mean: Array) -> Array:
         """From ζ̂ (l, a, N) to x̂ = Σ_m ζ̂_m (l, n, N).
@@ -371,7 +367,7 @@ class MarkovJumpSystem:
         for sensor in range(self.sensor_count):
             more = sent.copy()
             more[sensor] = True
-            each.append(self.fusion.fuse(means, offer.joint(more))[1])
+            each.append(self.fusion.fuse(means, offer.joint(more)).covariance)
         return each
 
 

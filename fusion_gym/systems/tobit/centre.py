@@ -6,14 +6,15 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from fusion_gym import linalg
+from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.fusion.feedback import FeedbackFusion
+from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.systems.tobit.filters import Expectation, NodeFilter, Plan
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
+from fusion_gym.validation import ConfigurationError
 
 
 class Outlook(NamedTuple):
@@ -66,6 +67,56 @@ class Centre(Protocol):
 
 
 @dataclass(frozen=True)
+class Feedback:
+    """How the nodes get the centre's prediction as their prior.
+
+    With shares w_m that add up to 1, ``share`` (sensors, 1), node m gets it with the covariance
+    inflated by 1/w_m. That is the paper's feedback (51) and local prediction (29) in one: both
+    the fused covariance and the process covariance are inflated, and it is the inflation of both
+    that keeps information from being counted twice when the nodes' informations are added up.
+
+    Without shares every node gets the prediction as it is. Nothing keeps the common prior from
+    being counted several times then but the fusion rule, which must be a form of covariance
+    intersection. Two nodes with a common prior and independent measurements are just the
+    structure for which the inverse form was derived, so "ici" keeps its bound here. With a single
+    delivery every form returns the node that got it.
+
+    Source: tobit_token_bucket, equation (51); round_robin_tobit, equation (28).
+    """
+
+    sensors: int
+    share: Array | None = None
+
+    @classmethod
+    def in_shares(cls, share: ArrayLike | None, sensors: int) -> Feedback:
+        """Shares w_m > 0 with sum 1; ``None`` stands for equal shares.
+
+        Raises:
+            ConfigurationError: a wrong shape, an entry <= 0, or a sum other than 1.
+        """
+        if share is None:
+            return cls(sensors, np.full((sensors, 1), 1.0 / sensors))
+        weights = validation.array("information_shares", share, (sensors,))
+        if np.any(weights <= 0) or abs(weights.sum() - 1.0) > 1e-9:
+            raise ConfigurationError(
+                f"information_shares = {weights.tolist()} is not allowed: they must be > 0 "
+                f"with sum 1 (their sum is {weights.sum():.6g})"
+            )
+        return cls(sensors, weights[:, None])
+
+    def distribute(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
+        """The nodes' priors from the centre's prediction.
+
+        From (n, N) and (n, n, N) to (sensors, n, N) and (sensors, n, n, N), read-only views where
+        the entries are the same for every node.
+        """
+        means = np.broadcast_to(mean, (self.sensors, *mean.shape))
+        if self.share is None:
+            return means, np.broadcast_to(covariance, (self.sensors, *covariance.shape))
+        return means, covariance / self.share[:, None, None]
+
+
+@dataclass(frozen=True)
 class FeedbackCentre:
     """A node filter for each sensor, fusion, and the result fed back to the nodes.
 
@@ -74,7 +125,8 @@ class FeedbackCentre:
     """
 
     filter: NodeFilter
-    fusion: FeedbackFusion
+    fusion: FusionRule
+    feedback: Feedback
 
     @property
     def sensors(self) -> CensoredSensors:
@@ -83,7 +135,7 @@ class FeedbackCentre:
 
     def look(self, mean: Array, covariance: Array, held: Array, time: Array) -> Outlook:
         """See :class:`Centre`."""
-        nodes = self.fusion.distribute(mean, covariance)
+        nodes = self.feedback.distribute(mean, covariance)
         expectation = self.filter.expect(nodes[0])
         matrix = self.sensors.measurement_matrix
         spread = (matrix * linalg.matmul(matrix, covariance)).sum(-2)
@@ -107,7 +159,8 @@ class FeedbackCentre:
         grant = granted[:, None]
         local_mean = np.where(grant, mean + update, plan.silent_mean)
         local = np.where(grant[:, None], plan.delivered_covariance, plan.silent_covariance)
-        return Posterior(*self.fusion.fuse(local_mean, local), local_mean)
+        fused = self.fusion.fuse(local_mean, local)
+        return Posterior(fused.mean, fused.covariance, local_mean)
 
     def variances(self, mean: Array, covariance: Array, outlook: Outlook) -> tuple[Array, Array]:
         """See :class:`Centre`; by the bound where the filter minimises one."""

@@ -7,14 +7,17 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from fusion_gym.core.options import CommonOptions, arrival_order, plain
-from fusion_gym.fusion.federated import FederatedFusion
-from fusion_gym.fusion.feedback import INTERSECTION_RULES, FeedbackFusion, IntersectionFusion
-from fusion_gym.systems.tobit.centre import FeedbackCentre, SequentialCentre
+from fusion_gym.core.options import CommonOptions, plain
+from fusion_gym.fusion.table import Structure, choose_rule
+from fusion_gym.systems.tobit.centre import Feedback, FeedbackCentre, SequentialCentre
 from fusion_gym.systems.tobit.filters import NodeFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
-from fusion_gym.validation import ConfigurationError, choice
+from fusion_gym.validation import ConfigurationError
+
+_STRUCTURE = Structure(
+    common="all nodes start from the same prediction", holds=("information shares",)
+)
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,13 @@ def feedback_centre(chosen: FeedbackOptions, node: NodeFilter) -> FeedbackCentre
     Raises:
         ConfigurationError: a rule that does not fit, or an option that is not the rule's.
     """
-    return FeedbackCentre(node, _fusion(chosen, node.sensors.count))
+    sensors = node.sensors.count
+    kind = "federated" if chosen.fusion is None else chosen.fusion
+    fusion = choose_rule(kind, _STRUCTURE, sensors, chosen.order)
+    if kind == "federated":
+        return FeedbackCentre(node, fusion, Feedback.in_shares(chosen.information_shares, sensors))
+    _refuse(chosen, ("information_shares",), f"fusion={kind!r}", "fusion='federated'")
+    return FeedbackCentre(node, fusion, Feedback(sensors))
 
 
 def stochastic_centre(chosen: FeedbackOptions, sensors: CensoredSensors) -> FeedbackCentre:
@@ -60,23 +69,6 @@ def stochastic_defaults(chosen: FeedbackOptions, kind: str) -> dict[str, dict[st
         return {"stochastic_event": {"weight": plain(chosen.stochastic_weight)}}
     _refuse(chosen, ("stochastic_weight",), f"filter={kind!r}", "filter='stochastic'")
     return {}
-
-
-def _fusion(chosen: FeedbackOptions, sensors: int) -> FeedbackFusion:
-    kind = "federated" if chosen.fusion is None else chosen.fusion
-    if kind == "information":
-        raise ConfigurationError(
-            "fusion = 'information' is not allowed: it must be one of "
-            f"{', '.join(map(repr, ('federated', *INTERSECTION_RULES)))}, for all nodes start "
-            "from the same prediction, and adding their information would count it several "
-            "times (information sharing, 'federated', is what makes the sum right)"
-        )
-    choice("fusion", kind, ("federated", *INTERSECTION_RULES))
-    if kind == "federated":
-        _refuse(chosen, ("order",), "fusion='federated'", "a sequential rule, 'sci' or 'sici'")
-        return FederatedFusion.create(chosen.information_shares, sensors)
-    _refuse(chosen, ("information_shares",), f"fusion={kind!r}", "fusion='federated'")
-    return IntersectionFusion.create(kind, sensors, arrival_order(chosen.order, sensors))
 
 
 def assumed_density_centre(chosen: FeedbackOptions, sensors: CensoredSensors) -> SequentialCentre:

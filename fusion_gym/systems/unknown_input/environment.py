@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.policies.rules.adaptive_threshold import check_thresholds
 from fusion_gym.systems.unknown_input.bound_filter import BoundTables
 from fusion_gym.systems.unknown_input.examples import EXAMPLES
@@ -35,7 +36,7 @@ from fusion_gym.systems.unknown_input.system import UnknownInputSystem
 from fusion_gym.validation import ConfigurationError
 
 FILTERS = ("random_walk", "predict", "paper")
-FUSIONS = ("ci", "exact_ci", "sci", "sici", "ici")
+_STRUCTURE = Structure(common="all contain the same process noise", holds=("tracked weights",))
 SIGNALS = ("sinusoids", "steps", "random_walk")
 
 
@@ -211,7 +212,8 @@ def _nodes(
         _given(chosen.input_deviation),
     )
     joint = JointGain.create(plant, sensors)
-    fusion = NodeFusion(_fusion(chosen.fusion, sensors.count), plant.size)
+    rule = choose_rule(chosen.fusion, _STRUCTURE, sensors.count)
+    fusion = NodeFusion(rule, plant.size, tracked=chosen.fusion == "ci")
     hold = None
     if chosen.hold_variance is not None:
         if kind != "random_walk":
@@ -227,22 +229,6 @@ def _nodes(
     if kind == "predict":
         return RunNodes(model, sensors, ExactInputStateFilter(model, joint), fusion)
     return RunNodes(model, sensors, RandomWalkInputFilter(model, sensors), fusion, hold)
-
-
-def _fusion(kind: str, sensors: int) -> str:
-    if kind in ("information", "federated"):
-        raise ConfigurationError(
-            f"fusion = {kind!r} is not allowed: it must be one of 'ci', 'exact_ci', 'sci', "
-            "'sici', 'ici', for the errors of all nodes contain the same process noise, nothing "
-            "is fed back, and adding their information would count it several times"
-        )
-    kind = validation.choice("fusion", kind, FUSIONS)
-    if kind == "ici" and sensors != 2:
-        raise ConfigurationError(
-            f"fusion = 'ici' is not allowed with {sensors} sensors: it joins exactly two (use "
-            "'sici', which takes one after the other)"
-        )
-    return kind
 
 
 def _trigger(chosen: UnknownInputOptions, sensors: int) -> dict[str, tuple[float, ...]]:

@@ -8,96 +8,95 @@ Source: unknown_input, equations (24)-(26).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.fusion.covariance_intersection import (
-    covariance_intersection_many,
-)
-from fusion_gym.fusion.sequential import SequentialFusion
+from fusion_gym.fusion.rules import Fused, FusionRule, own_covariances
+from fusion_gym.fusion.several import CovarianceIntersection
 
 _GAP = 0.01  # relative gap at which the tracked weights rest
 _STEPS = 4  # evaluations of the tracked weights at a time, at most
 _FLOOR = 1e-3  # a tracked weight stays above, so that it can come back
 
 
-class FusedEstimate(NamedTuple):
-    """``mean`` (s, N), ``covariance`` (s, s, N) with zero blocks between state and input, and the
-    state's ``weights`` (l, N), from which a search may go on at the next time."""
-
-    mean: Array
-    covariance: Array
-    weights: Array
-
-
 @dataclass(frozen=True)
-class NodeFusion:
+class NodeFusion(FusionRule):
     """The centre's rule for l nodes with n states and q inputs.
 
-    ``rule`` is one of
+    ``rule`` joins the ``states`` n entries of the nodes' states, and their inputs. Where it is
+    :class:`~fusion_gym.fusion.several.CovarianceIntersection` and ``tracked``, its weights near
+    the smallest trace may follow it from one time to the next (:func:`tracked_intersection`),
+    from those that :meth:`going_on` takes.
 
-    - ``"ci"``: weights near the smallest trace, tracked from one time to the next
-      (:func:`tracked_intersection`);
-    - ``"exact_ci"``: the weights of the smallest trace, searched anew every time;
-    - ``"sci"``: two at a time, in the order of the sensors, each pair with its best weight;
-    - ``"ici"``: inverse covariance intersection of two nodes, ``"sici"`` of several in turn.
-
-    The first three give a bound for every correlation of the nodes' errors, provided that the
-    nodes' covariances are bounds. The last two do not, for the errors share process noise.
+    Covariance intersection gives a bound for every correlation of the nodes' errors, provided
+    that the nodes' covariances are bounds. Its inverse form does not, for the errors share
+    process noise.
     """
 
-    rule: str
+    rule: FusionRule
     states: int
+    tracked: bool = False
+    weights: Array | None = None
 
-    def exact(self) -> NodeFusion:
-        """The same rule with its best weights instead of tracked ones."""
-        return NodeFusion("exact_ci", self.states) if self.rule == "ci" else self
+    def start(self, nodes: int, runs: int) -> Array | None:
+        """Equal weights (l, N) where they are tracked."""
+        return np.full((nodes, runs), 1.0 / nodes) if self.tracked else None
 
-    def start(self, nodes: int, runs: int) -> Array:
-        """Equal weights (l, N)."""
-        return np.full((nodes, runs), 1.0 / nodes)
+    def going_on(self, weights: Array | None) -> NodeFusion:
+        """The same rule from the last weights (l, N) on, if there are any."""
+        return self if weights is None else replace(self, weights=weights)
 
-    def fuse(self, mean: Array, covariance: Array, weights: Array) -> FusedEstimate:
-        """Means (l, s, N) and covariances (l, s, s, N) fused; ``weights`` (l, N) to go on from."""
-        n = self.states
-        state = self._block(mean[:, :n], covariance[:, :n, :n], weights)
-        inputs = self._block(mean[:, n:], covariance[:, n:, n:], weights)
-        joint = np.zeros(covariance.shape[1:])
+    def fuse(
+        self, means: Array, covariance: Array, active: NDArray[np.bool_] | None = None
+    ) -> Fused:
+        """See :class:`~fusion_gym.fusion.rules.FusionRule`, for means (l, s, N), s = n + q.
+
+        The covariance has zero blocks between state and input, and the weights are the state's,
+        if they are tracked.
+        """
+        n, own = self.states, own_covariances(covariance)
+        state = self._block(means[:, :n], own[:, :n, :n], active)
+        inputs = self._block(means[:, n:], own[:, n:, n:], active)
+        joint = np.zeros(own.shape[1:])
         joint[:n, :n], joint[n:, n:] = state.covariance, inputs.covariance
-        return FusedEstimate(np.concatenate((state.mean, inputs.mean)), joint, state.weights)
 
-    def _block(self, mean: Array, covariance: Array, weights: Array) -> FusedEstimate:
-        if len(mean) == 1:
-            return FusedEstimate(mean[0], covariance[0], weights)
-        if self.rule in ("sci", "ici", "sici"):
-            fused = SequentialFusion("ci" if self.rule == "sci" else "ici").fuse(
-                mean[0],
-                covariance[0],
-                mean[1:],
-                covariance[1:],
-                np.ones((len(mean) - 1, mean.shape[-1]), dtype=np.bool_),
-            )
-            return FusedEstimate(fused.mean, fused.covariance, weights)
-        if mean.shape[1] == 1:
-            return _smallest_variance(mean, covariance)
-        if self.rule == "exact_ci":
-            return FusedEstimate(*covariance_intersection_many(mean, covariance))
-        return tracked_intersection(mean, covariance, weights)
+        def gains() -> Array:
+            both = np.zeros(own.shape)
+            both[:, :n, :n], both[:, n:, n:] = state.gains, inputs.gains
+            return both
+
+        mean = np.concatenate((state.mean, inputs.mean))
+        return Fused(mean, joint, gains, state.weights if self.tracked else None)
+
+    def _block(self, means: Array, own: Array, active: NDArray[np.bool_] | None) -> Fused:
+        if active is not None:
+            return self.rule.fuse(means, own, active)
+        one = np.ones((1, means.shape[-1]))
+        if len(means) == 1:
+            identity = linalg.identity(means.shape[1]) * one
+            return Fused(means[0], own[0], lambda: identity[None], one)
+        if isinstance(self.rule, CovarianceIntersection):
+            if means.shape[1] == 1:
+                return _smallest_variance(means, own)
+            if self.weights is not None:
+                return tracked_intersection(means, own, self.weights)
+        return self.rule.fuse(means, own)
 
 
-def _smallest_variance(mean: Array, covariance: Array) -> FusedEstimate:
+def _smallest_variance(mean: Array, covariance: Array) -> Fused:
     """Covariance intersection of scalars: the smallest variance takes all, equals share."""
     smallest = covariance.min(0)
     chosen = (covariance == smallest)[:, 0, 0]
     weights = chosen / chosen.sum(0)
-    return FusedEstimate((weights[:, None] * mean).sum(0), smallest, weights)
+    joined = (weights[:, None] * mean).sum(0)
+    return Fused(joined, smallest, lambda: weights[:, None, None], weights)
 
 
-def tracked_intersection(mean: Array, covariance: Array, weights: Array) -> FusedEstimate:
+def tracked_intersection(mean: Array, covariance: Array, weights: Array) -> Fused:
     """Covariance intersection with weights that follow the smallest trace over time.
 
     From the given weights (l, N) on, w_i ← w_i √tr(P Y_i P), normalised, with Y_i = P_i⁻¹ and
@@ -132,7 +131,10 @@ def tracked_intersection(mean: Array, covariance: Array, weights: Array) -> Fuse
         lanes = np.flatnonzero(still) if isinstance(lanes, slice) else lanes[still]
         moved = np.maximum(some[:, still] * np.sqrt(gain[:, still]), _FLOOR**2)
         weights[:, lanes] = moved / _sum(moved)
-    return FusedEstimate(linalg.matvec(fused, _sum(weights[:, None] * vectors)), fused, weights)
+    joined = linalg.matvec(fused, _sum(weights[:, None] * vectors))
+    return Fused(
+        joined, fused, lambda: linalg.matmul(fused, weights[:, None, None] * information), weights
+    )
 
 
 def _sum(a: Array) -> Array:

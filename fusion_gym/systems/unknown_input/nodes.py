@@ -140,11 +140,8 @@ class TableNodes:
     def create(
         cls, model: InputModel, sensors: InputSensors, tables: BoundTables, fusion: NodeFusion
     ) -> TableNodes:
-        """Fuse the tables, with every time as a run; ``"ci"`` means the exact weights here."""
-        exact = fusion.exact()
-        n, times = fusion.states, tables.covariance.shape[-1]
-        count, size = tables.covariance.shape[:2]
-        start = exact.start(count, times)
+        """Fuse the tables, with every time as a run and the best weights."""
+        n, (count, size, _, times) = fusion.states, tables.covariance.shape
         gains = np.zeros((count, size, size, times))
         fused = np.empty(0)
         for node in range(count):
@@ -152,13 +149,8 @@ class TableNodes:
                 # The fusion is linear in the means: unit vectors read off its gains.
                 unit = np.zeros((count, size, times))
                 unit[node, entry] = 1.0
-                result = exact.fuse(unit, tables.covariance, start)
+                result = fusion.fuse(unit, tables.covariance)
                 gains[node, :, entry], fused = result.mean, result.covariance
-        delivered = []
-        for node in range(count):
-            alone = tables.covariance.copy()
-            alone[node] = tables.delivered[node]
-            delivered.append(exact.fuse(np.zeros((count, size, times)), alone, start).covariance)
         return cls(
             model=model,
             sensors=sensors,
@@ -166,7 +158,7 @@ class TableNodes:
             state_gain=gains[:, :n, :n],
             input_gain=gains[:, n:, n:],
             fused=fused,
-            delivered=np.array(delivered),
+            delivered=fusion.fuse_alone(tables.covariance, tables.delivered)[1],
             prior=model.predict_covariance(np.roll(tables.covariance, 1, axis=-1)),
         )
 
@@ -273,7 +265,7 @@ class RunNodes:
             correction *= grant
             covariance = np.where(grant[:, None], covariance, _own(outlook.covariance))
         mean = outlook.mean + correction
-        fused = self.fusion.fuse(mean, covariance, _own(estimates.weights))
+        fused = self.fusion.going_on(estimates.weights).fuse(mean, covariance)
         return Estimates(mean, fused.mean, covariance, fused.covariance, fused.weights)
 
     def prior_covariance(self, outlook: Outlook, time: Array) -> Array:
@@ -288,25 +280,15 @@ class RunNodes:
         self, estimates: Estimates, outlook: Outlook, weights: Array, time: Array
     ) -> tuple[Array, Array]:
         """See :class:`Nodes`; with the best fusion weights."""
-        count, runs, fusion = self.sensors.count, outlook.expected.shape[-1], self.fusion.exact()
-        nobody = np.zeros((count, runs), dtype=np.bool_)
+        nobody = np.zeros((self.sensors.count, outlook.expected.shape[-1]), dtype=np.bool_)
         silent = _own(outlook.covariance)
         if self.hold_variance is not None:
             silent = self._outcome(estimates, outlook, nobody)[1]
         delivered = self._outcome(estimates, outlook, ~nobody)[1]
-
-        def trace(covariance: Array) -> Array:
-            fused = fusion.fuse(outlook.mean, covariance, _own(estimates.weights)).covariance
-            total: Array = (weights[:, None] * linalg.diagonal(fused)).sum(0)
-            return total
-
-        start = trace(silent)
-        reduction = np.empty((count, runs))
-        for node in range(count):
-            alone = silent.copy()
-            alone[node] = delivered[node]
-            reduction[node] = start - trace(alone)
-        return start, reduction
+        together, alone = self.fusion.fuse_alone(silent, delivered)
+        every = weights[:, None]
+        start: Array = (every * linalg.diagonal(together)).sum(0)
+        return start, start - (every * linalg.diagonal(alone)).sum(1)
 
     def _outcome(
         self, estimates: Estimates, outlook: Outlook, granted: NDArray[np.bool_]

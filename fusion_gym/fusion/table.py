@@ -1,0 +1,148 @@
+"""The fusion rules by name: what each assumes of the estimates, and why it is refused elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from numpy.typing import ArrayLike
+
+from fusion_gym import validation
+from fusion_gym.fusion.intersection import (
+    SequentialIntersection,
+    covariance_intersection,
+    inverse_covariance_intersection,
+)
+from fusion_gym.fusion.rules import FusionRule, InformationFusion, MatrixWeightedFusion
+from fusion_gym.fusion.several import CovarianceIntersection
+from fusion_gym.validation import ConfigurationError
+
+Order = tuple[int, ...] | None
+Assumption = Literal[
+    "nothing",
+    "common information",
+    "independence",
+    "information shares",
+    "joint covariance",
+    "tracked weights",
+]
+
+# Why a rule is refused where its assumption does not hold. The inverse intersections assume common
+# information, and they are offered without it, as their papers do: they are then no bound.
+REASONS: dict[Assumption, str] = {
+    "independence": (
+        "the errors of these estimates are correlated ({common}), and adding their information "
+        "would count what they share several times"
+    ),
+    "information shares": (
+        "nothing is fed back to the nodes that could share information out among them, and the "
+        "errors of these estimates are correlated ({common})"
+    ),
+    "joint covariance": "the joint covariance of the errors is not known ({common})",
+    "tracked weights": "'ci' has the exact weights here",
+}
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A row of the table.
+
+    ``make`` gives the rule for an order of arrival, ``assumes`` is what it needs to hold for its
+    covariance to be a bound, ``pair`` means exactly two estimates, and ``ordered`` that the order
+    belongs to it.
+    """
+
+    make: Callable[[Order], FusionRule]
+    assumes: Assumption
+    pair: bool = False
+    ordered: bool = False
+
+
+RULES = {
+    "federated": Rule(lambda order: InformationFusion(), "information shares"),
+    "information": Rule(lambda order: InformationFusion(), "independence"),
+    "matrix": Rule(lambda order: MatrixWeightedFusion(), "joint covariance"),
+    "sici": Rule(
+        lambda order: SequentialIntersection(inverse_covariance_intersection, order),
+        "common information",
+        ordered=True,
+    ),
+    "sci": Rule(
+        lambda order: SequentialIntersection(covariance_intersection, order),
+        "nothing",
+        ordered=True,
+    ),
+    "ci": Rule(lambda order: CovarianceIntersection(), "nothing"),
+    "exact_ci": Rule(lambda order: CovarianceIntersection(), "tracked weights"),
+    "ici": Rule(
+        lambda order: SequentialIntersection(inverse_covariance_intersection),
+        "common information",
+        pair=True,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What is known of the errors of the estimates that a centre joins.
+
+    ``common`` says in words what makes them correlated, ``holds`` are the assumptions that hold
+    all the same, and ``prediction`` says that estimate 0 is the centre's own prediction.
+    """
+
+    common: str
+    holds: tuple[Assumption, ...] = ()
+    prediction: bool = False
+
+    def refusal(self, rule: Rule) -> str | None:
+        """Why the rule is not for these estimates, or ``None``."""
+        if rule.assumes in self.holds or rule.assumes not in REASONS:
+            return None
+        return REASONS[rule.assumes].format(common=self.common)
+
+
+def choose_rule(
+    name: Any, structure: Structure, sensors: int, order: ArrayLike | None = None
+) -> FusionRule:
+    """The rule of the options ``fusion`` and ``order`` for the estimates of so many sensors.
+
+    ``order`` is the sensors' order of arrival; a prediction comes before all of them.
+
+    Raises:
+        ConfigurationError: an unknown rule, one that is unsound for this structure, "ici" for
+            other than two estimates, an order for a rule that has none, or one that is no
+            permutation of the sensors 0 to l - 1.
+    """
+    offered = [key for key, rule in RULES.items() if structure.refusal(rule) is None]
+    if isinstance(name, str) and name in RULES and name not in offered:
+        raise ConfigurationError(
+            f"fusion = {name!r} is not allowed: it must be one of "
+            f"{', '.join(map(repr, offered))}, for {structure.refusal(RULES[name])}"
+        )
+    rule = RULES[validation.choice("fusion", name, offered)]
+    if rule.pair and sensors + structure.prediction != 2:
+        prediction = " (the centre's prediction is one of them)" if structure.prediction else ""
+        raise ConfigurationError(
+            f"fusion = {name!r} is not allowed with {sensors} sensors: it joins two "
+            f"estimates{prediction}; it must be 'sici' (two at a time) for more"
+        )
+    if order is None:
+        return rule.make(None)
+    if not rule.ordered:
+        raise ConfigurationError(
+            f"order = {order!r} is not allowed with fusion={name!r}: it belongs to the "
+            "sequential rules 'sici' and 'sci'"
+        )
+    arrival = _arrival(order, sensors)
+    return rule.make((0, *(i + 1 for i in arrival)) if structure.prediction else arrival)
+
+
+def _arrival(order: ArrayLike, sensors: int) -> tuple[int, ...]:
+    given = validation.array("order", order, (sensors,))
+    if sorted(given.tolist()) != list(range(sensors)):
+        raise ConfigurationError(
+            f"order = {order!r} is not allowed: it must hold each of the sensors 0 to "
+            f"{sensors - 1} once"
+        )
+    return tuple(int(sensor) for sensor in given)
