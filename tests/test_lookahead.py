@@ -17,6 +17,7 @@ from fusion_gym.policies.lookahead import Lookahead
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
+REMOTE = "fusion_gym/RemoteEstimation-v0"
 TOBIT = "fusion_gym/TobitOscillator-v0"
 TRACKING = "fusion_gym/BiasedTracking-v0"
 
@@ -67,6 +68,64 @@ def test_the_true_state_does_not_matter() -> None:
     np.testing.assert_array_equal(policy(batch.signals()), first)
 
 
+def test_coming_losses_do_not_matter() -> None:
+    """It cannot dodge them, and gets no more than the best of all policies that cannot either."""
+    options: dict[str, Any] = {"channel": "independent", "drop_probability": 0.5}
+    task, price = fusion_gym.make_task(REMOTE, cost_weight=5.0, **options), "lookahead:price=5"
+    batch, policy = EpisodeBatch.seeded(task, 300, 0), make_policy(price, task)
+    sent = lost = 0
+    for _ in range(task.horizon):
+        coming = batch.state.lost
+        granted = batch.step(policy(batch.signals())).granted
+        sent, lost = sent + granted.sum(), lost + (granted & coming).sum()
+    assert abs(lost - 0.5 * sent) < 4 * np.sqrt(0.25 * sent)
+    found = run_episodes(task, policy, 300, seed=0).returns
+    best = run_episodes(task, make_policy("optimal", task), 300, seed=0).returns
+    assert (found - best).mean() < 2 * (found - best).std() / np.sqrt(300)
+    assert found.mean() > 1.05 * best.mean()  # both are negative
+
+
+@pytest.mark.parametrize("access", ["any", "single"])
+def test_losses_are_weighed_by_their_probabilities(access: str) -> None:
+    options: dict[str, Any] = {
+        "sensors": 3, "noise_deviation": (1.0, 1.5, 0.7), "channel": "gilbert_elliott",
+        "drop_probability": (0.9, 0.2), "access": access,
+    }  # fmt: skip
+    task = fusion_gym.make_task(REMOTE, **options)
+    batch, price, runs = played(task), 1.2, 30
+    state, channel = batch.state, task.system.channel
+    error = (state.truth - state.prior) ** 2 * task.reward.state_weights
+    arrives = 1.0 - (channel.transition @ channel.drop)[state.channel, np.arange(3)[:, None]]
+    policy = Lookahead(task, price, steps=1)
+    asked = policy(batch.signals())
+    every = [p for p in product((0, 1), repeat=3) if access == "any" or sum(p) <= 1]
+    for run in range(runs):
+
+        def expected(sent: tuple[int, ...], run: int = run) -> float:
+            total = price * sum(sent)
+            for arrived in product(*[(0, 1) if one else (0,) for one in sent]):
+                chance = 1.0
+                for i in range(3):
+                    p = arrives[i, run] if sent[i] else 0.0
+                    chance *= p if arrived[i] else 1.0 - p
+                total += chance * sum(error[i, run] for i in range(3) if not arrived[i])
+            return total
+
+        assert tuple(asked[:, run].astype(int)) == min(every, key=expected)
+    assert 0.1 < asked.mean() < 0.9 if access == "any" else asked.sum(0).max() == 1
+
+
+def test_it_weighs_errors_as_the_reward_does() -> None:
+    """Ten times the weight at ten times the price is the same question."""
+    answers = [
+        Lookahead(task, 0.003 * weight)(played(task).signals())
+        for weight in (1.0, 10.0)
+        for task in [fusion_gym.make_task(TOBIT, filter="tobit", error_weight=weight)]
+    ]
+    np.testing.assert_array_equal(*answers)
+    assert 0.0 < answers[0].mean() < 1.0
+
+
 def test_its_limits() -> None:
     task = fusion_gym.make_task(TOBIT, filter="tobit", tokens="unlimited")
     assert run_episodes(task, Lookahead(task, price=1e9), 5, seed=0).rate.max() == 0.0
@@ -105,6 +164,9 @@ def test_what_cannot_be_is_refused() -> None:
     ):
         with pytest.raises(ConfigurationError, match=message):
             make_policy(text, task)
+    with pytest.raises(ConfigurationError, match=r"sensors = 13 .* at most 12, for all 2\^13"):
+        make_policy("lookahead", fusion_gym.make_task(REMOTE, sensors=13))
+    make_policy("lookahead", fusion_gym.make_task(REMOTE, sensors=13, access="single"))
     centre = fusion_gym.make_task(TOBIT, information="centre")
     with pytest.raises(ConfigurationError, match="information = 'centre'"):
         make_policy("lookahead", centre)
