@@ -9,31 +9,11 @@ import numpy as np
 from scipy import stats
 
 from fusion_gym.arrays import Array
-from fusion_gym.evaluation.envelope import EnvelopePoint, lower_envelope
+from fusion_gym.evaluation.envelope import envelope_mse
 from fusion_gym.evaluation.episodes import EpisodeResults
 
 RESAMPLES = 2000
 MIDDLE = (0.05, 0.5)  # of the rate that transmitting always gets: the middle of the front
-
-
-def mixture(hull: Sequence[EnvelopePoint], rate: float) -> dict[str, float] | None:
-    """The policies of a lower envelope and their shares at a rate, ``None`` left of it."""
-    if rate < hull[0].rate:
-        return None
-    left = max((p for p in hull if p.rate <= rate), key=lambda p: p.rate)
-    right = min((p for p in hull if p.rate > rate), key=lambda p: p.rate, default=None)
-    if right is None:
-        return {left.name: 1.0}
-    share = (rate - left.rate) / (right.rate - left.rate)
-    return {left.name: 1.0 - share, right.name: share}
-
-
-def envelope_mse(results: Mapping[str, EpisodeResults], rate: float) -> Array | None:
-    """Each episode's MSE (E,) on the lower envelope at a rate, ``None`` left of it."""
-    shares = mixture(lower_envelope(results), rate)
-    if shares is None:
-        return None
-    return np.asarray(sum(share * results[name].mse for name, share in shares.items()))
 
 
 def judge(

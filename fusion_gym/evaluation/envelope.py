@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fusion_gym.arrays import Array
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import Interval, mean_interval
 from fusion_gym.validation import ConfigurationError
@@ -53,6 +54,28 @@ def _above(left: EnvelopePoint, middle: EnvelopePoint, right: EnvelopePoint) -> 
     return rise >= (right.mse - left.mse) * (middle.rate - left.rate)
 
 
+def mixture(hull: Sequence[EnvelopePoint], rate: float) -> dict[str, float] | None:
+    """The policies of a lower envelope and their shares at a rate, ``None`` left of it."""
+    if rate < hull[0].rate:
+        return None
+    left = max((p for p in hull if p.rate <= rate), key=lambda p: p.rate)
+    right = min((p for p in hull if p.rate > rate), key=lambda p: p.rate, default=None)
+    if right is None:
+        return {left.name: 1.0}
+    share = (rate - left.rate) / (right.rate - left.rate)
+    return {left.name: 1.0 - share, right.name: share}
+
+
+def envelope_mse(results: Mapping[str, EpisodeResults], rate: float) -> Array | None:
+    """Each episode's MSE (E,) on the lower envelope at a rate, ``None`` left of it."""
+    shares = mixture(lower_envelope(results), rate)
+    return None if shares is None else _mixed(results, shares)
+
+
+def _mixed(results: Mapping[str, EpisodeResults], shares: Mapping[str, float]) -> Array:
+    return np.asarray(sum(share * results[name].mse for name, share in shares.items()))
+
+
 class Comparison(NamedTuple):
     """A policy against the envelope at its own rate, over paired episodes.
 
@@ -76,26 +99,19 @@ def compare_with_envelope(
     """
     hull = lower_envelope(baselines)
     rate = float(results.rate.mean())
-    if rate < hull[0].rate:
+    shares = mixture(hull, rate)
+    if shares is None:
         raise ConfigurationError(
             f"rate = {rate:.4f} is below every baseline's (the smallest is {hull[0].rate:.4f}): "
             "add 'never' to the baselines"
         )
-    left = max((p for p in hull if p.rate <= rate), key=lambda p: p.rate)
-    further = [p for p in hull if p.rate > rate]
-    mixture: Sequence[tuple[EnvelopePoint, float]] = [(left, 1.0)]
-    if further:
-        right = further[0]
-        share = (rate - left.rate) / (right.rate - left.rate)
-        mixture = [(left, 1.0 - share), (right, share)]
-    parts = [(baselines[point.name], share) for point, share in mixture]
-    if any(part.episodes != results.episodes for part, _ in parts):
+    if any(baselines[name].episodes != results.episodes for name in shares):
         raise ConfigurationError(
             "episodes differ between policy and baselines: they must be paired"
         )
-    envelope = np.sum([share * part.mse for part, share in parts], axis=0)
+    envelope = _mixed(baselines, shares)
     return Comparison(
         difference=mean_interval(results.mse - envelope),
         envelope=float(envelope.mean()),
-        between=tuple(point.name for point, share in mixture if share > 0.0),
+        between=tuple(name for name, share in shares.items() if share > 0.0),
     )
