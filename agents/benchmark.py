@@ -21,13 +21,14 @@ from typing import Any
 import joblib
 from tqdm import tqdm
 
+from fusion_gym.core.knowledge import covers
 from fusion_gym.evaluation.envelope import lower_envelope
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.validation import ConfigurationError, choice, integer
 
 from .command_line import Command, spelled, start
 from .output.files import load_results, write
-from .suite.config import COMPARABLE, Setting, Suite, load_suite
+from .suite.config import COMPARED_UP_TO, Setting, Suite, load_suite
 from .suite.jobs import Folders, Job, jobs, run, setting_task
 from .suite.verdict import judge
 from .training.checked import parse
@@ -135,7 +136,7 @@ def conclude(suite: Suite, setting: Setting, folders: Folders) -> dict[str, Any]
         comparable = {
             name: every[name]
             for curve in report["curves"].values()
-            if curve["knows"] in COMPARABLE[mode]
+            if covers(COMPARED_UP_TO[mode], curve["knows"])
             for name in curve["policies"]
         }
         agents = [list(load_results(folders.episodes(job)).values()) for job in done]

@@ -219,7 +219,8 @@ def text_of(
         "Every rule's parameters were tuned with one budget of trials on other seeds, for its "
         "whole curve. An agent is one policy that sees the price of a token, asked at several "
         "prices, and is compared at its own rate with the lower envelope (convex hull, mixtures "
-        "included) of the rules that know no more than it does:",
+        "included) of the rules that know no more than it does, except that a rule may remember "
+        "what a sensor did not send:",
         "",
         *(f"- **{mode}**: {meaning}." for mode, meaning in MODES.items()),
         "",

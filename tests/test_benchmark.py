@@ -16,14 +16,15 @@ import fusion_gym
 from agents import benchmark, report, solved, tune, zoo
 from agents.output.files import load_results, save_results
 from agents.suite import jobs
-from agents.suite.config import Choices, Family, Range, Tuning, load_suite
+from agents.suite.config import COMPARED_UP_TO, Choices, Family, Range, Tuning, load_suite
 from agents.suite.tuning import suggest
 from agents.suite.tuning import tune as tune_family
 from agents.suite.verdict import judge
 from agents.training.algorithms import PPOConfig
+from fusion_gym.core.knowledge import covers, least_covering
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.periodic_optimum import Schedule
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
@@ -40,13 +41,11 @@ SMALL: dict[str, Any] = {
         {
             "label": "innovation",
             "policy": "innovation_threshold",
-            "knows": "own",
             "parameters": {"threshold": {"low": 0.2, "high": 3, "per_sensor": True}},
         },
         {
             "label": "gain",
             "policy": "information_gain",
-            "knows": "centre",
             "parameters": {
                 "threshold": {"low": 0.001, "high": 0.3},
                 "at_most": {"values": [None, 1]},
@@ -158,6 +157,19 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
                 )
 
 
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "results").glob("*/baselines.json")), ids=lambda path: path.parent.name
+)
+def test_agents_were_compared_with_the_rules_that_know_no_more(path: Path) -> None:
+    """What the stored results say of a rule's knowledge decides as the rule's own word does."""
+    stored = json.loads(path.read_text())
+    task = fusion_gym.make_task(stored["env"], **stored["options"])
+    for curve in stored["curves"].values():
+        known = least_covering(make_policy(name, task).knowledge for name in curve["policies"])
+        for limit in COMPARED_UP_TO.values():
+            assert covers(limit, curve["knows"]) == covers(limit, known)
+
+
 def test_trainings_of_the_committed_suite(tmp_path: Path) -> None:
     """Local agents train on as many rows as a coordinator, in whole batches; settings override."""
     suite = load_suite(ROOT / "configs" / "benchmark.yaml")
@@ -185,7 +197,7 @@ def test_trainings_of_the_committed_suite(tmp_path: Path) -> None:
 def test_tuned_policies_are_a_curve() -> None:
     task = fusion_gym.make_task(ENV, filter="tobit", horizon=20)
     family = Family(
-        label="x", policy="innovation_threshold", knows="own",
+        label="x", policy="innovation_threshold",
         parameters={"threshold": Range(low=0.1, high=5), "whitened": Choices(values=(True, False))},
     )  # fmt: skip
     policies = tune_family(task, family, Tuning(trials=12, episodes=30, kept=5))
@@ -202,7 +214,7 @@ def test_tuning_begins_with_values_that_all_sensors_share(monkeypatch: pytest.Mo
     task = fusion_gym.make_task(ENV, filter="tobit", horizon=5)
     space = Range(low=0.1, high=10, per_sensor=True)
     family = Family(
-        label="x", policy="innovation_threshold", knows="own",
+        label="x", policy="innovation_threshold",
         parameters={"threshold": space, "whitened": Choices(values=(True, False))},
     )  # fmt: skip
     asked: list[str] = []

@@ -7,17 +7,19 @@ from typing import Any, Literal
 
 import pydantic
 
+from fusion_gym.core.knowledge import Knowledge
+
 from ..training.algorithms import AlgorithmConfig, AnyAlgorithm, settings
 from ..training.checked import Positive, Rate, Share, Strict, parse, read_yaml
 from ..training.config import EnvironmentConfig
 
 Mode = Literal["sensors", "centre", "local"]
-Knowledge = Literal["coordinator", "own", "centre", "clock"]
-# What a rule may know to be compared with an agent of this mode.
-COMPARABLE: dict[Mode, tuple[Knowledge, ...]] = {
-    "sensors": ("coordinator", "own", "centre", "clock"),
-    "centre": ("centre", "clock"),
-    "local": ("own", "clock"),
+# With which rules an agent of this mode is compared: those that know no more than this. Rules may
+# remember what a sensor did not send, and these agents do not: the envelope favours the rules.
+COMPARED_UP_TO: dict[Mode, Knowledge] = {
+    "sensors": "coordinator_memory",
+    "centre": "centre",
+    "local": "own_memory",
 }
 
 
@@ -43,15 +45,10 @@ class Choices(Strict):
 
 
 class Family(Strict):
-    """A rule with parameters to tune; ``knows`` says with which agents it is compared.
-
-    ``own``: a sensor's own signals. ``centre``: what the centre knows beforehand. ``clock``:
-    nothing but time. ``coordinator``: all sensors' new signals at once.
-    """
+    """A rule with parameters to tune."""
 
     label: str
     policy: str
-    knows: Knowledge
     parameters: dict[str, Range | Choices]
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from fusion_gym.core.knowledge import least_covering
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
@@ -113,9 +114,8 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
     for family in suite.families_of(setting):
         policies = tune(task, family, suite.tuning)
         found |= _test(task, policies, suite)
-        curves[family.label] = {"knows": family.knows, "policies": policies}
-    for name in setting.points:
-        curves[name] = {"knows": "clock", "policies": [name]}
+        curves[family.label] = _curve(task, policies)
+    curves |= {name: _curve(task, [name]) for name in setting.points}
     found |= _test(task, list(setting.points), suite)
     report: dict[str, Any] = {**_header(job, suite, task), "curves": curves}
     if setting.genie is not None:
@@ -124,6 +124,12 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
         results = run_episodes(free, make_policy("always", free), suite.episodes, suite.seed)
         report["genie"] = _summary(results) | {"assumes": setting.genie.assumes}
     _keep(job, folders, found, report)
+
+
+def _curve(task: Task, policies: list[str]) -> dict[str, Any]:
+    """A baseline's policies, and who knows all that they look at."""
+    knows = least_covering(make_policy(name, task).knowledge for name in policies)
+    return {"knows": knows, "policies": policies}
 
 
 def _run_references(job: Job, suite: Suite, folders: Folders) -> None:
