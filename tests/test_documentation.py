@@ -2,52 +2,88 @@
 
 from __future__ import annotations
 
+import ast
+import pydoc
 import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import pytest
 
 import fusion_gym
 from agents import report
-from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.envs.registration import ENVIRONMENTS
-from fusion_gym.policies.registry import TRIGGERS
+from fusion_gym.core.observation import ObservationLayout
+from fusion_gym.core.options import Scenario
+from fusion_gym.envs import pages
+from fusion_gym.envs.registration import ENVIRONMENTS, class_name, options_of
+from fusion_gym.envs.vector import reset_infos
+from fusion_gym.policies import registry
+from fusion_gym.policies.registry import policy_names
+from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions, build
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
-PAGES = [path.read_text() for path in sorted((ROOT / "docs").glob("*.md"))]
-BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", README + "".join(PAGES), re.DOTALL | re.MULTILINE)
+DOCS = sorted((ROOT / "docs").glob("*.md"))
+TEXTS = README + "".join(path.read_text() for path in (*DOCS, ROOT / "CONTRIBUTING.md"))
+BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", TEXTS, re.DOTALL | re.MULTILINE)
 EXAMPLES = [text for language, text in BLOCKS if language == "python"]
 
 
+@pytest.fixture
+def registries() -> Iterator[None]:
+    """What an example registers is gone after it."""
+    tables: tuple[dict[str, Any], ...] = (ENVIRONMENTS, gym.registry, registry._ROWS)
+    kept = [(table, dict(table)) for table in tables]
+    yield
+    for table, before in kept:
+        table.clear()
+        table.update(before)
+
+
 @pytest.mark.parametrize("code", EXAMPLES, ids=range(len(EXAMPLES)))
-def test_python_examples_run(code: str) -> None:
+def test_python_examples_run(code: str, registries: None) -> None:
     exec(compile(code, "example", "exec"), {})
 
 
 def test_the_evaluation_command_runs(tmp_path: Path) -> None:
-    block = next(text for language, text in BLOCKS if not language and "evaluate" in text)
+    block = next(text for _, text in BLOCKS if text.startswith("fusion-gym evaluate"))
     words = shlex.split(block.replace("\\\n", " "))
-    assert words[0] == "python"
+    assert words[0] == "fusion-gym"
     words[words.index("--json") + 1] = str(tmp_path / "evaluation.json")
-    subprocess.run([sys.executable, *words[1:]], cwd=ROOT, check=True, capture_output=True)
+    line = [sys.executable, "-m", "agents", *words[1:]]
+    subprocess.run(line, cwd=ROOT, check=True, capture_output=True)
     assert (tmp_path / "evaluation.json").exists()
 
 
 def test_files_and_configs_that_the_readme_names_exist() -> None:
     linked = re.findall(r"\]\(([\w/.]+)\)", README)
-    configs = re.findall(r"(?:--config|--sweep) (\S+)", README)
+    configs = re.findall(r"(?:--config|--sweep) (\w+)", README)
     assert linked
     assert configs
-    for name in (*linked, *configs):
+    for name in (*linked, *(f"configs/{name}.yaml" for name in configs)):
         assert (ROOT / name).exists(), name
 
 
+def test_files_and_names_of_the_library_that_the_texts_name_exist() -> None:
+    files = re.findall(r"`((?:fusion_gym|agents|configs|docs|tests)/[\w/]+\.\w+)`", TEXTS)
+    names = re.findall(r"`(fusion_gym(?:\.\w+)+)[`(]", TEXTS)
+    assert len(files) > 10
+    assert len(names) > 10
+    assert not [name for name in files if "/my_" not in name and not (ROOT / name).exists()]
+    # Installed, the commands are a part of the library.
+    names = [name.replace("fusion_gym.agents", "agents") for name in names]
+    assert not [name for name in names if pydoc.locate(name) is None]
+
+
 def test_every_policy_is_in_the_readme() -> None:
-    missing = [name for name in TRIGGERS if f"`{name}`" not in README]
+    missing = [name for name in policy_names() if not re.search(rf"`{name}(:\w+)?`", README)]
     assert not missing
 
 
@@ -60,12 +96,112 @@ def test_the_committed_report_says_what_the_results_say() -> None:
     assert missing == []
 
 
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
-def test_every_option_and_observation_is_on_the_page(env_id: str) -> None:
+def doc_of(env_id: str) -> str:
+    """The file in docs that the README's table links for an environment."""
     row = re.search(rf"\[`{env_id}`\]\((docs/\w+\.md)\)", README)
     assert row is not None
-    page = (ROOT / row[1]).read_text()
-    task = fusion_gym.make_task(env_id)
-    assert not [name for name in task.settings if f"`{name}`" not in page]
-    names = EpisodeBatch(task, 1).layout.names
-    assert not [name for name in names if f"`{name.split('[')[0]}" not in page]
+    return (ROOT / row[1]).read_text()
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_every_option_and_observation_is_in_the_docs(env_id: str) -> None:
+    text, task = doc_of(env_id), fusion_gym.make_task(env_id)
+    assert not [name for name in task.settings if f"`{name}`" not in text]
+    blocks = ObservationLayout(task).blocks
+    assert not [block.name for block in blocks if f"`{block.name}" not in text]
+
+
+@pytest.mark.parametrize("env_id", [name for name in ENVIRONMENTS if "BiasedTracking" not in name])
+def test_defaults_in_the_docs_are_those_of_the_code(env_id: str) -> None:
+    """Where a default is written as a number, a tuple or a string; others are described."""
+    defaults = {field.name: field.default for field in fields(options_of(env_id))}
+    compared = 0
+    for names, cell, _ in re.findall(r"^\| (`[^|]*`) \| ([^|]+) \| (.*) \|$", doc_of(env_id), re.M):
+        for name, item in zip(re.findall(r"`(\w+)`", names), written(cell), strict=False):
+            default: Any = defaults.get(name)
+            if default is not None and item is not None:
+                assert np.ravel(item).tolist() == np.ravel(default).tolist(), name
+                compared += 1
+    assert compared > 10
+
+
+def written(cell: str) -> list[Any]:
+    """The values in a table's cell, up to the first alternative; None for a description."""
+    parts = re.split(r",\s*(?![^(]*\))", re.split(r";| / |:", cell)[0])
+
+    def value(text: str) -> Any:
+        try:
+            return ast.literal_eval(text.strip().strip("`"))
+        except (SyntaxError, ValueError):
+            return None
+
+    return [value(part) for part in parts]
+
+
+@pytest.mark.parametrize("path", DOCS, ids=lambda path: path.stem)
+def test_observation_tables_are_those_of_the_code(path: Path) -> None:
+    text = path.read_text()
+    assert "<!-- observation: " in text
+    assert text == pages.documented(text), "run python -m fusion_gym.envs.pages docs/*.md"
+
+
+def test_a_table_marks_what_only_other_options_have() -> None:
+    text = pages.documented(
+        "<!-- observation: fusion_gym/RemoteEstimation-v0 access=random; channel=gilbert_elliott "
+        "-->\n<!-- end -->"
+    )
+    rows = {row.split("`")[1]: row for row in text.splitlines() if row.startswith("| `")}
+    assert 'only with `channel="gilbert_elliott"`' in rows["channel[sensor,bad/good]"]
+    assert "only with" not in rows["admitted[sensor]"]
+    assert "only with a `price_range`" in rows["price"]
+    assert [name for name, row in rows.items() if "` *" in row] == ["error[sensor]"]
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_help_shows_the_whole_page(env_id: str) -> None:
+    prefix = f"fusion_gym.envs.registered.{class_name(env_id)}"
+    text = pydoc.plain(pydoc.render_doc(f"{prefix}Env"))
+    options = [field.name for field in fields(options_of(env_id))]
+    assert not [name for name in options if f"    {name} = " not in text]
+    infos = reset_infos(fusion_gym.make_task(env_id), 1)
+    assert not [key for key in [*infos, *infos["rewards"]] if f"`{key}`" not in text]
+    assert "Starting state: " in text
+    assert "- v0: first version." in text
+    assert pages.page(env_id).splitlines()[0] in pydoc.render_doc(f"{prefix}VectorEnv")
+
+
+def test_an_object_tells_of_its_own_observation() -> None:
+    name = "fusion_gym/MarkovJumpTracking-v0"
+    env, envs = gym.make(name, filter="imm").unwrapped, gym.make_vec(name, 2, horizon=7)
+    assert "`mode_probability[" in str(env.__doc__)
+    assert "`mode_probability[" not in str(type(env).__doc__)
+    assert "here 7, never termination" in str(envs.__doc__)
+
+
+def test_a_page_without_a_text_and_one_with_a_history(monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclass(frozen=True)
+    class Bare(TobitOscillatorOptions):
+        pass
+
+    def bare(chosen: Bare) -> Scenario:
+        return build(chosen)
+
+    @dataclass(frozen=True)
+    class Later(TobitOscillatorOptions):
+        """A title.
+
+        Some text of :class:`Later` and ``Later``.
+
+        v1: it changed.
+        """
+
+    def later(chosen: Later) -> Scenario:
+        return build(chosen)
+
+    bare.__annotations__["chosen"], later.__annotations__["chosen"] = Bare, Later
+    monkeypatch.setitem(ENVIRONMENTS, "test/Bare-v0", bare)
+    monkeypatch.setitem(ENVIRONMENTS, "test/Later-v1", later)
+    assert pages.page("test/Bare-v0").splitlines()[0] == "test/Bare-v0"
+    text = pages.page("test/Later-v1")
+    assert text.startswith("A title.\n\nSome text of `Later` and `Later`.\n\n## Action")
+    assert "- v0: first version.\n- v1: it changed.\n" in text
