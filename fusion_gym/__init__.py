@@ -11,17 +11,18 @@ from typing import TYPE_CHECKING, Any
 from fusion_gym.envs.registration import make_task, register
 from fusion_gym.policies.registry import make_policy, policy_names, register_policy
 from fusion_gym.validation import ConfigurationError
+from fusion_gym.version import __version__
 
 if TYPE_CHECKING:
     from fusion_gym import evaluation, zoo
     from fusion_gym.envs.parallel import FusionParallelEnv, parallel_env
     from fusion_gym.envs.sb3 import FusionSB3VecEnv, make_sb3_vec_env
 
-__version__ = "0.1.0"
 __all__ = [
     "ConfigurationError",
     "FusionParallelEnv",
     "FusionSB3VecEnv",
+    "__version__",
     "evaluation",
     "make_policy",
     "make_sb3_vec_env",

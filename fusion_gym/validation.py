@@ -211,3 +211,30 @@ def not_negative(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     if np.any(result < 0):
         raise _refuse(field, value, ">= 0 everywhere")
     return result
+
+
+def one_or_each(value: ArrayLike) -> tuple[int, ...]:
+    """The shape of a parameter that is one number for all sensors, (), or one for each, (l,)."""
+    given = np.asarray(value)
+    return given.shape if given.ndim == 1 else ()
+
+
+def adaptive_thresholds(rho_bar: ArrayLike, rho_initial: ArrayLike, adaptation: ArrayLike) -> None:
+    """0 <= ρ₀ <= ρ̄ <= 1 and λ > 0, each one number or one a sensor.
+
+    Raises:
+        ConfigurationError: anything else.
+
+    Source: unknown_input, equations (5)-(7).
+    """
+    limit = not_negative("rho_bar", rho_bar, one_or_each(rho_bar))
+    if np.any(limit > 1.0):
+        raise _refuse("rho_bar", rho_bar, ">= 0 and <= 1")
+    initial = not_negative("rho_initial", rho_initial, one_or_each(rho_initial))
+    if initial.ndim == limit.ndim == 1 and len(initial) != len(limit):
+        raise _refuse(
+            "rho_initial", rho_initial, f"a number, or as many as rho_bar = {rho_bar!r} has"
+        )
+    if np.any(initial > limit):
+        raise _refuse("rho_initial", rho_initial, f"<= rho_bar = {rho_bar!r}")
+    positive("adaptation", adaptation, one_or_each(adaptation))

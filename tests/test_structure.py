@@ -15,6 +15,7 @@ FLOORS = {
     "gaussian": 0,
     "linalg": 0,
     "validation": 0,
+    "version": 0,
     "core": 1,
     "fusion": 1,
     "systems": 2,

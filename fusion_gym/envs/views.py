@@ -22,18 +22,32 @@ Requests = NDArray[np.bool_]
 
 
 class View(Protocol):
-    """What a policy sees of N runs and how it answers, batch axis first.
+    """What a policy sees of N runs and how it answers, batch axis first."""
 
-    ``names`` has one name an entry of a row, ``space`` is the Box of a row, ``actions`` the space
-    of its decision; ``rows_per_run`` rows of a run stand together. ``knowledge`` is what a row
-    shows, in the one vocabulary.
-    """
+    @property
+    def names(self) -> tuple[str, ...]:
+        """One name an entry of a row."""
+        ...
 
-    names: tuple[str, ...]
-    space: spaces.Box
-    actions: spaces.MultiBinary | spaces.Discrete[Any]
-    rows_per_run: int
-    knowledge: Knowledge
+    @property
+    def space(self) -> spaces.Box:
+        """The Box of a row, float32."""
+        ...
+
+    @property
+    def actions(self) -> spaces.MultiBinary | spaces.Discrete[Any]:
+        """The space of a row's decision."""
+        ...
+
+    @property
+    def rows_per_run(self) -> int:
+        """Rows that belong to one run; they stand together."""
+        ...
+
+    @property
+    def knowledge(self) -> Knowledge:
+        """What a row shows, in the one vocabulary."""
+        ...
 
     def rows(self, observation: Rows) -> Rows:
         """From observations (N, coordinator's entries) to rows (N·rows_per_run, entries)."""
@@ -101,7 +115,7 @@ class CoordinatorView:
                 f"action {given.tolist()!r} of type {given.dtype} is not allowed: it must be "
                 "numbers"
             )
-        wanted = (runs, *self.actions.shape)
+        wanted = (runs, *(self.actions.shape or ()))
         if given.shape != wanted:
             raise ValueError(f"action of shape {given.shape} is not allowed: it must be {wanted}")
         if isinstance(self.actions, spaces.MultiBinary):
@@ -170,7 +184,7 @@ class SensorView:
         low = np.concatenate((layout.low[columns[0]], np.zeros(count, dtype=np.float32)))
         high = np.concatenate((layout.high[columns[0]], np.ones(count, dtype=np.float32)))
         self.space = spaces.Box(low, high, dtype=np.float32)
-        self.actions: spaces.MultiBinary | spaces.Discrete[Any] = spaces.Discrete(2)
+        self.actions: spaces.Discrete[Any] = spaces.Discrete(2)
 
     def rows(self, observation: Rows) -> Rows:
         """See :class:`View`: (N, coordinator's entries) to (N·sensors, entries)."""

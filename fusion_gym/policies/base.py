@@ -83,8 +83,7 @@ def not_negative(name: str, value: Any) -> None:
     Raises:
         ConfigurationError: anything else.
     """
-    given = np.asarray(value)
-    validation.not_negative(name, value, given.shape if given.ndim == 1 else ())
+    validation.not_negative(name, value, validation.one_or_each(value))
 
 
 def each_number(name: str, value: Any, **limits: float) -> None:

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-import fusion_gym
 from fusion_gym import validation
 from fusion_gym.core.system import System
 from fusion_gym.validation import ConfigurationError
+from fusion_gym.version import __version__
 
 Patterns = NDArray[np.bool_]
 
@@ -36,7 +36,7 @@ class Schedule(NamedTuple):
 def schedule_key(system: System[Any], packets: int, period: int, steps: int | None) -> str:
     """Hash of the system's type and all its numbers, and of what is asked for."""
     digest = hashlib.sha256()
-    asked = (_FORMAT, fusion_gym.__version__, packets, period, steps)
+    asked = (_FORMAT, __version__, packets, period, steps)
     digest.update(repr(asked).encode())
     _feed(digest, system)
     return digest.hexdigest()

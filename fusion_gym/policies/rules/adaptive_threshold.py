@@ -10,8 +10,7 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.system import Signals
-from fusion_gym.policies.base import PerSensor, Requests, Rule, not_negative, parameter, shape_of
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.policies.base import PerSensor, Requests, Rule, parameter, shape_of
 
 
 @dataclass
@@ -40,7 +39,7 @@ class AdaptiveThreshold(Rule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_thresholds(self.rho_bar, self.rho_initial, self.adaptation)
+        validation.adaptive_thresholds(self.rho_bar, self.rho_initial, self.adaptation)
 
     @property
     def knowledge(self) -> Knowledge:
@@ -67,28 +66,3 @@ class AdaptiveThreshold(Rule):
         share = squared / (self.column("adaptation", sensors) + squared)
         self._rho = limit + share * (rho - limit)
         return request
-
-
-def check_thresholds(rho_bar: PerSensor, rho_initial: PerSensor, adaptation: PerSensor) -> None:
-    """0 <= ρ₀ <= ρ̄ <= 1 and λ > 0, each one number or one a sensor.
-
-    Raises:
-        ConfigurationError: anything else.
-    """
-    for name, value in (("rho_bar", rho_bar), ("rho_initial", rho_initial)):
-        not_negative(name, value)
-    if np.any(np.asarray(rho_bar) > 1.0):
-        raise ConfigurationError(f"rho_bar = {rho_bar!r} is not allowed: it must be >= 0 and <= 1")
-    try:
-        reversed_ = np.any(np.asarray(rho_initial) > np.asarray(rho_bar))
-    except ValueError:
-        raise ConfigurationError(
-            f"rho_initial = {rho_initial!r} is not allowed: it must be a number, or as many as "
-            f"rho_bar = {rho_bar!r} has"
-        ) from None
-    if reversed_:
-        raise ConfigurationError(
-            f"rho_initial = {rho_initial!r} is not allowed: it must be <= rho_bar = {rho_bar!r}"
-        )
-    given = np.asarray(adaptation)
-    validation.positive("adaptation", adaptation, given.shape if given.ndim == 1 else ())

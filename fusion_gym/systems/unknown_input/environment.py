@@ -16,7 +16,6 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.fusion.table import Structure, choose_rule
-from fusion_gym.policies.rules.adaptive_threshold import check_thresholds
 from fusion_gym.systems.unknown_input.bound_filter import BoundTables
 from fusion_gym.systems.unknown_input.examples import EXAMPLES
 from fusion_gym.systems.unknown_input.filters import ExactInputStateFilter, RandomWalkInputFilter
@@ -238,7 +237,7 @@ def _trigger(chosen: UnknownInputOptions, sensors: int) -> dict[str, tuple[float
         name: tuple(validation.spread(name, _given(getattr(chosen, name)), (sensors,)).tolist())
         for name in names
     }
-    check_thresholds(*spread.values())
+    validation.adaptive_thresholds(*spread.values())
     return spread
 
 
