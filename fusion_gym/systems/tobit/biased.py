@@ -18,13 +18,11 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import Scenario
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
-from fusion_gym.systems.tobit.centre import Centre
-from fusion_gym.systems.tobit.filters import KalmanFilter
 from fusion_gym.systems.tobit.options import (
+    FILTERS,
     FeedbackOptions,
-    assumed_density_centre,
-    feedback_centre,
-    stochastic_centre,
+    at_the_nodes,
+    make_centre,
     stochastic_defaults,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -33,6 +31,7 @@ from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 _ANGLE = 0.052 * math.pi
 _COS, _SIN = math.cos(_ANGLE), math.sin(_ANGLE)
+_FILTERS = {"paper": at_the_nodes(TobitKalmanFilter), **FILTERS}
 _PERIOD = 0.1  # seconds between two samples of the tracking example
 # Observed variances are relative to those after so many silent steps: over a whole episode the
 # target, a double integrator of a random walk, drifts thousands of times as far as it is known.
@@ -146,7 +145,7 @@ def _build(chosen: BiasedOscillatorOptions) -> Scenario:
     system = CensoredSystem(
         plant=plant,
         model=model,
-        centre=_centre(chosen, sensors),
+        centre=make_centre(chosen.filter, _FILTERS, chosen, sensors),
         random_start=random_start,
         state_names=tuple(f"x{i + 1}" for i in range(states))
         + (("b",) if biases == 1 else tuple(f"b{i + 1}" for i in range(biases))),
@@ -155,8 +154,7 @@ def _build(chosen: BiasedOscillatorOptions) -> Scenario:
     )
     # Every state counts alike, relative to its variance without any transmission.
     weights = 1.0 / (plant.size * system.open_loop(horizon))
-    defaults = stochastic_defaults(chosen, chosen.filter)
-    return Scenario(chosen, system, weights, defaults)
+    return Scenario(chosen, system, weights, stochastic_defaults(chosen))
 
 
 def _augmented(chosen: BiasedOscillatorOptions, aware: bool) -> tuple[LinearPlant, int]:
@@ -195,13 +193,3 @@ def _diagonal(first: Array, second: Array) -> Array:
     result = np.zeros((size + len(second),) * 2)
     result[:size, :size], result[size:, size:] = first, second
     return result
-
-
-def _centre(chosen: BiasedOscillatorOptions, sensors: CensoredSensors) -> Centre:
-    kind = validation.choice("filter", chosen.filter, ("paper", "adf", "kalman", "stochastic"))
-    if kind == "stochastic":
-        return stochastic_centre(chosen, sensors)
-    if kind == "adf":
-        return assumed_density_centre(chosen, sensors)
-    paper = kind == "paper"
-    return feedback_centre(chosen, TobitKalmanFilter(sensors) if paper else KalmanFilter(sensors))

@@ -1,7 +1,8 @@
-"""Options of environments whose nodes get the fused estimate back: fusion rule and centre."""
+"""Options of environments whose nodes get the fused estimate back: filters and fusion rule."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,11 +10,11 @@ from numpy.typing import ArrayLike
 
 from fusion_gym.core.options import CommonOptions, plain
 from fusion_gym.fusion.table import Structure, choose_rule
-from fusion_gym.systems.tobit.centre import Feedback, FeedbackCentre, SequentialCentre
-from fusion_gym.systems.tobit.filters import NodeFilter, StochasticEventFilter
+from fusion_gym.systems.tobit.centre import Centre, Feedback, FeedbackCentre, SequentialCentre
+from fusion_gym.systems.tobit.filters import KalmanFilter, NodeFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, choice
 
 _STRUCTURE = Structure(
     common="all nodes start from the same prediction", holds=("information shares",)
@@ -33,6 +34,37 @@ class FeedbackOptions(CommonOptions):
     information_shares: ArrayLike | None = None
     order: ArrayLike | None = None
     stochastic_weight: ArrayLike | None = None
+
+
+@dataclass(frozen=True)
+class Filter:
+    """A row of a table of filters: the centre that it makes of options and sensors.
+
+    ``own`` are options that belong to this filter alone; elsewhere they are ``None``.
+    """
+
+    make: Callable[[Any, CensoredSensors], Centre]
+    own: tuple[str, ...] = ()
+
+
+def at_the_nodes(node: Callable[[CensoredSensors], NodeFilter]) -> Filter:
+    """The row of a node filter without options of its own."""
+    return Filter(lambda chosen, sensors: feedback_centre(chosen, node(sensors)))
+
+
+def make_centre(
+    kind: str, filters: Mapping[str, Filter], chosen: FeedbackOptions, sensors: CensoredSensors
+) -> Centre:
+    """The centre of the option ``filter``, by a table of filters.
+
+    Raises:
+        ConfigurationError: an unknown filter, or an option that is not the filter's.
+    """
+    choice("filter", kind, filters)
+    for name, row in filters.items():
+        if name != kind:
+            _refuse(chosen, row.own, f"filter={kind!r}", f"filter={name!r}")
+    return filters[kind].make(chosen, sensors)
 
 
 def feedback_centre(chosen: FeedbackOptions, node: NodeFilter) -> FeedbackCentre:
@@ -59,16 +91,11 @@ def stochastic_centre(chosen: FeedbackOptions, sensors: CensoredSensors) -> Feed
     return feedback_centre(chosen, StochasticEventFilter.create(sensors, chosen.stochastic_weight))
 
 
-def stochastic_defaults(chosen: FeedbackOptions, kind: str) -> dict[str, dict[str, Any]]:
-    """The scenario's parameters of the policy ``stochastic_event``, if the filter knows it.
-
-    Raises:
-        ConfigurationError: a weight for another filter.
-    """
-    if kind == "stochastic":
-        return {"stochastic_event": {"weight": plain(chosen.stochastic_weight)}}
-    _refuse(chosen, ("stochastic_weight",), f"filter={kind!r}", "filter='stochastic'")
-    return {}
+def stochastic_defaults(chosen: FeedbackOptions) -> dict[str, dict[str, Any]]:
+    """The scenario's parameters of the policy ``stochastic_event``, if the filter knows it."""
+    if chosen.stochastic_weight is None:
+        return {}
+    return {"stochastic_event": {"weight": plain(chosen.stochastic_weight)}}
 
 
 def assumed_density_centre(chosen: FeedbackOptions, sensors: CensoredSensors) -> SequentialCentre:
@@ -84,6 +111,14 @@ def assumed_density_centre(chosen: FeedbackOptions, sensors: CensoredSensors) ->
         "a filter with nodes (here the centre takes the measurements itself)",
     )
     return SequentialCentre(AssumedDensityFilter(sensors))
+
+
+# What every environment of the family offers; each adds its paper's own.
+FILTERS = {
+    "kalman": at_the_nodes(KalmanFilter),
+    "adf": Filter(assumed_density_centre),
+    "stochastic": Filter(stochastic_centre, own=("stochastic_weight",)),
+}
 
 
 def _refuse(chosen: FeedbackOptions, names: tuple[str, ...], where: str, belongs: str) -> None:

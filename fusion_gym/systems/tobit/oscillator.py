@@ -19,12 +19,13 @@ from fusion_gym.core.options import Scenario
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.tobit.bound_filter import BoundConstants, BoundTobitFilter, EventError
 from fusion_gym.systems.tobit.centre import Centre
-from fusion_gym.systems.tobit.filters import KalmanFilter
 from fusion_gym.systems.tobit.options import (
+    FILTERS,
     FeedbackOptions,
-    assumed_density_centre,
+    Filter,
+    at_the_nodes,
     feedback_centre,
-    stochastic_centre,
+    make_centre,
     stochastic_defaults,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -103,13 +104,13 @@ def build(chosen: TobitOscillatorOptions) -> Scenario:
     system = CensoredSystem(
         plant=plant,
         model=plant,
-        centre=_centre(chosen, sensors, trigger),
+        centre=_centre(chosen, sensors),
         random_start=random_start,
         state_names=tuple(f"x{i + 1}" for i in range(plant.size)),
         scale=typical_magnitude(plant, horizon, random_start),
         reference=plant.open_loop(horizon),
     )
-    defaults = {"dynamic_event": trigger} | stochastic_defaults(chosen, chosen.filter)
+    defaults = {"dynamic_event": trigger} | stochastic_defaults(chosen)
     return Scenario(chosen, system, policy_defaults=defaults)
 
 
@@ -128,36 +129,39 @@ def _plant(chosen: TobitOscillatorOptions) -> LinearPlant:
     )
 
 
-def _centre(
-    chosen: TobitOscillatorOptions, sensors: CensoredSensors, trigger: dict[str, tuple[float, ...]]
-) -> Centre:
-    kind = validation.choice(
-        "filter", chosen.filter, ("paper", "tobit", "kalman", "adf", "stochastic")
-    )
-    constants = BoundConstants.create(chosen.bound_epsilon)
-    error = EventError.create(**trigger, young=chosen.bound_young, sensors=sensors.count)
-    silent, with_error = chosen.silent, chosen.event_error
-    if silent is not None:
-        validation.choice("silent", silent, ("hold", "predict"))
-    if with_error is not None:
-        validation.boolean("event_error", with_error)
-    if kind == "paper":
-        bound = BoundTobitFilter(
-            sensors, constants, None if with_error is False else error, hold=silent != "predict"
-        )
-        return feedback_centre(chosen, bound)
-    for name, value, refused in (("silent", silent, "hold"), ("event_error", with_error, True)):
-        if value == refused:
+def _centre(chosen: TobitOscillatorOptions, sensors: CensoredSensors) -> Centre:
+    centre = make_centre(chosen.filter, _FILTERS, chosen, sensors)
+    _bound_filter(chosen, sensors)  # its numbers are checked whatever the filter
+    for name, refused in (("silent", "hold"), ("event_error", True)):
+        if chosen.filter != "paper" and getattr(chosen, name) == refused:
             raise ConfigurationError(
-                f"{name} = {value!r} is not allowed with filter={kind!r}: it belongs to "
+                f"{name} = {refused!r} is not allowed with filter={chosen.filter!r}: it belongs to "
                 "filter='paper' (the others predict when nothing arrives and know no event error)"
             )
-    if kind == "adf":
-        return assumed_density_centre(chosen, sensors)
-    if kind == "stochastic":
-        return stochastic_centre(chosen, sensors)
-    tobit = kind == "tobit"
-    return feedback_centre(chosen, TobitKalmanFilter(sensors) if tobit else KalmanFilter(sensors))
+    return centre
+
+
+def _bound_filter(chosen: TobitOscillatorOptions, sensors: CensoredSensors) -> BoundTobitFilter:
+    """The filter of the paper, with its constants and the trigger's Ξ."""
+    constants = BoundConstants.create(chosen.bound_epsilon)
+    trigger = _trigger(chosen, sensors.count)
+    error = EventError.create(**trigger, young=chosen.bound_young, sensors=sensors.count)
+    if chosen.silent is not None:
+        validation.choice("silent", chosen.silent, ("hold", "predict"))
+    if chosen.event_error is not None:
+        validation.boolean("event_error", chosen.event_error)
+    with_error = chosen.event_error is None or chosen.event_error
+    hold = chosen.silent != "predict"
+    return BoundTobitFilter(sensors, constants, error if with_error else None, hold=hold)
+
+
+_FILTERS = {
+    "paper": Filter(
+        lambda chosen, sensors: feedback_centre(chosen, _bound_filter(chosen, sensors))
+    ),
+    "tobit": at_the_nodes(TobitKalmanFilter),
+    **FILTERS,
+}
 
 
 def _trigger(chosen: TobitOscillatorOptions, sensors: int) -> dict[str, tuple[float, ...]]:
