@@ -214,7 +214,7 @@ def compare(model: dict[str, Any], pattern: NDArray[np.bool_], tolerance: float 
     lags = recursion.start(runs)
     for time, sent in enumerate(pattern):
         place = recursion.filters.at(np.full(runs, time))
-        joint = recursion.offer(lags, place).joint(sent)
+        joint = recursion.prediction(lags, place).joint(sent)
         fused = fusion.fuse(np.zeros((len(sent), n, runs)), joint).covariance
         for run, other in enumerate(dense):
             expected = other.copies(sent[:, run])
@@ -249,7 +249,7 @@ def test_runs_at_different_times_stand_side_by_side() -> None:
     alone, lags = [], recursion.start(1)
     for time, sent in enumerate(pattern):
         place = recursion.filters.at(np.array([time]))
-        alone.append(recursion.offer(lags, place).joint(sent[:, None]))
+        alone.append(recursion.prediction(lags, place).joint(sent[:, None]))
         lags = recursion.predict(lags, sent[:, None], place)
     both, late = recursion.start(2), 7  # the second run begins later
     for time in range(late, 30):
@@ -261,7 +261,7 @@ def test_runs_at_different_times_stand_side_by_side() -> None:
                 array[..., 0] = getattr(lags, name)[..., 0]
         place = recursion.filters.at(np.array([time, time - late]))
         sent = np.stack((pattern[time], pattern[time - late]), axis=1)
-        joint = recursion.offer(both, place).joint(sent)
+        joint = recursion.prediction(both, place).joint(sent)
         np.testing.assert_array_equal(joint[..., 0], alone[time][..., 0])
         np.testing.assert_array_equal(joint[..., 1], alone[time - late][..., 0])
         both = recursion.predict(both, sent, place)

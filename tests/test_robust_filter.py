@@ -112,7 +112,7 @@ def test_update_agrees_with_filterpys_correlated_update(size: int) -> None:
     covariance = random_covariances(size, 3, plant.size, 6)
     mean = np.random.default_rng(1).normal(size=(3, plant.size, 6))
     measurement = np.random.default_rng(2).normal(size=(3, size, 6))
-    plan, expected = node.plan(covariance), node.expect(mean)
+    outcomes, expected = node.outcomes(covariance), node.expect(mean)
     for sensor in range(3):
         for run in range(6):
             other = filterpy.kalman.KalmanFilter(dim_x=plant.size, dim_z=size)
@@ -121,14 +121,14 @@ def test_update_agrees_with_filterpys_correlated_update(size: int) -> None:
             other.R = sensors.covariance[sensor, sensor, ..., 0]
             other.M = sensors.cross_covariance[sensor, ..., 0]
             other.update_correlated(measurement[sensor, :, run])
-            gain = plan.gain[sensor, ..., run]
+            gain = outcomes.gain[sensor, ..., run]
             innovation = measurement[sensor, :, run] - expected[sensor, :, run]
             np.testing.assert_allclose(gain, other.K, rtol=1e-9, atol=1e-12)
             np.testing.assert_allclose(
                 mean[sensor, :, run] + gain @ innovation, other.x, rtol=1e-9, atol=1e-12
             )
             np.testing.assert_allclose(
-                plan.delivered_covariance[sensor, ..., run], other.P, rtol=1e-8, atol=1e-10
+                outcomes.delivered_covariance[sensor, ..., run], other.P, rtol=1e-8, atol=1e-10
             )
 
 
@@ -150,9 +150,9 @@ def test_uncorrelated_node_that_always_receives_is_filterpys_kalman_filter() -> 
     for _ in range(50):
         measurement = draw.normal(size=(3, 1, 1))
         mean, covariance = plant.predict(mean, covariance)
-        plan = node.plan(covariance)
-        mean = mean + plan.gain[:, :, 0] * (measurement - node.expect(mean))
-        covariance = plan.delivered_covariance
+        outcomes = node.outcomes(covariance)
+        mean = mean + outcomes.gain[:, :, 0] * (measurement - node.expect(mean))
+        covariance = outcomes.delivered_covariance
         for sensor, other in enumerate(others):
             other.predict()
             other.update(measurement[sensor, :, 0])
@@ -168,7 +168,7 @@ def test_update_conditions_the_joint_gaussian_of_state_and_measurement() -> None
     n, r, m = plant.size, plant.noise_channels, sensors.size
     source = np.block([[before, np.zeros((n, r + m))], [np.zeros((r + m, n)), np.eye(r + m)]])
     prior = phi @ before @ phi.T + gamma @ gamma.T
-    plan = RobustKalmanFilter(sensors).plan(np.tile(prior[None, ..., None], (3, 1, 1, 1)))
+    outcomes = RobustKalmanFilter(sensors).outcomes(np.tile(prior[None, ..., None], (3, 1, 1, 1)))
     for sensor in range(3):
         matrix = sensors.measurement_matrix[sensor, ..., 0]
         state = np.hstack([phi, gamma, np.zeros((n, m))])
@@ -176,12 +176,14 @@ def test_update_conditions_the_joint_gaussian_of_state_and_measurement() -> None
         seen = matrix @ state + np.hstack([np.zeros((m, n)), sensors.coupling[sensor, ..., 0], own])
         cross, variance = state @ source @ seen.T, seen @ source @ seen.T
         posterior = state @ source @ state.T - cross @ np.linalg.solve(variance, cross.T)
-        np.testing.assert_allclose(plan.innovation_covariance[sensor, ..., 0], variance, rtol=1e-10)
         np.testing.assert_allclose(
-            plan.gain[sensor, ..., 0], cross @ np.linalg.inv(variance), rtol=1e-8, atol=1e-12
+            outcomes.innovation_covariance[sensor, ..., 0], variance, rtol=1e-10
         )
         np.testing.assert_allclose(
-            plan.delivered_covariance[sensor, ..., 0], posterior, rtol=1e-8, atol=1e-10
+            outcomes.gain[sensor, ..., 0], cross @ np.linalg.inv(variance), rtol=1e-8, atol=1e-12
+        )
+        np.testing.assert_allclose(
+            outcomes.delivered_covariance[sensor, ..., 0], posterior, rtol=1e-8, atol=1e-10
         )
 
 
@@ -190,7 +192,7 @@ def test_posterior_is_the_papers_lyapunov_form_and_its_gain_the_best() -> None:
     plant, sensors = random_parts(21)
     before = random_covariances(22, 3, plant.size, 1)
     _, prior = plant.predict(np.zeros((3, plant.size, 1)), before)
-    plan = RobustKalmanFilter(sensors).plan(prior)
+    outcomes = RobustKalmanFilter(sensors).outcomes(prior)
 
     def lyapunov(sensor: int, gain: Array) -> Array:
         kept = np.eye(plant.size) - gain @ sensors.measurement_matrix[sensor, ..., 0]
@@ -206,9 +208,9 @@ def test_posterior_is_the_papers_lyapunov_form_and_its_gain_the_best() -> None:
         return result
 
     for sensor in range(3):
-        gain = plan.gain[sensor, ..., 0]
+        gain = outcomes.gain[sensor, ..., 0]
         best = lyapunov(sensor, gain)
-        np.testing.assert_allclose(plan.delivered_covariance[sensor, ..., 0], best, rtol=1e-8)
+        np.testing.assert_allclose(outcomes.delivered_covariance[sensor, ..., 0], best, rtol=1e-8)
         for seed in range(5):
             worse = lyapunov(sensor, gain + np.random.default_rng(seed).normal(size=gain.shape))
             assert np.linalg.eigvalsh(worse - best)[0] >= -1e-9
@@ -242,16 +244,16 @@ def walk(
         measurement = sensors.measure(truth, process, own)
         mean = np.einsum("ij,sjr->sir", plant.transition[..., 0], mean)
         _, covariance = plant.predict(np.zeros((count, n, 1)), covariance)
-        plan = node.plan(covariance)
+        outcomes = node.outcomes(covariance)
         granted = draw.random((count, 1)) < 0.5
         weights = draw.normal(size=(count + 1, n, n, 1)) * 0.3
         weights[0] = np.eye(n)[..., None] - weights[1:].sum(0)
-        gain = np.where(granted[:, None, None], plan.gain, 0.0)
+        gain = np.where(granted[:, None, None], outcomes.gain, 0.0)
         mean[1:] += np.einsum("sim,smr->sir", gain[..., 0], measurement - node.expect(mean[1:]))
         mean[0] = np.einsum("sij,sjr->ir", weights[..., 0], mean)
-        covariance = np.where(granted[:, None, None], plan.delivered_covariance, covariance)
+        covariance = np.where(granted[:, None, None], outcomes.delivered_covariance, covariance)
         joint = tracker.predict(joint, factor)
-        joint = tracker.fuse(tracker.update(joint, plan.gain, granted, factor), weights)
+        joint = tracker.fuse(tracker.update(joint, outcomes.gain, granted, factor), weights)
         dense = dense_step(plant, sensors, dense, gain[..., 0], weights[..., 0], scale)
     blocks = dense.reshape(count + 1, n, count + 1, n).transpose(0, 2, 1, 3)
     return (truth - mean).reshape(-1, runs), joint[..., 0], blocks, covariance[..., 0]

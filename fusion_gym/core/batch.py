@@ -73,7 +73,7 @@ class EpisodeBatch:
 
     @classmethod
     def seeded(cls, task: Task, episodes: int, seed: int) -> EpisodeBatch:
-        """Episodes with the seeds ``seed``, ``seed + 1``, …, side by side at their first sensing."""
+        """Episodes side by side, sensed once, with the seeds ``seed``, ``seed + 1``, …"""
         batch = cls(task, episodes)
         batch.seed(np.arange(episodes), [seed + i for i in range(episodes)])
         batch.reset()

@@ -18,7 +18,7 @@ from fusion_gym.systems.correlated.sensors import CorrelatedSensors
 from fusion_gym.systems.linear_plant import LinearPlant
 
 
-class RobustPlan(NamedTuple):
+class RobustOutcomes(NamedTuple):
     """What a delivery would do at every node; none of it depends on the measurement.
 
     ``gain`` K (sensors, n, m, N); ``innovation_covariance`` (sensors, m, m, N);
@@ -60,7 +60,7 @@ class RobustKalmanFilter:
         noise = sensors.covariance[own, own] + crossed + linalg.transpose(crossed)
         return linalg.congruence(matrix, covariance) + noise
 
-    def plan(self, covariance: Array) -> RobustPlan:
+    def outcomes(self, covariance: Array) -> RobustOutcomes:
         """Gains and posterior covariances from prior covariances (sensors, n, n, N).
 
         Source: adaptive_innovation, equation (12).
@@ -74,7 +74,7 @@ class RobustKalmanFilter:
         else:
             gain = linalg.transpose(linalg.solve(innovation, linalg.transpose(cross)))
         reduction = linalg.matmul(gain, linalg.transpose(cross))
-        return RobustPlan(gain, innovation, linalg.symmetrise(covariance - reduction))
+        return RobustOutcomes(gain, innovation, linalg.symmetrise(covariance - reduction))
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.systems.correlated.filters import (
     JointErrorCovariance,
     RobustKalmanFilter,
-    RobustPlan,
+    RobustOutcomes,
 )
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.validation import ConfigurationError
@@ -36,8 +36,8 @@ class CorrelatedTrackingState:
     Estimate 0 is the fused one and estimate i the one of node i. ``truth`` (n, N) · ``scale``
     (N,), actual variances over their bounds · ``measurement`` (l, m, N) · ``held`` (l, m, N), the
     last delivered measurement · ``age`` (l, N), steps since then · ``prior_mean`` (l + 1, n, N),
-    ``prior_covariance`` (l + 1, n, n, N), predictions · ``expected`` (l, m, N) and ``plan`` of the
-    nodes · ``mean`` (l + 1, n, N), ``covariance`` (l + 1, n, n, N), posteriors · ``joint``
+    ``prior_covariance`` (l + 1, n, n, N), predictions · ``expected`` (l, m, N) and ``outcomes`` at
+    the nodes · ``mean`` (l + 1, n, N), ``covariance`` (l + 1, n, n, N), posteriors · ``joint``
     (l + 1, l + 1, n, n, N), the actual covariances, if they are tracked.
     """
 
@@ -49,7 +49,7 @@ class CorrelatedTrackingState:
     prior_mean: Array
     prior_covariance: Array
     expected: Array
-    plan: RobustPlan | None
+    outcomes: RobustOutcomes | None
     mean: Array
     covariance: Array
     joint: Array | None
@@ -199,7 +199,7 @@ class CorrelatedTrackingSystem:
             prior_mean=mean,
             prior_covariance=covariance,
             expected=expected,
-            plan=None,
+            outcomes=None,
             mean=mean,
             covariance=covariance,
             joint=None if self.joint is None else self.joint.start(scale),
@@ -224,7 +224,7 @@ class CorrelatedTrackingSystem:
             prior_mean=prior_mean,
             prior_covariance=prior_covariance,
             expected=self.filter.expect(prior_mean[1:]),
-            plan=self.filter.plan(prior_covariance[1:]),
+            outcomes=self.filter.outcomes(prior_covariance[1:]),
             joint=joint,
         )
 
@@ -235,17 +235,17 @@ class CorrelatedTrackingSystem:
 
         Source: adaptive_innovation, equations (12), (37)-(41) or (47)-(53).
         """
-        plan = _sensed(state)
+        outcomes = _sensed(state)
         grant = granted[:, None]
         mean, covariance = state.prior_mean.copy(), state.prior_covariance.copy()
-        correction = linalg.matvec(plan.gain, state.measurement - state.expected)
+        correction = linalg.matvec(outcomes.gain, state.measurement - state.expected)
         mean[1:] += np.where(grant, correction, 0.0)
-        np.copyto(covariance[1:], plan.delivered_covariance, where=grant[:, None])
+        np.copyto(covariance[1:], outcomes.delivered_covariance, where=grant[:, None])
         fused = self.fusion.fuse(mean, covariance, _with_prediction(granted))
         mean[0], covariance[0] = fused.mean, fused.covariance
         joint = state.joint
         if self.joint is not None and joint is not None:
-            joint = self.joint.update(joint, plan.gain, granted, state.scale)
+            joint = self.joint.update(joint, outcomes.gain, granted, state.scale)
             joint = self.joint.fuse(joint, fused.gains)
         return replace(
             state,
@@ -260,18 +260,18 @@ class CorrelatedTrackingSystem:
         self, state: CorrelatedTrackingState
     ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
         """The signals named in ``SIGNALS``."""
-        plan = _sensed(state)
+        outcomes = _sensed(state)
         return {
             "measurement": state.measurement,
             "innovation": lambda: state.measurement - state.expected,
             "held": state.held,
             "age": state.age,
             "expected_measurement": state.expected,
-            "innovation_deviation": lambda: _deviation(plan.innovation_covariance),
+            "innovation_deviation": lambda: _deviation(outcomes.innovation_covariance),
             "prior_mean": state.prior_mean[0],
             "prior_covariance": state.prior_covariance[0],
             "silent_variance": lambda: self._weighted_trace(state.prior_covariance[0]),
-            "variance_reduction": lambda: self._variance_reduction(state, plan),
+            "variance_reduction": lambda: self._variance_reduction(state, outcomes),
         }
 
     def visible(self, state: CorrelatedTrackingState) -> CorrelatedTrackingState:
@@ -334,8 +334,10 @@ class CorrelatedTrackingSystem:
     def _weighted_trace(self, covariance: Array) -> Array:
         return (self.state_weights[:, None] * linalg.diagonal(covariance)).sum(-2)
 
-    def _variance_reduction(self, state: CorrelatedTrackingState, plan: RobustPlan) -> Array:
-        covariance = np.concatenate((state.prior_covariance[:1], plan.delivered_covariance))
+    def _variance_reduction(
+        self, state: CorrelatedTrackingState, outcomes: RobustOutcomes
+    ) -> Array:
+        covariance = np.concatenate((state.prior_covariance[:1], outcomes.delivered_covariance))
         silent = self._weighted_trace(covariance[0])
         result = np.empty((self.sensor_count, len(silent)))
         for sensor in range(self.sensor_count):
@@ -356,7 +358,7 @@ def _deviation(covariance: Array) -> Array:
     return np.sqrt(linalg.diagonal(covariance))
 
 
-def _sensed(state: CorrelatedTrackingState) -> RobustPlan:
-    if state.plan is None:
+def _sensed(state: CorrelatedTrackingState) -> RobustOutcomes:
+    if state.outcomes is None:
         raise RuntimeError("the state has no measurements yet: call sense first")
-    return state.plan
+    return state.outcomes

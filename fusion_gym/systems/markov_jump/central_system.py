@@ -19,7 +19,7 @@ from fusion_gym.core.system import Block, Signal, SignalArray, age_block, number
 from fusion_gym.systems.markov_jump.centralised_linear import (
     Belief,
     CentralisedLinearFilter,
-    Forecast,
+    Prediction,
 )
 from fusion_gym.systems.markov_jump.interacting_models import InteractingModels
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, Times
@@ -37,7 +37,7 @@ class MarkovJumpCentralState:
     ``time`` k (N,) · ``truth`` (n, N), ``mode`` θ (N,), ``process_noise`` w(k) (r, N), which moves
     the plant next · ``measurement`` (l, N), the held value where a sensor does not sample ·
     ``held`` (l, N), the last delivered measurement · ``age`` (l, N), steps since then ·
-    ``belief`` of the centre, a prediction until delivery · ``forecast`` from that prediction ·
+    ``belief`` of the centre, a prior until delivery · ``prediction`` made from that prior ·
     ``mean`` (n, N), ``covariance`` (n, n, N), the centre's after the delivery.
     """
 
@@ -49,7 +49,7 @@ class MarkovJumpCentralState:
     held: Array
     age: Array
     belief: Belief
-    forecast: Forecast | None
+    prediction: Prediction | None
     mean: Array
     covariance: Array
 
@@ -243,7 +243,7 @@ class MarkovJumpCentralSystem:
         truth, mode = self.plant.start(noise[: n + 1])
         belief, time = self.estimator.start(runs), np.zeros(runs, dtype=np.int64)
         mean, covariance = self.estimator.estimate(belief)
-        held = self.estimator.forecast(belief, time).mean[n:]
+        held = self.estimator.prediction(belief, time).mean[n:]
         return MarkovJumpCentralState(
             time=time,
             truth=truth,
@@ -253,7 +253,7 @@ class MarkovJumpCentralSystem:
             held=held,
             age=np.zeros((self.sensor_count, runs)),
             belief=belief,
-            forecast=None,
+            prediction=None,
             mean=mean,
             covariance=covariance,
         )
@@ -277,7 +277,7 @@ class MarkovJumpCentralSystem:
             measurement=np.where(self.sensors.sampled(time), measurement, state.held),
             age=state.age + 1.0,
             belief=belief,
-            forecast=self.estimator.forecast(belief, time),
+            prediction=self.estimator.prediction(belief, time),
         )
 
     def deliver(
@@ -303,25 +303,25 @@ class MarkovJumpCentralSystem:
         self, state: MarkovJumpCentralState
     ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
         """The signals named in ``CENTRAL_SIGNALS``."""
-        forecast, n = _sensed(state), self.plant.size
-        prior = forecast.covariance[:n, :n]
+        prediction, n = _sensed(state), self.plant.size
+        prior = prediction.covariance[:n, :n]
         return {
             "measurement": state.measurement[:, None],
-            "innovation": lambda: self._innovation(state, forecast)[:, None],
+            "innovation": lambda: self._innovation(state, prediction)[:, None],
             "held": state.held[:, None],
             "age": state.age,
-            "expected_measurement": forecast.mean[n:, None],
-            "innovation_deviation": lambda: self._deviation(forecast)[:, None],
-            "prior_mean": forecast.mean[:n],
+            "expected_measurement": prediction.mean[n:, None],
+            "innovation_deviation": lambda: self._deviation(prediction)[:, None],
+            "prior_mean": prediction.mean[:n],
             "prior_covariance": prior,
             "silent_variance": lambda: (self.state_weights[:, None] * linalg.diagonal(prior)).sum(
                 0
             ),
             "variance_reduction": lambda: self._reduction(
-                forecast.covariance, self.state_weights, self.sensors.sampled(state.time)
+                prediction.covariance, self.state_weights, self.sensors.sampled(state.time)
             ),
             "centre_variance": lambda: linalg.trace(prior),
-            "greedy_variance": lambda: self._greedy_variance(state, forecast),
+            "greedy_variance": lambda: self._greedy_variance(state, prediction),
             "sampled": lambda: self.sensors.sampled(state.time),
         }
 
@@ -345,12 +345,12 @@ class MarkovJumpCentralSystem:
         """Mean error variance (n,) over t = 1..horizon of a centre that never receives."""
         return self.model.open_loop(horizon)
 
-    def _innovation(self, state: MarkovJumpCentralState, forecast: Forecast) -> Array:
-        surprise = state.measurement - forecast.mean[self.plant.size :]
+    def _innovation(self, state: MarkovJumpCentralState, prediction: Prediction) -> Array:
+        surprise = state.measurement - prediction.mean[self.plant.size :]
         return np.where(self.sensors.sampled(state.time), surprise, 0.0)
 
-    def _deviation(self, forecast: Forecast) -> Array:
-        return np.sqrt(linalg.diagonal(forecast.covariance)[self.plant.size :])
+    def _deviation(self, prediction: Prediction) -> Array:
+        return np.sqrt(linalg.diagonal(prediction.covariance)[self.plant.size :])
 
     def _reduction(self, covariance: Array, weights: Array, useful: NDArray[np.bool_]) -> Array:
         """Fall (l, N) of the weighted trace by each measurement alone, best linear update."""
@@ -360,9 +360,9 @@ class MarkovJumpCentralSystem:
         own = linalg.diagonal(covariance)[n:]
         return np.where(useful, squares / np.where(useful, own, 1.0), 0.0)
 
-    def _greedy_variance(self, state: MarkovJumpCentralState, forecast: Forecast) -> Array:
+    def _greedy_variance(self, state: MarkovJumpCentralState, prediction: Prediction) -> Array:
         """Samples join one after another, each time the one that lowers the trace most."""
-        n, covariance = self.plant.size, forecast.covariance
+        n, covariance = self.plant.size, prediction.covariance
         left = self.sensors.sampled(state.time)
         sensors, result = np.arange(self.sensor_count)[:, None], np.zeros(left.shape)
         for _ in range(self.sensor_count):
@@ -392,7 +392,7 @@ def _measured(linear: CentralisedLinearFilter, horizon: int) -> Array:
     return np.asarray(np.sqrt(total / horizon + ((coupling @ noise) * coupling).sum(1)))
 
 
-def _sensed(state: MarkovJumpCentralState) -> Forecast:
-    if state.forecast is None:
+def _sensed(state: MarkovJumpCentralState) -> Prediction:
+    if state.prediction is None:
         raise RuntimeError("the state has no measurements yet: call sense first")
-    return state.forecast
+    return state.prediction

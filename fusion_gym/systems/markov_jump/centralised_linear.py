@@ -36,7 +36,7 @@ class Belief(NamedTuple):
     covariance: Array
 
 
-class Forecast(NamedTuple):
+class Prediction(NamedTuple):
     """Moments of col(x, y): the plant's states and all sensors' measurements.
 
     ``mean`` (n + l, N), ``covariance`` (n + l, n + l, N), as if all sensors sampled.
@@ -58,7 +58,7 @@ def with_noise(
     return Belief(probability, means, spread)
 
 
-def absorb(
+def condition_on(
     belief: Belief, rows: Array, variance: Array, measurement: Array, taken: NDArray[np.bool_]
 ) -> tuple[Belief, Array]:
     """The belief after the measurements that are ``taken``, and their log likelihood by model.
@@ -103,14 +103,14 @@ def mixture(belief: Belief, maps: Array) -> tuple[Array, Array]:
     return mean, (belief.probability[:, None, None] * spreads).sum(0)
 
 
-def foresee(belief: Belief, maps: Array, variance: Array) -> Forecast:
-    """The forecast with ``maps`` (M, n + l, s, 1) and the noises' ``variance`` (M, l, N)."""
+def predict_jointly(belief: Belief, maps: Array, variance: Array) -> Prediction:
+    """The prediction with ``maps`` (M, n + l, s, 1) and the noises' ``variance`` (M, l, N)."""
     mean, covariance = mixture(belief, maps)
     own, sensors = (belief.probability[:, None] * variance).sum(0), variance.shape[1]
     for sensor in range(sensors):
         place = len(mean) - sensors + sensor
         covariance[place, place] += own[sensor]
-    return Forecast(mean, covariance)
+    return Prediction(mean, covariance)
 
 
 @dataclass(frozen=True)
@@ -178,16 +178,16 @@ class CentralisedLinearFilter:
         noise = self.model.plant.noise_covariance
         return with_noise(belief.probability, mean[None], covariance[None], noise)
 
-    def forecast(self, belief: Belief, time: Times) -> Forecast:
+    def prediction(self, belief: Belief, time: Times) -> Prediction:
         """What a prediction for ``time`` (N,) says of the plant and the measurements."""
-        return foresee(belief, self.maps, self._variance(time))
+        return predict_jointly(belief, self.maps, self._variance(time))
 
     def update(
         self, belief: Belief, measurement: Array, taken: NDArray[np.bool_], time: Times
     ) -> Belief:
         """A prediction for ``time`` after the ``taken`` (l, N) of the measurements (l, N)."""
         rows = self.maps[:, self.model.plant.size :]
-        return absorb(belief, rows, self._variance(time), measurement, taken)[0]
+        return condition_on(belief, rows, self._variance(time), measurement, taken)[0]
 
     def estimate(self, belief: Belief) -> tuple[Array, Array]:
         """Mean (n, N) and covariance (n, n, N) of the plant's state."""

@@ -16,10 +16,10 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.systems.markov_jump.centralised_linear import (
     Belief,
-    Forecast,
-    absorb,
-    foresee,
+    Prediction,
+    condition_on,
     mixture,
+    predict_jointly,
     with_noise,
 )
 from fusion_gym.systems.markov_jump.linear_minimum_variance import Times
@@ -96,10 +96,10 @@ class InteractingModels:
         probability /= probability.sum(0)
         return with_noise(probability, mean, covariance, self.plant.noise_covariance)
 
-    def forecast(self, belief: Belief, time: Times) -> Forecast:
+    def prediction(self, belief: Belief, time: Times) -> Prediction:
         """What a prediction for ``time`` (N,) says of the plant and the measurements."""
         del time
-        return foresee(belief, self.maps, self._variance(belief))
+        return predict_jointly(belief, self.maps, self._variance(belief))
 
     def update(
         self, belief: Belief, measurement: Array, taken: NDArray[np.bool_], time: Times
@@ -107,7 +107,7 @@ class InteractingModels:
         """A prediction for ``time`` after the ``taken`` (l, N) of the measurements (l, N)."""
         del time
         rows, variance = self.maps[:, self.plant.size :], self._variance(belief)
-        after, likelihood = absorb(belief, rows, variance, measurement, taken)
+        after, likelihood = condition_on(belief, rows, variance, measurement, taken)
         # The likeliest possible model has weight one, so that far tails do not make 0 / 0.
         possible = np.where(belief.probability > 0.0, likelihood, -np.inf)
         weights = belief.probability * np.exp(possible - possible.max(0))

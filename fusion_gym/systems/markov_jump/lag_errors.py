@@ -29,7 +29,7 @@ class LagCovariances(NamedTuple):
     crossed: Array
 
 
-class Offer(NamedTuple):
+class JointPrediction(NamedTuple):
     """What may be sent at time k, in the plant's states: covariances after the nodes' update.
 
     ``local`` E L⁺_i L⁺_jᵀ, ``crossed`` E d⁺_i L⁺_jᵀ and ``lag`` E d⁺_i d⁺_jᵀ, each
@@ -134,7 +134,7 @@ class LagRecursion:
             np.multiply(block, silent[i] * silent[j], out=following.lag[row])
         return following
 
-    def offer(self, now: LagCovariances, place: Times) -> Offer:
+    def prediction(self, now: LagCovariances, place: Times) -> JointPrediction:
         """After the nodes' update at the time with the ``place`` (N,), before anything is sent."""
         filters, n = self.filters, self.states
         count, runs = len(filters.gain), len(place)
@@ -160,7 +160,7 @@ class LagRecursion:
             lag[i, j] = block + linalg.outer(gain[i], right)
             if i != j:
                 lag[j, i] = linalg.transpose(lag[i, j])
-        return Offer(self.local.take(place, -1), crossed, lag)
+        return JointPrediction(self.local.take(place, -1), crossed, lag)
 
 
 def _ordered(count: int) -> list[tuple[int, int]]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import Block, Signal, numbered
-from fusion_gym.systems.markov_jump.lag_errors import LagCovariances, Offer
+from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagCovariances
 from fusion_gym.systems.markov_jump.linear_minimum_variance import Times
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
@@ -63,7 +63,7 @@ class MarkovJumpState:
     ``node_mean`` ζ̂(k|k) (l, a, N), ``node_noise`` ŵ (l, r, N), the nodes' ·
     ``copy_mean`` (l, a, N), ``copy_noise`` (l, r, N), the centre's: a prediction until delivery ·
     ``held`` (l, n, N), the last delivered estimates · ``age`` (l, N), steps since then ·
-    ``sent`` (l, N) bool, the last deliveries · ``lags`` and ``offer``, covariances ·
+    ``sent`` (l, N) bool, the last deliveries · ``lags`` and ``prediction``, covariances ·
     ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N), fused if nobody transmits ·
     ``mean`` (n, N), ``covariance`` (n, n, N), fused after the delivery.
     """
@@ -81,7 +81,7 @@ class MarkovJumpState:
     age: Array
     sent: NDArray[np.bool_]
     lags: LagCovariances
-    offer: Offer | None
+    prediction: JointPrediction | None
     prior_mean: Array
     prior_covariance: Array
     mean: Array

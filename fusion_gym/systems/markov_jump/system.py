@@ -16,7 +16,7 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
-from fusion_gym.systems.markov_jump.lag_errors import LagRecursion, Offer
+from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagRecursion
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
@@ -196,7 +196,7 @@ class MarkovJumpSystem:
             age=np.zeros((count, runs)),
             sent=np.ones((count, runs), dtype=np.bool_),
             lags=self.recursion.start(runs),
-            offer=None,
+            prediction=None,
             prior_mean=state_mean,
             prior_covariance=covariance,
             mean=state_mean,
@@ -217,9 +217,9 @@ class MarkovJumpSystem:
         update = self.filters.update(prior, measurement, self.sensors.sampled(time), place)
         copy_mean = self.filters.predict(state.copy_mean, state.copy_noise, before)
         lags = self.recursion.predict(state.lags, state.sent, before)
-        offer = self.recursion.offer(lags, place)
+        prediction = self.recursion.prediction(lags, place)
         nobody = np.zeros(state.sent.shape, dtype=np.bool_)
-        silent = self.fusion.fuse(self._collapse(copy_mean), offer.joint(nobody))
+        silent = self.fusion.fuse(self._collapse(copy_mean), prediction.joint(nobody))
         return replace(
             state,
             time=time,
@@ -233,7 +233,7 @@ class MarkovJumpSystem:
             copy_noise=np.zeros_like(state.copy_noise),
             age=state.age + 1.0,
             lags=lags,
-            offer=offer,
+            prediction=prediction,
             prior_mean=silent.mean,
             prior_covariance=silent.covariance,
         )
@@ -259,7 +259,7 @@ class MarkovJumpSystem:
 
     def read(self, state: MarkovJumpState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
         """The signals named in ``SIGNALS``."""
-        offer = _sensed(state)
+        prediction = _sensed(state)
         place = self.filters.at(state.time)
         return {
             "measurement": lambda: self._collapse(state.node_mean),
@@ -267,13 +267,13 @@ class MarkovJumpSystem:
             "held": state.held,
             "age": state.age,
             "expected_measurement": lambda: self._collapse(state.copy_mean),
-            "innovation_deviation": lambda: self._lag_deviation(offer),
+            "innovation_deviation": lambda: self._lag_deviation(prediction),
             "prior_mean": state.prior_mean,
             "prior_covariance": state.prior_covariance,
             "silent_variance": lambda: self._weighted_trace(state.prior_covariance),
-            "variance_reduction": lambda: self._variance_reduction(state, offer),
+            "variance_reduction": lambda: self._variance_reduction(state, prediction),
             "centre_variance": lambda: linalg.trace(state.prior_covariance),
-            "greedy_variance": lambda: self._greedy_variance(state, offer),
+            "greedy_variance": lambda: self._greedy_variance(state, prediction),
             "local_variance": lambda: self.recursion.local_trace.take(place, -1),
             "sampled": lambda: self.sensors.sampled(state.time),
         }
@@ -327,32 +327,32 @@ class MarkovJumpSystem:
         return self.recursion.local_trace.take(self.filters.at(state.time), -1)
 
     def _copy_log_deviation(self, state: MarkovJumpState) -> Array:
-        offer, nodes = _sensed(state), np.arange(self.sensor_count)
-        copies = linalg.diagonal(offer.local[nodes, nodes] + offer.lag[nodes, nodes])
+        prediction, nodes = _sensed(state), np.arange(self.sensor_count)
+        copies = linalg.diagonal(prediction.local[nodes, nodes] + prediction.lag[nodes, nodes])
         return 0.5 * np.log(copies / self.reference[:, None])
 
-    def _lag_deviation(self, offer: Offer) -> Array:
+    def _lag_deviation(self, prediction: JointPrediction) -> Array:
         """Predicted deviations (l, n, N) of node minus copy, never zero."""
         nodes = np.arange(self.sensor_count)
-        variance = linalg.diagonal(offer.lag[nodes, nodes])
+        variance = linalg.diagonal(prediction.lag[nodes, nodes])
         return np.sqrt(np.maximum(variance, (_FLOOR * _FLOOR) * self.reference[:, None]))
 
     def _weighted_trace(self, covariance: Array) -> Array:
         return (self.state_weights[:, None] * linalg.diagonal(covariance)).sum(-2)
 
-    def _variance_reduction(self, state: MarkovJumpState, offer: Offer) -> Array:
+    def _variance_reduction(self, state: MarkovJumpState, prediction: JointPrediction) -> Array:
         silent = self._weighted_trace(state.prior_covariance)
         nobody = np.zeros(state.sent.shape, dtype=np.bool_)
-        each = self._covariances_with_one_more(state, offer, nobody)
+        each = self._covariances_with_one_more(state, prediction, nobody)
         return np.stack([silent - self._weighted_trace(covariance) for covariance in each])
 
-    def _greedy_variance(self, state: MarkovJumpState, offer: Offer) -> Array:
+    def _greedy_variance(self, state: MarkovJumpState, prediction: JointPrediction) -> Array:
         """Sensors join one after another, each time the one that lowers the trace most."""
         sent = np.zeros(state.sent.shape, dtype=np.bool_)
         sensors, result = np.arange(self.sensor_count)[:, None], np.empty(sent.shape)
         trace = linalg.trace(state.prior_covariance)
         for _ in range(self.sensor_count):
-            each = self._covariances_with_one_more(state, offer, sent)
+            each = self._covariances_with_one_more(state, prediction, sent)
             options = np.where(sent, np.inf, [linalg.trace(covariance) for covariance in each])
             chosen = sensors == options.argmin(0)
             result[chosen] = np.broadcast_to(trace, sent.shape)[chosen]
@@ -360,18 +360,18 @@ class MarkovJumpSystem:
         return result
 
     def _covariances_with_one_more(
-        self, state: MarkovJumpState, offer: Offer, sent: NDArray[np.bool_]
+        self, state: MarkovJumpState, prediction: JointPrediction, sent: NDArray[np.bool_]
     ) -> list[Array]:
         """Fused covariances (n, n, N) if ``sent`` (l, N) and one sensor more transmit, each."""
         means, each = self._collapse(state.copy_mean), []
         for sensor in range(self.sensor_count):
             more = sent.copy()
             more[sensor] = True
-            each.append(self.fusion.fuse(means, offer.joint(more)).covariance)
+            each.append(self.fusion.fuse(means, prediction.joint(more)).covariance)
         return each
 
 
-def _sensed(state: MarkovJumpState) -> Offer:
-    if state.offer is None:
+def _sensed(state: MarkovJumpState) -> JointPrediction:
+    if state.prediction is None:
         raise RuntimeError("the state has no measurements yet: call sense first")
-    return state.offer
+    return state.prediction

@@ -37,7 +37,7 @@ class Estimates(NamedTuple):
     weights: Array | None
 
 
-class Outlook(NamedTuple):
+class Prediction(NamedTuple):
     """Predictions for the coming measurement.
 
     ``mean`` (l, s, N), ``fused_mean`` (s, N), ``expected`` measurements (l, m, N), and
@@ -67,14 +67,14 @@ class Nodes(Protocol):
         """Before any measurement."""
         ...
 
-    def look(self, estimates: Estimates, time: Array) -> Outlook:
+    def predict(self, estimates: Estimates, time: Array) -> Prediction:
         """Predictions for the measurements at ``time`` (N,)."""
         ...
 
     def update(
         self,
         estimates: Estimates,
-        outlook: Outlook,
+        prediction: Prediction,
         held: Array,
         granted: NDArray[np.bool_],
         time: Array,
@@ -82,7 +82,7 @@ class Nodes(Protocol):
         """Posteriors; ``held`` (l, m, N) are the last delivered measurements, the new included."""
         ...
 
-    def prior_covariance(self, outlook: Outlook, time: Array) -> Array:
+    def prior_covariance(self, prediction: Prediction, time: Array) -> Array:
         """The nodes' covariances (l, s, s, N or 1) before the update at ``time``."""
         ...
 
@@ -91,7 +91,7 @@ class Nodes(Protocol):
         ...
 
     def variances(
-        self, estimates: Estimates, outlook: Outlook, weights: Array, time: Array
+        self, estimates: Estimates, prediction: Prediction, weights: Array, time: Array
     ) -> tuple[Array, Array]:
         """Weighted fused trace (N,) if nobody transmits, and its reductions (l, N) by each alone.
 
@@ -110,10 +110,10 @@ def _start(model: InputModel, sensors: InputSensors, runs: int) -> tuple[Array, 
 
 def _predicted(
     model: InputModel, sensors: InputSensors, estimates: Estimates, covariance: Array | None
-) -> Outlook:
+) -> Prediction:
     every = np.concatenate((estimates.mean, estimates.fused_mean[None]))
     prior = model.predict(every)
-    return Outlook(prior[:-1], prior[-1], sensors.expect(prior[:-1]), covariance)
+    return Prediction(prior[:-1], prior[-1], sensors.expect(prior[:-1]), covariance)
 
 
 @dataclass(frozen=True)
@@ -167,14 +167,14 @@ class TableNodes:
         mean, fused, _ = _start(self.model, self.sensors, runs)
         return Estimates(mean, fused, None, None, None)
 
-    def look(self, estimates: Estimates, time: Array) -> Outlook:
+    def predict(self, estimates: Estimates, time: Array) -> Prediction:
         """See :class:`Nodes`."""
         return _predicted(self.model, self.sensors, estimates, None)
 
     def update(
         self,
         estimates: Estimates,
-        outlook: Outlook,
+        prediction: Prediction,
         held: Array,
         granted: NDArray[np.bool_],
         time: Array,
@@ -184,14 +184,14 @@ class TableNodes:
         Source: unknown_input, equations (8), (24).
         """
         gain = self._at(self.tables.gain, time)
-        mean = outlook.mean + linalg.matvec(gain, held - outlook.expected)
+        mean = prediction.mean + linalg.matvec(gain, held - prediction.expected)
         n = self.model.size
         state = linalg.matvec(self._at(self.state_gain, time), mean[:, :n])
         inputs = linalg.matvec(self._at(self.input_gain, time), mean[:, n:])
         fused = np.concatenate((state.sum(0), inputs.sum(0)))
         return Estimates(mean, fused, None, None, None)
 
-    def prior_covariance(self, outlook: Outlook, time: Array) -> Array:
+    def prior_covariance(self, prediction: Prediction, time: Array) -> Array:
         """From the table; at time 0, where nothing is predicted, without meaning."""
         return self._at(self.prior, time)
 
@@ -200,7 +200,7 @@ class TableNodes:
         return self._at(self.fused, time)
 
     def variances(
-        self, estimates: Estimates, outlook: Outlook, weights: Array, time: Array
+        self, estimates: Estimates, prediction: Prediction, weights: Array, time: Array
     ) -> tuple[Array, Array]:
         """The bound's trace, and how far it falls where one held difference is known to be zero."""
         every = weights[:, None]
@@ -244,7 +244,7 @@ class RunNodes:
             mean, fused, every, covariance, self.fusion.start(self.sensors.count, runs)
         )
 
-    def look(self, estimates: Estimates, time: Array) -> Outlook:
+    def predict(self, estimates: Estimates, time: Array) -> Prediction:
         """See :class:`Nodes`."""
         prior = self.model.predict_covariance(_own(estimates.covariance))
         return _predicted(self.model, self.sensors, estimates, prior)
@@ -252,46 +252,46 @@ class RunNodes:
     def update(
         self,
         estimates: Estimates,
-        outlook: Outlook,
+        prediction: Prediction,
         held: Array,
         granted: NDArray[np.bool_],
         time: Array,
     ) -> Estimates:
         """Granted nodes update, the others predict (or hold); the centre fuses all."""
-        gain, covariance = self._outcome(estimates, outlook, granted)
-        correction = linalg.matvec(gain, held - outlook.expected)
+        gain, covariance = self._outcome(estimates, prediction, granted)
+        correction = linalg.matvec(gain, held - prediction.expected)
         if self.hold_variance is None:
             grant = granted[:, None]
             correction *= grant
-            covariance = np.where(grant[:, None], covariance, _own(outlook.covariance))
-        mean = outlook.mean + correction
+            covariance = np.where(grant[:, None], covariance, _own(prediction.covariance))
+        mean = prediction.mean + correction
         fused = self.fusion.going_on(estimates.weights).fuse(mean, covariance)
         return Estimates(mean, fused.mean, covariance, fused.covariance, fused.weights)
 
-    def prior_covariance(self, outlook: Outlook, time: Array) -> Array:
+    def prior_covariance(self, prediction: Prediction, time: Array) -> Array:
         """The runs' own (l, s, s, N)."""
-        return _own(outlook.covariance)
+        return _own(prediction.covariance)
 
     def fused_covariance(self, estimates: Estimates, time: Array) -> Array:
         """The centre's covariance (s, s, N)."""
         return _own(estimates.fused_covariance)
 
     def variances(
-        self, estimates: Estimates, outlook: Outlook, weights: Array, time: Array
+        self, estimates: Estimates, prediction: Prediction, weights: Array, time: Array
     ) -> tuple[Array, Array]:
         """See :class:`Nodes`; with the best fusion weights."""
-        nobody = np.zeros((self.sensors.count, outlook.expected.shape[-1]), dtype=np.bool_)
-        silent = _own(outlook.covariance)
+        nobody = np.zeros((self.sensors.count, prediction.expected.shape[-1]), dtype=np.bool_)
+        silent = _own(prediction.covariance)
         if self.hold_variance is not None:
-            silent = self._outcome(estimates, outlook, nobody)[1]
-        delivered = self._outcome(estimates, outlook, ~nobody)[1]
+            silent = self._outcome(estimates, prediction, nobody)[1]
+        delivered = self._outcome(estimates, prediction, ~nobody)[1]
         together, alone = self.fusion.fuse_alone(silent, delivered)
         every = weights[:, None]
         start: Array = (every * linalg.diagonal(together)).sum(0)
         return start, start - (every * linalg.diagonal(alone)).sum(1)
 
     def _outcome(
-        self, estimates: Estimates, outlook: Outlook, granted: NDArray[np.bool_]
+        self, estimates: Estimates, prediction: Prediction, granted: NDArray[np.bool_]
     ) -> tuple[Array, Array]:
         """Gain (l, s, m, N) and covariance (l, s, s, N) of an update."""
         noise = self.sensors.covariance
@@ -300,7 +300,7 @@ class RunNodes:
         if self.hold_variance is not None:
             extra = self.hold_variance * ~granted[:, None, None]
             noise = noise + linalg.identity(self.sensors.size) * extra
-        return self.filter.update(_own(outlook.covariance), noise)
+        return self.filter.update(_own(prediction.covariance), noise)
 
 
 def _own(value: Array | None) -> Array:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
-from fusion_gym.systems.unknown_input.nodes import Estimates, Nodes, Outlook, RunNodes
+from fusion_gym.systems.unknown_input.nodes import Estimates, Nodes, Prediction, RunNodes
 from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
 from fusion_gym.systems.unknown_input.signals import InputSignal
 
@@ -30,7 +30,7 @@ class UnknownInputState:
     ``truth`` (s, N), the state x(k) and the input d(k - 1) that has just acted · ``signal``
     (rows, N), the memory of the input signal · ``time`` (N,), sampling instants since the start ·
     ``measurement`` (l, m, N) · ``held`` (l, m, N), the last delivered measurement · ``age`` (l, N),
-    instants since then · ``estimates``, the posteriors · ``outlook``, the predictions.
+    instants since then · ``estimates``, the posteriors · ``prediction``, the predictions.
     """
 
     truth: Array
@@ -40,7 +40,7 @@ class UnknownInputState:
     held: Array
     age: Array
     estimates: Estimates
-    outlook: Outlook | None
+    prediction: Prediction | None
 
 
 _COMPONENTS = "(sensors, m, N)"
@@ -193,7 +193,7 @@ class UnknownInputSystem:
             held=measurement,
             age=np.zeros((sensors.count, runs)),
             estimates=self.nodes.start(runs),
-            outlook=None,
+            prediction=None,
         )
 
     def sense(self, state: UnknownInputState, noise: Array) -> UnknownInputState:
@@ -212,7 +212,7 @@ class UnknownInputSystem:
             time=time,
             measurement=self.nodes.sensors.measure(moved, noise[drawn + r :]),
             age=state.age + 1.0,
-            outlook=self.nodes.look(state.estimates, time),
+            prediction=self.nodes.predict(state.estimates, time),
         )
 
     def deliver(self, state: UnknownInputState, granted: NDArray[np.bool_]) -> UnknownInputState:
@@ -232,23 +232,23 @@ class UnknownInputSystem:
         self, state: UnknownInputState
     ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
         """The signals named in ``SIGNALS``."""
-        outlook = _sensed(state)
+        prediction = _sensed(state)
 
         @functools.cache
         def variances() -> tuple[Array, Array]:
-            return self.nodes.variances(state.estimates, outlook, self.state_weights, state.time)
+            return self.nodes.variances(state.estimates, prediction, self.state_weights, state.time)
 
         def everyone(value: Array) -> Array:
             return np.broadcast_to(value, (*value.shape[:-1], len(state.time)))
 
         return {
             "measurement": state.measurement,
-            "innovation": lambda: state.measurement - outlook.expected,
+            "innovation": lambda: state.measurement - prediction.expected,
             "held": state.held,
             "age": state.age,
-            "expected_measurement": outlook.expected,
+            "expected_measurement": prediction.expected,
             "innovation_deviation": lambda: everyone(self._deviation(state)),
-            "prior_mean": outlook.fused_mean[: self.plant.size],
+            "prior_mean": prediction.fused_mean[: self.plant.size],
             "prior_covariance": lambda: everyone(self._fused_prior(state)),
             "silent_variance": lambda: variances()[0],
             "variance_reduction": lambda: variances()[1],
@@ -322,7 +322,7 @@ def _lanes(value: Array, runs: int) -> Array:
     return np.broadcast_to(value, (*value.shape[:-1], runs))
 
 
-def _sensed(state: UnknownInputState) -> Outlook:
-    if state.outlook is None:
+def _sensed(state: UnknownInputState) -> Prediction:
+    if state.prediction is None:
         raise RuntimeError("the state has no measurements yet: call sense first")
-    return state.outlook
+    return state.prediction
