@@ -1,0 +1,1 @@
+"""Shipped configs of trainings, sweeps, tables and the benchmark."""
