@@ -7,7 +7,9 @@ Information Technology & Electronic Engineering 24, 2023.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,7 +36,6 @@ from fusion_gym.systems.unknown_input.signals import (
 from fusion_gym.systems.unknown_input.system import UnknownInputSystem
 from fusion_gym.validation import ConfigurationError
 
-FILTERS = ("random_walk", "predict", "paper")
 _STRUCTURE = Structure(common="all contain the same process noise", holds=("tracked weights",))
 SIGNALS = ("sinusoids", "steps", "random_walk")
 
@@ -213,21 +214,51 @@ def _nodes(
     joint = JointGain.create(plant, sensors)
     rule = choose_rule(chosen.fusion, _STRUCTURE, sensors.count)
     fusion = NodeFusion(rule, plant.size, tracked=chosen.fusion == "ci")
+    if chosen.hold_variance is not None and kind != "random_walk":
+        raise ConfigurationError(
+            f"hold_variance = {chosen.hold_variance!r} is not allowed with filter={kind!r}: "
+            "it belongs to filter='random_walk'"
+        )
+    return FILTERS[kind](chosen, _Parts(model, sensors, joint, fusion, factor, horizon))
+
+
+class _Parts(NamedTuple):
+    """What nodes are made of; ``factor`` (sensors,) is that of Young's inequality."""
+
+    model: InputModel
+    sensors: InputSensors
+    joint: JointGain
+    fusion: NodeFusion
+    factor: Array
+    horizon: int
+
+
+def _random_walk(chosen: UnknownInputOptions, parts: _Parts) -> Nodes:
     hold = None
     if chosen.hold_variance is not None:
-        if kind != "random_walk":
-            raise ConfigurationError(
-                f"hold_variance = {chosen.hold_variance!r} is not allowed with filter={kind!r}: "
-                "it belongs to filter='random_walk'"
-            )
-        hold = validation.not_negative("hold_variance", chosen.hold_variance, (sensors.count,))
+        shape = (parts.sensors.count,)
+        hold = validation.not_negative("hold_variance", chosen.hold_variance, shape)
         hold = hold[:, None, None, None]
-    if kind == "paper":
-        tables = BoundTables.create(joint, model, _given(chosen.rho_bar), factor, horizon)
-        return TableNodes.create(model, sensors, tables, fusion)
-    if kind == "predict":
-        return RunNodes(model, sensors, ExactInputStateFilter(model, joint), fusion)
-    return RunNodes(model, sensors, RandomWalkInputFilter(model, sensors), fusion, hold)
+    node = RandomWalkInputFilter(parts.model, parts.sensors)
+    return RunNodes(parts.model, parts.sensors, node, parts.fusion, hold)
+
+
+def _predict(chosen: UnknownInputOptions, parts: _Parts) -> Nodes:
+    node = ExactInputStateFilter(parts.model, parts.joint)
+    return RunNodes(parts.model, parts.sensors, node, parts.fusion)
+
+
+def _paper(chosen: UnknownInputOptions, parts: _Parts) -> Nodes:
+    bound = _given(chosen.rho_bar)
+    tables = BoundTables.create(parts.joint, parts.model, bound, parts.factor, parts.horizon)
+    return TableNodes.create(parts.model, parts.sensors, tables, parts.fusion)
+
+
+FILTERS: dict[str, Callable[[UnknownInputOptions, _Parts], Nodes]] = {
+    "random_walk": _random_walk,
+    "predict": _predict,
+    "paper": _paper,
+}
 
 
 def _trigger(chosen: UnknownInputOptions, sensors: int) -> dict[str, tuple[float, ...]]:
