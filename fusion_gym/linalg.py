@@ -48,6 +48,14 @@ def trace(a: FloatArray) -> FloatArray:
     return total
 
 
+def weighted_trace(a: FloatArray, weights: FloatArray) -> FloatArray:
+    """Sum of the diagonal's entries times ``weights`` (n,): ``(..., n, n, N)`` to ``(..., N)``."""
+    total = weights[0] * a[..., 0, 0, :]
+    for k in range(1, a.shape[-2]):
+        total += weights[k] * a[..., k, k, :]
+    return total
+
+
 def add_diagonal(a: FloatArray, d: FloatArray) -> FloatArray:
     """``a + diag(d)``: ``(..., n, n, N)`` and d broadcastable to ``(..., n, N)``, a new array."""
     result = a.copy()

@@ -60,10 +60,17 @@ def outcomes(
     """Delivered mean and covariance, silent mean and covariance."""
     expectation = node_filter.expect(problem.mean)
     times = np.full(problem.mean.shape[-1], float(time))
-    plan = node_filter.plan(problem.mean, problem.covariance, expectation, problem.held, times)
+    outcomes = node_filter.outcomes(
+        problem.mean, problem.covariance, expectation, problem.held, times
+    )
     innovation = problem.value - expectation.value
-    delivered = problem.mean + np.einsum("smkN,smN->skN", plan.correction, innovation)
-    return delivered, plan.delivered_covariance, plan.silent_mean, plan.silent_covariance
+    delivered = problem.mean + np.einsum("smkN,smN->skN", outcomes.correction, innovation)
+    return (
+        delivered,
+        outcomes.delivered_covariance,
+        outcomes.silent_mean,
+        outcomes.silent_covariance,
+    )
 
 
 def make_bound_filter(

@@ -186,7 +186,7 @@ def test_posterior_equals_its_joseph_form(kind: Any) -> None:
     problem = random_problem(12, 2, 3, lanes=10, threshold=0.3)
     node_filter = kind(problem.sensors)
     expectation = node_filter.expect(problem.mean)
-    plan = node_filter.plan(
+    outcomes = node_filter.outcomes(
         problem.mean, problem.covariance, expectation, problem.held, np.ones(10)
     )
     for sensor in range(2):
@@ -195,12 +195,12 @@ def test_posterior_equals_its_joseph_form(kind: Any) -> None:
             q = expectation.uncensored_probability[sensor, :, lane]
             v = expectation.truncated_variance[sensor, :, lane]
             wanted = joseph(
-                plan.correction[sensor, :, :, lane],
+                outcomes.correction[sensor, :, :, lane],
                 q[:, None] * matrix,
                 problem.covariance[sensor, :, :, lane],
                 np.diag(problem.sensors.variance[sensor, :, 0] * v),
             )
-            found = plan.delivered_covariance[sensor, :, :, lane]
+            found = outcomes.delivered_covariance[sensor, :, :, lane]
             np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
             assert np.array_equal(found, found.T)
 
@@ -216,8 +216,10 @@ def test_a_delivered_gain_is_the_best_one(kind: str) -> None:
         "paper": make_bound_filter(sensors),
     }[kind]
     expectation = node_filter.expect(problem.mean)
-    plan = node_filter.plan(problem.mean, problem.covariance, expectation, problem.held, np.ones(1))
-    correction, posterior = plan.correction[0, ..., 0], plan.delivered_covariance[0, ..., 0]
+    outcomes = node_filter.outcomes(
+        problem.mean, problem.covariance, expectation, problem.held, np.ones(1)
+    )
+    correction, posterior = outcomes.correction[0, ..., 0], outcomes.delivered_covariance[0, ..., 0]
     grow = BoundConstants.create(PAPER_EPSILON).kappa[0] if kind == "paper" else 1.0
     q = expectation.uncensored_probability[0, :, 0]
     weighted = q[:, None] * sensors.measurement_matrix[0, :, :, 0]

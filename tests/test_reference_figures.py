@@ -26,7 +26,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.systems.tobit.filters import Expectation, Plan
+from fusion_gym.systems.tobit.filters import Expectation, Outcomes
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
@@ -413,8 +413,8 @@ class WronglyInformed:
     def expect(self, mean: Array) -> Expectation:
         return self.believed.expect(mean)
 
-    def plan(self, *arguments: Any) -> Plan:
-        return self.believed.plan(*arguments)
+    def outcomes(self, *arguments: Any) -> Outcomes:
+        return self.believed.outcomes(*arguments)
 
 
 def misinformed_task(factor: float, **options: Any) -> Task:

@@ -161,16 +161,16 @@ def test_silence_against_quadrature() -> None:
     node = StochasticEventFilter.create(sensors, weight)
     mean, covariance = np.array([[[prior_mean]]]), np.array([[[[prior]]]])
     expectation = node.expect(mean)
-    plan = node.plan(mean, covariance, expectation, np.zeros((1, 1, 1)), np.ones(1))
+    outcomes = node.outcomes(mean, covariance, expectation, np.zeros((1, 1, 1)), np.ones(1))
     x = (prior_mean + np.sqrt(prior) * np.linspace(-9, 9, 1501))[:, None]
     y = (gain * prior_mean + np.linspace(-14, 14, 2001))[None]
     density = np.exp(-((x - prior_mean) ** 2) / (2 * prior) - (y - gain * x) ** 2 / (2 * noise))
     density *= np.exp(-weight * (y - gain * prior_mean) ** 2 / 2)
     posterior = density.sum(1) / density.sum()
     centre = (posterior * x[:, 0]).sum()
-    assert plan.silent_mean[0, 0, 0] == pytest.approx(centre, abs=1e-10)
+    assert outcomes.silent_mean[0, 0, 0] == pytest.approx(centre, abs=1e-10)
     spread = (posterior * (x[:, 0] - centre) ** 2).sum()
-    assert plan.silent_covariance[0, 0, 0, 0] == pytest.approx(spread, rel=1e-9)
+    assert outcomes.silent_covariance[0, 0, 0, 0] == pytest.approx(spread, rel=1e-9)
 
 
 @pytest.mark.parametrize("size", [1, 2, 3])

@@ -270,7 +270,9 @@ class CorrelatedTrackingSystem:
             "innovation_deviation": lambda: _deviation(outcomes.innovation_covariance),
             "prior_mean": state.prior_mean[0],
             "prior_covariance": state.prior_covariance[0],
-            "silent_variance": lambda: self._weighted_trace(state.prior_covariance[0]),
+            "silent_variance": lambda: linalg.weighted_trace(
+                state.prior_covariance[0], self.state_weights
+            ),
             "variance_reduction": lambda: self._variance_reduction(state, outcomes),
         }
 
@@ -331,20 +333,17 @@ class CorrelatedTrackingSystem:
         """ln √(variance/reference) (..., n, N) of covariances (..., n, n, N)."""
         return 0.5 * np.log(linalg.diagonal(covariance) / self.reference[:, None])
 
-    def _weighted_trace(self, covariance: Array) -> Array:
-        return (self.state_weights[:, None] * linalg.diagonal(covariance)).sum(-2)
-
     def _variance_reduction(
         self, state: CorrelatedTrackingState, outcomes: RobustOutcomes
     ) -> Array:
         covariance = np.concatenate((state.prior_covariance[:1], outcomes.delivered_covariance))
-        silent = self._weighted_trace(covariance[0])
+        silent = linalg.weighted_trace(covariance[0], self.state_weights)
         result = np.empty((self.sensor_count, len(silent)))
         for sensor in range(self.sensor_count):
             alone = np.zeros(result.shape, dtype=np.bool_)
             alone[sensor] = True
             fused = self.fusion.fuse(state.prior_mean, covariance, _with_prediction(alone))
-            result[sensor] = silent - self._weighted_trace(fused.covariance)
+            result[sensor] = silent - linalg.weighted_trace(fused.covariance, self.state_weights)
         return result
 
 

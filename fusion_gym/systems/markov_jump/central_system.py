@@ -314,9 +314,7 @@ class MarkovJumpCentralSystem:
             "innovation_deviation": lambda: self._deviation(prediction)[:, None],
             "prior_mean": prediction.mean[:n],
             "prior_covariance": prior,
-            "silent_variance": lambda: (self.state_weights[:, None] * linalg.diagonal(prior)).sum(
-                0
-            ),
+            "silent_variance": lambda: linalg.weighted_trace(prior, self.state_weights),
             "variance_reduction": lambda: self._reduction(
                 prediction.covariance, self.state_weights, self.sensors.sampled(state.time)
             ),

@@ -270,7 +270,9 @@ class MarkovJumpSystem:
             "innovation_deviation": lambda: self._lag_deviation(prediction),
             "prior_mean": state.prior_mean,
             "prior_covariance": state.prior_covariance,
-            "silent_variance": lambda: self._weighted_trace(state.prior_covariance),
+            "silent_variance": lambda: linalg.weighted_trace(
+                state.prior_covariance, self.state_weights
+            ),
             "variance_reduction": lambda: self._variance_reduction(state, prediction),
             "centre_variance": lambda: linalg.trace(state.prior_covariance),
             "greedy_variance": lambda: self._greedy_variance(state, prediction),
@@ -337,14 +339,13 @@ class MarkovJumpSystem:
         variance = linalg.diagonal(prediction.lag[nodes, nodes])
         return np.sqrt(np.maximum(variance, (_FLOOR * _FLOOR) * self.reference[:, None]))
 
-    def _weighted_trace(self, covariance: Array) -> Array:
-        return (self.state_weights[:, None] * linalg.diagonal(covariance)).sum(-2)
-
     def _variance_reduction(self, state: MarkovJumpState, prediction: JointPrediction) -> Array:
-        silent = self._weighted_trace(state.prior_covariance)
+        silent = linalg.weighted_trace(state.prior_covariance, self.state_weights)
         nobody = np.zeros(state.sent.shape, dtype=np.bool_)
         each = self._covariances_with_one_more(state, prediction, nobody)
-        return np.stack([silent - self._weighted_trace(covariance) for covariance in each])
+        return np.stack(
+            [silent - linalg.weighted_trace(covariance, self.state_weights) for covariance in each]
+        )
 
     def _greedy_variance(self, state: MarkovJumpState, prediction: JointPrediction) -> Array:
         """Sensors join one after another, each time the one that lowers the trace most."""

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.systems.tobit.filters import Expectation, Plan, linear_update
+from fusion_gym.systems.tobit.filters import Expectation, Outcomes, linear_update
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import expect_censored
 from fusion_gym.validation import ConfigurationError
@@ -144,9 +144,9 @@ class BoundTobitFilter:
         """See :class:`fusion_gym.systems.tobit.filters.NodeFilter`."""
         return expect_censored(self.sensors, mean)
 
-    def plan(
+    def outcomes(
         self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
-    ) -> Plan:
+    ) -> Outcomes:
         """See :class:`fusion_gym.systems.tobit.filters.NodeFilter`.
 
         Source: tobit_token_bucket, equations (30) and (37). At the optimal gain (30) is
@@ -160,9 +160,9 @@ class BoundTobitFilter:
         moment = grow * spread + shift * linalg.outer(latent, latent)
         correction, delivered = self._delivered(covariance, spread, moment, expectation, time)
         if not self.hold:
-            return Plan(correction, delivered, mean, covariance)
+            return Outcomes(correction, delivered, mean, covariance)
         silent = self._held(mean, covariance, cross, spread, moment, expectation, held)
-        return Plan(correction, delivered, *silent)
+        return Outcomes(correction, delivered, *silent)
 
     def _delivered(
         self, covariance: Array, spread: Array, moment: Array, expectation: Expectation, time: Array

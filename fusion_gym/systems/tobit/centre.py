@@ -1,32 +1,45 @@
-"""Nodes and fusion centre: from the centre's prediction and what arrived to the fused estimate."""
+"""Nodes and fusion centre, and the options that choose their filter and their fusion rule."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.options import CommonOptions, plain
 from fusion_gym.fusion.rules import FusionRule
-from fusion_gym.systems.tobit.filters import Expectation, NodeFilter, Plan
+from fusion_gym.fusion.table import Structure, choose_rule
+from fusion_gym.systems.tobit.filters import (
+    Expectation,
+    KalmanFilter,
+    NodeFilter,
+    Outcomes,
+    StochasticEventFilter,
+)
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, choice
+
+_STRUCTURE = Structure(
+    common="all nodes start from the same prediction", holds=("information shares",)
+)
 
 
-class Outlook(NamedTuple):
+class Prediction(NamedTuple):
     """What centre and nodes expect before anything is sent.
 
     ``expectation`` of the measurements, ``deviation`` (sensors, m, N) of the innovation, and the
-    nodes' ``plan`` where there are nodes.
+    nodes' ``outcomes`` where there are nodes.
     """
 
     expectation: Expectation
     deviation: Array
-    plan: Plan | None
+    outcomes: Outcomes | None
 
 
 class Posterior(NamedTuple):
@@ -46,7 +59,7 @@ class Centre(Protocol):
         """The sensors."""
         ...
 
-    def look(self, mean: Array, covariance: Array, held: Array, time: Array) -> Outlook:
+    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> Prediction:
         """Expectations under the centre's prediction (n, N), (n, n, N)."""
         ...
 
@@ -54,15 +67,20 @@ class Centre(Protocol):
         self,
         mean: Array,
         covariance: Array,
-        outlook: Outlook,
+        prediction: Prediction,
         measurement: Array,
         granted: NDArray[np.bool_],
     ) -> Posterior:
         """The posterior after the granted (sensors, N) of the measurements (sensors, m, N)."""
         ...
 
-    def variances(self, mean: Array, covariance: Array, outlook: Outlook) -> tuple[Array, Array]:
-        """Fused trace (N,) if nobody transmits, and its reduction (sensors, N) by each alone."""
+    def variances(
+        self, mean: Array, covariance: Array, prediction: Prediction, weights: Array
+    ) -> tuple[Array, Array]:
+        """Weighted fused trace (N,) if nobody transmits, its reduction (sensors, N) by each alone.
+
+        ``weights`` (n,) weigh the entries of the trace.
+        """
         ...
 
 
@@ -133,7 +151,7 @@ class FeedbackCentre:
         """The sensors."""
         return self.filter.sensors
 
-    def look(self, mean: Array, covariance: Array, held: Array, time: Array) -> Outlook:
+    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> Prediction:
         """See :class:`Centre`."""
         nodes = self.feedback.distribute(mean, covariance)
         expectation = self.filter.expect(nodes[0])
@@ -142,31 +160,35 @@ class FeedbackCentre:
         q = expectation.uncensored_probability
         floor = 1e-3 * self.sensors.variance
         deviation = np.sqrt(q * q * spread + expectation.noise_variance + floor)
-        return Outlook(expectation, deviation, self.filter.plan(*nodes, expectation, held, time))
+        return Prediction(
+            expectation, deviation, self.filter.outcomes(*nodes, expectation, held, time)
+        )
 
     def update(
         self,
         mean: Array,
         covariance: Array,
-        outlook: Outlook,
+        prediction: Prediction,
         measurement: Array,
         granted: NDArray[np.bool_],
     ) -> Posterior:
         """Each node takes the planned outcome of the network's answer; the centre fuses."""
-        plan = _planned(outlook)
-        innovation = measurement - outlook.expectation.value
-        update = linalg.matvec(linalg.transpose(plan.correction), innovation)
+        outcomes = _outcomes(prediction)
+        innovation = measurement - prediction.expectation.value
+        update = linalg.matvec(linalg.transpose(outcomes.correction), innovation)
         grant = granted[:, None]
-        local_mean = np.where(grant, mean + update, plan.silent_mean)
-        local = np.where(grant[:, None], plan.delivered_covariance, plan.silent_covariance)
+        local_mean = np.where(grant, mean + update, outcomes.silent_mean)
+        local = np.where(grant[:, None], outcomes.delivered_covariance, outcomes.silent_covariance)
         fused = self.fusion.fuse(local_mean, local)
         return Posterior(fused.mean, fused.covariance, local_mean)
 
-    def variances(self, mean: Array, covariance: Array, outlook: Outlook) -> tuple[Array, Array]:
+    def variances(
+        self, mean: Array, covariance: Array, prediction: Prediction, weights: Array
+    ) -> tuple[Array, Array]:
         """See :class:`Centre`; by the bound where the filter minimises one."""
-        plan = _planned(outlook)
-        fused = self.fusion.fuse_alone(plan.silent_covariance, plan.delivered_covariance)
-        silent, alone = (linalg.trace(covariance) for covariance in fused)
+        outcomes = _outcomes(prediction)
+        fused = self.fusion.fuse_alone(outcomes.silent_covariance, outcomes.delivered_covariance)
+        silent, alone = (linalg.weighted_trace(covariance, weights) for covariance in fused)
         return silent, silent - alone
 
 
@@ -181,17 +203,17 @@ class SequentialCentre:
         """The sensors."""
         return self.filter.sensors
 
-    def look(self, mean: Array, covariance: Array, held: Array, time: Array) -> Outlook:
+    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> Prediction:
         """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
         expectation = self.filter.expect(mean, covariance)
         floor = 1e-3 * self.sensors.variance
-        return Outlook(expectation, np.sqrt(expectation.noise_variance + floor), None)
+        return Prediction(expectation, np.sqrt(expectation.noise_variance + floor), None)
 
     def update(
         self,
         mean: Array,
         covariance: Array,
-        outlook: Outlook,
+        prediction: Prediction,
         measurement: Array,
         granted: NDArray[np.bool_],
     ) -> Posterior:
@@ -200,14 +222,125 @@ class SequentialCentre:
         local = np.broadcast_to(mean, (self.sensors.count, *mean.shape))
         return Posterior(mean, covariance, local)
 
-    def variances(self, mean: Array, covariance: Array, outlook: Outlook) -> tuple[Array, Array]:
+    def variances(
+        self, mean: Array, covariance: Array, prediction: Prediction, weights: Array
+    ) -> tuple[Array, Array]:
         """See :class:`Centre`; the reduction is the expected one."""
-        silent = linalg.trace(covariance)
+        silent = linalg.weighted_trace(covariance, weights)
         expected = self.filter.expected_covariance(mean, covariance)
-        return silent, silent - linalg.trace(expected)
+        return silent, silent - linalg.weighted_trace(expected, weights)
 
 
-def _planned(outlook: Outlook) -> Plan:
-    if outlook.plan is None:
-        raise RuntimeError("the outlook has no plan: it was made by another centre")
-    return outlook.plan
+def _outcomes(prediction: Prediction) -> Outcomes:
+    if prediction.outcomes is None:
+        raise RuntimeError("the prediction has no outcomes: it was made by another centre")
+    return prediction.outcomes
+
+
+@dataclass(frozen=True)
+class FeedbackOptions(CommonOptions):
+    """How the nodes are joined; ``None`` is the default of the filter and the rule.
+
+    ``fusion`` is "federated" (with ``information_shares``, equal by default) or a form of
+    covariance intersection, the sequential ones with an ``order`` of arrival.
+    ``stochastic_weight`` belongs to ``filter="stochastic"`` and its policy.
+    """
+
+    fusion: str | None = None
+    information_shares: ArrayLike | None = None
+    order: ArrayLike | None = None
+    stochastic_weight: ArrayLike | None = None
+
+
+@dataclass(frozen=True)
+class Filter:
+    """A row of a table of filters: the centre that it makes of options and sensors.
+
+    ``own`` are options that belong to this filter alone; elsewhere they are ``None``.
+    """
+
+    make: Callable[[Any, CensoredSensors], Centre]
+    own: tuple[str, ...] = ()
+
+
+def at_the_nodes(node: Callable[[CensoredSensors], NodeFilter]) -> Filter:
+    """The row of a node filter without options of its own."""
+    return Filter(lambda chosen, sensors: feedback_centre(chosen, node(sensors)))
+
+
+def make_centre(
+    kind: str, filters: Mapping[str, Filter], chosen: FeedbackOptions, sensors: CensoredSensors
+) -> Centre:
+    """The centre of the option ``filter``, by a table of filters.
+
+    Raises:
+        ConfigurationError: an unknown filter, or an option that is not the filter's.
+    """
+    choice("filter", kind, filters)
+    for name, row in filters.items():
+        if name != kind:
+            _refuse(chosen, row.own, f"filter={kind!r}", f"filter={name!r}")
+    return filters[kind].make(chosen, sensors)
+
+
+def feedback_centre(chosen: FeedbackOptions, node: NodeFilter) -> FeedbackCentre:
+    """Nodes with this filter and the options' fusion.
+
+    Raises:
+        ConfigurationError: a rule that does not fit, or an option that is not the rule's.
+    """
+    sensors = node.sensors.count
+    kind = "federated" if chosen.fusion is None else chosen.fusion
+    fusion = choose_rule(kind, _STRUCTURE, sensors, chosen.order)
+    if kind == "federated":
+        return FeedbackCentre(node, fusion, Feedback.in_shares(chosen.information_shares, sensors))
+    _refuse(chosen, ("information_shares",), f"fusion={kind!r}", "fusion='federated'")
+    return FeedbackCentre(node, fusion, Feedback(sensors))
+
+
+def stochastic_centre(chosen: FeedbackOptions, sensors: CensoredSensors) -> FeedbackCentre:
+    """The centre of ``filter="stochastic"``.
+
+    Raises:
+        ConfigurationError: no weight or one that is not allowed, or an option that does not fit.
+    """
+    return feedback_centre(chosen, StochasticEventFilter.create(sensors, chosen.stochastic_weight))
+
+
+def stochastic_defaults(chosen: FeedbackOptions) -> dict[str, dict[str, Any]]:
+    """The scenario's parameters of the policy ``stochastic_event``, if the filter knows it."""
+    if chosen.stochastic_weight is None:
+        return {}
+    return {"stochastic_event": {"weight": plain(chosen.stochastic_weight)}}
+
+
+def assumed_density_centre(chosen: FeedbackOptions, sensors: CensoredSensors) -> SequentialCentre:
+    """The centre of ``filter="adf"``.
+
+    Raises:
+        ConfigurationError: an option of the nodes' fusion, for there are no nodes.
+    """
+    _refuse(
+        chosen,
+        ("fusion", "information_shares", "order"),
+        "filter='adf'",
+        "a filter with nodes (here the centre takes the measurements itself)",
+    )
+    return SequentialCentre(AssumedDensityFilter(sensors))
+
+
+# What every environment of the family offers; each adds its paper's own.
+FILTERS = {
+    "kalman": at_the_nodes(KalmanFilter),
+    "adf": Filter(assumed_density_centre),
+    "stochastic": Filter(stochastic_centre, own=("stochastic_weight",)),
+}
+
+
+def _refuse(chosen: FeedbackOptions, names: tuple[str, ...], where: str, belongs: str) -> None:
+    for name in names:
+        value = getattr(chosen, name)
+        if value is not None:
+            raise ConfigurationError(
+                f"{name} = {value!r} is not allowed with {where}: it belongs to {belongs}"
+            )

@@ -37,7 +37,7 @@ class Expectation(NamedTuple):
     truncated_variance: Array
 
 
-class Plan(NamedTuple):
+class Outcomes(NamedTuple):
     """Both outcomes at every node.
 
     ``correction`` (sensors, m, n, N): the transposed gain of a delivery, so that the delivered
@@ -63,9 +63,9 @@ class NodeFilter(Protocol):
         """Expectation of the measurements from the prior means (sensors, n, N)."""
         ...
 
-    def plan(
+    def outcomes(
         self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
-    ) -> Plan:
+    ) -> Outcomes:
         """Both outcomes from the priors (sensors, n, N), (sensors, n, n, N).
 
         ``held`` (sensors, m, N) is the last delivered measurement, ``time`` (N,) the number of
@@ -111,15 +111,15 @@ class KalmanFilter:
             truncated_variance=one,
         )
 
-    def plan(
+    def outcomes(
         self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
-    ) -> Plan:
+    ) -> Outcomes:
         """See :class:`NodeFilter`; ``held`` and ``time`` do not matter here."""
         matrix = self.sensors.measurement_matrix
         innovation = linalg.congruence(matrix, covariance)
         innovation = linalg.add_diagonal(innovation, self.sensors.variance)
         correction, posterior = linear_update(covariance, matrix, innovation)
-        return Plan(correction, posterior, mean, covariance)
+        return Outcomes(correction, posterior, mean, covariance)
 
 
 @dataclass(frozen=True)
@@ -167,9 +167,9 @@ class StochasticEventFilter:
         """See :class:`NodeFilter`; censoring is ignored."""
         return KalmanFilter(self.sensors).expect(mean)
 
-    def plan(
+    def outcomes(
         self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
-    ) -> Plan:
+    ) -> Outcomes:
         """See :class:`NodeFilter`; ``held`` and ``time`` do not matter here."""
         matrix = self.sensors.measurement_matrix
         innovation = linalg.congruence(matrix, covariance)
@@ -179,4 +179,4 @@ class StochasticEventFilter:
         weight = self.weight[:, None, None]
         scaled = linalg.add_diagonal(weight * innovation, np.ones((matrix.shape[-3], 1)))
         _, silent = linear_update(covariance, np.sqrt(weight) * matrix, scaled)
-        return Plan(correction, delivered, mean, silent)
+        return Outcomes(correction, delivered, mean, silent)

@@ -17,7 +17,7 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.tobit.centre import Centre, FeedbackCentre, Outlook
+from fusion_gym.systems.tobit.centre import Centre, FeedbackCentre, Prediction
 from fusion_gym.systems.tobit.filters import KalmanFilter
 
 _WHITE = 5.0  # whitened quantities are clipped at this many standard deviations
@@ -30,7 +30,7 @@ class CensoredState:
 
     ``truth`` (n, N) · ``measurement`` (l, m, N) · ``held`` (l, m, N), the last delivered
     measurement · ``age`` (l, N), steps since then · ``time`` (N,), the step in the episode ·
-    ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N), the centre's prediction · ``outlook``,
+    ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N), the centre's prediction · ``prediction``,
     what is expected of the measurements · ``local_mean`` (l, n, N), the nodes' posterior before
     the feedback · ``mean`` (n, N), ``covariance`` (n, n, N), the fused posterior.
     """
@@ -42,7 +42,7 @@ class CensoredState:
     time: Array
     prior_mean: Array
     prior_covariance: Array
-    outlook: Outlook | None
+    prediction: Prediction | None
     local_mean: Array
     mean: Array
     covariance: Array
@@ -60,7 +60,7 @@ SIGNALS = (
     Signal("uncensored_probability", "centre", _COMPONENTS, "predicted, from 0 to 1"),
     Signal("prior_mean", "centre", "(n, N)", "the centre's prediction"),
     Signal("prior_covariance", "centre", "(n, n, N)", "its covariance"),
-    Signal("silent_variance", "centre", "(N,)", "fused trace if nobody transmits"),
+    Signal("silent_variance", "centre", "(N,)", "weighted fused trace if nobody transmits"),
     Signal(
         "variance_reduction",
         "centre",
@@ -94,6 +94,11 @@ class CensoredSystem:
     def sensor_count(self) -> int:
         """Number of sensors."""
         return self.centre.sensors.count
+
+    @property
+    def state_weights(self) -> Array:
+        """Weights (n,) of the traces among the signals: all 1, a plain trace as in the papers."""
+        return np.ones(self.plant.size)
 
     @property
     def noise_channels(self) -> int:
@@ -160,7 +165,7 @@ class CensoredSystem:
                 "own",
                 components,
                 "predicted probability that the component is not censored",
-                lambda state: _outlook(state).expectation.uncensored_probability,
+                lambda state: _prediction(state).expectation.uncensored_probability,
             ),
             age_block(nodes),
             Block(
@@ -204,7 +209,7 @@ class CensoredSystem:
             time=np.zeros(runs),
             prior_mean=mean,
             prior_covariance=covariance,
-            outlook=None,
+            prediction=None,
             local_mean=np.broadcast_to(mean, (sensors.count, *mean.shape)).copy(),
             mean=mean,
             covariance=covariance,
@@ -227,7 +232,7 @@ class CensoredSystem:
             time=time,
             prior_mean=prior_mean,
             prior_covariance=prior_covariance,
-            outlook=self.centre.look(prior_mean, prior_covariance, state.held, time),
+            prediction=self.centre.predict(prior_mean, prior_covariance, state.held, time),
             local_mean=state.local_mean,
             mean=state.mean,
             covariance=state.covariance,
@@ -239,7 +244,7 @@ class CensoredSystem:
         Source: tobit_token_bucket, equations (20), (22), (30), (50).
         """
         posterior = self.centre.update(
-            state.prior_mean, state.prior_covariance, _outlook(state), state.measurement, granted
+            state.prior_mean, state.prior_covariance, _prediction(state), state.measurement, granted
         )
         return CensoredState(
             truth=state.truth,
@@ -249,7 +254,7 @@ class CensoredSystem:
             time=state.time,
             prior_mean=state.prior_mean,
             prior_covariance=state.prior_covariance,
-            outlook=state.outlook,
+            prediction=state.prediction,
             local_mean=posterior.local_mean,
             mean=posterior.mean,
             covariance=posterior.covariance,
@@ -257,11 +262,13 @@ class CensoredSystem:
 
     def read(self, state: CensoredState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
         """The signals named in ``SIGNALS``."""
-        expectation, deviation, _ = _outlook(state)
+        expectation, deviation, _ = _prediction(state)
 
         @functools.cache
         def variances() -> tuple[Array, Array]:
-            return self.centre.variances(state.prior_mean, state.prior_covariance, _outlook(state))
+            return self.centre.variances(
+                state.prior_mean, state.prior_covariance, _prediction(state), self.state_weights
+            )
 
         return {
             "measurement": state.measurement,
@@ -300,11 +307,11 @@ class CensoredSystem:
 
 
 def _whitened_innovation(state: CensoredState) -> Array:
-    expectation, deviation, _ = _outlook(state)
+    expectation, deviation, _ = _prediction(state)
     return (state.measurement - expectation.value) / deviation
 
 
-def _outlook(state: CensoredState) -> Outlook:
-    if state.outlook is None:
+def _prediction(state: CensoredState) -> Prediction:
+    if state.prediction is None:
         raise RuntimeError("the state has no measurements yet: call sense first")
-    return state.outlook
+    return state.prediction

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import gaussian, linalg
 from fusion_gym.arrays import Array
-from fusion_gym.systems.tobit.filters import Expectation, Plan, linear_update
+from fusion_gym.systems.tobit.filters import Expectation, Outcomes, linear_update
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 _FAR = 50.0  # a threshold this many deviations away never censors
@@ -92,16 +92,16 @@ class TobitKalmanFilter:
         """See :class:`NodeFilter`."""
         return expect_censored(self.sensors, mean)
 
-    def plan(
+    def outcomes(
         self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
-    ) -> Plan:
+    ) -> Outcomes:
         """See :class:`NodeFilter`; ``held`` and ``time`` do not matter here."""
         weighted = expectation.uncensored_probability[:, :, None] * self.sensors.measurement_matrix
         innovation = linalg.congruence(weighted, covariance)
         noise = self.sensors.variance * expectation.truncated_variance
         innovation = linalg.add_diagonal(innovation, noise)
         correction, posterior = linear_update(covariance, weighted, innovation)
-        return Plan(correction, posterior, mean, covariance)
+        return Outcomes(correction, posterior, mean, covariance)
 
 
 @dataclass(frozen=True)

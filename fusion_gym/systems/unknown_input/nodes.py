@@ -203,9 +203,8 @@ class TableNodes:
         self, estimates: Estimates, prediction: Prediction, weights: Array, time: Array
     ) -> tuple[Array, Array]:
         """The bound's trace, and how far it falls where one held difference is known to be zero."""
-        every = weights[:, None]
-        silent = (every * linalg.diagonal(self.fused)).sum(0)
-        reduction = silent - (every * linalg.diagonal(self.delivered)).sum(1)
+        silent = linalg.weighted_trace(self.fused, weights)
+        reduction = silent - linalg.weighted_trace(self.delivered, weights)
         rows = self._rows(time)
         return silent[rows], reduction[:, rows]
 
@@ -286,9 +285,8 @@ class RunNodes:
             silent = self._outcome(estimates, prediction, nobody)[1]
         delivered = self._outcome(estimates, prediction, ~nobody)[1]
         together, alone = self.fusion.fuse_alone(silent, delivered)
-        every = weights[:, None]
-        start: Array = (every * linalg.diagonal(together)).sum(0)
-        return start, start - (every * linalg.diagonal(alone)).sum(1)
+        start = linalg.weighted_trace(together, weights)
+        return start, start - linalg.weighted_trace(alone, weights)
 
     def _outcome(
         self, estimates: Estimates, prediction: Prediction, granted: NDArray[np.bool_]
