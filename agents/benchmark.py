@@ -21,7 +21,7 @@ from typing import Any
 import joblib
 from tqdm import tqdm
 
-from fusion_gym.core.knowledge import covers
+from fusion_gym.core.system import covers
 from fusion_gym.evaluation.envelope import lower_envelope
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.validation import ConfigurationError, choice, integer

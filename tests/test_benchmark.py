@@ -21,7 +21,7 @@ from agents.suite.tuning import suggest
 from agents.suite.tuning import tune as tune_family
 from agents.suite.verdict import judge
 from agents.training.algorithms import PPOConfig
-from fusion_gym.core.knowledge import covers, least_covering
+from fusion_gym.core.system import covers, least_covering
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.periodic_optimum import Schedule
 from fusion_gym.policies.registry import make_policy

@@ -213,7 +213,7 @@ def test_infos_and_the_terms_of_the_reward(sharing: str, error: str) -> None:
     assert info.keys() == keys
     assert not info["diverged"]
     assert info["cost"] == info["cost_tokens"] == 0.0
-    assert info["rewards"] == {"error": 0.0, "cost": 0.0}
+    assert info["rewards"] == {"error": 0.0, "communication": 0.0}
     assert not info["granted"].any()
     assert not info["denied"].any()
     assert not info["squared_error"].any()
@@ -234,7 +234,7 @@ def test_infos_and_the_terms_of_the_reward(sharing: str, error: str) -> None:
         np.testing.assert_allclose(info["squared_error"], squared, rtol=1e-12)
         size = squared if error == "squared" else np.diagonal(covariance[..., 0])
         assert info["rewards"]["error"] == pytest.approx(-2.0 * weights @ size)
-        assert info["rewards"]["cost"] == pytest.approx(-0.3 * info["cost"])
+        assert info["rewards"]["communication"] == pytest.approx(-0.3 * info["cost"])
         assert reward == pytest.approx(sum(info["rewards"].values()), rel=1e-14)
         denied += info["denied"].sum()
     assert denied > 0

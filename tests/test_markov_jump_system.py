@@ -256,7 +256,7 @@ def test_other_sizes_and_fusions_run(fusion: str) -> None:
         for _ in range(20):
             outcome = batch.step(policy(batch.signals()))
             assert np.isfinite(outcome.reward).all()
-            assert linalg.is_positive_definite(task.system.fused(batch.delivered)[1]).all()
+            assert np.isfinite(linalg.cholesky(task.system.fused(batch.delivered)[1])).all()
             assert np.isfinite(batch.observe()).all()
         assert task.system.state_names == tuple(f"x{i + 1}" for i in range(n))
 
@@ -271,7 +271,7 @@ def test_short_and_long_episodes_of_rare_deliveries(horizon: int) -> None:
     for _ in range(horizon):
         outcome = batch.step(policy(batch.signals()))
         assert np.isfinite(outcome.reward).all()
-        assert linalg.is_positive_definite(task.system.fused(batch.delivered)[1]).all()
+        assert np.isfinite(linalg.cholesky(task.system.fused(batch.delivered)[1])).all()
     assert outcome.truncated.all()
 
 

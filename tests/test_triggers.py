@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import ConfigurationError, make_task
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.knowledge import covers
+from fusion_gym.core.system import covers
 from fusion_gym.policies.registry import make_policy, make_rule, policy_names
 from fusion_gym.policies.settings import parse_settings, parse_value
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import pydantic
 
-from fusion_gym.core.knowledge import Knowledge
+from fusion_gym.core.system import Knowledge
 
 from ..training.algorithms import AlgorithmConfig, AnyAlgorithm, settings
 from ..training.checked import Positive, Rate, Share, Strict, parse, read_yaml

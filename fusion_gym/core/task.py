@@ -9,10 +9,9 @@ from typing import Any
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.access import ACCESS_RULES
-from fusion_gym.core.knowledge import Knowledge, covers
 from fusion_gym.core.options import CommonOptions, Scenario, plain
 from fusion_gym.core.reward import Price, Reward
-from fusion_gym.core.system import System
+from fusion_gym.core.system import Knowledge, System, covers
 from fusion_gym.core.token_bucket import TokenBucket
 
 # What a policy of each information mode may know.

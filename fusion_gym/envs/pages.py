@@ -19,11 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from fusion_gym.core.knowledge import covers
 from fusion_gym.core.observation import ObservationLayout, network_blocks
 from fusion_gym.core.options import CommonOptions, plain
 from fusion_gym.core.reward import Price
-from fusion_gym.core.system import Block, numbered
+from fusion_gym.core.system import Block, covers, numbered
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task, options_of
 from fusion_gym.envs.vector import reset_infos

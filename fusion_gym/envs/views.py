@@ -12,8 +12,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.observation import ObservationLayout
+from fusion_gym.core.system import Knowledge
 from fusion_gym.core.task import Task
 from fusion_gym.validation import ConfigurationError
 

@@ -8,9 +8,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_gym.core.knowledge import Knowledge
 from fusion_gym.core.reward import Price
-from fusion_gym.core.system import Signals
+from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.base import Requests

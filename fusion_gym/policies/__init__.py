@@ -1,6 +1,6 @@
 """Every policy: rules, references that know the model, saved agents.
 
-Each declares the least class of :mod:`fusion_gym.core.knowledge` that knows all that it looks at,
+Each declares the least class of :mod:`fusion_gym.core.system` that knows all that it looks at,
 and a test holds it to that: what lies outside is changed, and its requests stay bitwise equal.
 
 The classes with memory are about what a sensor measured and did not deliver. Three papers' triggers

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.knowledge import Knowledge
-from fusion_gym.core.system import Signals
+from fusion_gym.core.system import Knowledge, Signals
 
 Requests = NDArray[np.bool_]
 PerSensor = float | tuple[float, ...]
@@ -29,7 +28,7 @@ class Policy(Protocol):
 
     @property
     def knowledge(self) -> Knowledge:
-        """The least class of :mod:`fusion_gym.core.knowledge` that knows all that it looks at."""
+        """The least class of :mod:`fusion_gym.core.system` that knows all that it looks at."""
         ...
 
     def reset(self, runs: int, seed: int = 0) -> None:

@@ -8,8 +8,7 @@ import numpy as np
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.knowledge import Knowledge
-from fusion_gym.core.system import Signals
+from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests
 from fusion_gym.policies.planning import Model, transmission_sets

@@ -16,9 +16,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from fusion_gym import validation
-from fusion_gym.core.knowledge import Knowledge, least_covering
 from fusion_gym.core.reward import Price
-from fusion_gym.core.system import Signals
+from fusion_gym.core.system import Knowledge, Signals, least_covering
 from fusion_gym.core.task import ACTION_KINDS, Task
 from fusion_gym.envs.views import make_view
 from fusion_gym.policies.base import Requests

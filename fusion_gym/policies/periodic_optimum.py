@@ -11,8 +11,7 @@ import numpy as np
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.knowledge import Knowledge
-from fusion_gym.core.system import ConservativeSystem, Signals, System
+from fusion_gym.core.system import ConservativeSystem, Knowledge, Signals, System
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests
 from fusion_gym.policies.schedule_file import (

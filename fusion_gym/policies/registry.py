@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.knowledge import KNOWLEDGE
+from fusion_gym.core.system import KNOWLEDGE
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.settings import parse_settings

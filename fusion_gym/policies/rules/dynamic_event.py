@@ -9,8 +9,7 @@ import numpy as np
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.knowledge import Knowledge
-from fusion_gym.core.system import Signals
+from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.policies.base import (
     PerSensor,
     Requests,

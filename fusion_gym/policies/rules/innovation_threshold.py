@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion_gym import validation
-from fusion_gym.core.knowledge import Knowledge
-from fusion_gym.core.system import Signals
+from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.policies.base import (
     PerSensor,
     Requests,

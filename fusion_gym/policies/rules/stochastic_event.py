@@ -8,8 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from fusion_gym import validation
-from fusion_gym.core.knowledge import Knowledge
-from fusion_gym.core.system import Signals
+from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.policies.base import PerSensor, Requests, Rule, not_negative, parameter, surprise
 from fusion_gym.policies.chance import Chance
 

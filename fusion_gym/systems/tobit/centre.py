@@ -1,33 +1,24 @@
-"""Nodes and fusion centre, and the options that choose their filter and their fusion rule."""
+"""Nodes and fusion centre: from the centre's prediction and what arrived to the fused estimate."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import CommonOptions, plain
 from fusion_gym.fusion.rules import FusionRule
-from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.tobit.filters import (
     Expectation,
-    KalmanFilter,
     NodeFilter,
     Outcomes,
-    StochasticEventFilter,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
-from fusion_gym.validation import ConfigurationError, choice
-
-_STRUCTURE = Structure(
-    common="all nodes start from the same prediction", holds=("information shares",)
-)
+from fusion_gym.validation import ConfigurationError
 
 
 class Prediction(NamedTuple):
@@ -235,112 +226,3 @@ def _outcomes(prediction: Prediction) -> Outcomes:
     if prediction.outcomes is None:
         raise RuntimeError("the prediction has no outcomes: it was made by another centre")
     return prediction.outcomes
-
-
-@dataclass(frozen=True)
-class FeedbackOptions(CommonOptions):
-    """How the nodes are joined; ``None`` is the default of the filter and the rule.
-
-    ``fusion`` is "federated" (with ``information_shares``, equal by default) or a form of
-    covariance intersection, the sequential ones with an ``order`` of arrival.
-    ``stochastic_weight`` belongs to ``filter="stochastic"`` and its policy.
-    """
-
-    fusion: str | None = None
-    information_shares: ArrayLike | None = None
-    order: ArrayLike | None = None
-    stochastic_weight: ArrayLike | None = None
-
-
-@dataclass(frozen=True)
-class Filter:
-    """A row of a table of filters: the centre that it makes of options and sensors.
-
-    ``own`` are options that belong to this filter alone; elsewhere they are ``None``.
-    """
-
-    make: Callable[[Any, CensoredSensors], Centre]
-    own: tuple[str, ...] = ()
-
-
-def at_the_nodes(node: Callable[[CensoredSensors], NodeFilter]) -> Filter:
-    """The row of a node filter without options of its own."""
-    return Filter(lambda chosen, sensors: feedback_centre(chosen, node(sensors)))
-
-
-def make_centre(
-    kind: str, filters: Mapping[str, Filter], chosen: FeedbackOptions, sensors: CensoredSensors
-) -> Centre:
-    """The centre of the option ``filter``, by a table of filters.
-
-    Raises:
-        ConfigurationError: an unknown filter, or an option that is not the filter's.
-    """
-    choice("filter", kind, filters)
-    for name, row in filters.items():
-        if name != kind:
-            _refuse(chosen, row.own, f"filter={kind!r}", f"filter={name!r}")
-    return filters[kind].make(chosen, sensors)
-
-
-def feedback_centre(chosen: FeedbackOptions, node: NodeFilter) -> FeedbackCentre:
-    """Nodes with this filter and the options' fusion.
-
-    Raises:
-        ConfigurationError: a rule that does not fit, or an option that is not the rule's.
-    """
-    sensors = node.sensors.count
-    kind = "federated" if chosen.fusion is None else chosen.fusion
-    fusion = choose_rule(kind, _STRUCTURE, sensors, chosen.order)
-    if kind == "federated":
-        return FeedbackCentre(node, fusion, Feedback.in_shares(chosen.information_shares, sensors))
-    _refuse(chosen, ("information_shares",), f"fusion={kind!r}", "fusion='federated'")
-    return FeedbackCentre(node, fusion, Feedback(sensors))
-
-
-def stochastic_centre(chosen: FeedbackOptions, sensors: CensoredSensors) -> FeedbackCentre:
-    """The centre of ``filter="stochastic"``.
-
-    Raises:
-        ConfigurationError: no weight or one that is not allowed, or an option that does not fit.
-    """
-    return feedback_centre(chosen, StochasticEventFilter.create(sensors, chosen.stochastic_weight))
-
-
-def stochastic_defaults(chosen: FeedbackOptions) -> dict[str, dict[str, Any]]:
-    """The scenario's parameters of the policy ``stochastic_event``, if the filter knows it."""
-    if chosen.stochastic_weight is None:
-        return {}
-    return {"stochastic_event": {"weight": plain(chosen.stochastic_weight)}}
-
-
-def assumed_density_centre(chosen: FeedbackOptions, sensors: CensoredSensors) -> SequentialCentre:
-    """The centre of ``filter="adf"``.
-
-    Raises:
-        ConfigurationError: an option of the nodes' fusion, for there are no nodes.
-    """
-    _refuse(
-        chosen,
-        ("fusion", "information_shares", "order"),
-        "filter='adf'",
-        "a filter with nodes (here the centre takes the measurements itself)",
-    )
-    return SequentialCentre(AssumedDensityFilter(sensors))
-
-
-# What every environment of the family offers; each adds its paper's own.
-FILTERS = {
-    "kalman": at_the_nodes(KalmanFilter),
-    "adf": Filter(assumed_density_centre),
-    "stochastic": Filter(stochastic_centre, own=("stochastic_weight",)),
-}
-
-
-def _refuse(chosen: FeedbackOptions, names: tuple[str, ...], where: str, belongs: str) -> None:
-    for name in names:
-        value = getattr(chosen, name)
-        if value is not None:
-            raise ConfigurationError(
-                f"{name} = {value!r} is not allowed with {where}: it belongs to {belongs}"
-            )

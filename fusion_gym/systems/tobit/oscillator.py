@@ -18,7 +18,7 @@ from fusion_gym import validation
 from fusion_gym.core.options import Scenario
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.tobit.bound_filter import BoundConstants, BoundTobitFilter, EventError
-from fusion_gym.systems.tobit.centre import (
+from fusion_gym.systems.tobit.options import (
     FILTERS,
     Centre,
     FeedbackOptions,
