@@ -7,7 +7,6 @@ build for ``fusion_gym/TobitOscillator-v0``; ``help`` shows their page, with eve
 from __future__ import annotations
 
 import inspect
-from dataclasses import fields
 from typing import Any
 
 from gymnasium.vector import AutoresetMode
@@ -64,12 +63,8 @@ def _vector(env_id: str) -> type:
 def _made(env_id: str, base: type, init: Any) -> type:
     """A class whose signature shows every option with its default."""
     own = list(inspect.signature(init).parameters.values())[:-1]
-    options = [
-        inspect.Parameter(
-            f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=f.type
-        )
-        for f in fields(options_of(env_id))
-    ]
-    init.__signature__ = inspect.Signature([*own, *options])
+    options = inspect.signature(options_of(env_id)).parameters.values()
+    named = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
+    init.__signature__ = inspect.Signature([*own, *named])
     body = {"__init__": init, "__module__": __name__, "__doc__": _Page(env_id)}
     return type(base.__name__, (base,), body)
