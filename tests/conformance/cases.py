@@ -1,0 +1,147 @@
+"""The cases of the conformance suite: every registered environment, and what changes its parts."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from own_system import OWN_ID
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import ENVIRONMENTS
+
+TOBIT = "fusion_gym/TobitOscillator-v0"
+CORRELATED = "fusion_gym/CorrelatedTracking-v0"
+JUMP = "fusion_gym/MarkovJumpTracking-v0"
+INPUT = "fusion_gym/UnknownInput-v0"
+BIASED = "fusion_gym/BiasedOscillator-v0"
+TRACKING = "fusion_gym/BiasedTracking-v0"
+REMOTE = "fusion_gym/RemoteEstimation-v0"
+IDS = [name for name in ENVIRONMENTS if name != OWN_ID] + [OWN_ID]
+
+Options = dict[str, Any]
+LIMITED: Options = {"tokens": "limited", "token_rate": 1.0, "initial_tokens": 5.0}
+DRAWN: Options = {"cost_weight": "random", "price_range": (0.001, 1.0)}
+LOSSY: Options = {"sensors": 3, "channel": "gilbert_elliott", "coefficient": (0.9, 1.0, 1.02)}
+GIVEN = np.sin(np.arange(41.0) / 3.0)[:, None].tolist()
+STARVED: Options = {"bias_aware": False, "access": "round_robin", **LIMITED}
+UNCENSORED: Options = {"filter": "kalman", "censoring_threshold": -np.inf, "random_start": True}
+UNALIKE: Options = {"token_cost": (1.0, 2.0, 4.0), "process_noise": "full", "error": "trace"}
+
+# Options that change what an environment is made of.
+VARIANTS: dict[str, list[Options]] = {
+    TOBIT: [
+        {"filter": "tobit", "information": "centre", "action": "discrete"},
+        {"filter": "adf", "access": "random"},
+        {"filter": "stochastic", "stochastic_weight": 1.0, "fusion": "sici"},
+        {"filter": "tobit", "fusion": "ci", "order": None, "access": "single"},
+        {"filter": "tobit", "fusion": "sci", "access": "round_robin", **DRAWN},
+        {"silent": "predict", "event_error": False, **UNALIKE},
+        UNCENSORED,
+        {"filter": "tobit", "measurement_matrices": (((1.0, 0.0),),)},
+    ],
+    CORRELATED: [
+        {"fusion": "sci", "order": (2, 0, 1), "information": "centre", **LIMITED},
+        {"fusion": "ci", "track_actual": True, "access": "random"},
+        {"noise_scale": "random", "action": "discrete", "error": "trace", **DRAWN},
+        {
+            "fusion": "ici",
+            "measurement_matrices": (((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),),
+            "measurement_variance": ((0.6, 0.4),),
+            "noise_coupling": 0.2,
+            "trigger_threshold": 0.5,
+            "trigger_offset": 0.2,
+            "trigger_sensitivity": 0.9,
+        },
+    ],
+    JUMP: [
+        {"fusion": "ci", "access": "single", **DRAWN},
+        {"fusion": "sici", "information": "centre", "error": "trace", **LIMITED},
+        {"filter": "centralised", "access": "round_robin"},
+        {"filter": "imm"},
+        {"filter": "imm", "information": "centre", "action": "discrete"},
+    ],
+    INPUT: [
+        {"filter": "predict", "fusion": "exact_ci", "access": "random", **DRAWN},
+        {"filter": "paper", "input_signal": "steps", "information": "centre"},
+        {"hold_variance": 0.1, "input_signal": "random_walk", "fusion": "sici", **LIMITED},
+        {"example": "paper", "input_phase": "random", "action": "discrete", "error": "trace"},
+        {"example": "paper", "input_signal": "steps", "filter": "random_walk", "fusion": "ici"},
+        {"input_signal": GIVEN, "horizon": 40, "fusion": "sci"},
+    ],
+    BIASED: [
+        {"filter": "adf", "access": "any", "information": "centre"},
+        {"filter": "kalman", "access": "random", "random_start": True, **DRAWN},
+        STARVED,
+    ],
+    TRACKING: [
+        {"filter": "stochastic", "stochastic_weight": 1.0, "access": "any", "fusion": "ici"},
+        {"filter": "adf", "access": "round_robin", "error": "trace"},
+    ],
+    REMOTE: [
+        LOSSY | {"access": "single", "initial_deviation": 1.0} | DRAWN,
+        {"sensors": 2, "channel": "independent", "action": "discrete", "error": "trace"},
+        LOSSY | LIMITED | {"information": "centre"},
+    ],
+    OWN_ID: [{"access": "random", **DRAWN}, {"information": "centre", **LIMITED}],
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """An environment with options; ``number`` counts those of one id, 0 is the default."""
+
+    env_id: str
+    number: int
+
+    @property
+    def options(self) -> Options:
+        """The options that are not the environment's defaults."""
+        return VARIANTS[self.env_id][self.number - 1] if self.number else {}
+
+    @functools.cache  # noqa: B019  cases live as long as the tests
+    def task(self, horizon: int | None = None) -> Task:
+        """The task, with its own horizon or another one."""
+        options = self.options if horizon is None else self.options | {"horizon": horizon}
+        return fusion_gym.make_task(self.env_id, **options)
+
+    def batch(self, seeds: list[int], horizon: int | None = None) -> EpisodeBatch:
+        """Runs with these seeds, each at the start of an episode."""
+        batch = EpisodeBatch(self.task(horizon), len(seeds))
+        batch.seed(np.arange(len(seeds)), seeds)
+        batch.reset()
+        return batch
+
+    def __str__(self) -> str:
+        words = [value for value in self.options.values() if isinstance(value, str)]
+        return "-".join([self.env_id.partition("/")[2].removesuffix("-v0"), *words])
+
+
+CASES = [Case(name, n) for name in IDS for n in range(1 + len(VARIANTS.get(name, ())))]
+DEFAULTS = [case for case in CASES if not case.number]
+LASTING = [case for case in CASES if not isinstance(case.options.get("input_signal"), list)]
+each_case = pytest.mark.parametrize("case", CASES, ids=str)
+each_default = pytest.mark.parametrize("case", DEFAULTS, ids=str)
+each_lasting = pytest.mark.parametrize("case", LASTING, ids=str)  # of any horizon
+each_id = pytest.mark.parametrize("env_id", IDS)
+
+
+def requests(task: Task, runs: int, steps: int, rate: float = 0.4) -> NDArray[np.bool_]:
+    """Random requests (steps, sensors, runs), always the same; one a step with single access."""
+    wanted = np.random.default_rng(7).random((steps, task.sensors, runs)) < rate
+    return wanted & (wanted.cumsum(1) == 1) if task.access == "single" else wanted
+
+
+def actions(task: Task, wanted: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Actions (runs, …) of a coordinator for the requests (sensors, runs)."""
+    if task.access == "single":
+        return np.where(wanted.any(0), 1 + wanted.argmax(0), 0)
+    if task.action == "discrete":
+        return (wanted * 2 ** np.arange(task.sensors)[:, None]).sum(0)
+    return wanted.T.astype(np.int64)

@@ -1,0 +1,20 @@
+"""The user's environment is registered while this folder's tests run, and no longer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import gymnasium
+import own_system
+import pytest
+
+import fusion_gym
+from fusion_gym.envs.registration import ENVIRONMENTS
+
+
+@pytest.fixture(autouse=True, scope="module")
+def users_environment() -> Iterator[None]:
+    """``mine/RandomWalk-v0`` through the public door."""
+    fusion_gym.register(own_system.OWN_ID, own_system.build)
+    yield
+    del ENVIRONMENTS[own_system.OWN_ID], gymnasium.registry[own_system.OWN_ID]

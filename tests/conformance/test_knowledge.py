@@ -1,0 +1,155 @@
+"""Signals are what they are declared to be, and nobody is shown what they cannot know."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from cases import Case, each_case, requests
+from numpy.typing import NDArray
+
+from fusion_gym.arrays import take_runs
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.observation import Network
+from fusion_gym.core.system import Signals, covers
+from fusion_gym.envs.views import SensorView
+
+STEPS = 12
+
+
+def read(batch: EpisodeBatch, state: Any) -> dict[str, NDArray[Any]]:
+    """All signals of a state, withheld ones too."""
+    offered = batch.task.system.read(state)
+    return {name: np.asarray(Signals(dict(offered))[name]) for name in offered}
+
+
+def observed(batch: EpisodeBatch, state: Any) -> NDArray[np.float32]:
+    """Observations of a state with as many runs as it has, and the batch's first run's network."""
+    runs = batch.task.system.truth(state).shape[-1]
+    network = Network(
+        np.repeat(batch.tokens[:1], runs),
+        lambda: np.repeat(batch.admitted()[:, :1], runs, axis=1),
+        np.repeat(batch.price[:1], runs),
+    )
+    return batch.layout.encode(state, network)
+
+
+@each_case
+def test_signals_are_those_declared_with_their_axes(case: Case) -> None:
+    runs = 5
+    system, batch = case.task().system, case.batch(list(range(runs)))
+    assert len({signal.name for signal in system.signals}) == len(system.signals)
+    for wanted in requests(case.task(), runs, STEPS):
+        found, sizes = read(batch, batch.state), {"N": runs, "sensors": system.sensor_count}
+        assert found.keys() == {signal.name for signal in system.signals}
+        assert len(found["prior_mean"]) <= len(system.state_names)
+        for signal in system.signals:
+            assert covers("coordinator", signal.knowledge)
+            axes = [axis for axis in signal.axes.strip("()").replace(" ", "").split(",") if axis]
+            value = found[signal.name]
+            assert value.ndim == len(axes), signal.name
+            for axis, size in zip(axes, value.shape, strict=True):
+                # The letters n and m are one size each, whatever it is.
+                fixed = int(axis) if axis.isdigit() else sizes.setdefault(axis, size)
+                assert size == fixed, f"{signal.name}: {axis}"
+            assert np.isfinite(value).all(), signal.name
+        batch.step(wanted)
+
+
+@each_case
+def test_withheld_signals_are_those_of_the_sensors(case: Case) -> None:
+    task, batch = case.task(), case.batch([0, 1])
+    shown, withheld = set(batch.signals()), set()
+    for signal in task.system.signals:
+        if covers(task.knowledge, signal.knowledge):
+            assert signal.name in shown
+        else:
+            withheld.add(signal.name)
+    assert withheld.isdisjoint(shown)
+    assert ("state" in shown) == (task.information == "sensors") == (not withheld)
+
+
+@each_case
+def test_nothing_shown_depends_on_the_truth(case: Case) -> None:
+    """What is hidden is gone from the visible state, and nobody notices."""
+    runs = 3
+    system, batch = case.task().system, case.batch(list(range(runs)))
+    for wanted in requests(case.task(), runs, 6):
+        state = system.visible(batch.state)
+        measured_exactly = np.array_equal(system.truth(state), system.truth(batch.state))
+        assert measured_exactly or np.isnan(system.truth(state)).all()
+        found = read(batch, state)
+        for name, value in read(batch, batch.state).items():
+            np.testing.assert_array_equal(found[name], value, err_msg=name)
+        np.testing.assert_array_equal(batch.layout.encode(state, _network(batch)), batch.observe())
+        nobody = np.zeros_like(wanted)
+        for granted in (wanted, nobody):
+            seen = system.fused(system.deliver(state, granted))
+            full = system.fused(system.deliver(batch.state, granted))
+            lost = getattr(batch.state, "lost", nobody)
+            for one, other in zip(seen, full, strict=True):
+                assert np.isfinite(one).all()
+                kept = ~(lost & granted).any(0)
+                np.testing.assert_array_equal(one[..., kept], other[..., kept])
+        batch.step(wanted)
+
+
+@each_case
+def test_whoever_is_shown_something_can_know_it(case: Case) -> None:
+    """One normal of the coming step is changed at a time.
+
+    Where it changes the new measurement of a single sensor, nobody else's view changes, and the
+    centre's not at all; each sensor's view changes with its own measurement somewhere. Where the
+    nodes are told nothing of the state, not even a delivery changes another sensor's view later.
+    """
+    task = case.task()
+    system, batch = task.system, case.batch([3])
+    view = SensorView(task) if task.knowledge == "coordinator" else None
+    told = any(block.node == "told" for block in system.observation)
+    noticed = np.zeros(task.sensors, dtype=np.bool_)
+    before = system.start(np.random.default_rng(0).standard_normal((system.start_channels, 1)))
+    draw, channels = np.random.default_rng(1), system.noise_channels
+    for wanted in requests(task, 1, STEPS):
+        # Run 0 as drawn, run c + 1 with another normal in channel c.
+        noise = np.repeat(draw.standard_normal((channels, 1)), channels + 1, axis=1)
+        noise[np.arange(channels), np.arange(1, channels + 1)] *= -1.5
+        state = system.sense(take_runs(before, np.zeros(channels + 1, dtype=np.int64)), noise)
+        signals = read(batch, state)
+        measured = _changed(signals["measurement"]).reshape(task.sensors, -1, channels).any(1)
+        alone = measured.sum(0) == 1
+        for signal in system.signals:
+            changed = _changed(signals[signal.name])
+            if signal.knowledge in ("clock", "centre"):
+                assert not changed.any(), signal.name
+            elif signal.axes.startswith("(sensors"):
+                by_sensor = changed.reshape(task.sensors, -1, channels).any(1)
+                assert not (by_sensor & ~measured)[:, alone].any(), signal.name
+        observation = observed(batch, state)
+        if view is None:
+            assert not _changed(observation.T).any()
+        else:
+            changed = _changed_rows(view, observation)
+            assert not (changed & ~measured)[:, alone].any()
+            noticed |= (changed & measured)[:, alone].any(1)
+            everyone = np.ones((task.sensors, channels + 1), dtype=np.bool_)
+            later = system.sense(system.deliver(state, everyone), noise[:, :1] * everyone[:1])
+            changed = _changed_rows(view, observed(batch, later))
+            alone &= ~_changed(system.truth(later)).any(0)  # a normal of the sensor, not the plant
+            assert told or not (changed & ~measured)[:, alone].any()
+        before = system.deliver(take_runs(state, np.zeros(1, dtype=np.int64)), wanted)
+    assert view is None or noticed.all()
+
+
+def _changed(value: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where the later runs differ from run 0."""
+    return np.asarray(value[..., 1:] != value[..., :1])
+
+
+def _changed_rows(view: SensorView, observation: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which sensors' rows (sensors, later runs) differ from run 0's."""
+    rows = view.rows(observation).reshape(len(observation), view.rows_per_run, -1)
+    return _changed(rows.transpose(1, 2, 0)).any(1)
+
+
+def _network(batch: EpisodeBatch) -> Network:
+    return Network(batch.tokens, batch.admitted, batch.price)
