@@ -248,8 +248,7 @@ class SequentialIntersection(FusionRule):
     order: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
-        if self.order is not None:
-            self._check_order(len(self.order) if isinstance(self.order, tuple) else 0)
+        self._check_order()
 
     def fuse(
         self, means: Array, covariance: Array, active: NDArray[np.bool_] | None = None
@@ -257,8 +256,7 @@ class SequentialIntersection(FusionRule):
         """See :class:`~fusion_gym.fusion.rules.FusionRule`."""
         own = own_covariances(covariance)
         count, _, runs = means.shape
-        if self.order is not None and len(self.order) != count:
-            self._check_order(count)
+        self._check_order(count)
         chosen = np.ones((count, runs), dtype=np.bool_) if active is None else active
         mean, fused = np.full(means.shape[1:], np.nan), np.full(own.shape[1:], np.nan)
         begun = np.zeros(runs, dtype=np.bool_)
@@ -283,17 +281,18 @@ class SequentialIntersection(FusionRule):
             steps.append(_Step(estimate, first, lanes, pair))
         return Fused(mean, fused, lambda: _chained(steps, own.shape))
 
-    def _check_order(self, count: int) -> None:
-        given = self.order if isinstance(self.order, tuple) else ()
-        whole = all(
-            isinstance(estimate, (int, np.integer)) and not isinstance(estimate, bool)
-            for estimate in given
+    def _check_order(self, count: int | None = None) -> None:
+        given = self.order
+        if given is None:
+            return
+        whole = isinstance(given, tuple) and all(
+            isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in given
         )
-        if not count or not whole or sorted(given) != list(range(count)):
-            last = f"{count - 1}" if count else "l - 1"
+        if not whole or not given or sorted(given) != list(range(count or len(given))):
+            last = "l - 1" if count is None else f"{count - 1}"
             raise ConfigurationError(
-                f"order = {self.order!r} is not allowed: it must be a tuple that holds each of "
-                f"the estimates 0 to {last} exactly once"
+                f"order = {given!r} is not allowed: it must be a tuple that holds each of the "
+                f"estimates 0 to {last} exactly once"
             )
 
 

@@ -66,7 +66,7 @@ class FusionRule(ABC):
     def fuse_alone(self, silent: Array, delivered: Array) -> tuple[Array, Array]:
         """Fused covariances if nobody delivers (n, n, N), and (l, n, n, N) if each alone does.
 
-        From the nodes' covariances without and with a delivery, both (l, n, n, N).
+        From the nodes' own covariances without and with a delivery, both (l, n, n, N).
         """
         nowhere = np.zeros(silent.shape[:2] + silent.shape[-1:])
         alone = np.empty(silent.shape)

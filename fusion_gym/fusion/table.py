@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 from numpy.typing import ArrayLike
@@ -59,27 +60,17 @@ class Rule:
     ordered: bool = False
 
 
+_IN_TURN = partial(SequentialIntersection, covariance_intersection)
+_INVERSE = partial(SequentialIntersection, inverse_covariance_intersection)
 RULES = {
     "federated": Rule(lambda order: InformationFusion(), "information shares"),
     "information": Rule(lambda order: InformationFusion(), "independence"),
     "matrix": Rule(lambda order: MatrixWeightedFusion(), "joint covariance"),
-    "sici": Rule(
-        lambda order: SequentialIntersection(inverse_covariance_intersection, order),
-        "common information",
-        ordered=True,
-    ),
-    "sci": Rule(
-        lambda order: SequentialIntersection(covariance_intersection, order),
-        "nothing",
-        ordered=True,
-    ),
+    "sici": Rule(_INVERSE, "common information", ordered=True),
+    "sci": Rule(_IN_TURN, "nothing", ordered=True),
     "ci": Rule(lambda order: CovarianceIntersection(), "nothing"),
     "exact_ci": Rule(lambda order: CovarianceIntersection(), "tracked weights"),
-    "ici": Rule(
-        lambda order: SequentialIntersection(inverse_covariance_intersection),
-        "common information",
-        pair=True,
-    ),
+    "ici": Rule(_INVERSE, "common information", pair=True),
 }
 
 
