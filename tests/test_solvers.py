@@ -19,11 +19,11 @@ from fusion_gym.solvers.grid import ErrorGrid, gaussian_rows
 from fusion_gym.solvers.joint import JointProblem, solve_joint_average, solve_joint_finite
 from fusion_gym.solvers.single import (
     AverageSolution,
-    SourceProblem,
     solve_average,
     solve_discounted,
     solve_finite,
 )
+from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.solvers.tokens import TokenLevels
 from fusion_gym.validation import ConfigurationError
 

@@ -14,11 +14,11 @@ from fusion_gym.solvers.single import (
     AverageSolution,
     DiscountedSolution,
     FiniteSolution,
-    SourceProblem,
     solve_average,
     solve_discounted,
     solve_finite,
 )
+from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.solvers.task import Optimum, solve_task, source_problems
 from fusion_gym.solvers.tokens import TokenLevels
 

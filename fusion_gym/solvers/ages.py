@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.solvers.single import SourceProblem
+from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.validation import ConfigurationError
 
 _LAZINESS = 0.3  # share of the old value that is kept: optimal schedules are periodic

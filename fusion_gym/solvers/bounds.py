@@ -10,7 +10,8 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from fusion_gym import validation
-from fusion_gym.solvers.single import SourceProblem, solve_average, solve_finite
+from fusion_gym.solvers.single import solve_average, solve_finite
+from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.validation import ConfigurationError
 
 _TOLERANCE = 1e-3  # of the multiplier, relatively: the bound is flat there

@@ -11,7 +11,7 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.solvers.grid import ErrorGrid, default_reach, gaussian_rows
-from fusion_gym.solvers.single import SourceProblem
+from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.solvers.tokens import TokenLevels
 from fusion_gym.validation import ConfigurationError
 

@@ -16,10 +16,10 @@ from fusion_gym.solvers.joint import JointProblem, solve_joint_average, solve_jo
 from fusion_gym.solvers.single import (
     AverageSolution,
     FiniteSolution,
-    SourceProblem,
     solve_average,
     solve_finite,
 )
+from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.solvers.tokens import TokenLevels
 from fusion_gym.systems.remote.system import RemoteEstimationSystem
 from fusion_gym.validation import ConfigurationError

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from fusion_gym.arrays import Array
-from fusion_gym.solvers.single import SourceProblem, solve_average
+from fusion_gym.solvers.single import solve_average
+from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.validation import ConfigurationError
 
 _PRICES = np.geomspace(0.02, 5000.0, 32)  # in units of w σ², at which the optimum is solved

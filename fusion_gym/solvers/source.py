@@ -1,0 +1,117 @@
+"""One source of remote estimation as a problem of dynamic programming."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.token_bucket import TokenBucket
+from fusion_gym.solvers.grid import ErrorGrid, default_reach
+from fusion_gym.solvers.tokens import TokenLevels
+from fusion_gym.validation import ConfigurationError
+
+_FINEST, _COARSEST = 40.0, 5.0  # points of the default grid a deviation of the noise
+_POINTS = 600  # that it has about, between these; half of them where tokens are limited
+
+
+@dataclass(frozen=True)
+class SourceProblem:
+    """When should one source transmit, so that w e² + price · transmissions is least?
+
+    One step, from the error e and the channel state s of the step before, both known: request or
+    not; the channel moves to s'; a packet is lost with probability ``drop[s']``; the error becomes
+    0 on a delivery and stays e otherwise; its square is paid; then e moves to a e + w.
+
+    ``coefficient`` a, ``deviation`` σ, ``price`` of a transmission, ``error_weight`` w; the
+    channel's ``transition`` (S, S) and ``drop`` (S,); ``tokens``, the levels of the bucket.
+    """
+
+    coefficient: float
+    deviation: float
+    price: float
+    error_weight: float
+    transition: Array
+    drop: Array
+    tokens: TokenLevels
+
+    @classmethod
+    def create(
+        cls,
+        coefficient: float = 1.0,
+        deviation: float = 1.0,
+        price: float = 1.0,
+        error_weight: float = 1.0,
+        drop: ArrayLike = 0.0,
+        transition: ArrayLike = ((1.0,),),
+        bucket: TokenBucket | None = None,
+    ) -> SourceProblem:
+        """Check the numbers; without a bucket transmissions are limited by their price alone.
+
+        Raises:
+            ConfigurationError: a value that is not allowed.
+        """
+        matrix = validation.array("transition", transition, (None, None))
+        if matrix.shape[0] != matrix.shape[1] or not np.allclose(matrix.sum(1), 1.0):
+            raise ConfigurationError(
+                f"transition = {matrix.tolist()} is not allowed: it must be a square matrix whose "
+                "rows sum to 1"
+            )
+        loss = validation.not_negative("drop", drop, matrix.shape[:1])
+        if np.any(loss > 1.0):
+            raise ConfigurationError(
+                f"drop = {loss.tolist()} is not allowed: it must be at most 1 everywhere"
+            )
+        if bucket is None:
+            bucket = TokenBucket.create(1.0, 1.0, 1.0, 1.0, sensors=1, unlimited=True)
+        return cls(
+            coefficient=validation.number("coefficient", coefficient),
+            deviation=validation.number("deviation", deviation, above=0.0),
+            price=validation.number("price", price, at_least=0.0),
+            error_weight=validation.number("error_weight", error_weight, above=0.0),
+            transition=matrix,
+            drop=loss,
+            tokens=TokenLevels.create(bucket),
+        )
+
+    @property
+    def scale(self) -> float:
+        """The threshold that is optimal in continuous time for a = 1: (6 price/w)^¼ σ^½."""
+        return float((6.0 * self.price / self.error_weight) ** 0.25 * self.deviation**0.5)
+
+    @property
+    def wait(self) -> float:
+        """Steps between two transmissions that the tokens can sustain, at least 1."""
+        tokens = self.tokens
+        if len(tokens.level) == 1:
+            return 1.0
+        rate = float((tokens.level[tokens.following[:, 0]] - tokens.level).max())
+        return max(1.0, float(tokens.spent[1]) / max(rate, 1e-12))
+
+    def grid(
+        self, horizon: int | None = None, reach: float | None = None, step: float | None = None
+    ) -> ErrorGrid:
+        """A grid of errors up to ``reach`` in steps of ``step``.
+
+        The default goes beyond what is reached with a probability of 1e-10, in about 600 points
+        (300 with limited tokens), but at most 40 and at least 5 a deviation of the noise.
+        """
+        if reach is None:
+            threshold = max(self.scale, self.deviation * float(np.sqrt(self.wait)))
+            reach = default_reach(
+                self.coefficient,
+                self.deviation,
+                threshold,
+                self.transition,
+                self.drop,
+                self.wait,
+                horizon,
+            )
+        if step is None:
+            finest, coarsest = self.deviation / _FINEST, self.deviation / _COARSEST
+            points = _POINTS if len(self.tokens.level) == 1 else _POINTS / 2
+            step = min(max(reach / points, finest), coarsest)
+        return ErrorGrid.create(self.coefficient, self.deviation, reach, step)
