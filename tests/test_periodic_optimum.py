@@ -49,8 +49,8 @@ def recursion_traces(schedules: NDArray[np.bool_], steps: int, last: int) -> Arr
         lags = recursion.predict(lags, sent, recursion.filters.at(np.full(runs, time - 1)))
         sent = schedules[(time - 1) % len(schedules)]
         if time > steps - last:
-            offer = recursion.offer(lags, place)
-            total += linalg.trace(system.fusion.fuse(means, offer.joint(sent)).covariance)
+            prediction = recursion.prediction(lags, place)
+            total += linalg.trace(system.fusion.fuse(means, prediction.joint(sent)).covariance)
     return total / last
 
 
