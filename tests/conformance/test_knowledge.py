@@ -5,21 +5,25 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from cases import Case, each_case, requests
+import pytest
+from cases import CASES, Case, each_case, requests
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import take_runs
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.observation import Network
 from fusion_gym.core.system import Signals, covers
+from fusion_gym.core.task import Task
 from fusion_gym.envs.views import SensorView
 
 STEPS = 12
+# A channel with a state tells the centre of it, whether or not anything is sent.
+QUIET = [case for case in CASES if case.options.get("channel") != "gilbert_elliott"]
 
 
-def read(batch: EpisodeBatch, state: Any) -> dict[str, NDArray[Any]]:
+def read(task: Task, state: Any) -> dict[str, NDArray[Any]]:
     """All signals of a state, withheld ones too."""
-    offered = batch.task.system.read(state)
+    offered = task.system.read(state)
     return {name: np.asarray(Signals(dict(offered))[name]) for name in offered}
 
 
@@ -40,7 +44,7 @@ def test_signals_are_those_declared_with_their_axes(case: Case) -> None:
     system, batch = case.task().system, case.batch(list(range(runs)))
     assert len({signal.name for signal in system.signals}) == len(system.signals)
     for wanted in requests(case.task(), runs, STEPS):
-        found, sizes = read(batch, batch.state), {"N": runs, "sensors": system.sensor_count}
+        found, sizes = read(case.task(), batch.state), {"N": runs, "sensors": system.sensor_count}
         assert found.keys() == {signal.name for signal in system.signals}
         assert len(found["prior_mean"]) <= len(system.state_names)
         for signal in system.signals:
@@ -66,7 +70,9 @@ def test_withheld_signals_are_those_of_the_sensors(case: Case) -> None:
         else:
             withheld.add(signal.name)
     assert withheld.isdisjoint(shown)
-    assert ("state" in shown) == (task.information == "sensors") == (not withheld)
+    sees_all = task.information == "sensors"
+    assert ("model" in shown) is sees_all
+    assert bool(withheld) is not sees_all
 
 
 @each_case
@@ -78,8 +84,8 @@ def test_nothing_shown_depends_on_the_truth(case: Case) -> None:
         state = system.visible(batch.state)
         measured_exactly = np.array_equal(system.truth(state), system.truth(batch.state))
         assert measured_exactly or np.isnan(system.truth(state)).all()
-        found = read(batch, state)
-        for name, value in read(batch, batch.state).items():
+        found = read(case.task(), state)
+        for name, value in read(case.task(), batch.state).items():
             np.testing.assert_array_equal(found[name], value, err_msg=name)
         np.testing.assert_array_equal(batch.layout.encode(state, _network(batch)), batch.observe())
         nobody = np.zeros_like(wanted)
@@ -114,7 +120,7 @@ def test_whoever_is_shown_something_can_know_it(case: Case) -> None:
         noise = np.repeat(draw.standard_normal((channels, 1)), channels + 1, axis=1)
         noise[np.arange(channels), np.arange(1, channels + 1)] *= -1.5
         state = system.sense(take_runs(before, np.zeros(channels + 1, dtype=np.int64)), noise)
-        signals = read(batch, state)
+        signals = read(case.task(), state)
         measured = _changed(signals["measurement"]).reshape(task.sensors, -1, channels).any(1)
         alone = measured.sum(0) == 1
         for signal in system.signals:
@@ -138,6 +144,28 @@ def test_whoever_is_shown_something_can_know_it(case: Case) -> None:
             assert told or not (changed & ~measured)[:, alone].any()
         before = system.deliver(take_runs(state, np.zeros(1, dtype=np.int64)), wanted)
     assert view is None or noticed.all()
+
+
+@pytest.mark.parametrize("case", QUIET, ids=str)
+def test_silence_tells_the_centre_nothing(case: Case) -> None:
+    """Other noises, the same silence: what the centre knows is the same, measurements are not."""
+    system, runs = case.task().system, 4
+    draw = np.random.default_rng(2)
+    first = draw.standard_normal((system.start_channels, 1))
+    state = take_runs(system.start(first), np.zeros(runs, dtype=np.int64))
+    moved = np.zeros(system.sensor_count, dtype=np.bool_)
+    for _ in range(STEPS):
+        state = system.sense(state, draw.standard_normal((system.noise_channels, runs)))
+        signals = read(case.task(), state)
+        for signal in system.signals:
+            if signal.knowledge in ("clock", "centre"):
+                assert not _changed(signals[signal.name]).any(), signal.name
+        for block in system.observation:
+            if block.knowledge in ("clock", "centre"):
+                assert not _changed(block.fill(state)).any(), block.name
+        moved |= _changed(signals["measurement"]).reshape(system.sensor_count, -1).any(1)
+        state = system.deliver(state, np.zeros((system.sensor_count, runs), dtype=np.bool_))
+    assert moved.all()
 
 
 def _changed(value: NDArray[Any]) -> NDArray[np.bool_]:
