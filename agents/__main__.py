@@ -9,17 +9,15 @@ from pathlib import Path
 
 from fusion_gym.validation import ConfigurationError, choice
 
-COMMANDS = (
-    *("train", "evaluate", "compare", "tune", "benchmark", "report", "reproduce", "solved"),
-    *("demo", "zoo"),
-)
+FOLDER = Path(__file__).parent
+COMMANDS = sorted(file.stem for file in FOLDER.glob("[a-z]*.py") if file.stem != "command_line")
 
 
 def usage() -> str:
     """Every command with the first sentence of its module."""
     lines = ["usage: fusion-gym COMMAND [OPTIONS]", ""]
     for name in COMMANDS:
-        source = Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8")
+        source = (FOLDER / f"{name}.py").read_text(encoding="utf-8")
         sentence = (ast.get_docstring(ast.parse(source)) or "").splitlines()[0]
         lines.append(f"  {name:<10} {sentence}")
     return "\n".join([*lines, "", "fusion-gym COMMAND --help shows the options of a command."])

@@ -46,11 +46,8 @@ class Compare(Command):
         task = make_task(chosen.id, **chosen.options)
         make_policy(self.policy, task)
         baselines = run_all(task, sweep.policies, self.episodes, self.seed, "baselines")
-        learned = run_all(task, [self.policy], self.episodes, self.seed, "policy")[self.policy]
-        compare(
-            chosen.id, task, chosen.id, baselines, sweep, self.policy, learned, self.seed,
-            self.output,
-        )  # fmt: skip
+        names = (chosen.id, chosen.id)
+        compare(names, task, sweep, baselines, self.policy, self.seed, self.output)
 
 
 def main() -> None:

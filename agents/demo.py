@@ -18,7 +18,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import record_episode
 from fusion_gym.policies.registry import make_policy
 
-from .command_line import Command, spelled, start
+from .command_line import Command, start
 from .output import figures
 from .suite.comparison import compare, run_all
 from .suite.sweep import Sweep
@@ -74,18 +74,14 @@ class Demo(Command):
             shutil.rmtree(self.output / setting.name, ignore_errors=True)
         sweep = load(Sweep, self.sweep)
         for setting in SETTINGS:
-            experiment = load(Experiment, setting.config)
-            if self.timesteps is not None:
-                training = experiment.training.model_copy(update={"timesteps": self.timesteps})
-                experiment = experiment.model_copy(update={"training": training})
-            if not demonstrate(setting, experiment, sweep, self):
+            if not demonstrate(setting, load(Experiment, setting.config), sweep, self):
                 raise KeyboardInterrupt
         seconds = time.perf_counter() - began
         print(f"\nfigures, tables and models are in {self.output}; {seconds:.0f} s")
 
     def interrupted(self) -> str:
         """Nothing is lost."""
-        return f"interrupted: run {spelled('demo')} again to go on"
+        return "interrupted: run the same command again to go on"
 
 
 def demonstrate(setting: Setting, experiment: Experiment, sweep: Sweep, given: Demo) -> bool:
@@ -94,24 +90,12 @@ def demonstrate(setting: Setting, experiment: Experiment, sweep: Sweep, given: D
     task = make_task(experiment.environment.id, **experiment.environment.options)
     print(f"\n{setting.title}")
     baselines = run_all(task, sweep.policies, given.episodes, given.seed, "baselines")
-    plain = experiment.model_dump() | {"output": str(folder / "agent")}
-    training = Experiment.model_validate(plain)
-    summary = train(training, resume=(folder / "agent" / "config.yaml").exists())
-    if not summary["finished"]:
+    training = experiment.changed(folder / "agent", timesteps=given.timesteps)
+    if not train(training, resume=(folder / "agent" / "config.yaml").exists())["finished"]:
         return False
     agent = f"model:{folder / 'agent' / 'best_model.zip'}"
-    learned = run_all(task, [agent], given.episodes, given.seed, "agent")[agent]
-    compare(
-        experiment.environment.id,
-        task,
-        setting.title,
-        baselines,
-        sweep,
-        agent,
-        learned,
-        given.seed,
-        folder,
-    )
+    names = (experiment.environment.id, setting.title)
+    compare(names, task, sweep, baselines, agent, given.seed, folder)
     for name, text in (("agent", agent), ("dynamic_event", "dynamic_event")):
         trajectory = record_episode(task, make_policy(text, task), given.seed)
         figures.episode(

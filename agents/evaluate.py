@@ -132,8 +132,7 @@ def evaluate(given: Evaluate) -> dict[str, Any]:
             results[name] = run_episodes(task, policy, given.episodes, given.seed, bar.update)
             report["policies"][name] = summarise(results[name])
             report["quantiles"][name] = robust_summary(results[name])
-            if given.json is not None:
-                write(given.json, report)
+            write(given.json, report)
     differences = {
         name: paired_difference(found, results[given.reference])
         for name, found in results.items()
@@ -144,8 +143,7 @@ def evaluate(given: Evaluate) -> dict[str, Any]:
             "name": given.reference,
             "differences": {name: found._asdict() for name, found in differences.items()},
         }
-    if given.json is not None:
-        write(given.json, report)
+    write(given.json, report)
     title = f"{env_id}: {given.episodes} episodes of {task.horizon} steps, seed {given.seed}"
     console = tables.console()
     console.print(

@@ -76,13 +76,11 @@ def trained(experiment: Experiment, seed: int, folder: Path) -> Path:
     Raises:
         KeyboardInterrupt: the training was interrupted.
     """
-    plain = experiment.model_dump()
-    plain["training"]["seed"] = seed
-    plain["output"] = str(folder / f"{experiment.algorithm.name}_{seed}")
-    output = Path(plain["output"])
+    output = folder / f"{experiment.algorithm.name}_{seed}"
     summary = output / "summary.json"
     if not (summary.exists() and json.loads(summary.read_text())["finished"]):
-        found = train(Experiment.model_validate(plain), resume=(output / "config.yaml").exists())
+        chosen = experiment.changed(output, seed=seed)
+        found = train(chosen, resume=(output / "config.yaml").exists())
         if not found["finished"]:
             raise KeyboardInterrupt
     return output / "final_model.zip"

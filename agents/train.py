@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from .command_line import Command, start
-from .training.checked import load, parse
+from .training.checked import load
 from .training.config import Experiment
 from .training.run import train
 
@@ -41,14 +41,9 @@ class Train(Command):
         Raises:
             ConfigurationError: a config or a value that is not allowed.
         """
-        plain = load(Experiment, self.config).model_dump()
-        for key in ("timesteps", "seed", "target_rate"):
-            value = getattr(self, key)
-            if value is not None:
-                plain["training"][key] = value
-        if self.output is not None:
-            plain["output"] = self.output
-        return parse(Experiment, plain, "command line")
+        return load(Experiment, self.config).changed(
+            self.output, timesteps=self.timesteps, seed=self.seed, target_rate=self.target_rate
+        )
 
     def run(self) -> None:
         """Train; an interrupted training has said how to go on."""

@@ -14,8 +14,10 @@ from fusion_gym.evaluation.episodes import EpisodeResults
 FIELDS = tuple(EpisodeResults.__dataclass_fields__)
 
 
-def write(path: Path, report: Mapping[str, Any]) -> None:
-    """Replace a JSON file in one move, so that an interrupt never leaves half of it."""
+def write(path: Path | None, report: Mapping[str, Any]) -> None:
+    """Replace a JSON file, if one is wanted, in one move: an interrupt never leaves half of it."""
+    if path is None:
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".part")
     partial.write_text(json.dumps(report, indent=1) + "\n")

@@ -34,21 +34,19 @@ def run_all(
 
 
 def compare(
-    env_id: str,
-    task: Task,
-    title: str,
-    baselines: dict[str, EpisodeResults],
-    sweep: Sweep,
-    agent: str,
-    learned: EpisodeResults,
-    seed: int,
-    folder: Path,
-) -> dict[str, Any]:
-    """Write, print and draw the comparison; return the verdict.
+    names: tuple[str, str], task: Task, sweep: Sweep, baselines: dict[str, EpisodeResults],
+    agent: str, seed: int, folder: Path,
+) -> None:  # fmt: skip
+    """Run the agent on the baselines' episodes; write, print and draw the comparison.
+
+    ``names`` are the environment's id and the title.
 
     Raises:
         ConfigurationError: the agent transmits less than every baseline.
     """
+    env_id, title = names
+    episodes = next(iter(baselines.values())).episodes
+    learned = run_all(task, [agent], episodes, seed, "agent")[agent]
     comparison = compare_with_envelope(learned, baselines)
     envelope = lower_envelope(baselines)
     results = baselines | {agent: learned}
@@ -90,7 +88,6 @@ def compare(
     points = {name: baselines[name] for name in sweep.points}
     label = "PPO agent" if agent.startswith("model:") else agent
     figures.pareto(folder / "pareto.png", title, lines, points, {label: learned}, envelope)
-    return verdict
 
 
 def comparison_table(comparison: Comparison, learned: EpisodeResults) -> Table:

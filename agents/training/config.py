@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pydantic
 
 from .algorithms import AnyAlgorithm
-from .checked import Positive, Share, Strict
+from .checked import Positive, Share, Strict, parse
 
 
 class EnvironmentConfig(Strict):
@@ -54,3 +55,13 @@ class Experiment(Strict):
     training: TrainingConfig
     validation: ValidationConfig = ValidationConfig()
     output: str
+
+    def changed(self, output: str | Path | None, **training: Any) -> Experiment:
+        """The experiment with another output or training, where they are given, checked again.
+
+        Raises:
+            ConfigurationError: a value that is not allowed.
+        """
+        plain = self.model_dump() | ({} if output is None else {"output": str(output)})
+        plain["training"] |= {key: value for key, value in training.items() if value is not None}
+        return parse(Experiment, plain, "command line")

@@ -40,29 +40,17 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
     """What the network adds to a system's own blocks; their values are made of a `Network`."""
     capacity, price = task.bucket.capacity, task.reward.price
     tokens = Block(
-        "tokens",
-        "centre",
-        "told",
-        (),
-        "tokens over the capacity",
-        lambda net: net.tokens / capacity,
+        "tokens", "tokens over the capacity", lambda net: net.tokens / capacity, node="told"
     )
     admitted = Block(
         "admitted",
-        "centre",
-        "own",
-        (numbered(task.sensors),),
         "whether the network's access rule admits the sensor in this step",
         lambda net: net.admitted(),
+        (numbered(task.sensors),),
+        node="own",
     )
-    shown = Block(
-        "price",
-        "centre",
-        "told",
-        (),
-        "place of a token's price in its range, in the logarithm",
-        lambda net: price.encode(net.price),
-    )
+    place = "place of a token's price in its range, in the logarithm"
+    shown = Block("price", place, lambda net: price.encode(net.price), node="told")
     decides = task.access in ("round_robin", "random")
     return (
         tokens,

@@ -96,11 +96,11 @@ class Block:
     """
 
     name: str
-    knowledge: Knowledge
-    node: Literal["own", "told", "hidden"]
-    labels: tuple[tuple[str, ...], ...]
     meaning: str
     value: Callable[[Any], NDArray[Any]]
+    labels: tuple[tuple[str, ...], ...] = ()
+    knowledge: Knowledge = "centre"
+    node: Literal["own", "told", "hidden"] = "hidden"
     limit: float | None = None
 
     @property
@@ -135,13 +135,9 @@ class Block:
 
 def age_block(sensors: tuple[str, ...]) -> Block:
     """The entry that all systems have, of a state with ``age`` (sensors, N)."""
+    meaning = "a/(a + 10), a steps since the last delivery"
     return Block(
-        "age",
-        "centre",
-        "own",
-        (sensors,),
-        "a/(a + 10), a steps since the last delivery",
-        lambda state: state.age / (state.age + 10.0),
+        "age", meaning, lambda state: state.age / (state.age + 10.0), (sensors,), node="own"
     )
 
 

@@ -51,9 +51,9 @@ class RandomWalk:
     @property
     def observation(self) -> tuple[Block, ...]:
         return (
-            Block("surprise", "own", "own", (("0",),), "whitened innovation", self._surprise, 5.0),
+            Block("surprise", "whitened innovation", self._surprise, (("0",),), "own", "own", 5.0),
             age_block(("0",)),
-            Block("spread", "centre", "told", (), "ln(P/q) over ten", self._spread, limit=5.0),
+            Block("spread", "ln(P/q) over ten", self._spread, node="told", limit=5.0),
         )
 
     def start(self, noise: Array) -> WalkState:

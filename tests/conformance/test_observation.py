@@ -119,7 +119,7 @@ def declared(*blocks: Block) -> EpisodeBatch:
 
 def test_a_block_of_another_shape_is_refused() -> None:
     def block(value: Any) -> Block:
-        return Block("age", "centre", "own", (("0",),), "steps", value)
+        return Block("age", "steps", value, (("0",),), node="own")
 
     assert declared(block(lambda state: state.age)).observe().shape == (3, 2)
     for wrong in (lambda state: state.age[0], lambda state: state.age[:, None]):
@@ -128,7 +128,7 @@ def test_a_block_of_another_shape_is_refused() -> None:
 
 
 def test_two_blocks_of_one_name_are_refused() -> None:
-    own = Block("age", "centre", "told", (), "steps", lambda state: state.age[0])
+    own = Block("age", "steps", lambda state: state.age[0], node="told")
     with pytest.raises(ValueError, match="'age' is declared twice"):
         declared(own, own)
     with pytest.raises(ValueError, match="'tokens' is declared twice"):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,56 +126,38 @@ class CorrelatedTrackingSystem:
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation."""
         nodes, states = numbered(self.sensor_count), self.state_names
+        block = partial(Block, limit=_RANGE)
         components = (nodes, numbered(self.filter.sensors.size))
+        innovation = "innovation of the node over its predicted deviation"
+        deviation = "logarithm of the node's predicted over the open-loop deviation"
         return (
-            Block(
-                "whitened_innovation",
-                "own",
-                "own",
-                components,
-                "innovation of the node over its predicted deviation",
-                lambda state: (
-                    (state.measurement - state.expected)
-                    / _deviation(_sensed(state).innovation_covariance)
-                ),
-                limit=_RANGE,
-            ),
-            Block(
+            block("whitened_innovation", innovation, self._whitened, components, "own", "own"),
+            block(
                 "fused_innovation",
-                "coordinator",
-                "hidden",
-                components,
                 "the same against the fused prediction",
                 self._fused_innovation,
-                limit=_RANGE,
+                components,
+                "coordinator",
             ),
             age_block(nodes),
-            Block(
+            block(
                 "local_log_deviation",
-                "centre",
-                "own",
+                deviation,
+                lambda s: self._log_deviation(s.prior_covariance[1:]),
                 (nodes, states),
-                "logarithm of the node's predicted over the open-loop deviation",
-                lambda state: self._log_deviation(state.prior_covariance[1:]),
-                limit=_RANGE,
+                node="own",
             ),
-            Block(
+            block(
                 "log_deviation",
-                "centre",
-                "hidden",
-                (states,),
                 "the same of the fused prediction",
-                lambda state: self._log_deviation(state.prior_covariance[0]),
-                limit=_RANGE,
-            ),
-            Block(
-                "estimate",
-                "centre",
-                "hidden",
+                lambda s: self._log_deviation(s.prior_covariance[0]),
                 (states,),
+            ),
+            block(
+                "estimate",
                 "fused prediction over the state's root mean square",
-                lambda state: state.prior_mean[0] / self.magnitude[:, None],
-                limit=_RANGE,
+                lambda s: s.prior_mean[0] / self.magnitude[:, None],
+                (states,),
             ),
         )
 
@@ -324,6 +307,10 @@ class CorrelatedTrackingSystem:
     def open_loop(self, horizon: int) -> Array:
         """Mean error variance (n,) over t = 1..horizon of a centre that only predicts (bound)."""
         return self.plant.open_loop(horizon)
+
+    def _whitened(self, state: CorrelatedTrackingState) -> Array:
+        deviation = _deviation(_sensed(state).innovation_covariance)
+        return (state.measurement - state.expected) / deviation
 
     def _fused_innovation(self, state: CorrelatedTrackingState) -> Array:
         deviation = _deviation(self.filter.innovation_covariance(state.prior_covariance[0]))

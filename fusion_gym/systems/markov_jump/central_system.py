@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,75 +168,50 @@ class MarkovJumpCentralSystem:
     @property
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation; mode probabilities only with interacting models."""
-        nodes, states, n = numbered(self.sensor_count), self.state_names, self.plant.size
-        scale = self.scale[:, None]
-        blocks = (
-            Block(
-                "whitened_innovation",
-                "coordinator",
-                "hidden",
-                (nodes,),
-                "innovation against the centre's expectation, whitened, 0 without a sample",
-                lambda state: (
-                    self._innovation(state, _sensed(state)) / self._deviation(_sensed(state))
-                ),
-                limit=_RANGE,
-            ),
-            Block(
+        nodes, n, scale = numbered(self.sensor_count), self.plant.size, self.scale[:, None]
+        block = partial(Block, limit=_RANGE)
+        innovation = "innovation against the centre's expectation, whitened, 0 without a sample"
+        deviation = (
+            "logarithm of the innovation's deviation over the measurement's root mean square"
+        )
+        probability = Block(
+            "mode_probability",
+            "probability of the mode",
+            lambda s: s.belief.probability,
+            (numbered(self.plant.modes),),
+        )
+        return (
+            block("whitened_innovation", innovation, self._whitened, (nodes,), "coordinator"),
+            block(
                 "difference",
-                "own",
-                "own",
-                (nodes,),
                 "new minus held measurement over its root mean square",
-                lambda state: (state.measurement - state.held) / scale,
-                limit=_RANGE,
+                lambda s: (s.measurement - s.held) / scale,
+                (nodes,),
+                "own",
+                "own",
             ),
             *sampling_blocks(self.sensors),
             age_block(nodes),
-            Block(
+            block(
                 "innovation_log_deviation",
-                "centre",
-                "hidden",
+                deviation,
+                lambda s: np.log(self._deviation(_sensed(s)) / scale),
                 (nodes,),
-                "logarithm of the innovation's deviation over the measurement's root mean square",
-                lambda state: np.log(self._deviation(_sensed(state)) / scale),
-                limit=_RANGE,
             ),
-            Block(
+            block(
                 "log_deviation",
-                "centre",
-                "hidden",
-                (states,),
                 "logarithm of the predicted over the open-loop deviation",
-                lambda state: (
-                    0.5
-                    * np.log(
-                        linalg.diagonal(_sensed(state).covariance)[:n] / self.reference[:, None]
-                    )
-                ),
-                limit=_RANGE,
+                self._log_deviation,
+                (self.state_names,),
             ),
-            Block(
+            block(
                 "estimate",
-                "centre",
-                "hidden",
-                (states,),
                 "prediction over the state's root mean square",
-                lambda state: _sensed(state).mean[:n] / self.magnitude[:, None],
-                limit=_RANGE,
+                lambda s: _sensed(s).mean[:n] / self.magnitude[:, None],
+                (self.state_names,),
             ),
+            *((probability,) if isinstance(self.estimator, InteractingModels) else ()),
         )
-        if not isinstance(self.estimator, InteractingModels):
-            return blocks
-        probability = Block(
-            "mode_probability",
-            "centre",
-            "hidden",
-            (numbered(self.plant.modes),),
-            "probability of the mode",
-            lambda state: state.belief.probability,
-        )
-        return (*blocks, probability)
 
     def start(self, noise: Array) -> MarkovJumpCentralState:
         """Time 0: nothing is measured; what is held is what would be expected."""
@@ -342,6 +318,14 @@ class MarkovJumpCentralSystem:
     def open_loop(self, horizon: int) -> Array:
         """Mean error variance (n,) over t = 1..horizon of a centre that never receives."""
         return self.model.open_loop(horizon)
+
+    def _whitened(self, state: MarkovJumpCentralState) -> Array:
+        prediction = _sensed(state)
+        return self._innovation(state, prediction) / self._deviation(prediction)
+
+    def _log_deviation(self, state: MarkovJumpCentralState) -> Array:
+        variance = linalg.diagonal(_sensed(state).covariance)[: self.plant.size]
+        return 0.5 * np.log(variance / self.reference[:, None])
 
     def _innovation(self, state: MarkovJumpCentralState, prediction: Prediction) -> Array:
         surprise = state.measurement - prediction.mean[self.plant.size :]

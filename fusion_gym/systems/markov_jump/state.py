@@ -7,6 +7,7 @@ systems with correlated noises and fading measurements).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -120,24 +121,15 @@ SIGNALS = (
 
 def sampling_blocks(sensors: FadingSensors) -> tuple[Block, Block]:
     """Blocks of the observation that tell where in their sampling the sensors are."""
-    nodes = (numbered(sensors.count),)
+    own = partial(Block, labels=(numbered(sensors.count),), node="own")
+    since = "steps since the sensor's last sampling time over its period"
     return (
-        Block(
+        own(
             "sampled",
-            "centre",
-            "own",
-            nodes,
             "whether the sensor samples at this step",
-            lambda state: sensors.sampled(state.time),
+            lambda s: sensors.sampled(s.time),
         ),
-        Block(
-            "phase",
-            "centre",
-            "own",
-            nodes,
-            "steps since the sensor's last sampling time over its period",
-            lambda state: (state.time % sensors.period) / sensors.period,
-        ),
+        own("phase", since, lambda s: (s.time % sensors.period) / sensors.period),
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,68 +109,29 @@ class MarkovJumpSystem:
     @property
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation."""
-        nodes, states = numbered(self.sensor_count), self.state_names
+        nodes, states = (numbered(self.sensor_count),), (self.state_names,)
+        own = partial(Block, node="own", limit=_RANGE)
+        fused = partial(Block, labels=states, limit=_RANGE)
+        difference = "node's estimate minus the centre's copy, over its deviation"
+        innovation = "node's innovation over its deviation, 0 without a sample"
+        local = "logarithm of the root of the node's trace over the open-loop trace"
+        copies = "logarithm of the copy's predicted over the open-loop deviation"
         return (
-            Block(
-                "whitened_difference",
-                "own",
-                "own",
-                (nodes, states),
-                "node's estimate minus the centre's copy, over its deviation",
-                lambda state: (
-                    self._collapse(state.node_mean - state.copy_mean)
-                    / self._lag_deviation(_sensed(state))
-                ),
-                limit=_RANGE,
-            ),
-            Block(
-                "whitened_innovation",
-                "own",
-                "own",
-                (nodes,),
-                "node's innovation over its deviation, 0 without a sample",
-                self._whitened_innovation,
-                limit=_RANGE,
-            ),
+            own("whitened_difference", difference, self._difference, nodes + states, "own"),
+            own("whitened_innovation", innovation, self._whitened_innovation, nodes, "own"),
             *sampling_blocks(self.sensors),
-            age_block(nodes),
-            Block(
-                "local_log_deviation",
-                "centre",
-                "own",
-                (nodes,),
-                "logarithm of the root of the node's trace over the open-loop trace",
-                lambda state: 0.5 * np.log(self._local_trace(state) / self.reference.sum()),
-                limit=_RANGE,
-            ),
-            Block(
-                "copy_log_deviation",
-                "centre",
-                "own",
-                (nodes, states),
-                "logarithm of the copy's predicted over the open-loop deviation",
-                self._copy_log_deviation,
-                limit=_RANGE,
-            ),
-            Block(
+            age_block(*nodes),
+            own("local_log_deviation", local, self._local_log_deviation, nodes),
+            own("copy_log_deviation", copies, self._copy_log_deviation, nodes + states),
+            fused(
                 "log_deviation",
-                "centre",
-                "hidden",
-                (states,),
                 "the same of the fused estimate if nobody transmits",
-                lambda state: (
-                    0.5 * np.log(linalg.diagonal(state.prior_covariance) / self.reference[:, None])
-                ),
-                limit=_RANGE,
+                lambda s: self._log_deviation(s.prior_covariance),
             ),
-            Block(
+            fused(
                 "estimate",
-                "centre",
-                "hidden",
-                (states,),
                 "that estimate over the state's root mean square",
-                lambda state: state.prior_mean / self.magnitude[:, None],
-                limit=_RANGE,
+                lambda s: s.prior_mean / self.magnitude[:, None],
             ),
         )
 
@@ -320,18 +282,26 @@ class MarkovJumpSystem:
             result += mean[:, first : first + n]
         return result
 
+    def _difference(self, state: MarkovJumpState) -> Array:
+        lag = self._collapse(state.node_mean - state.copy_mean)
+        return lag / self._lag_deviation(_sensed(state))
+
     def _whitened_innovation(self, state: MarkovJumpState) -> Array:
         nodes, place = np.arange(self.sensor_count), self.filters.at(state.time)
         variance = self.filters.innovation_covariance[nodes, nodes].take(place, -1)
         return state.innovation / np.sqrt(variance)
 
-    def _local_trace(self, state: MarkovJumpState) -> Array:
-        return self.recursion.local_trace.take(self.filters.at(state.time), -1)
+    def _local_log_deviation(self, state: MarkovJumpState) -> Array:
+        trace = self.recursion.local_trace.take(self.filters.at(state.time), -1)
+        return 0.5 * np.log(trace / self.reference.sum())
 
     def _copy_log_deviation(self, state: MarkovJumpState) -> Array:
         prediction, nodes = _sensed(state), np.arange(self.sensor_count)
-        copies = linalg.diagonal(prediction.local[nodes, nodes] + prediction.lag[nodes, nodes])
-        return 0.5 * np.log(copies / self.reference[:, None])
+        return self._log_deviation(prediction.local[nodes, nodes] + prediction.lag[nodes, nodes])
+
+    def _log_deviation(self, covariance: Array) -> Array:
+        """ln √(variance/reference) (..., n, N) of covariances (..., n, n, N)."""
+        return 0.5 * np.log(linalg.diagonal(covariance) / self.reference[:, None])
 
     def _lag_deviation(self, prediction: JointPrediction) -> Array:
         """Predicted deviations (l, n, N) of node minus copy, never zero."""

@@ -116,23 +116,21 @@ class RemoteEstimationSystem:
         nodes = numbered(self.sensor_count)
         error = Block(
             "error",
-            "own",
-            "own",
-            (nodes,),
             "value minus the centre's prediction, over ``error_scale``",
-            lambda state: (state.truth - state.prior) / self.error_scale[:, None],
-            limit=_RANGE,
+            lambda s: (s.truth - s.prior) / self.error_scale[:, None],
+            (nodes,),
+            "own",
+            "own",
+            _RANGE,
         )
-        age = age_block(nodes)
         channel = Block(
             "channel",
-            "centre",
-            "own",
-            (nodes, STATES),
             "state of the channel at the step before, one-hot",
-            lambda state: state.channel[:, None] == np.arange(len(STATES))[:, None],
+            lambda s: s.channel[:, None] == np.arange(len(STATES))[:, None],
+            (nodes, STATES),
+            node="own",
         )
-        return (error, age, channel) if self.channel.states > 1 else (error, age)
+        return (error, age_block(nodes), *((channel,) if self.channel.states > 1 else ()))
 
     def start(self, noise: Array) -> RemoteEstimationState:
         """Time 0: x(0) is drawn about zero, which is all that the centre knows."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,7 @@ from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.centre import Centre, FeedbackCentre, Prediction
 from fusion_gym.systems.tobit.filters import KalmanFilter
 
-_WHITE = 5.0  # whitened quantities are clipped at this many standard deviations
-_LOG_RANGE = 5.0  # log variance ratios are clipped here: starved bounds grow as 1.25^t
+_RANGE = 5.0  # whitened quantities and logarithms of variance ratios are clipped here
 
 
 @dataclass(slots=True)
@@ -129,64 +129,33 @@ class CensoredSystem:
     @property
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation."""
-        sensors = self.centre.sensors
-        nodes, states = numbered(sensors.count), self.state_names
-        components = (nodes, numbered(sensors.size))
+        sensors, nodes = self.centre.sensors, numbered(self.sensor_count)
+        own = partial(Block, labels=(nodes, numbered(sensors.size)), node="own")
+        new = partial(own, knowledge="own", limit=_RANGE)
+        told = partial(Block, labels=(self.state_names,), node="told", limit=_RANGE)
+        at_threshold = "whether the component is at its threshold"
+        uncensored = "predicted probability that the component is not censored"
+        moved = "new minus last delivered measurement, over two noise deviations"
+        variance = "logarithm of the predicted variance over its open-loop mean"
         return (
-            Block(
-                "whitened_innovation",
-                "own",
-                "own",
-                components,
-                "innovation over its predicted deviation",
-                _whitened_innovation,
-                limit=_WHITE,
-            ),
-            Block(
-                "censored",
-                "own",
-                "own",
-                components,
-                "whether the component is at its threshold",
-                lambda state: sensors.censored(state.measurement),
-            ),
-            Block(
+            new("whitened_innovation", "innovation over its predicted deviation", _whitened),
+            new("censored", at_threshold, lambda s: sensors.censored(s.measurement), limit=None),
+            new(
                 "held_difference",
-                "own",
-                "own",
-                components,
-                "new minus last delivered measurement, over two noise deviations",
-                lambda state: (state.measurement - state.held) / (2.0 * sensors.deviation),
-                limit=_WHITE,
+                moved,
+                lambda s: (s.measurement - s.held) / (2.0 * sensors.deviation),
             ),
-            Block(
+            own(
                 "uncensored_probability",
-                "centre",
-                "own",
-                components,
-                "predicted probability that the component is not censored",
-                lambda state: _prediction(state).expectation.uncensored_probability,
+                uncensored,
+                lambda s: _prediction(s).expectation.uncensored_probability,
             ),
             age_block(nodes),
-            Block(
-                "log_variance",
-                "centre",
-                "told",
-                (states,),
-                "logarithm of the predicted variance over its open-loop mean",
-                lambda state: np.log(
-                    linalg.diagonal(state.prior_covariance) / self.reference[:, None]
-                ),
-                limit=_LOG_RANGE,
-            ),
-            Block(
+            told("log_variance", variance, self._log_variance),
+            told(
                 "estimate",
-                "centre",
-                "told",
-                (states,),
                 "prediction over the state's root mean square",
-                lambda state: state.prior_mean / self.scale[:, None],
-                limit=_WHITE,
+                lambda s: s.prior_mean / self.scale[:, None],
             ),
         )
 
@@ -285,6 +254,9 @@ class CensoredSystem:
             "variance_reduction": lambda: variances()[1],
         }
 
+    def _log_variance(self, state: CensoredState) -> Array:
+        return np.log(linalg.diagonal(state.prior_covariance) / self.reference[:, None])
+
     def visible(self, state: CensoredState) -> CensoredState:
         """The state without the truth; nothing else is hidden."""
         return replace(state, truth=np.full_like(state.truth, np.nan))
@@ -306,7 +278,7 @@ class CensoredSystem:
         return self.plant.open_loop(horizon)
 
 
-def _whitened_innovation(state: CensoredState) -> Array:
+def _whitened(state: CensoredState) -> Array:
     expectation, deviation, _ = _prediction(state)
     return (state.measurement - expectation.value) / deviation
 

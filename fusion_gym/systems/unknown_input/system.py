@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,56 +127,26 @@ class UnknownInputSystem:
     @property
     def observation(self) -> tuple[Block, ...]:
         """Blocks of the observation; a "state" is a state or an input."""
-        nodes, states = numbered(self.sensor_count), self.state_names
-        components = (nodes, numbered(self.nodes.sensors.size))
+        nodes, states = (numbered(self.sensor_count),), (self.state_names,)
+        own = partial(Block, node="own", limit=_RANGE)
+        new = partial(own, labels=(*nodes, numbered(self.nodes.sensors.size)), knowledge="own")
+        fused = partial(Block, labels=states, limit=_RANGE)
+        innovation = "innovation of the node over its predicted deviation"
+        deviation = "logarithm of the node's predicted over the open-loop deviation"
         return (
-            Block(
-                "whitened_innovation",
-                "own",
-                "own",
-                components,
-                "innovation of the node over its predicted deviation",
-                lambda state: (
-                    (state.measurement - _sensed(state).expected) / self._deviation(state)
-                ),
-                limit=_RANGE,
-            ),
-            Block(
+            new("whitened_innovation", innovation, self._whitened),
+            new(
                 "held_difference",
-                "own",
-                "own",
-                components,
                 "new minus held measurement over √2 noise deviations",
-                lambda state: (state.measurement - state.held) / self._noise_deviation,
-                limit=_RANGE,
+                lambda s: (s.measurement - s.held) / self._noise_deviation,
             ),
-            age_block(nodes),
-            Block(
-                "local_log_deviation",
-                "centre",
-                "own",
-                (nodes, states),
-                "logarithm of the node's predicted over the open-loop deviation",
-                self._local_log_deviation,
-                limit=_RANGE,
-            ),
-            Block(
-                "log_deviation",
-                "centre",
-                "hidden",
-                (states,),
-                "the same of the last fused estimate",
-                self._fused_log_deviation,
-                limit=_RANGE,
-            ),
-            Block(
+            age_block(*nodes),
+            own("local_log_deviation", deviation, self._local_log_deviation, nodes + states),
+            fused("log_deviation", "the same of the last fused estimate", self._log_deviation),
+            fused(
                 "estimate",
-                "centre",
-                "hidden",
-                (states,),
                 "fused prediction over the root mean square",
-                lambda state: _sensed(state).fused_mean / self.magnitude[:, None],
-                limit=_RANGE,
+                lambda s: _sensed(s).fused_mean / self.magnitude[:, None],
             ),
         )
 
@@ -295,11 +266,14 @@ class UnknownInputSystem:
         """√2 deviations of the measurement noise, (l, m, 1)."""
         return np.sqrt(2.0 * linalg.diagonal(self.nodes.sensors.covariance))
 
+    def _whitened(self, state: UnknownInputState) -> Array:
+        return (state.measurement - _sensed(state).expected) / self._deviation(state)
+
     def _local_log_deviation(self, state: UnknownInputState) -> Array:
         prior = self.nodes.prior_covariance(_sensed(state), state.time)
         return _lanes(_log_deviation(prior, self.reference), len(state.time))
 
-    def _fused_log_deviation(self, state: UnknownInputState) -> Array:
+    def _log_deviation(self, state: UnknownInputState) -> Array:
         before = self.nodes.fused_covariance(state.estimates, state.time - 1.0)
         return _lanes(_log_deviation(before, self.reference), len(state.time))
 
