@@ -112,27 +112,18 @@ def make_task(env: str | CommonOptions, **options: Any) -> Task:
         ConfigurationError: an id that is not registered, an unknown option, or a value that is
             not allowed.
     """
+    limit = options.pop("max_episode_steps", None)
+    if limit is not None:
+        limit = validation.integer("max_episode_steps", limit, at_least=1)
     if isinstance(env, CommonOptions):
-        validation.keys("option beside an options object", options, ["max_episode_steps"])
+        validation.keys("option beside an options object", options, [])
         env_id = next((name for name in ENVIRONMENTS if options_of(name) is type(env)), None)
         if env_id is None:
             raise ConfigurationError(
                 f"options of type {type(env).__name__} are not allowed: they belong to none of the "
                 "registered environments"
             )
-        chosen = env
-    else:
-        env_id, kind = env, options_of(env)
-        for name in ("num_envs", "autoreset_mode", "render_mode"):
-            if name in options:
-                raise ConfigurationError(
-                    f"{name} = {options[name]!r} is not allowed: it is no option of a task"
-                )
-    limit = options.pop("max_episode_steps", None)
-    if not isinstance(env, CommonOptions):
-        known = [field.name for field in fields(kind)]
-        validation.keys(f"option of {env_id}", options, known)
-        chosen = kind(**options)
-    if limit is not None:
-        limit = validation.integer("max_episode_steps", limit, at_least=1)
-    return Task.create(build_of(env_id)(chosen), limit)
+        return Task.create(build_of(env_id)(env), limit)
+    kind = options_of(env)
+    validation.keys(f"option of {env}", options, [field.name for field in fields(kind)])
+    return Task.create(build_of(env)(kind(**options)), limit)

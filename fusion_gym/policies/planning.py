@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Signals
+from fusion_gym.core.system import LossySystem, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import Grants
 from fusion_gym.validation import ConfigurationError
@@ -46,8 +46,10 @@ class Model:
     def __init__(self, task: Task, signals: Signals) -> None:
         self._task, self._state, self._step = task, signals["model"], signals["step"]
         self._tokens, self._admitted = signals["tokens"], signals["admitted"]
-        told = getattr(task.system, "arrival_probability", None)
-        self.arrival: Array | None = None if told is None else told(self._state)
+        system = task.system
+        self.arrival: Array | None = None
+        if isinstance(system, LossySystem):
+            self.arrival = system.arrival_probability(self._state)
 
     @property
     def runs(self) -> int:

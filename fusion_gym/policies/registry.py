@@ -96,15 +96,6 @@ def policy_names(kind: Kind | None = None) -> list[str]:
     return sorted(name for name, row in _ROWS.items() if kind in (None, row.kind))
 
 
-def policy_parameters(name: str) -> dict[str, Any]:
-    """The parameters that ``name:key=value`` may set, with their defaults.
-
-    Raises:
-        ConfigurationError: an unknown policy.
-    """
-    return {key: found.default for key, found in _parameters(name, _maker(name)).items()}
-
-
 def make_policy(spec: str, task: Task) -> Policy:
     """The policy that ``NAME`` or ``NAME:key=value,…`` names, tried out on one run of the task.
 

@@ -193,18 +193,15 @@ class CensoredSystem:
         truth = self.plant.advance(state.truth, noise[:r])
         prior_mean, prior_covariance = self.model.predict(state.mean, state.covariance)
         time = state.time + 1.0
-        return CensoredState(
+        return replace(
+            state,
             truth=truth,
             measurement=self.centre.sensors.measure(truth, noise[r:]),
-            held=state.held,
             age=state.age + 1.0,
             time=time,
             prior_mean=prior_mean,
             prior_covariance=prior_covariance,
             prediction=self.centre.predict(prior_mean, prior_covariance, state.held, time),
-            local_mean=state.local_mean,
-            mean=state.mean,
-            covariance=state.covariance,
         )
 
     def deliver(self, state: CensoredState, granted: NDArray[np.bool_]) -> CensoredState:
@@ -215,15 +212,10 @@ class CensoredSystem:
         posterior = self.centre.update(
             state.prior_mean, state.prior_covariance, _prediction(state), state.measurement, granted
         )
-        return CensoredState(
-            truth=state.truth,
-            measurement=state.measurement,
+        return replace(
+            state,
             held=np.where(granted[:, None], state.measurement, state.held),
             age=np.where(granted, 0.0, state.age),
-            time=state.time,
-            prior_mean=state.prior_mean,
-            prior_covariance=state.prior_covariance,
-            prediction=state.prediction,
             local_mean=posterior.local_mean,
             mean=posterior.mean,
             covariance=posterior.covariance,
