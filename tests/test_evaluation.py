@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 import zipfile
 from dataclasses import fields
 from pathlib import Path
@@ -392,3 +394,14 @@ def test_files_that_hold_no_fitting_agent(task: Task, tmp_path: Path) -> None:
             make_policy(f"model:{path}", task)
         assert str(path) in str(caught.value)
         assert part in str(caught.value)
+
+
+def test_the_zoo_and_the_evaluation_come_with_the_package_and_torch_does_not() -> None:
+    lines = (
+        "import sys, fusion_gym",
+        "task = fusion_gym.make_task('fusion_gym/TobitOscillator-v0', horizon=3)",
+        "fusion_gym.evaluation.run_episodes(task, fusion_gym.make_policy('always', task), 2, 0)",
+        "assert fusion_gym.zoo.names() and fusion_gym.policy_names()",
+        "assert not {'torch', 'stable_baselines3'} & sys.modules.keys()",
+    )
+    subprocess.run([sys.executable, "-c", "; ".join(lines)], check=True)
