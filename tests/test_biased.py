@@ -301,18 +301,6 @@ def test_network_access_is_shown_and_enforced() -> None:
             np.testing.assert_array_equal(info["denied"], ~shown)
 
 
-@pytest.mark.parametrize("env_id", [OSCILLATOR, TRACKING])
-@pytest.mark.parametrize("access", ["single", "any", "random"])
-@pytest.mark.filterwarnings("error")
-def test_the_checkers_find_nothing(env_id: str, access: str) -> None:
-    from gymnasium.utils.env_checker import check_env
-    from stable_baselines3.common.env_checker import check_env as check_for_sb3
-
-    env = gymnasium.make(env_id, access=access).unwrapped
-    check_env(env)
-    check_for_sb3(env)
-
-
 def test_divergence_is_told() -> None:
     """With little noise the paper's filter loses the state in a few runs; the target never."""
     results = evaluate(OSCILLATOR, "round_robin", measurement_variance=0.06)

@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.channel import Channel
-from fusion_gym.envs.registered import RemoteEstimationEnv, RemoteEstimationVectorEnv
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.optimal import OptimalPolicy
@@ -67,11 +65,6 @@ def test_simple_channels_and_certain_starts() -> None:
 
 
 # --- the environment -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("options", [{}, {"sensors": 2, **LOSSY}, {"action": "discrete"}])
-def test_gymnasiums_checker(options: dict[str, Any]) -> None:
-    check_env(RemoteEstimationEnv(**options), skip_render_check=True)
 
 
 @pytest.mark.parametrize(
@@ -192,15 +185,6 @@ def test_triggers_and_observations(options: dict[str, Any]) -> None:
                 seen = batch.observe()
                 assert ((seen >= batch.layout.low) & (seen <= batch.layout.high)).all()
             assert asked > 0, name
-        offered = batch.signals()
-        names = list(offered)
-        for signal in task.system.signals:
-            assert (signal.name in names) == (
-                information == "sensors" or signal.knowledge == "centre"
-            )
-            if signal.name in names:
-                axes = signal.axes.strip("()").split(",")
-                assert offered[signal.name].ndim == len([axis for axis in axes if axis])
 
 
 def test_observed_errors_do_not_saturate_where_the_decision_is_made() -> None:
@@ -208,21 +192,6 @@ def test_observed_errors_do_not_saturate_where_the_decision_is_made() -> None:
         task = build(cost_weight=price, error_weight=weight)
         threshold = float(solve_average(source_problems(task)[0]).threshold[0, 0])
         assert 0.5 < threshold / task.system.error_scale[0] < 2.0
-
-
-def test_a_run_does_not_depend_on_its_neighbours() -> None:
-    options = {"sensors": 2, "tokens": "limited", **LOSSY}
-    many, one = RemoteEstimationVectorEnv(5, **options), RemoteEstimationEnv(**options)
-    seen, _ = many.reset(seed=20)
-    alone, _ = one.reset(seed=23)
-    draw = np.random.default_rng(1)
-    np.testing.assert_array_equal(seen[3], alone)
-    for _ in range(50):
-        action = draw.integers(0, 2, (5, 2), dtype=np.int8)
-        seen, reward, *_ = many.step(action)
-        alone, single, *_ = one.step(action[3])
-        np.testing.assert_allclose(seen[3], alone, rtol=1e-6)
-        assert reward[3] == pytest.approx(single, rel=1e-10)
 
 
 # --- the optimal policy --------------------------------------------------------------------------

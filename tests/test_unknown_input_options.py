@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.registry import make_rule
-from fusion_gym.systems.unknown_input.environment import UnknownInputOptions
 from fusion_gym.validation import ConfigurationError
 
 build = partial(make_task, "fusion_gym/UnknownInput-v0")
@@ -188,11 +186,3 @@ def test_given_numbers_go_before_the_examples() -> None:
     assert task.settings["filter"] == "paper"
     assert task.system.state_names == ("x1", "x2", "d1", "d2")
     assert build().system.state_names[-1] == "force"
-
-
-def test_page_names_every_option_and_observation() -> None:
-    page = (ROOT / "docs" / "unknown_input.md").read_text()
-    options = [field.name for field in dataclasses.fields(UnknownInputOptions)]
-    assert not [name for name in options if f"`{name}`" not in page]
-    kinds = {name.split("[")[0] for name in EpisodeBatch(build(), 1).layout.names}
-    assert not [kind for kind in kinds if f"`{kind}" not in page]

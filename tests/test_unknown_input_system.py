@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from scipy.special import ndtr
 
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.envs.registered import UnknownInputEnv, UnknownInputVectorEnv
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.fusion.several import covariance_intersection_many
@@ -272,48 +270,3 @@ def test_reward_weighs_state_and_input() -> None:
     given_weights = (1.0, 0.0, 2.0, 0.0, 3.0)
     task = build(state_weights=given_weights)
     np.testing.assert_array_equal(task.reward.state_weights[:, 0], given_weights)
-
-
-# --- invariance ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", ["random_walk", "predict", "paper"])
-def test_a_run_does_not_depend_on_what_stands_beside_it(kind: str) -> None:
-    """Alone and in a batch whose other runs are reset in between, so that times differ."""
-    task = build(filter=kind, horizon=30, tokens="limited")
-    together, alone = EpisodeBatch(task, 3), EpisodeBatch(task, 1)
-    together.seed(np.arange(3), [5, 6, 7])
-    alone.seed(np.arange(1), [6])
-    together.reset()
-    alone.reset()
-    draw = np.random.default_rng(1)
-    for step in range(29):
-        if step in (4, 11):
-            together.reset(np.array([0 if step == 4 else 2]))
-        requests = draw.random((3, 3)) < 0.5
-        many, one = together.step(requests), alone.step(requests[:, 1:2])
-        np.testing.assert_allclose(many.reward[1], one.reward[0], rtol=1e-10)
-        np.testing.assert_allclose(together.observe()[1], alone.observe()[0], rtol=1e-6)
-        for mine, other in zip(
-            task.system.fused(together.delivered), task.system.fused(alone.delivered), strict=True
-        ):
-            np.testing.assert_allclose(mine[..., 1], other[..., 0], rtol=1e-10, atol=1e-14)
-
-
-def test_vector_environment_is_the_single_ones_across_autoresets() -> None:
-    options: dict[str, Any] = {"horizon": 12, "input_signal": "steps", "tokens": "limited"}
-    vector = UnknownInputVectorEnv(num_envs=3, autoreset_mode="SameStep", **options)
-    seen, _ = vector.reset(seed=11)
-    singles = [UnknownInputEnv(**options) for _ in range(3)]
-    actions = np.random.default_rng(0).integers(0, 2, (30, 3, 3), dtype=np.int8)
-    for number, env in enumerate(singles):
-        np.testing.assert_allclose(env.reset(seed=11 + number)[0], seen[number], rtol=1e-6)
-    for action in actions:
-        seen, reward, _, truncated, _ = vector.step(action)
-        for number, env in enumerate(singles):
-            observation, value, _, ended, _ = env.step(action[number])
-            if ended:
-                observation, _ = env.reset()
-            assert ended == truncated[number]
-            assert value == pytest.approx(reward[number], rel=1e-10)
-            np.testing.assert_allclose(observation, seen[number], rtol=1e-5, atol=1e-6)

@@ -32,7 +32,7 @@ LOSSY: Options = {"sensors": 3, "channel": "gilbert_elliott", "coefficient": (0.
 GIVEN = np.sin(np.arange(41.0) / 3.0)[:, None].tolist()
 STARVED: Options = {"bias_aware": False, "access": "round_robin", **LIMITED}
 UNCENSORED: Options = {"filter": "kalman", "censoring_threshold": -np.inf, "random_start": True}
-UNALIKE: Options = {"token_cost": (1.0, 2.0, 4.0), "process_noise": "full", "error": "trace"}
+UNALIKE: Options = {"token_cost": (1.0, 2.0, 4.0), "process_noise": "full", "sharing": "fixed"}
 
 # Options that change what an environment is made of.
 VARIANTS: dict[str, list[Options]] = {

@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from cases import IDS, Case, actions, each_case, each_default, requests
+from cases import IDS, Case, actions, each_case, each_default, each_lasting, requests
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from own_system import OWN_ID, WalkOptions, build
 from pettingzoo.test import parallel_api_test, parallel_seed_test
@@ -79,23 +79,31 @@ def test_agents_of_pettingzoo_see_the_rows_of_their_sensors(case: Case) -> None:
         np.testing.assert_array_equal(costs, outcome.granted[:, 0] * bucket.cost[:, 0])
 
 
-@each_case
+@each_lasting
 def test_sensors_rows_of_stable_baselines_are_the_coordinators_runs(case: Case) -> None:
     if case.task().information == "centre":
         with pytest.raises(ConfigurationError, match="information = 'centre'"):
             fusion_gym.make_sb3_vec_env(case.env_id, 3, local=True, **case.options)
         return
-    local = fusion_gym.make_sb3_vec_env(case.env_id, 3, seed=3, local=True, **case.options)
-    whole = fusion_gym.make_sb3_vec_env(case.env_id, 3, seed=3, **case.options)
+    options = case.options | {"horizon": 5}
+    local = fusion_gym.make_sb3_vec_env(case.env_id, 3, seed=3, local=True, **options)
+    whole = fusion_gym.make_sb3_vec_env(case.env_id, 3, seed=3, **options)
     sensors = case.task().sensors
     assert local.num_envs == 3 * sensors
     np.testing.assert_array_equal(local.reset(), local.view.rows(whole.reset()))
-    for wanted in requests(case.task(), 3, 4):
-        rows, row_reward, row_done, _ = local.step(wanted.T.ravel().astype(np.int64))
-        plain, reward, done, _ = whole.step(actions(case.task(), wanted))
+    for step, wanted in enumerate(requests(case.task(), 3, 6), start=1):
+        rows, row_reward, row_done, row_infos = local.step(wanted.T.ravel().astype(np.int64))
+        plain, reward, done, infos = whole.step(actions(case.task(), wanted))
         np.testing.assert_array_equal(rows, local.view.rows(plain))
         np.testing.assert_array_equal(row_reward, reward.repeat(sensors))
         np.testing.assert_array_equal(row_done, done.repeat(sensors))
+        assert done.all() == (step == 5)
+        if step == 5:
+            last = np.stack([info["terminal_observation"] for info in infos])
+            rows = np.stack([info["terminal_observation"] for info in row_infos])
+            np.testing.assert_array_equal(rows, local.view.rows(last))
+            returns = np.repeat([info["episode"]["r"] for info in infos], sensors)
+            assert [info["episode"]["r"] for info in row_infos] == returns.tolist()
 
 
 @each_id
