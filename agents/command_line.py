@@ -7,6 +7,7 @@ import io
 import itertools
 import re
 import sys
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -20,9 +21,10 @@ _Kind = TypeVar("_Kind", bound="Command")
 
 
 @dataclass(frozen=True)
-class Command:
+class Command(ABC):
     """A command: its fields are its options, its docstring and theirs are its help."""
 
+    @abstractmethod
     def run(self) -> None:
         """Do the work.
 
@@ -30,7 +32,6 @@ class Command:
             ConfigurationError: anything that is not allowed.
             KeyboardInterrupt: the work was interrupted.
         """
-        raise NotImplementedError
 
     def interrupted(self) -> str:
         """What to say after an interrupt."""

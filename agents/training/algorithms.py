@@ -16,7 +16,6 @@ from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 
-from fusion_gym.policies.model import ALGORITHMS
 from fusion_gym.validation import choice
 
 from .checked import Positive, Rate, Share, Strict
@@ -125,8 +124,6 @@ TABLE = {
     "ppo": Algorithm(PPO, PPOConfig),
     "recurrent_ppo": Algorithm(RecurrentPPO, RecurrentPPOConfig, "MlpLstmPolicy", True),
 }
-# Saved models carry the name, and the library loads them by it.
-ALGORITHMS.update((name, row.model) for name, row in TABLE.items())
 
 
 def settings(content: Any) -> AlgorithmConfig:

@@ -6,12 +6,14 @@ Loading a model unpickles parts of the file: load only files that you trust.
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import sb3_contrib
+import stable_baselines3
 from sb3_contrib import MaskablePPO, RecurrentPPO
-from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
@@ -23,12 +25,13 @@ from fusion_gym.envs.views import make_view
 from fusion_gym.policies.base import Requests
 from fusion_gym.validation import ConfigurationError
 
+# Every algorithm of both libraries by its name in configs and saved models: MaskablePPO is
+# "maskable_ppo".
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
-    "a2c": A2C,
-    "dqn": DQN,
-    "maskable_ppo": MaskablePPO,
-    "ppo": PPO,
-    "recurrent_ppo": RecurrentPPO,
+    re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower(): kind
+    for library in (stable_baselines3, sb3_contrib)
+    for name, kind in vars(library).items()
+    if isinstance(kind, type) and issubclass(kind, BaseAlgorithm)
 }
 _TAG = "fusion_gym_model"
 
