@@ -31,6 +31,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.metrics import summarise
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.schedule_file import Schedule
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
@@ -81,7 +82,14 @@ def test_committed_experiments_are_valid(path: Path) -> None:
     assert needed == (task.action == "discrete")
 
 
-def test_committed_sweep_and_comparison_name_policies_that_exist() -> None:
+def test_committed_sweep_and_comparison_name_policies_that_exist(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def unsearched(system: Any, packets: int, period: int, *_: Any) -> Schedule:
+        return Schedule(np.ones((period, system.sensor_count), dtype=np.bool_), float(packets))
+
+    # The policies are made, but not the search of a schedule.
+    monkeypatch.setattr("fusion_gym.policies.periodic_optimum.optimum", unsearched)
     for name, env_id in (
         ("tobit_oscillator", ENV),
         ("biased", "fusion_gym/BiasedOscillator-v0"),

@@ -140,21 +140,24 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
     def unsearched(system: Any, packets: int, period: int, *_: Any) -> Schedule:
         return Schedule(np.ones((period, system.sensor_count), dtype=np.bool_), float(packets))
 
-    # The policies are made, but the schedules' searches would take minutes.
+    # The policies are made, but the schedules' searches would take minutes, and so would more than
+    # one optimum of two sources.
     monkeypatch.setattr("fusion_gym.policies.periodic_optimum.optimum", unsearched)
-    for quick in (False, True):
-        suite = load_suite(ROOT / "configs" / "benchmark.yaml", quick)
-        for setting in suite.settings:
-            task = jobs.setting_task(setting)
-            for name in (*setting.points, *setting.informed, *setting.references):
+    suite = load_suite(ROOT / "configs" / "benchmark.yaml")
+    assert load_suite(ROOT / "configs" / "benchmark.yaml", quick=True).settings == suite.settings
+    for setting in suite.settings:
+        task = jobs.setting_task(setting)
+        optima = [name for name in setting.informed if name.startswith("optimal:")]
+        for name in (*setting.points, *setting.informed, *setting.references):
+            if name not in optima[1:]:
                 make_policy(name, task)
-            for family in suite.families_of(setting):
-                trial = optuna.create_study().ask()
-                make_policy(suggest(trial, family, task.sensors), task)
-            if setting.genie is not None:
-                fusion_gym.make_task(
-                    setting.environment.id, **(setting.environment.options | setting.genie.options)
-                )
+        for family in suite.families_of(setting):
+            trial = optuna.create_study().ask()
+            make_policy(suggest(trial, family, task.sensors), task)
+        if setting.genie is not None:
+            fusion_gym.make_task(
+                setting.environment.id, **(setting.environment.options | setting.genie.options)
+            )
 
 
 @pytest.mark.parametrize(

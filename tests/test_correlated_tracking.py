@@ -232,7 +232,9 @@ TABLE = {  # scale: rates, then MSE, actual and conservative trace of SCI and of
 }
 
 
-@pytest.mark.parametrize("scale", TABLE)
+@pytest.mark.parametrize(
+    "scale", [1.0, *(pytest.param(scale, marks=pytest.mark.slow) for scale in (0.8, 0.6, 0.4))]
+)
 def test_figures_of_the_papers_trigger(scale: float) -> None:
     rates, *rows = TABLE[scale]
     for fusion, row in zip(("sci", "sici"), rows, strict=True):
@@ -255,7 +257,10 @@ def test_figures_of_the_papers_trigger(scale: float) -> None:
 
 @pytest.mark.parametrize(
     ("fusion", "event", "always", "at_random"),
-    [("sci", 0.374, 0.310, 0.510), ("sici", 0.288, 0.250, 0.413)],
+    [
+        pytest.param("sci", 0.374, 0.310, 0.510, marks=pytest.mark.slow),
+        ("sici", 0.288, 0.250, 0.413),
+    ],
 )
 def test_figures_of_event_always_and_random(
     fusion: str, event: float, always: float, at_random: float
@@ -295,7 +300,7 @@ def test_inverse_covariance_intersection_does_not() -> None:
     assert (found.actual < found.conservative).all()
 
 
-@pytest.mark.parametrize("fusion", ["sci", "sici", "ci"])
+@pytest.mark.parametrize("fusion", [pytest.param("sci", marks=pytest.mark.slow), "sici", "ci"])
 def test_squared_error_is_the_actual_trace_under_random_requests_only(fusion: str) -> None:
     spread = f"random:rate={'/'.join(map(str, RATES))}"
     for policy, equal in ((spread, True), ("event", False)):

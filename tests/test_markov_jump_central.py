@@ -325,8 +325,8 @@ def test_a_far_outlier_leaves_everything_finite(where: str) -> None:
 
 
 @each_filter
-@pytest.mark.parametrize("horizon", [1, 2500])
-def test_short_and_long_episodes(where: str, horizon: int) -> None:
+def test_long_episodes(where: str) -> None:
+    horizon = 800
     task = build(filter=where, horizon=horizon)
     batch = EpisodeBatch(task, 3)
     batch.reset()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,10 @@ from fusion_gym.validation import ConfigurationError
 
 _PRICES = np.geomspace(0.02, 5000.0, 32)  # in units of w σ², at which the optimum is solved
 
+# The tables by everything but the price, while the process lives: a sweep asks for one again and
+# again.
+_found: dict[bytes, tuple[Array, Array]] = {}
+
 
 def index_table(number: int, problem: SourceProblem) -> tuple[Array, Array]:
     """Prices (P,) and the thresholds (P, S) there, of source ``number``.
@@ -20,6 +25,13 @@ def index_table(number: int, problem: SourceProblem) -> tuple[Array, Array]:
     Raises:
         ConfigurationError: an unstable source, or thresholds that do not grow with the price.
     """
+    key = pickle.dumps(replace(problem, price=0.0))
+    if key not in _found:
+        _found[key] = _solved(number, problem)
+    return _found[key]
+
+
+def _solved(number: int, problem: SourceProblem) -> tuple[Array, Array]:
     if abs(problem.coefficient) > 1.0:
         raise ConfigurationError(
             f"coefficient = {problem.coefficient:g} of source {number} is not allowed for the "
