@@ -290,6 +290,7 @@ def test_locals_and_covariance_intersection_bound_the_actual_covariance(
         assert run(policy, 12, 150, fusion=fusion, noise_scale=scale).worst.min() > -1e-9
 
 
+@pytest.mark.slow
 def test_inverse_covariance_intersection_does_not() -> None:
     """Theorem 5 fails; at the bounds in two steps of five, while the traces are in order."""
     found = run(fusion="sici")
@@ -300,7 +301,9 @@ def test_inverse_covariance_intersection_does_not() -> None:
     assert (found.actual < found.conservative).all()
 
 
-@pytest.mark.parametrize("fusion", [pytest.param("sci", marks=pytest.mark.slow), "sici", "ci"])
+@pytest.mark.parametrize(
+    "fusion", ["ci", *(pytest.param(rule, marks=pytest.mark.slow) for rule in ("sci", "sici"))]
+)
 def test_squared_error_is_the_actual_trace_under_random_requests_only(fusion: str) -> None:
     spread = f"random:rate={'/'.join(map(str, RATES))}"
     for policy, equal in ((spread, True), ("event", False)):

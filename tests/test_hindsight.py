@@ -154,6 +154,7 @@ def test_it_costs_less_than_policies_that_do_not_know_the_noise() -> None:
         assert best.mean() < -0.7 * results.returns.mean(), name
 
 
+@pytest.mark.slow
 def test_a_wider_beam_costs_less_and_a_higher_price_sends_less() -> None:
     task = fusion_gym.make_task(TOBIT, **BENCHMARK)
     costs = [find_schedules(task, 0.04, width, 20, seed=0).cost.mean() for width in (1, 8, 64)]

@@ -81,6 +81,7 @@ def test_papers_trigger(
         ((0.0, 0.0, 0.31), (1.811, 0.518)),
     ],
 )
+@pytest.mark.slow
 def test_random_requests_at_the_same_rates(
     rates: tuple[float, ...], errors: tuple[float, ...]
 ) -> None:
@@ -89,6 +90,7 @@ def test_random_requests_at_the_same_rates(
 
 
 @pytest.mark.parametrize(("m", "errors"), [(0.0, (1.185, 0.417)), (0.9, (1.474, 0.487))])
+@pytest.mark.slow
 def test_covariance_intersection_of_the_same_estimates(m: float, errors: tuple[float, ...]) -> None:
     ours = run_episodes(build(fusion="ci"), papers_trigger(m), 2000, 10_000)
     np.testing.assert_allclose(rmse(ours), errors, rtol=0.03)  # standard errors 0.6 % and 0.4 %
@@ -101,6 +103,7 @@ def test_intersection_is_the_same_where_only_one_node_sends() -> None:
     np.testing.assert_allclose(same[0].squared_error, same[1].squared_error, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_larger_thresholds_send_less_and_err_more() -> None:
     results = [run_episodes(build(), papers_trigger(m), 300, 4) for m in (0.2, 0.9, 1.3, 1.5)]
     sent = [found.rate.sum(1).mean() for found in results]
@@ -143,6 +146,7 @@ def test_claimed_covariance_is_that_of_the_errors(kind: str) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.slow
 def test_claimed_trace_of_other_models(seed: int) -> None:
     """Asymmetric chain, two process noises, four sensors, a mean that is not zero."""
     task = build(horizon=15, **options(random_model(seed)))

@@ -146,6 +146,7 @@ def test_existing_policies_work_on_its_signals() -> None:
             assert asked > 0, name
 
 
+@pytest.mark.slow
 def test_whitened_differences_have_unit_variance_under_random_requests() -> None:
     task = build(horizon=12)
     batch = EpisodeBatch(task, 20_000)
@@ -201,6 +202,7 @@ def test_long_episodes_of_rare_deliveries() -> None:
     assert outcome.truncated.all()
 
 
+@pytest.mark.slow
 def test_open_loop_is_what_never_costs() -> None:
     results = run_episodes(build(), make_rule("never"), 3000, 0)
     task = build()

@@ -127,6 +127,7 @@ def test_a_system_that_tracks_already_has_the_same_optimum() -> None:
     assert tracked.trace == other.trace
 
 
+@pytest.mark.slow
 def test_an_input_as_the_filter_believes_it_makes_the_claim_true() -> None:
     """One sensor, so that nothing is fused; 2,000 episodes, 4 standard errors of 0.5 %."""
     kept = np.exp(-1.0 / 5.0)
@@ -214,6 +215,7 @@ def test_brute_force_of_uncensored_nodes(name: str) -> None:
     assert squared_by_impulses(task.system, best, 30) == pytest.approx(min(traces), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_transient_is_part_of_an_episode() -> None:
     """What is best in the end is not what is best over ten steps from the start."""
     task = correlated(horizon=10)

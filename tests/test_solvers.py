@@ -255,6 +255,7 @@ def limited(price: float = 0.0, capacity: float = 3.0) -> AverageSolution:
     return solve_average(SourceProblem.create(price=price, bucket=bucket), tolerance=1e-5)
 
 
+@pytest.mark.slow
 def test_tokens_that_are_scarce_have_a_higher_threshold() -> None:
     solution = limited()
     threshold = solution.threshold[0]
@@ -265,6 +266,7 @@ def test_tokens_that_are_scarce_have_a_higher_threshold() -> None:
     assert (limited(5.0).threshold[0, 3:] > threshold[3:]).all()
 
 
+@pytest.mark.slow
 def test_limited_tokens_cost_more_than_the_dual_bound_and_less_than_a_period() -> None:
     free = SourceProblem.create(price=0.0)
     bound = lagrangian_bound((free,), (1.0,), 0.25)

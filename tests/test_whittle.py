@@ -68,6 +68,7 @@ def test_two_sources_that_share_a_link_are_near_their_joint_optimum() -> None:
     assert ages > 2 * best
 
 
+@pytest.mark.slow
 def test_many_sources_need_it_more_than_the_largest_error() -> None:
     """Four different sources on one link: paired differences, far beyond their deviation."""
     options: dict[str, Any] = {
