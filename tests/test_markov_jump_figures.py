@@ -58,8 +58,8 @@ def test_reference_level_of_the_trigger() -> None:
     [
         (0.0, (1.0, 1.0, 1.0), (1.004, 0.407), 1.190),
         (0.9, (0.0, 0.44, 0.95), (1.313, 0.480), 1.991),
-        (1.3, (0.0, 0.0, 0.62), (1.687, 0.518), 3.176),
-        (1.5, (0.0, 0.0, 0.31), (1.830, 0.526), 3.696),
+        pytest.param(1.3, (0.0, 0.0, 0.62), (1.687, 0.518), 3.176, marks=pytest.mark.slow),
+        pytest.param(1.5, (0.0, 0.0, 0.31), (1.830, 0.526), 3.696, marks=pytest.mark.slow),
     ],
 )
 def test_papers_trigger(
@@ -77,8 +77,8 @@ def test_papers_trigger(
     ("rates", "errors"),
     [
         ((0.0, 0.44, 0.95), (1.298, 0.476)),
-        ((0.0, 0.0, 0.62), (1.635, 0.510)),
-        ((0.0, 0.0, 0.31), (1.811, 0.518)),
+        pytest.param((0.0, 0.0, 0.62), (1.635, 0.510), marks=pytest.mark.slow),
+        pytest.param((0.0, 0.0, 0.31), (1.811, 0.518), marks=pytest.mark.slow),
     ],
 )
 @pytest.mark.slow
@@ -103,6 +103,7 @@ def test_intersection_is_the_same_where_only_one_node_sends() -> None:
     np.testing.assert_allclose(same[0].squared_error, same[1].squared_error, rtol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.slow
 def test_larger_thresholds_send_less_and_err_more() -> None:
     results = [run_episodes(build(), papers_trigger(m), 300, 4) for m in (0.2, 0.9, 1.3, 1.5)]

@@ -162,6 +162,7 @@ def test_there_is_something_to_learn(kind: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_larger_thresholds_give_fewer_transmissions_and_larger_errors() -> None:
     for example in ("two_carts", "paper"):
         task = build(example=example, filter="random_walk")
