@@ -73,6 +73,7 @@ class ObservationLayout:
         def shown(blocks: tuple[Block, ...]) -> tuple[Block, ...]:
             return tuple(block for block in blocks if covers(task.knowledge, block.knowledge))
 
+        self._task = task
         self._own, self._network = shown(task.system.observation), shown(network_blocks(task))
         self.blocks = self._own + self._network
         names = [block.name for block in self.blocks]
@@ -84,6 +85,10 @@ class ObservationLayout:
         bounds = [block.bounds for block in self.blocks for _ in block.places]
         self.low, self.high = np.array(bounds, dtype=np.float32).T.copy()
 
+    def __reduce__(self) -> tuple[type[ObservationLayout], tuple[Task]]:
+        """Pickled as the task that it belongs to: the blocks' values are functions."""
+        return ObservationLayout, (self._task,)
+
     def encode(self, state: Any, network: Network) -> NDArray[np.float32]:
         """Observations (N, entries) float32, clipped to their bounds.
 
@@ -93,7 +98,8 @@ class ObservationLayout:
         filled = [block.fill(state) for block in self._own]
         filled += [block.fill(network) for block in self._network]
         rows = np.concatenate(filled, dtype=np.float64)
-        result = np.ascontiguousarray(rows.T, dtype=np.float32)
+        with np.errstate(over="ignore"):  # what float32 cannot hold lies beyond every bound
+            result = np.ascontiguousarray(rows.T, dtype=np.float32)
         np.maximum(result, self.low, out=result)
         return np.minimum(result, self.high, out=result)
 

@@ -74,7 +74,7 @@ def test_a_copied_task_is_the_same_task(case: Case, copied: Callable[[Any], Any]
         np.testing.assert_array_equal(again.step(wanted).reward, batch.step(wanted).reward)
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy])
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickled])
 @each_case
 def test_a_copy_goes_on_alike(case: Case, copied: Callable[[Any], Any]) -> None:
     """Of a batch, a single and a vector environment, in the middle of their episodes."""
