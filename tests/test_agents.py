@@ -229,7 +229,9 @@ def test_a_target_rate_needs_a_fixed_price(tmp_path: Path) -> None:
         train.train(load(Experiment, config))
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_an_interrupted_training_loses_nothing(tmp_path: Path, number: signal.Signals) -> None:
     config = small_config(tmp_path, training={"timesteps": 10_000_000, "num_envs": 8})
     command = [sys.executable, "-m", "agents.train", "--config", str(config)]

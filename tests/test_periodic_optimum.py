@@ -102,6 +102,7 @@ def test_the_policy_reaches_its_trace_and_no_schedule_a_lower_one(options: Any) 
     assert found.max() > 1.2 * found.min()
 
 
+@pytest.mark.slow
 def test_it_beats_random_requests_and_knows_its_error() -> None:
     task = markov()
     best = run_episodes(task, PeriodicOptimum(task), 1500, 0)
