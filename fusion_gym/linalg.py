@@ -232,6 +232,20 @@ def cholesky(a: FloatArray) -> FloatArray:
     return factor
 
 
+def factor(a: FloatArray) -> FloatArray:
+    """Some F with ``F F^T = a``: ``(..., n, n, N)`` to the same shape.
+
+    Args:
+        a: symmetric positive semi-definite with a positive diagonal; negative eigenvalues, which
+            rounding leaves of zeros, count as zero.
+    """
+    correlation, scale = _equilibrate(a)
+    values, vectors = np.linalg.eigh(np.moveaxis(correlation, -1, -3))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+    result: FloatArray = np.moveaxis(root, -3, -1) / scale[..., :, None, :]
+    return result
+
+
 @np.errstate(all="ignore")
 def solve(a: FloatArray, b: FloatArray) -> FloatArray:
     """Solve ``a x = b`` for symmetric positive definite `a`.

@@ -112,6 +112,12 @@ def exact_float(value: Any) -> Array:
     return np.array([[float(entry) for entry in row] for row in value.tolist()])
 
 
+def exact_inverse(a: Any) -> Any:
+    """Of a positive definite matrix whose diagonal may span more orders than there are digits."""
+    scale = mpmath.diag([1 / mpmath.sqrt(a[i, i]) for i in range(a.rows)])
+    return scale * (scale * a * scale) ** -1 * scale
+
+
 def hadamard(a: Any, b: Any) -> Any:
     result = a.copy()
     for i in range(a.rows):
@@ -184,7 +190,7 @@ def exact_bound_update(
             + k[6] * xi
         )
     )
-    gain = psi * phi**-1
+    gain = psi * exact_inverse(phi)
     keep = mpmath.eye(covariance.rows) - gain * q * matrix
     bound = (
         k[1] * keep * covariance * keep.T

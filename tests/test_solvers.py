@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from fusion_gym.core.token_bucket import TokenBucket
+from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.registry import make_rule
 from fusion_gym.solvers.ages import solve_ages
 from fusion_gym.solvers.bounds import lagrangian_bound
 from fusion_gym.solvers.grid import ErrorGrid, gaussian_rows
@@ -24,6 +27,7 @@ from fusion_gym.solvers.single import (
     solve_finite,
 )
 from fusion_gym.solvers.source import SourceProblem
+from fusion_gym.solvers.task import solve_task, source_problems
 from fusion_gym.solvers.tokens import TokenLevels
 from fusion_gym.validation import ConfigurationError
 
@@ -377,6 +381,39 @@ def test_dual_bound_of_an_episode() -> None:
     assert loose.cost == pytest.approx(sum(solve_finite(s, 30).cost for s in sources))
 
 
+@pytest.mark.parametrize("start", ["good", "bad", "stationary"])
+def test_dual_bound_of_channels_that_start_in_a_state(start: str) -> None:
+    """It lies below what always transmitting costs, and is the optimum where tokens abound."""
+    task = make_task(
+        "fusion_gym/RemoteEstimation-v0",
+        sensors=3,
+        channel="gilbert_elliott",
+        channel_transition=((0.95, 0.05), (0.05, 0.95)),
+        drop_probability=(1.0, 0.0),
+        initial_channel=start,
+        cost_weight=0.0,
+        horizon=20,
+    )
+    problems = source_problems(task)
+    bound = lagrangian_bound(problems, (1.0,) * 3, 3.0, horizon=20, initial_tokens=3.0)
+    always = -run_episodes(task, make_rule("always"), 2000, 0).returns
+    room = 4.0 * always.std() / math.sqrt(len(always))
+    assert bound.cost == pytest.approx(solve_task(task).cost)
+    assert abs(always.mean() - bound.cost) < room < 0.1 * bound.cost
+    scarce = lagrangian_bound(problems, (1.0,) * 3, 0.5, horizon=20)
+    assert scarce.cost > bound.cost
+    assert scarce.multiplier > 0.0
+
+
+def test_a_channel_starts_in_its_stationary_law_unless_told() -> None:
+    transition = ((0.9, 0.1, 0.0), (0.2, 0.7, 0.1), (0.0, 0.4, 0.6))
+    problem = SourceProblem.create(drop=(0.9, 0.3, 0.0), transition=transition)
+    assert problem.initial @ problem.transition == pytest.approx(problem.initial)
+    assert problem.initial.sum() == pytest.approx(1.0)
+    given = SourceProblem.create(drop=(0.9, 0.3, 0.0), transition=transition, initial=(0, 0, 1))
+    assert solve_finite(given, 10).cost < solve_finite(problem, 10).cost
+
+
 # --- what is refused -----------------------------------------------------------------------------
 
 
@@ -389,6 +426,9 @@ def test_dual_bound_of_an_episode() -> None:
         ({"drop": 1.2}, "drop"),
         ({"transition": [[0.5, 0.4], [0.1, 0.9]], "drop": 0.1}, "transition"),
         ({"transition": [[0.5, 0.5]], "drop": 0.1}, "transition"),
+        ({"transition": np.eye(2), "drop": 0.1}, "initial = None"),
+        ({"initial": 0.5}, "initial"),
+        ({"initial": (0.5, 0.4), "transition": np.eye(2), "drop": 0.1}, "initial"),
     ],
 )
 def test_bad_problems_are_refused(settings: dict[str, float], field: str) -> None:

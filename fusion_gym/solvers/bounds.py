@@ -41,8 +41,9 @@ def lagrangian_bound(
     (``access="single"``) is a rate of 1 with ``spent`` of 1. The problems' own tokens must be
     unlimited.
 
-    With ``horizon`` the cost is that of an episode, for which there are ``initial_tokens`` and
-    ``rate`` after every step but the last; otherwise it is the average a step.
+    With ``horizon`` the cost is that of an episode, whose channels start in the problems' own
+    ``initial`` laws and for which there are ``initial_tokens`` and ``rate`` after every step but
+    the last; otherwise it is the average a step.
 
     Raises:
         ConfigurationError: a value that is not allowed.

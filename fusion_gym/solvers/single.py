@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
@@ -204,13 +203,11 @@ def solve_finite(
     problem: SourceProblem,
     horizon: int,
     initial_deviation: float = 0.0,
-    initial_channel: ArrayLike | None = None,
     grid: ErrorGrid | None = None,
 ) -> FiniteSolution:
     """Least expected cost of ``horizon`` steps by dynamic programming.
 
-    x(0) has ``initial_deviation``; ``initial_channel`` (S,) is the distribution of the channel's
-    state at time 0, by default all on the first.
+    x(0) has ``initial_deviation``, the channel's state at time 0 the problem's ``initial`` law.
 
     Raises:
         ConfigurationError: a value that is not allowed.
@@ -219,7 +216,6 @@ def solve_finite(
     spread = validation.number("initial_deviation", initial_deviation, at_least=0.0)
     bellman = Bellman(problem, grid or problem.grid(steps))
     value, sent = np.zeros(bellman.shape), np.zeros(bellman.shape)
-    states = bellman.shape[1]
     found = np.empty((steps, *bellman.shape[1:]))
     ordered = True
     for step in reversed(range(steps)):
@@ -229,8 +225,7 @@ def solve_finite(
         ordered = ordered and here
     deviation = float(np.hypot(problem.coefficient * spread, problem.deviation))
     first = gaussian_rows(np.zeros(1), deviation, bellman.grid.points)[0]
-    start = np.eye(states)[0] if initial_channel is None else np.asarray(initial_channel)
-    cost = float(first @ value[..., problem.tokens.initial] @ start)
-    rate = float(first @ sent[..., problem.tokens.initial] @ start) / steps
+    cost = float(first @ value[..., problem.tokens.initial] @ problem.initial)
+    rate = float(first @ sent[..., problem.tokens.initial] @ problem.initial) / steps
     error = (cost / steps - problem.price * rate) / problem.error_weight
     return FiniteSolution(cost, error, rate, found, ordered)

@@ -27,7 +27,8 @@ class SourceProblem:
     0 on a delivery and stays e otherwise; its square is paid; then e moves to a e + w.
 
     ``coefficient`` a, ``deviation`` σ, ``price`` of a transmission, ``error_weight`` w; the
-    channel's ``transition`` (S, S) and ``drop`` (S,); ``tokens``, the levels of the bucket.
+    channel's ``transition`` (S, S), ``drop`` (S,) and ``initial`` (S,), the law of its state at
+    time 0; ``tokens``, the levels of the bucket.
     """
 
     coefficient: float
@@ -36,6 +37,7 @@ class SourceProblem:
     error_weight: float
     transition: Array
     drop: Array
+    initial: Array
     tokens: TokenLevels
 
     @classmethod
@@ -48,11 +50,15 @@ class SourceProblem:
         drop: ArrayLike = 0.0,
         transition: ArrayLike = ((1.0,),),
         bucket: TokenBucket | None = None,
+        initial: ArrayLike | None = None,
     ) -> SourceProblem:
         """Check the numbers; without a bucket transmissions are limited by their price alone.
 
+        Without ``initial`` the channel starts in its stationary law.
+
         Raises:
-            ConfigurationError: a value that is not allowed.
+            ConfigurationError: a value that is not allowed, or no ``initial`` for a channel that
+                has no unique stationary law.
         """
         matrix = validation.array("transition", transition, (None, None))
         if matrix.shape[0] != matrix.shape[1] or not np.allclose(matrix.sum(1), 1.0):
@@ -74,6 +80,7 @@ class SourceProblem:
             error_weight=validation.number("error_weight", error_weight, above=0.0),
             transition=matrix,
             drop=loss,
+            initial=_initial_law(matrix, initial),
             tokens=TokenLevels.create(bucket),
         )
 
@@ -115,3 +122,25 @@ class SourceProblem:
             points = _POINTS if len(self.tokens.level) == 1 else _POINTS / 2
             step = min(max(reach / points, finest), coarsest)
         return ErrorGrid.create(self.coefficient, self.deviation, reach, step)
+
+
+def _initial_law(transition: Array, given: ArrayLike | None) -> Array:
+    """The given law of the channel's state at time 0, or the stationary one."""
+    states = len(transition)
+    if given is not None:
+        law = validation.not_negative(
+            "initial", validation.array("initial", given, (states,)), (states,)
+        )
+        if not np.isclose(law.sum(), 1.0, rtol=0.0, atol=1e-9):
+            raise ConfigurationError(
+                f"initial = {law.tolist()} is not allowed: it must be probabilities that sum to 1"
+            )
+        return law
+    balance = np.vstack((transition.T - np.eye(states), np.ones(states)))
+    law, _, rank, _ = np.linalg.lstsq(balance, np.append(np.zeros(states), 1.0))
+    if rank < states:
+        raise ConfigurationError(
+            f"initial = None is not allowed with transition = {transition.tolist()}, which has no "
+            "unique stationary law: it must be the probabilities of the states at time 0"
+        )
+    return np.asarray(law)

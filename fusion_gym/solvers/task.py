@@ -73,6 +73,7 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
             error_weight=float(weights[i]),
             drop=system.channel.drop[:, i],
             transition=system.channel.transition,
+            initial=system.channel.initial,
         )
         for i in range(system.sensor_count)
     )
@@ -112,7 +113,7 @@ def solve_task(task: Task, criterion: str = "finite") -> Optimum:
         else:
             system = _system(task)
             spread = float(system.initial_deviation[i])
-            solution = solve_finite(problem, task.horizon, spread, system.channel.initial)
+            solution = solve_finite(problem, task.horizon, spread)
         if not solution.ordered:
             raise ConfigurationError(
                 "the optimum of this task asks for no thresholds on the error: it is not solved "

@@ -106,10 +106,11 @@ class Case:
         return VARIANTS[self.env_id][self.number - 1] if self.number else {}
 
     @functools.cache  # noqa: B019  cases live as long as the tests
-    def task(self, horizon: int | None = None) -> Task:
-        """The task, with its own horizon or another one."""
-        options = self.options if horizon is None else self.options | {"horizon": horizon}
-        return fusion_gym.make_task(self.env_id, **options)
+    def task(self, horizon: int | None = None, tokens: str | None = None) -> Task:
+        """The task, with its own horizon and tokens or others."""
+        other = {"horizon": horizon, "tokens": tokens}
+        chosen = {name: value for name, value in other.items() if value is not None}
+        return fusion_gym.make_task(self.env_id, **self.options | chosen)
 
     def batch(self, seeds: list[int], horizon: int | None = None) -> EpisodeBatch:
         """Runs with these seeds, each at the start of an episode."""

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import LASTING, TOBIT, Case, actions, each_case, each_lasting, requests
+from cases import LASTING, Case, actions, each_case, each_lasting, requests
+from endurance import endure
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
@@ -19,7 +20,7 @@ from fusion_gym.envs.registration import class_name
 SILENT, RUNS = 1000, 32
 ANSWERED = {"tokens": "unlimited", "access": "any"}
 SLOW = [case for case in LASTING if "fusion" in case.options]
-STARVED = [case for case in LASTING if case not in (Case(TOBIT, 0), *SLOW)]
+STARVED = [case for case in LASTING if case not in SLOW]
 STARVED += [pytest.param(case, marks=pytest.mark.slow) for case in SLOW]
 
 
@@ -56,6 +57,13 @@ def test_finite_after_a_thousand_silent_steps_and_then_deliveries(case: Case) ->
             mean, covariance = system.fused(batch.delivered)
             assert np.isfinite(mean).all()
             assert (np.einsum("iir->ir", covariance) > 0.0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("error")
+@each_lasting
+def test_sound_for_a_million_steps_of_sparse_dense_and_random_requests(case: Case) -> None:
+    endure(case, runs=1000, steps=1000)
 
 
 def pickled(thing: Any) -> Any:

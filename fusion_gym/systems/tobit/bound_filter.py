@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.systems.tobit.filters import Expectation, Outcomes, linear_update
+from fusion_gym.systems.tobit.filters import Expectation, Outcomes, joseph_form, linear_update
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import expect_censored
 from fusion_gym.validation import ConfigurationError
@@ -25,8 +25,6 @@ from fusion_gym.validation import ConfigurationError
 _SMALLEST_PROBABILITY = 1e-290
 # The same where a held value is divided by q, and the ratio is squared.
 _SMALLEST_DIVISOR = 1e-140
-# Starved, the bound grows as 1.25^t; it is kept below this trace, where squares do not overflow.
-_LARGEST_TRACE = 1e100
 
 
 @dataclass(frozen=True)
@@ -178,7 +176,8 @@ class BoundTobitFilter:
         total = linalg.outer(q, q) * (k1 * spread) + k2 * linalg.outer(a, a)
         total = linalg.add_diagonal(total, noise)
         weighted = q[:, :, None] * self.sensors.measurement_matrix
-        return linear_update(k1 * covariance, weighted, total)
+        bias = np.sqrt(k2) * a
+        return linear_update(self.sensors, k1 * covariance, weighted, total, noise, bias)
 
     def _held(
         self,
@@ -198,21 +197,32 @@ class BoundTobitFilter:
         itself, which grows as 1/q, is never formed.
         """
         k1, k2, _, k4, k5, _, k7, _ = self.constants.kappa
+        grow, shift = self.constants.second_moment
+        matrix, latent = self.sensors.measurement_matrix, expectation.latent
         threshold = self.sensors.finite_threshold
         q = np.maximum(expectation.uncensored_probability, _SMALLEST_PROBABILITY)
         bias = expectation.hazard * self.sensors.deviation
         core = k1 * spread + k4 * moment + k2 * linalg.outer(bias, bias)
         columns = _pinned_columns(held, threshold, q, np.sqrt(k5), np.sqrt(k7))
-        whitened, shift = _pinned_solve(core, cross, columns)
-        uncensored = expectation.latent + bias
-        step = linalg.matvec(linalg.transpose(cross), shift) - linalg.matvec(
+        solved, pull = _pinned_solve(core, cross, columns)
+        whitened, pinned = np.split(solved, [cross.shape[-2]], axis=-2)
+        uncensored = latent + bias
+        step = linalg.matvec(linalg.transpose(cross), pull) - linalg.matvec(
             linalg.transpose(whitened), uncensored
         )
         bound = k1 * covariance - k1**2 * linalg.matmul(linalg.transpose(cross), whitened)
         bound = linalg.symmetrise(bound)
-        trace = linalg.trace(bound)
-        if np.any(trace > _LARGEST_TRACE):
-            bound *= np.minimum(1.0, _LARGEST_TRACE / trace)[:, None, None]
+        lanes = self.sensors.starved(covariance)
+        if lanes.size:
+            prior, gain = covariance[..., lanes], k1 * linalg.transpose(whitened)[..., lanes]
+            seen = linalg.matmul(matrix, linalg.factor(prior))
+            offsets = np.stack((np.sqrt(k4 * shift) * latent, np.sqrt(k2) * bias), axis=-2)
+            noise = [
+                linalg.matmul(gain, np.sqrt(k4 * grow) * seen),
+                linalg.matmul(gain, offsets[..., lanes]),
+                k1 * linalg.matmul(linalg.transpose(cross), pinned)[..., lanes],
+            ]
+            bound[..., lanes] = joseph_form(self.sensors, k1 * prior, matrix, gain, noise)
         return mean + k1 * step, bound
 
 
@@ -256,7 +266,7 @@ def _pinned_columns(
 def _pinned_solve(
     core: Array, right: Array, columns: list[tuple[Array, Array]]
 ) -> tuple[Array, Array]:
-    """(N + F Fᵀ)⁻¹ B and (N + F Fᵀ)⁻¹ F c, one column of F after another.
+    """(N + F Fᵀ)⁻¹ [B, F] and (N + F Fᵀ)⁻¹ F c, one column of F after another.
 
     ``core`` N (…, m, m, N) is positive definite, ``right`` B (…, m, n, N); ``columns`` are those
     of :func:`_pinned_columns`. Each step is the Sherman-Morrison formula: with h = M⁻¹ f,
@@ -272,4 +282,5 @@ def _pinned_solve(
         shift = shift + weight * (factor - linalg.dot(f, shift)[..., None, :])
         projected = linalg.matvec(linalg.transpose(solved), f)
         solved = solved - linalg.outer(weight, projected)
-    return solved[..., :n, :], shift
+        solved[..., n + place, :] = weight
+    return solved, shift

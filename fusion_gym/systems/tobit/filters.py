@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
@@ -75,17 +75,53 @@ class NodeFilter(Protocol):
 
 
 def linear_update(
-    covariance: Array, matrix: Array, innovation_covariance: Array
+    sensors: CensoredSensors,
+    covariance: Array,
+    matrix: Array,
+    innovation_covariance: Array,
+    noise: Array,
+    bias: Array | None = None,
 ) -> tuple[Array, Array]:
     """Correction S⁻¹ C P (…, m, n, N) and posterior covariance P - P Cᵀ S⁻¹ C P (…, n, n, N).
 
-    The minimum-variance update for ``matrix`` C (…, m, n, N) and innovation covariance S
-    (…, m, m, N), S ⪰ C P Cᵀ.
+    The minimum-variance update for ``matrix`` C (…, m, n, N) and innovation covariance
+    S = C P Cᵀ + N (…, m, m, N), with N = diag(``noise``) + ``bias`` ``bias``ᵀ, both (…, m, N).
+    Where P is far larger than what ``sensors`` leave of it, the difference has no digits left,
+    and the posterior is :func:`joseph_form` instead.
     """
     cross = linalg.matmul(matrix, covariance)
     correction = linalg.solve(innovation_covariance, cross)
     reduction = linalg.matmul(linalg.transpose(cross), correction)
-    return correction, linalg.symmetrise(covariance - reduction)
+    posterior = linalg.symmetrise(covariance - reduction)
+    lanes = sensors.starved(covariance)
+    if lanes.size:
+        gain = linalg.transpose(in_lanes(correction, lanes))
+        parts = [gain * np.sqrt(in_lanes(noise, lanes))[..., None, :, :]]
+        if bias is not None:
+            parts.append(linalg.matvec(gain, in_lanes(bias, lanes))[..., None, :])
+        prior, matrix = in_lanes(covariance, lanes), in_lanes(matrix, lanes)
+        posterior[..., lanes] = joseph_form(sensors, prior, matrix, gain, parts)
+    return correction, posterior
+
+
+def joseph_form(
+    sensors: CensoredSensors, covariance: Array, matrix: Array, gain: Array, noise: list[Array]
+) -> Array:
+    """(I - K C) P (I - K C)ᵀ + Σ V Vᵀ (…, n, n, N) for any gain K (…, n, m, N).
+
+    A sum of squares, which keeps its small eigenvalues beside large ones. ``noise`` are the V
+    (…, n, k, N), what the gain makes of the measurement's noise.
+    Source: R. S. Bucy and P. D. Joseph, "Filtering for stochastic processes with applications to
+    guidance", 1968.
+    """
+    keep = linalg.identity(covariance.shape[-2]) - linalg.matmul(gain, matrix)
+    kept = linalg.matmul(keep, linalg.factor(covariance))
+    return sensors.gram(np.concatenate([kept, *noise], axis=-2))
+
+
+def in_lanes(values: Array, lanes: NDArray[np.intp]) -> Array:
+    """The runs with these numbers, of values with one column a run or one for all."""
+    return values if values.shape[-1] == 1 else values[..., lanes]
 
 
 @dataclass(frozen=True)
@@ -117,8 +153,9 @@ class KalmanFilter:
         """See :class:`NodeFilter`; ``held`` and ``time`` do not matter here."""
         matrix = self.sensors.measurement_matrix
         innovation = linalg.congruence(matrix, covariance)
-        innovation = linalg.add_diagonal(innovation, self.sensors.variance)
-        correction, posterior = linear_update(covariance, matrix, innovation)
+        noise = self.sensors.variance
+        innovation = linalg.add_diagonal(innovation, noise)
+        correction, posterior = linear_update(self.sensors, covariance, matrix, innovation, noise)
         return Outcomes(correction, posterior, mean, covariance)
 
 
@@ -173,10 +210,14 @@ class StochasticEventFilter:
         """See :class:`NodeFilter`; ``held`` and ``time`` do not matter here."""
         matrix = self.sensors.measurement_matrix
         innovation = linalg.congruence(matrix, covariance)
-        innovation = linalg.add_diagonal(innovation, self.sensors.variance)
-        correction, delivered = linear_update(covariance, matrix, innovation)
+        noise = self.sensors.variance
+        innovation = linalg.add_diagonal(innovation, noise)
+        correction, delivered = linear_update(self.sensors, covariance, matrix, innovation, noise)
         # Both sides times √Z, so that weight 0 is no exception: √Z C measured with √Z S √Z + I.
         weight = self.weight[:, None, None]
-        scaled = linalg.add_diagonal(weight * innovation, np.ones((matrix.shape[-3], 1)))
-        _, silent = linear_update(covariance, np.sqrt(weight) * matrix, scaled)
+        one = np.ones((matrix.shape[-3], 1))
+        scaled = linalg.add_diagonal(weight * innovation, one)
+        noise = self.weight[:, None] * noise + one
+        matrix = np.sqrt(weight) * matrix
+        _, silent = linear_update(self.sensors, covariance, matrix, scaled, noise)
         return Outcomes(correction, delivered, mean, silent)

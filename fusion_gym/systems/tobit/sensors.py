@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.validation import ConfigurationError
+
+# In units of the resolution: beyond it, differences of covariances have too few digits left.
+_STARVED = 1e6
+_HUGE = 1e10  # beyond it, small eigenvalues may be lost beside large ones
+_WIDEST = 1e12  # ratio of two eigenvalues of a covariance
+_LARGEST = 1e13  # deviation: what a delivery leaves of a larger one would drown in its rounding
 
 
 @dataclass(frozen=True)
@@ -97,6 +104,44 @@ class CensoredSensors:
         latent += self.deviation * noise.reshape(shape)
         np.maximum(latent, self.threshold, out=latent)
         return np.minimum(latent, self.upper, out=latent) if self.two_sided else latent
+
+    @functools.cached_property
+    def resolution(self) -> Array:
+        """Variance (n, 1) that one look at all sensors would leave of each state alone.
+
+        1/Σ C² R⁻¹, of a state that no sensor measures the largest of the others.
+        """
+        information = (self.measurement_matrix**2 / self.variance[:, :, None]).sum((0, 1))
+        seen = information > 0.0
+        found = 1.0 / np.where(seen, information, np.inf)
+        return np.where(seen, found, found.max() if seen.any() else np.inf)
+
+    def starved(self, covariance: Array, factor: float = _STARVED) -> NDArray[np.intp]:
+        """Numbers of the runs of a covariance (…, n, n, N) with a variance > factor resolution."""
+        large = linalg.diagonal(covariance) > factor * self.resolution
+        return np.flatnonzero(large.reshape(-1, large.shape[-1]).any(0))
+
+    def gram(self, factor: Array) -> Array:
+        """F Fᵀ (…, n, n, N) of F (…, n, k, N), k >= n, as far as float64 can hold it.
+
+        The eigenvalues, in units of the resolution, lie no further apart than a factor of 10¹²: the
+        largest come down first, but not below that, then the smallest go up. Where the largest is
+        above 10²⁶, all are scaled down together.
+        """
+        result = linalg.matmul(factor, linalg.transpose(factor))
+        lanes = self.starved(result, _HUGE)
+        if lanes.size:
+            unit = np.sqrt(self.resolution)
+            vectors, values, _ = np.linalg.svd(
+                np.moveaxis(factor[..., lanes] / unit[:, None], -1, -3), full_matrices=False
+            )
+            variances = (values * np.minimum(1.0, _LARGEST / values[..., :1])) ** 2
+            variances = np.minimum(variances, _WIDEST * np.maximum(variances[..., -1:], 1.0))
+            variances = np.maximum(variances, variances[..., :1] / _WIDEST)
+            root = vectors * np.sqrt(variances)[..., None, :]
+            root = unit[:, None] * np.moveaxis(root, -3, -1)
+            result[..., lanes] = linalg.matmul(root, linalg.transpose(root))
+        return result
 
     def censored(self, measurement: Array) -> NDArray[np.bool_]:
         """Which components (sensors, m, N) lie at a threshold."""

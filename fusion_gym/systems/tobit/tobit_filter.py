@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import gaussian, linalg
 from fusion_gym.arrays import Array
-from fusion_gym.systems.tobit.filters import Expectation, Outcomes, linear_update
+from fusion_gym.systems.tobit.filters import Expectation, Outcomes, joseph_form, linear_update
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 _FAR = 50.0  # a threshold this many deviations away never censors
@@ -100,7 +100,7 @@ class TobitKalmanFilter:
         innovation = linalg.congruence(weighted, covariance)
         noise = self.sensors.variance * expectation.truncated_variance
         innovation = linalg.add_diagonal(innovation, noise)
-        correction, posterior = linear_update(covariance, weighted, innovation)
+        correction, posterior = linear_update(self.sensors, covariance, weighted, innovation, noise)
         return Outcomes(correction, posterior, mean, covariance)
 
 
@@ -157,7 +157,7 @@ class AssumedDensityFilter:
                 distance = sign * (latent[:, component] - limit) / np.sqrt(variance)
                 distance = np.where(np.isfinite(limit), distance, _FAR)
                 share -= gaussian.upper_tail(distance) * gaussian.truncated_variance(distance)
-            result = result - linalg.outer(cross, cross) * (share / variance)[:, None, None]
+            result = self._explained(result, row, cross, variance, noise[:, component], share)
         return result
 
     def _take(
@@ -184,8 +184,41 @@ class AssumedDensityFilter:
             step = np.where(censored, -sign * gaussian.hazard(distance) / deviation, step)
             loss = np.where(censored, _loss(distance), loss)
         step = np.where(granted, step, 0.0)
-        loss = np.where(granted, loss / variance, 0.0)
-        return mean + cross * step, covariance - linalg.outer(cross, cross) * loss
+        loss = np.where(granted, loss, 0.0)
+        noise = self.sensors.variance[sensor, component]
+        covariance = self._explained(covariance, row, cross, variance, noise, loss)
+        return mean + cross * step, covariance
+
+    def _explained(
+        self,
+        covariance: Array,
+        row: Array,
+        cross: Array,
+        variance: Array,
+        noise: Array,
+        share: Array,
+    ) -> Array:
+        """P - P Cᵀ C P s/S, where a scalar measurement explains the share s of its variance S.
+
+        P (…, n, n, N), ``row`` C (…, n, 1), ``cross`` P Cᵀ (…, n, N), ``noise`` R (…, 1), S and s
+        (…, N). The same as :func:`joseph_form` with K = P Cᵀ s/S and the noise that makes s
+        optimal, s (1 - s)/S + R s²/S² in units of P Cᵀ; that is taken where P is large.
+        """
+        loss = share / variance
+        result = covariance - linalg.outer(cross, cross) * loss[..., None, None, :]
+        lanes = self.sensors.starved(covariance)
+        if lanes.size:
+            gain, loss = cross[..., lanes] * loss[..., None, lanes], loss[..., lanes]
+            left = loss * (1.0 - share[..., lanes]) + noise * loss * loss
+            part = cross[..., lanes] * np.sqrt(left)[..., None, :]
+            result[..., lanes] = joseph_form(
+                self.sensors,
+                covariance[..., lanes],
+                row[..., None, :, :],
+                gain[..., None, :],
+                [part[..., None, :]],
+            )
+        return result
 
 
 def _loss(distance: Array) -> Array:

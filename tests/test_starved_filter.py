@@ -1,0 +1,145 @@
+"""Filters of censored sensors after long silence and from priors far larger than the noise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mpmath
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from reference_tobit import Example as PaperExample
+from reference_tobit import event_error, exact_bound_update, exact_float, exact_matrix, kappas
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+
+TOBIT = "fusion_gym/TobitOscillator-v0"
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+def follow(
+    requests: Flags, seed: int = 0, **options: Any
+) -> tuple[list[Any], list[tuple[Array, Array]]]:
+    """States after sensing, and mean and covariance after each delivery, of (T, sensors, N)."""
+    steps, _, runs = requests.shape
+    task = fusion_gym.make_task(TOBIT, tokens="unlimited", horizon=steps + 1, **options)
+    batch = EpisodeBatch.seeded(task, runs, seed)
+    states, found = [], []
+    for wanted in requests:
+        states.append(batch.state)
+        batch.step(wanted)
+        found.append(task.system.fused(batch.delivered))
+    return states, found
+
+
+def smallest(covariance: Array) -> Array:
+    """Smallest eigenvalue of the correlations (N,) of (n, n, N)."""
+    matrices = np.moveaxis(covariance, -1, 0)
+    scale = np.sqrt(np.einsum("rii->ri", matrices))
+    result: Array = np.linalg.eigvalsh(matrices / scale[:, :, None] / scale[:, None])[:, 0]
+    return result
+
+
+def exactly(states: list[Any], requests: Flags, run: int, digits: int) -> tuple[Array, Array]:
+    """Mean and covariance at the end of one run by the printed equations in so many digits."""
+    example = PaperExample()
+    kappa, shares = kappas(example.epsilon), len(example.matrices)
+    with mpmath.workdps(digits):
+        transition = exact_matrix(example.transition)
+        process = exact_matrix(example.process_covariance)
+        matrix = exact_matrix(example.matrices[0])
+        mean = exact_matrix(example.initial_mean)
+        covariance = exact_matrix(example.initial_covariance)
+        for time, (state, granted) in enumerate(zip(states, requests[..., run], strict=True), 1):
+            prior = transition * mean
+            spread = shares * (transition * covariance * transition.T + process)
+            information, total = mpmath.zeros(2), mpmath.zeros(2, 1)
+            for sensor, arrived in enumerate(granted):
+                value = (state.measurement if arrived else state.held)[sensor, :, run]
+                local, bound = exact_bound_update(
+                    prior,
+                    spread,
+                    matrix,
+                    example.variances[sensor],
+                    example.thresholds[sensor],
+                    exact_matrix(value),
+                    not arrived,
+                    kappa,
+                    example.epsilon[13],
+                    event_error(example, sensor, time),
+                )
+                weight = bound**-1
+                information += weight
+                total += weight * local
+            covariance = information**-1
+            mean = covariance * total
+        return exact_float(mean)[:, 0], exact_float(covariance)
+
+
+def sparse_requests(runs: int) -> Flags:
+    """Requests (250, 3, runs) of one step in fifty, always the same."""
+    return np.random.default_rng(5).random((250, 3, 400))[..., :runs] < 0.02
+
+
+def test_long_silence_leaves_estimates_and_covariances_sound() -> None:
+    """Where P - P Cᵀ S⁻¹ C P loses all its digits: in 10 of these 200 runs."""
+    _, found = follow(sparse_requests(200))
+    for mean, covariance in found:
+        assert np.isfinite(mean).all()
+        assert smallest(covariance).min() > 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", [52, 66, 107, 146])
+def test_long_silence_in_many_digits(run: int) -> None:
+    """Runs in which that difference fails, and whose covariances float64 can hold."""
+    requests = sparse_requests(run + 1)
+    states, found = follow(requests)
+    exact_mean, exact_covariance = exactly(states, requests, run, 300)
+    mean, covariance = (values[..., run] for values in found[-1])
+    assert np.abs(mean - exact_mean).max() < 1e-3 * np.abs(exact_mean).max()
+    np.testing.assert_allclose(covariance, exact_covariance, rtol=2e-3)
+
+
+MATRICES = np.array([[[1.0, 0.3], [-0.2, 1.0]], [[1.0, -2.3], [0.2, 1.0]]])
+UNKNOWN = {
+    "initial_covariance": ((1e10, 9.9e9), (9.9e9, 1e10)),
+    "measurement_matrices": MATRICES,
+    "measurement_variance": 1e-8,
+}
+
+
+@pytest.mark.parametrize("kind", ["paper", "tobit", "kalman", "adf"])
+@pytest.mark.parametrize("pattern", ["both", "in turn"])
+def test_a_prior_of_any_size_beside_any_noise(kind: str, pattern: str) -> None:
+    """P₀ is 10¹⁸ times R."""
+    requests = np.ones((40, 2, 50), dtype=np.bool_)
+    if pattern == "in turn":
+        requests[::2, 0] = requests[1::2, 1] = False
+    _, found = follow(requests, filter=kind, **UNKNOWN)
+    for mean, covariance in found:
+        assert np.isfinite(mean).all()
+        assert smallest(covariance).min() > -1e-12
+
+
+@pytest.mark.parametrize("kind", ["tobit", "kalman", "adf"])
+def test_the_first_look_from_an_unknown_start(kind: str) -> None:
+    """Uncensored, all three are the Kalman filter; here against its information form."""
+    requests = np.ones((1, 2, 5), dtype=np.bool_)
+    options = UNKNOWN | {"filter": kind, "censoring_threshold": -np.inf}
+    states, found = follow(requests, **options)
+    for run in range(5):
+        with mpmath.workdps(60):
+            information = exact_matrix(states[0].prior_covariance[..., run]) ** -1
+            total = information * exact_matrix(states[0].prior_mean[:, run])
+            for matrix, value in zip(MATRICES, states[0].measurement[..., run], strict=True):
+                weight = exact_matrix(matrix).T * 10**8
+                information += weight * exact_matrix(matrix)
+                total += weight * exact_matrix(value)
+            exact = information**-1
+            wanted = exact_float(exact * total)[:, 0]
+        mean, covariance = (values[..., run] for values in found[0])
+        np.testing.assert_allclose(covariance, exact_float(exact), rtol=1e-5)
+        np.testing.assert_allclose(mean, wanted, rtol=1e-5)
