@@ -280,6 +280,23 @@ def test_the_verdict_is_the_arithmetic_that_it_says() -> None:
     assert verdict["points"][1]["difference"]["mean"] == pytest.approx(1 / 1.2 - 1)
 
 
+@pytest.mark.parametrize("always", [1.0, 0.4])
+def test_the_middle_of_the_front_is_from_a_twentieth_to_half_of_always(always: float) -> None:
+    """Rates just outside and just inside, each with a difference of its own."""
+    noise = np.random.default_rng(0).uniform(0.5, 1.5, 50)
+    baselines = {"never": made_up(0.0, 2 * noise), "always": made_up(1.0, noise)}
+
+    def middle(*shares: float) -> float | None:
+        rates = [share * always for share in shares]
+        agents = [[made_up(rate, 0.9 * (2.0 - rate) * noise) for rate in rates]]
+        verdict = judge(agents, list(rates), baselines, {}, always=always)
+        return verdict["middle"]["mean"] if "middle" in verdict else None
+
+    assert middle(0.049, 0.501) is None
+    assert middle(0.051) == pytest.approx(-0.1)
+    assert middle(0.499) == pytest.approx(-0.1)
+
+
 def test_the_interval_covers_the_difference_between_episodes() -> None:
     """Unpaired noise of known deviation: the interval is that of the ratio of two means."""
     generator = np.random.default_rng(1)

@@ -106,6 +106,32 @@ def test_dynamic_event(text: str, sigma: Any, decay: Any, divisor: Any, initial:
     assert lost > 0
 
 
+def test_what_the_clip_of_dynamic_event_changes() -> None:
+    """λ χ > 1 keeps η positive, and the paper's numbers violate it: figures of the docs."""
+    task = make_task("fusion_gym/TobitOscillator-v0")
+    runs = 2000
+    batch, policy = EpisodeBatch.seeded(task, runs, 0), make_policy("dynamic_event", task)
+    policy.reset(runs)
+    sigma, decay = np.array([[0.1], [0.2], [0.3]]), np.array([[0.1], [0.2], [0.1]])
+    eta, lowest = np.full((3, runs), 1.5), 0.0
+    reference = batch.signals()["held"]
+    counts, differs = np.zeros((2, 3)), np.zeros(runs, dtype=np.bool_)
+    for _ in range(task.horizon):
+        signals = batch.signals()
+        clipped, measurement = policy(signals), signals["measurement"]
+        size = np.linalg.norm(reference - measurement, axis=1)
+        free = size >= eta / 5.0 + sigma
+        eta = decay * eta + sigma - np.where(free, 0.0, size)
+        reference = np.where(free[:, None], measurement, reference)
+        lowest = min(lowest, eta.min())
+        counts += clipped.sum(1), free.sum(1)
+        differs |= (clipped != free).any(0)
+        batch.step(clipped)
+    assert lowest == pytest.approx(-0.15, abs=0.01)
+    assert 0 < differs.sum() < runs / 200
+    assert 0 < np.abs(np.diff(counts, axis=0)).max() / (runs * task.horizon) < 1e-4
+
+
 def test_dynamic_event_error_is_zero_after_a_request() -> None:
     """η' = λ η + σ whatever was measured, where a request was made; less |ε| where none was."""
     policy: Any = make_rule("dynamic_event:threshold=1,decay=0.5,divisor=2,initial=4")

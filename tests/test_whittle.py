@@ -42,7 +42,9 @@ def test_it_grows_with_the_error_without_end() -> None:
     error = np.geomspace(1e-3, 1e3, 200)[None]
     index = WhittleIndex(task).index(error, np.zeros(error.shape, int))[0]
     assert (np.diff(index) > 0).all()
+    # Below and beyond the prices that were solved it is a parabola.
     assert index[0] == pytest.approx(index[1] * (error[0, 0] / error[0, 1]) ** 2)
+    assert index[-1] == pytest.approx(index[-2] * (error[0, -1] / error[0, -2]) ** 2)
 
 
 @pytest.mark.parametrize(
