@@ -16,6 +16,7 @@ from fusion_gym.validation import ConfigurationError
 _STARVED = 1e6
 _HUGE = 1e10  # beyond it, small eigenvalues may be lost beside large ones
 _WIDEST = 1e12  # ratio of two eigenvalues of a covariance
+_NONE = np.empty(0, dtype=np.intp)
 _LARGEST = 1e13  # deviation: what a delivery leaves of a larger one would drown in its rounding
 
 
@@ -116,8 +117,14 @@ class CensoredSensors:
         found = 1.0 / np.where(seen, information, np.inf)
         return np.where(seen, found, found.max() if seen.any() else np.inf)
 
+    @functools.cached_property
+    def _finest(self) -> float:
+        return float(self.resolution.min())
+
     def starved(self, covariance: Array, factor: float = _STARVED) -> NDArray[np.intp]:
         """Numbers of the runs of a covariance (…, n, n, N) with a variance > factor resolution."""
+        if not covariance.max() > factor * self._finest:  # the usual case, told apart in no time
+            return _NONE
         large = linalg.diagonal(covariance) > factor * self.resolution
         return np.flatnonzero(large.reshape(-1, large.shape[-1]).any(0))
 

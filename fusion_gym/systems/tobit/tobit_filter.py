@@ -128,13 +128,14 @@ class AssumedDensityFilter:
         self, mean: Array, covariance: Array, measurement: Array, granted: NDArray[np.bool_]
     ) -> tuple[Array, Array]:
         """Posterior (n, N), (n, n, N) after the granted (sensors, N) measurements."""
+        lanes = self.sensors.starved(covariance)
         for sensor in range(self.sensors.count):
             if not granted[sensor].any():
                 continue
             for component in range(self.sensors.size):
                 mean, covariance = self._take(
                     mean, covariance, sensor, component, measurement[sensor, component],
-                    granted[sensor],
+                    granted[sensor], lanes,
                 )  # fmt: skip
         return mean, covariance
 
@@ -147,6 +148,7 @@ class AssumedDensityFilter:
         matrix, noise = self.sensors.measurement_matrix, self.sensors.variance
         latent = linalg.matvec(matrix, mean)
         result = np.broadcast_to(covariance, (self.sensors.count, *covariance.shape))
+        lanes = self.sensors.starved(covariance)
         for component in range(self.sensors.size):
             row = matrix[:, component]
             cross = linalg.matvec(result, row)
@@ -157,7 +159,9 @@ class AssumedDensityFilter:
                 distance = sign * (latent[:, component] - limit) / np.sqrt(variance)
                 distance = np.where(np.isfinite(limit), distance, _FAR)
                 share -= gaussian.upper_tail(distance) * gaussian.truncated_variance(distance)
-            result = self._explained(result, row, cross, variance, noise[:, component], share)
+            result = self._explained(
+                result, row, cross, variance, noise[:, component], share, lanes
+            )
         return result
 
     def _take(
@@ -168,6 +172,7 @@ class AssumedDensityFilter:
         component: int,
         value: Array,
         granted: NDArray[np.bool_],
+        lanes: NDArray[np.intp],
     ) -> tuple[Array, Array]:
         row = self.sensors.measurement_matrix[sensor, component]
         cross = linalg.matvec(covariance, row)
@@ -186,7 +191,7 @@ class AssumedDensityFilter:
         step = np.where(granted, step, 0.0)
         loss = np.where(granted, loss, 0.0)
         noise = self.sensors.variance[sensor, component]
-        covariance = self._explained(covariance, row, cross, variance, noise, loss)
+        covariance = self._explained(covariance, row, cross, variance, noise, loss, lanes)
         return mean + cross * step, covariance
 
     def _explained(
@@ -197,20 +202,21 @@ class AssumedDensityFilter:
         variance: Array,
         noise: Array,
         share: Array,
+        lanes: NDArray[np.intp],
     ) -> Array:
         """P - P Cᵀ C P s/S, where a scalar measurement explains the share s of its variance S.
 
         P (…, n, n, N), ``row`` C (…, n, 1), ``cross`` P Cᵀ (…, n, N), ``noise`` R (…, 1), S and s
         (…, N). The same as :func:`joseph_form` with K = P Cᵀ s/S and the noise that makes s
-        optimal, s (1 - s)/S + R s²/S² in units of P Cᵀ; that is taken where P is large.
+        optimal, s (1 - s)/S + R s²/S² in units of P Cᵀ; that is taken in the ``lanes`` where P is
+        large.
         """
         loss = share / variance
         result = covariance - linalg.outer(cross, cross) * loss[..., None, None, :]
-        lanes = self.sensors.starved(covariance)
         if lanes.size:
             gain, loss = cross[..., lanes] * loss[..., None, lanes], loss[..., lanes]
             left = loss * (1.0 - share[..., lanes]) + noise * loss * loss
-            part = cross[..., lanes] * np.sqrt(left)[..., None, :]
+            part = cross[..., lanes] * np.sqrt(np.maximum(left, 0.0))[..., None, :]
             result[..., lanes] = joseph_form(
                 self.sensors,
                 covariance[..., lanes],
