@@ -25,6 +25,7 @@ from fusion_gym.validation import ConfigurationError
 _SMALLEST_PROBABILITY = 1e-290
 # The same where a held value is divided by q, and the ratio is squared.
 _SMALLEST_DIVISOR = 1e-140
+_RIDGE = 1e-14  # relative: just above the rounding of a sum
 
 
 @dataclass(frozen=True)
@@ -203,6 +204,10 @@ class BoundTobitFilter:
         q = np.maximum(expectation.uncensored_probability, _SMALLEST_PROBABILITY)
         bias = expectation.hazard * self.sensors.deviation
         core = k1 * spread + k4 * moment + k2 * linalg.outer(bias, bias)
+        lanes = self.sensors.starved(covariance)
+        if lanes.size:  # the squares of C x̂ and of C P Cᵀ may lie as far apart as float64 reaches
+            ridge = _RIDGE * linalg.diagonal(core[..., lanes])
+            core[..., lanes] = linalg.add_diagonal(core[..., lanes], ridge)
         columns = _pinned_columns(held, threshold, q, np.sqrt(k5), np.sqrt(k7))
         solved, pull = _pinned_solve(core, cross, columns)
         whitened, pinned = np.split(solved, [cross.shape[-2]], axis=-2)
@@ -212,8 +217,7 @@ class BoundTobitFilter:
         )
         bound = k1 * covariance - k1**2 * linalg.matmul(linalg.transpose(cross), whitened)
         bound = linalg.symmetrise(bound)
-        lanes = self.sensors.starved(covariance)
-        if lanes.size:
+        if lanes.size:  # true for any gain, the one with the ridge too
             prior, gain = covariance[..., lanes], k1 * linalg.transpose(whitened)[..., lanes]
             seen = linalg.matmul(matrix, linalg.factor(prior))
             offsets = np.stack((np.sqrt(k4 * shift) * latent, np.sqrt(k2) * bias), axis=-2)
