@@ -20,6 +20,7 @@ from fusion_gym.validation import ConfigurationError
 
 from .command_line import Command, spelled, start
 from .output import figures
+from .output.files import write_text
 
 LEAST_ROOM = 0.05  # below that the share of it that an agent closes says nothing
 MODES = {
@@ -44,8 +45,8 @@ class Report(Command):
         quick = " --quick" if self.results.name == "quick" else ""
         text = text_of(found, f"{spelled('benchmark')}{quick}", spelled("report"))
         page, readme = self.results / "report.html", self.results / "README.md"
-        readme.write_text(text)
-        page.write_text(page_of(text, self.results))
+        write_text(readme, text)
+        write_text(page, page_of(text, self.results))
         print(f"wrote {readme} and {page}")
 
 

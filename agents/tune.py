@@ -23,6 +23,7 @@ from optuna.trial import TrialState
 from fusion_gym.validation import ConfigurationError, integer
 
 from .command_line import Command, spelled, start
+from .output.files import write_text
 from .training.checked import load, parse
 from .training.config import Experiment
 from .training.run import train
@@ -65,7 +66,7 @@ class Tune(Command):
             study = tune(parse(Experiment, plain, "command line"), self.trials, self.output)
             command = shlex.join([*spelled("tune").split(), *sys.argv[1:]])
             path = self.output / "best.yaml"
-            path.write_text(best_config(study, experiment, command))
+            write_text(path, best_config(study, experiment, command))
         except ValueError as error:
             raise ConfigurationError(str(error)) from None
         print(f"best return {study.best_value:.4g} with {study.best_params}; config in {path}")

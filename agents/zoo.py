@@ -18,7 +18,7 @@ from fusion_gym import zoo
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import Command, spelled, start
-from .output.files import write
+from .output.files import replacing, write
 
 LARGEST = 300_000  # bytes of a model
 
@@ -73,7 +73,8 @@ def add(name: str, report: dict[str, Any], work: Path, folder: Path) -> None:
             f"{model} has {model.stat().st_size} bytes: it must have at most {LARGEST}"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(model, folder / f"{name}.zip")
+    with replacing(folder / f"{name}.zip") as partial:
+        shutil.copyfile(model, partial)
     training = report["training"] | {"output": f"runs/{name}"}
     card = {
         "env": report["env"],

@@ -17,6 +17,8 @@ from fusion_gym.evaluation.envelope import EnvelopePoint
 from fusion_gym.evaluation.episodes import EpisodeResults, Trajectory
 from fusion_gym.evaluation.intervals import mean_interval
 
+from .files import replacing
+
 _INK = "#30343b"
 _AGENT = "#c8102e"
 _TALLEST = 7.0  # of the least error, where the errors' axis of the fronts ends
@@ -194,6 +196,8 @@ def episode(path: Path, title: str, trajectory: Trajectory, capacity: float) -> 
 
 
 def _save(figure: plt.Figure, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, bbox_inches="tight")
-    plt.close(figure)
+    try:
+        with replacing(path) as partial:
+            figure.savefig(partial, bbox_inches="tight")
+    finally:
+        plt.close(figure)

@@ -1,27 +1,85 @@
-"""Results on disk: JSON for readers, and episodes for a verdict."""
+"""Files that are whole: each is written under another name and moved to its own at the end."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import os
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fusion_gym.evaluation.episodes import EpisodeResults
+from fusion_gym.validation import ConfigurationError
 
 FIELDS = tuple(EpisodeResults.__dataclass_fields__)
+_PARTIAL = re.compile(r"\.\d+\.part(\.\w+)?$")  # with the process that writes it
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file beside ``path`` to be written, which replaces ``path`` at the end of the block.
+
+    Whoever reads ``path`` finds what was there before or all of what is new, whenever the process
+    is killed; where the block fails, nothing is left of it. Folders are made. The partial file has
+    the suffix of ``path``, and in its name the process, so that two never write the same one. A
+    link's target is replaced, and what is no plain file (``/dev/stdout``) is written to directly.
+
+    Raises:
+        OSError: the folder or the file cannot be written.
+    """
+    path = path.resolve()
+    if path.exists() and not path.is_file() and not path.is_dir():
+        yield path
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def remove_partials(folder: Path) -> None:
+    """Remove what killed processes left half-written; nobody else may be writing there."""
+    for partial in folder.glob("*"):
+        if _PARTIAL.search(partial.name):
+            partial.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Replace a text file in one move."""
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
 def write(path: Path | None, report: Mapping[str, Any]) -> None:
-    """Replace a JSON file, if one is wanted, in one move: an interrupt never leaves half of it."""
-    if path is None:
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".part")
-    partial.write_text(json.dumps(report, indent=1) + "\n")
-    partial.replace(path)
+    """Replace a JSON file, if one is wanted, in one move."""
+    if path is not None:
+        write_text(path, json.dumps(report, indent=1) + "\n")
+
+
+def read_json(path: Path, name: str) -> dict[str, Any]:
+    """The object that a JSON file holds; ``name`` is what an error calls it.
+
+    Raises:
+        ConfigurationError: it cannot be read, or holds no JSON object; one line says which.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(
+            f"{name} = {str(path)!r} cannot be read: {error.strerror or error}"
+        ) from None
+    except ValueError as error:  # no JSON, or no text
+        raise ConfigurationError(f"{name} = {str(path)!r} holds no JSON: {error}") from None
+    if not isinstance(found, dict):
+        raise ConfigurationError(f"{name} = {str(path)!r} holds no JSON object")
+    return found
 
 
 def save_results(path: Path, results: Mapping[str, EpisodeResults]) -> None:
@@ -31,10 +89,8 @@ def save_results(path: Path, results: Mapping[str, EpisodeResults]) -> None:
         for place, found in enumerate(results.values())
         for field in FIELDS
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.stem + ".part.npz")
-    np.savez_compressed(partial, names=np.array(list(results), dtype=np.str_), **arrays)
-    partial.replace(path)
+    with replacing(path) as partial:
+        np.savez_compressed(partial, names=np.array(list(results), dtype=np.str_), **arrays)
 
 
 def load_results(path: Path) -> dict[str, EpisodeResults]:
