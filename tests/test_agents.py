@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 import yaml
 from stable_baselines3 import PPO
+from training_configs import ENV, SMALL, read_records, small_config
 
 import fusion_gym
 from agents import demo, evaluate, reproduce
 from agents.command_line import read
 from agents.suite.sweep import Comparison, Sweep
-from agents.training import monitor
 from agents.training import run as train
 from agents.training.algorithms import TABLE
 from agents.training.checked import load
@@ -36,42 +36,7 @@ from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
 CONFIGS = ROOT / "configs"
-ENV = "fusion_gym/TobitOscillator-v0"
 EXPERIMENTS = [f for f in sorted(CONFIGS.glob("*.yaml")) if "\ntraining:" in f.read_text()]
-SMALL: dict[str, dict[str, Any]] = {
-    "ppo": {"name": "ppo", "n_steps": 16, "batch_size": 128, "n_epochs": 1},
-    "maskable_ppo": {"name": "maskable_ppo", "n_steps": 16, "batch_size": 128, "n_epochs": 1},
-    "recurrent_ppo": {
-        "name": "recurrent_ppo",
-        "n_steps": 16,
-        "batch_size": 128,
-        "n_epochs": 1,
-        "memory": 8,
-    },
-    "a2c": {"name": "a2c", "n_steps": 8},
-    "dqn": {
-        "name": "dqn",
-        "buffer_size": 2000,
-        "learning_starts": 100,
-        "batch_size": 32,
-        "learning_rate_end": 1e-4,
-    },
-}
-
-
-def small_config(folder: Path, kind: str = "ppo", **changes: Any) -> Path:
-    content: dict[str, Any] = {
-        "environment": {"id": ENV, "options": {"filter": "tobit", "horizon": 20}},
-        "algorithm": SMALL[kind],
-        "training": {"timesteps": 1024, "num_envs": 8},
-        "validation": {"every": 512, "episodes": 4},
-        "output": str(folder / "run"),
-    }
-    if TABLE[kind].discrete_only:
-        content["environment"]["options"]["action"] = "discrete"
-    path = folder / "config.yaml"
-    path.write_text(yaml.safe_dump(content | changes))
-    return path
 
 
 @pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
@@ -144,7 +109,7 @@ def test_training_writes_its_results_and_resumes(tmp_path: Path, algorithm: str)
     assert summary["timesteps"] >= 1024
     assert json.loads((folder / "summary.json").read_text()) == summary
     assert list((folder / "tensorboard").glob("events*"))
-    records = monitor.read_records(folder)
+    records = read_records(folder)
     assert max(r["return"] for r in records) == summary["best_validation"]["return"]
     with pytest.raises(ConfigurationError, match="--resume"):
         train.train(experiment)
@@ -153,7 +118,7 @@ def test_training_writes_its_results_and_resumes(tmp_path: Path, algorithm: str)
     )
     again = train.train(longer, resume=True)
     assert again["timesteps"] >= 2048
-    assert len(monitor.read_records(folder)) > len(records)
+    assert len(read_records(folder)) > len(records)
     other = longer.model_copy(
         update={"validation": longer.validation.model_copy(update={"episodes": 5})}
     )
@@ -197,7 +162,7 @@ def test_validation_counts_episodes_by_their_price(tmp_path: Path) -> None:
     content["training"]["price_exponent"] = 1.0
     path.write_text(yaml.safe_dump(content))
     train.train(load(Experiment, path), quiet=True)
-    record = monitor.read_records(tmp_path / "run")[-1]
+    record = read_records(tmp_path / "run")[-1]
     task = fusion_gym.make_task(ENV, **content["environment"]["options"])
     batch = EpisodeBatch(task, 4)
     batch.seed(np.arange(4), [500_000_000 + place for place in range(4)])
@@ -246,13 +211,13 @@ def test_an_interrupted_training_loses_nothing(tmp_path: Path, number: signal.Si
     assert b"go on with --resume" in output
     summary = json.loads((folder / "summary.json").read_text())
     assert not summary["finished"]
-    records = len(monitor.read_records(folder))
+    records = len(read_records(folder))
     resumed = [*command, "--resume", "--timesteps", str(summary["timesteps"] + 1500)]
     subprocess.run(resumed, cwd=ROOT, check=True, capture_output=True, timeout=120)
     later = json.loads((folder / "summary.json").read_text())
     assert later["finished"]
     assert later["timesteps"] >= summary["timesteps"] + 1500
-    assert len(monitor.read_records(folder)) > records
+    assert len(read_records(folder)) > records
 
 
 def run_evaluation(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> dict[str, Any]:
@@ -353,7 +318,7 @@ def test_demo_from_baselines_to_figures(tmp_path: Path, monkeypatch: pytest.Monk
         assert json.loads((folder / "agent" / "summary.json").read_text())["finished"]
     began = (output / "paper" / "agent" / "final_model.zip").stat().st_mtime
     demo.main()
-    records = monitor.read_records(output / "paper" / "agent")
+    records = read_records(output / "paper" / "agent")
     assert len(records) == 1, "a finished training is not repeated"
     assert (output / "paper" / "agent" / "final_model.zip").stat().st_mtime >= began
 

@@ -18,7 +18,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from fusion_gym.validation import choice
 
-from .checked import Positive, Rate, Share, Strict
+from .checked import Positive, Rate, Several, Share, Strict, Weight
 
 # Share of the steps in which the untrained policy lets every sensor request; by default one half.
 # Where that is far more than the tokens pay for, asking for less changes nothing (another sensor's
@@ -56,8 +56,8 @@ class A2CConfig(AlgorithmConfig):
     """A2C, and what PPO has in common with it."""
 
     gae_lambda: Share = 0.9
-    ent_coef: float = 0.0
-    vf_coef: float = 0.5
+    ent_coef: Weight = 0.0
+    vf_coef: Weight = 0.5
     max_grad_norm: Rate = 0.5
     initial_rate: InitialRate = None
     n_steps: Positive = 8
@@ -73,7 +73,7 @@ class PPOConfig(A2CConfig):
     """PPO, also the one that cannot choose what the tokens do not allow (``maskable_ppo``)."""
 
     n_steps: Positive = 64
-    batch_size: Positive = 4096
+    batch_size: Several = 4096
     n_epochs: Positive = 4
     clip_range: Rate = 0.2
 

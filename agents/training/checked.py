@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -16,14 +18,56 @@ SHIPPED = Path(__file__).parents[2] / "configs"
 
 Model = TypeVar("Model", bound=pydantic.BaseModel)
 Positive = Annotated[int, pydantic.Field(gt=0)]
+Several = Annotated[int, pydantic.Field(gt=1)]
+Weight = Annotated[float, pydantic.Field(ge=0)]
 Rate = Annotated[float, pydantic.Field(gt=0)]
 Share = Annotated[float, pydantic.Field(ge=0, le=1)]
 
 
 class Strict(pydantic.BaseModel):
-    """No unknown keys, and nothing changes afterwards."""
+    """No unknown keys, no conversions, finite numbers, and nothing changes afterwards."""
 
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+    model_config = pydantic.ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False
+    )
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _tuples(cls, content: Any) -> Any:
+        """YAML knows lists alone."""
+        if not isinstance(content, Mapping):
+            return content
+        return {
+            key: tuple(value) if isinstance(value, list) else value
+            for key, value in content.items()
+        }
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML whose keys are given once, and whose ``1e-3`` is a number, as in YAML 1.2."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """A mapping.
+
+        Raises:
+            ConstructorError: a key that is given twice.
+        """
+        seen = set()
+        for key_node, _ in node.value:
+            if key_node.tag == "tag:yaml.org,2002:merge":
+                continue
+            key = self.construct_object(key_node, deep=True)
+            if isinstance(key, Hashable) and key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key!r} is given twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), "-+.0123456789"
+)
 
 
 def config_path(name: str | Path) -> Path:
@@ -56,13 +100,14 @@ def read_yaml(name: str | Path) -> Any:
         ConfigurationError: no such file, or no YAML.
     """
     try:
-        return yaml.safe_load(config_path(name).read_text())
+        return yaml.load(config_path(name).read_text(encoding="utf-8"), _Loader)  # a safe loader
     except OSError as error:
         raise ConfigurationError(
             f"config {str(name)!r} cannot be read: {error.strerror or error}"
         ) from None
-    except yaml.YAMLError as error:
-        raise ConfigurationError(f"config {str(name)!r} is no YAML: {error}") from None
+    except (yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigurationError(f"config {str(name)!r} is no YAML: {reason}") from None
 
 
 def parse(kind: type[Model], content: Any, source: str) -> Model:

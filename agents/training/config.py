@@ -56,6 +56,12 @@ class Experiment(Strict):
     validation: ValidationConfig = ValidationConfig()
     output: str
 
+    def inputs(self) -> dict[str, Any]:
+        """What the results depend on; a training can be made longer, moved, or given threads."""
+        return self.model_dump(
+            mode="json", exclude={"output": True, "training": {"timesteps": True, "threads": True}}
+        )
+
     def changed(self, output: str | Path | None, **training: Any) -> Experiment:
         """The experiment with another output or training, where they are given, checked again.
 

@@ -8,6 +8,7 @@ from gymnasium.spaces import Discrete, MultiBinary
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fusion_gym.arrays import Array
+from fusion_gym.core.task import Task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.policies.model import tag_model
 from fusion_gym.validation import ConfigurationError
@@ -16,17 +17,46 @@ from .algorithms import TABLE
 from .config import Experiment
 
 
+def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
+    """The environment to train in.
+
+    Raises:
+        ConfigurationError: actions that the algorithm does not know.
+    """
+    name, local = experiment.algorithm.name, experiment.environment.local
+    many = not local and task.action != "discrete" and task.access != "single"
+    if TABLE[name].discrete_only and many:
+        raise ConfigurationError(
+            f"action = {task.action!r} is not allowed with algorithm {name!r}: set the "
+            "environment's option action: discrete"
+        )
+    return FusionSB3VecEnv(
+        task,
+        experiment.training.num_envs,
+        stagger=True,
+        local=local,
+        price_exponent=experiment.training.price_exponent,
+    )
+
+
 def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
     """A new model of the config's algorithm.
 
     Raises:
-        ConfigurationError: an ``initial_rate`` that the action space does not allow.
+        ConfigurationError: settings that the algorithm's class refuses, or an ``initial_rate``
+            that the action space does not allow.
     """
     settings = experiment.algorithm
     row = TABLE[settings.name]
-    model = row.model(
-        row.policy, env, seed=experiment.training.seed, device="cpu", **settings.arguments()
-    )
+    try:
+        model = row.model(
+            row.policy, env, seed=experiment.training.seed, device="cpu", **settings.arguments()
+        )
+    except (AssertionError, ValueError) as error:  # what Stable-Baselines3 checks by itself
+        reason = " ".join(str(error).split())
+        raise ConfigurationError(
+            f"algorithm = {settings.name!r} is not allowed with these settings: {reason}"
+        ) from None
     rate = getattr(settings, "initial_rate", None)
     if rate is not None:
         _begin_at(model, env, rate)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import signal
 import time
@@ -11,7 +12,6 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
 
@@ -22,6 +22,9 @@ from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.model import ModelPolicy
 
+from ..output.files import replacing, write_text
+from . import checkpoint
+from .checkpoint import Journal
 from .config import Experiment
 from .constraint import score
 
@@ -47,6 +50,10 @@ class Interrupt:
         signal.signal(number, self._before[signal.Signals(number)])
 
 
+class Stop(Exception):
+    """Ends a training between two rollouts, where the steps counted are the steps trained on."""
+
+
 class Progress(BaseCallback):
     """Validation, best model, checkpoints, the progress bar and the split of the wall time."""
 
@@ -57,49 +64,77 @@ class Progress(BaseCallback):
         task: Task,
         interrupt: Interrupt,
         bar: tqdm[Any],
+        journal: Journal,
         watch: Callable[[dict[str, Any]], bool] | None = None,
     ) -> None:
         super().__init__()
         self.watch, self.stopped = watch, False
         self.experiment, self.folder, self.task = experiment, folder, task
-        self.interrupt, self.bar = interrupt, bar
-        self.records = read_records(folder)
+        self.interrupt, self.bar, self.journal = interrupt, bar, journal
         self.target = experiment.training.target_rate
-        self.best = max((score(r, self.target) for r in self.records), default=(-np.inf, -np.inf))
-        self.seconds = {"environment": 0.0, "policy": 0.0, "update": 0.0, "validation": 0.0}
+        scores = (score(record, self.target) for record in journal.records)
+        self.best = max(scores, default=(-np.inf, -np.inf))
         self._mark = 0.0
         self._env_mark = 0.0
         self._next = 0
+        self._due = False  # a checkpoint, as soon as the model has learned from the rollout
+        self._write_records()
+        if journal.best is not None:
+            self._write_best(journal.best)
+        for record in journal.records:
+            self._show(record)
 
     def _on_training_start(self) -> None:
-        self._next = self.num_timesteps + self.experiment.validation.every
+        self._plan()
         self._mark = time.perf_counter()
 
     def _on_rollout_start(self) -> None:
-        now = time.perf_counter()
-        self.seconds["update"] += now - self._mark
-        self._mark, self._env_mark = now, self._environment().seconds
+        self._measure("update")
+        if self.interrupt.raised or self.stopped:
+            raise Stop
+        if self._due:
+            self._due = False
+            self.save()
+            self._measure("validation")
+        self._env_mark = self._environment().seconds
 
     def _on_step(self) -> bool:
-        return not (self.interrupt.raised or self.stopped)
+        return True
 
     def _on_rollout_end(self) -> None:
         environment = self._environment().seconds - self._env_mark
-        now = time.perf_counter()
-        self.seconds["environment"] += environment
-        self.seconds["policy"] += now - self._mark - environment
-        self._mark = now
+        self._measure("policy")
+        self.journal.seconds["policy"] -= environment
+        self.journal.seconds["environment"] += environment
         self.bar.update(self.num_timesteps - self.bar.n)
-        if self.num_timesteps >= self._next:
-            self._next += self.experiment.validation.every
+        # The last validation is that of the finished model.
+        if self._next <= self.num_timesteps < self.experiment.training.timesteps:
+            self._plan()
+            self._due = True
             self.validate()
-            self.save()
-            now = time.perf_counter()
-            self.seconds["validation"] += now - self._mark
-            self._mark = now
+            self._measure("validation")
 
     def _on_training_end(self) -> None:
-        self.seconds["update"] += time.perf_counter() - self._mark
+        self._measure("update")
+
+    def _measure(self, activity: str) -> None:
+        """Add the time since the last call to an activity's."""
+        now = time.perf_counter()
+        self.journal.seconds[activity] += now - self._mark
+        self._mark = now
+
+    def _plan(self) -> None:
+        """The next validation is at the next multiple of the steps between two."""
+        every = self.experiment.validation.every
+        self._next = (self.num_timesteps // every + 1) * every
+
+    def finish(self) -> None:
+        """Validate the finished model, if that was not done before."""
+        records = self.journal.records
+        if not records or records[-1]["timesteps"] < self.num_timesteps:
+            self._mark = time.perf_counter()
+            self.validate()
+            self._measure("validation")
 
     def validate(self) -> None:
         """Run the validation episodes, log them, and keep the model if it is the best so far."""
@@ -112,20 +147,34 @@ class Progress(BaseCallback):
             "mse": float(found.mse.mean()),
             "rate": float(found.rate.mean()),
         }
-        self.records.append(record)
-        with (self.folder / "validation.jsonl").open("a") as file:
-            file.write(json.dumps(record) + "\n")
+        if score(record, self.target) > self.best:
+            self.best = score(record, self.target)
+            file = io.BytesIO()
+            self.model.save(file)
+            self.journal.best = file.getvalue()
+            self._write_best(self.journal.best)
+        self.journal.records.append(record)
+        self._write_records()
         for key in ("return", "mse", "rate"):
             self.logger.record(f"validation/{key}", record[key])
         self.logger.dump(self.num_timesteps)
+        self._show(record)
+
+    def _show(self, record: dict[str, Any]) -> None:
+        """A validation to the bar, and to whoever watches and may end the training."""
         self.bar.set_postfix(
             mse=f"{record['mse']:.4f}", rate=f"{record['rate']:.3f}", refresh=False
         )
-        if score(record, self.target) > self.best:
-            self.best = score(record, self.target)
-            save(self.model, self.folder / "best_model.zip")
         if self.watch is not None:
             self.stopped = self.watch(record)
+
+    def _write_best(self, content: bytes) -> None:
+        with replacing(self.folder / "best_model.zip") as partial:
+            partial.write_bytes(content)
+
+    def _write_records(self) -> None:
+        lines = [json.dumps(record) + "\n" for record in self.journal.records]
+        write_text(self.folder / "validation.jsonl", "".join(lines))
 
     def _weights(self) -> Array:
         """What each validation episode's return counts, by its price."""
@@ -137,27 +186,10 @@ class Progress(BaseCallback):
         return self.task.reward.price.scale(batch.price, exponent)
 
     def save(self) -> None:
-        """Write the checkpoint, with the replay buffer where there is one."""
-        if getattr(self.model, "replay_buffer", None) is not None:
-            partial = self.folder / "latest_buffer.part.pkl"
-            self.model.save_replay_buffer(partial)  # type: ignore[attr-defined]
-            partial.replace(self.folder / "latest_buffer.pkl")
-        save(self.model, self.folder / "latest.zip")
+        """Write the checkpoint."""
+        checkpoint.save(self.folder / "latest.zip", self.model, self._environment(), self.journal)
 
     def _environment(self) -> FusionSB3VecEnv:
         env = self.training_env.unwrapped
         assert isinstance(env, FusionSB3VecEnv)
         return env
-
-
-def save(model: BaseAlgorithm, path: Path) -> None:
-    """Save in one move, so that an interrupt never leaves half a file."""
-    partial = path.with_name(path.stem + ".part.zip")
-    model.save(partial)
-    partial.replace(path)
-
-
-def read_records(folder: Path) -> list[dict[str, float]]:
-    """The validations written so far."""
-    file = folder / "validation.jsonl"
-    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []

@@ -1,7 +1,8 @@
-"""One training from config to summary; it can be interrupted at any step and gone on with."""
+"""One training from config to summary; it can be ended at any moment and gone on with."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from typing import Any
 
 import torch
 import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import configure
 
@@ -19,46 +21,51 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import ConfigurationError
 
-from ..output.files import write
+from ..output.files import replacing, write, write_text
+from ..output.folders import alone_in, check_inputs, fingerprint
 from ..output.progress import progress_bar
-from .algorithms import TABLE
 from .checked import load
+from .checkpoint import Journal, read_journal, restore
 from .config import Experiment
 from .constraint import TargetRate, score
-from .models import make_model
-from .monitor import Interrupt, Progress, save
+from .models import make_env, make_model
+from .monitor import Interrupt, Progress, Stop
 
 # Training seeds lie far from the validation's and from the small numbers that tests use.
 TRAINING_SEEDS = 1_000_000_000
 
 
-def prepare(experiment: Experiment, folder: Path, resume: bool) -> None:
-    """Make the folder, or check that it holds the same experiment.
+def holds_training(folder: Path) -> bool:
+    """Whether a training was begun in the folder."""
+    return any((folder / name).exists() for name in ("config.yaml", "latest.zip"))
+
+
+def earlier(experiment: Experiment, folder: Path, resume: bool) -> Journal | None:
+    """The journal of the training to go on with; none where it is begun.
 
     Raises:
         ConfigurationError: the folder holds a training and ``resume`` is false, there is nothing
-            to resume, or the training there had another config.
+            to resume, the training there had another config, or its checkpoint is damaged.
     """
-    plain = experiment.model_dump(mode="json")
-    file = folder / "config.yaml"
+    where, checkpoint = f"the training in {str(folder)!r}", folder / "latest.zip"
     if not resume:
-        if file.exists():
+        if holds_training(folder):
             raise ConfigurationError(
                 f"output = {str(folder)!r} holds a training already: go on with --resume, or give "
                 "another --output"
             )
-        folder.mkdir(parents=True, exist_ok=True)
-        file.write_text(yaml.safe_dump(plain, sort_keys=False))
-        return
-    if not file.exists():
-        raise ConfigurationError(f"output = {str(folder)!r} holds no training: nothing to resume")
-    earlier = load(Experiment, file).model_dump(mode="json")
-    for key in ("environment", "algorithm", "validation"):
-        if earlier[key] != plain[key]:
-            raise ConfigurationError(
-                f"{key} = {plain[key]} differs from the training in {str(folder)!r}: {earlier[key]}"
-            )
-    file.write_text(yaml.safe_dump(plain, sort_keys=False))
+        return None
+    if checkpoint.exists():
+        journal = read_journal(checkpoint)
+        check_inputs(experiment.inputs(), journal.inputs, where)
+        return journal
+    if (folder / "final_model.zip").exists():
+        raise ConfigurationError(
+            f"output = {str(folder)!r} holds a finished training without its checkpoint, "
+            "latest.zip: nothing to resume"
+        )
+    check_inputs(experiment.inputs(), load(Experiment, folder / "config.yaml").inputs(), where)
+    return None
 
 
 def validation_task(experiment: Experiment, task: Task) -> Task:
@@ -90,80 +97,78 @@ def train(
 ) -> dict[str, Any]:
     """Run the training and return its summary; ``quiet`` shows neither bar nor summary.
 
-    ``watch`` is handed each validation's record and may end the training by returning true.
+    ``watch`` is handed each validation's record, those of earlier stretches first, and may end the
+    training by returning true.
 
-    The summary has ``timesteps``, ``finished``, ``steps_per_second``, ``seconds`` by activity,
-    and the best validation.
+    The summary has ``timesteps``, ``finished``, ``steps_per_second``, ``seconds`` by activity (of
+    all stretches together), the best validation, and a hash of the inputs.
 
     Raises:
-        ConfigurationError: a config, environment or folder that does not fit.
+        ConfigurationError: a config, environment or folder that does not fit; a config that is not
+            allowed leaves no folder.
     """
-    task = make_task(experiment.environment.id, **experiment.environment.options)
-    name = experiment.algorithm.name
-    local = experiment.environment.local
-    row = TABLE[name]
-    many = not local and task.action != "discrete" and task.access != "single"
-    if row.discrete_only and many:
-        raise ConfigurationError(
-            f"action = {task.action!r} is not allowed with algorithm {name!r}: set the "
-            "environment's option action: discrete"
-        )
     folder = Path(experiment.output)
-    prepare(experiment, folder, resume)
+    task = make_task(experiment.environment.id, **experiment.environment.options)
+    scored = validation_task(experiment, task)
     torch.set_num_threads(experiment.training.threads)
-    env = FusionSB3VecEnv(
-        task,
-        experiment.training.num_envs,
-        stagger=True,
-        local=local,
-        price_exponent=experiment.training.price_exponent,
-    )
-    checkpoint = folder / "latest.zip"
-    if resume and checkpoint.exists():
-        model = row.model.load(checkpoint, env=env, device="cpu")
-        if (folder / "latest_buffer.pkl").exists():
-            model.load_replay_buffer(folder / "latest_buffer.pkl")  # type: ignore[attr-defined]
-    else:
-        model = make_model(experiment, env)
-    begun = model.num_timesteps
-    remaining = experiment.training.timesteps - begun
-    # Every stretch of a training gets noise of its own, also after an interrupt.
-    env.seed(TRAINING_SEEDS + 10_000_019 * experiment.training.seed + begun)
+    env = make_env(experiment, task)
+    model = make_model(experiment, env)
+    if resume and not holds_training(folder):
+        raise ConfigurationError(f"output = {str(folder)!r} holds no training: nothing to resume")
+    with alone_in(folder, "output"):
+        journal = earlier(experiment, folder, resume)
+        if journal is None:
+            journal = Journal(experiment.inputs())
+            env.seed(TRAINING_SEEDS + 10_000_019 * experiment.training.seed)
+        else:
+            model = restore(folder / "latest.zip", type(model), env)
+        plain = experiment.model_dump(mode="json")
+        write_text(folder / "config.yaml", yaml.safe_dump(plain, sort_keys=False))
+        return _learn(experiment, folder, model, env, scored, journal, quiet, watch)
+
+
+def _learn(
+    experiment: Experiment, folder: Path, model: BaseAlgorithm, env: FusionSB3VecEnv, scored: Task,
+    journal: Journal, quiet: bool, watch: Callable[[dict[str, Any]], bool] | None,
+) -> dict[str, Any]:  # fmt: skip
+    """Train what remains, write the results and return the summary."""
     model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
-    began = time.perf_counter()
+    total, begun, began = experiment.training.timesteps, model.num_timesteps, time.perf_counter()
     with (
         Interrupt() as interrupt,
-        progress_bar(experiment.training.timesteps, f"training {name}", begun, quiet) as bar,
+        progress_bar(total, f"training {experiment.algorithm.name}", begun, quiet) as bar,
     ):
-        scored = validation_task(experiment, task)
-        progress = Progress(experiment, folder, scored, interrupt, bar, watch)
+        progress = Progress(experiment, folder, scored, interrupt, bar, journal, watch)
+        progress.init_callback(model)
         callbacks: list[BaseCallback] = [progress]
         if experiment.training.target_rate is not None:
-            price = task.reward.price.fixed
+            price = env.task.reward.price.fixed
             assert price is not None  # validation_task refuses a drawn price
             callbacks.append(TargetRate(experiment.training.target_rate, price))
-        if remaining > 0:
-            model.learn(remaining, callback=CallbackList(callbacks), reset_num_timesteps=False)
-            progress.num_timesteps = model.num_timesteps
-            bar.update(model.num_timesteps - bar.n)
-            if not (interrupt.raised or progress.stopped):
-                progress.validate()
-            progress.save()
-    elapsed = time.perf_counter() - began
-    finished = model.num_timesteps >= experiment.training.timesteps
-    if finished:
-        save(model, folder / "final_model.zip")
-    best = max(progress.records, key=lambda r: score(r, progress.target), default=None)
+        if begun < total:
+            with contextlib.suppress(Stop):
+                model.learn(total - begun, CallbackList(callbacks), reset_num_timesteps=False)
+        progress.num_timesteps = model.num_timesteps
+        finished = model.num_timesteps >= total
+        if finished:
+            progress.finish()
+        progress.save()
+        if finished:
+            with replacing(folder / "final_model.zip") as partial:
+                model.save(partial)
     summary = {
         "timesteps": model.num_timesteps,
         "finished": finished,
-        "steps_per_second": round((model.num_timesteps - begun) / elapsed) if remaining > 0 else 0,
-        "seconds": {key: round(value, 2) for key, value in progress.seconds.items()},
-        "best_validation": best,
+        "steps_per_second": round(model.num_timesteps / (sum(journal.seconds.values()) or 1.0)),
+        "seconds": {key: round(value, 2) for key, value in journal.seconds.items()},
+        "best_validation": max(
+            journal.records, key=lambda record: score(record, progress.target), default=None
+        ),
+        "inputs": fingerprint(journal.inputs),
     }
     write(folder / "summary.json", summary)
     if not quiet:
-        print(describe(summary, folder, elapsed))
+        print(describe(summary, folder, time.perf_counter() - began))
     return summary
 
 
@@ -171,7 +176,7 @@ def describe(summary: dict[str, Any], folder: Path, elapsed: float) -> str:
     """What a reader wants to know of a training, in a few lines."""
     lines = [
         f"{'finished' if summary['finished'] else 'interrupted'} after {summary['timesteps']:,} "
-        f"steps; this stretch: {elapsed:.0f} s, {summary['steps_per_second']:,} steps/s"
+        f"steps at {summary['steps_per_second']:,} steps/s; this stretch: {elapsed:.0f} s"
     ]
     total = sum(summary["seconds"].values())
     if total > 0.0:

@@ -213,6 +213,14 @@ class EpisodeBatch:
         }
         return Signals(values, self.task.hidden_signals)
 
+    def snapshot(self) -> dict[str, Any]:
+        """Where all runs are, without the task, for :meth:`restore`; valid until the next step."""
+        return {key: value for key, value in vars(self).items() if key not in ("task", "layout")}
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Put the runs where they were at a :meth:`snapshot` of a batch like this one."""
+        vars(self).update(snapshot)
+
     def _next_episode(self, run: int) -> np.random.Generator:
         """The run's generator at the start of its next episode.
 

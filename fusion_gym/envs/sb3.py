@@ -133,6 +133,22 @@ class FusionSB3VecEnv(VecEnv):
         self.seconds += time.perf_counter() - began
         return result
 
+    def snapshot(self) -> dict[str, Any]:
+        """Where all runs are, without the task, for :meth:`restore`; valid until the next step."""
+        return {
+            "batch": self.batch.snapshot(),
+            "returns": self._returns,
+            "spent": self._spent,
+            "totals": self.totals,
+        }
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Put the runs where they were at a :meth:`snapshot` of an environment like this one."""
+        self.batch.restore(snapshot["batch"])
+        self._returns = snapshot["returns"]
+        self._spent = snapshot["spent"]
+        self.totals = snapshot["totals"]
+
     def _finish(
         self, runs: NDArray[np.int64], lengths: NDArray[np.int64], infos: list[dict[str, Any]]
     ) -> None:

@@ -1,0 +1,221 @@
+"""A training that was interrupted or killed ends as an undisturbed one does, bitwise."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from training_configs import small_config
+
+from agents.training import run
+from agents.training.algorithms import TABLE
+from agents.training.checked import load
+from agents.training.config import Experiment
+from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.validation import ConfigurationError
+
+
+class Killed(BaseException):
+    """The process is gone: nothing of the training handles it."""
+
+
+def experiment_of(folder: Path, kind: str, price: str = "fixed", **training: Any) -> Experiment:
+    folder.mkdir()
+    path = small_config(folder, kind)
+    content = yaml.safe_load(path.read_text())
+    content["training"] |= {"timesteps": 1024, **training}
+    content["validation"] = {"every": 256, "episodes": 2}
+    if price == "drawn":
+        content["environment"]["options"] |= {"cost_weight": "random", "price_range": [0.01, 0.1]}
+        content["training"]["price_exponent"] = 0.5
+    path.write_text(yaml.safe_dump(content))
+    return load(Experiment, path)
+
+
+def end_at(monkeypatch: pytest.MonkeyPatch, step: int, how: str) -> None:
+    """At this step of the runs the process is interrupted, or killed."""
+    before, counted = FusionSB3VecEnv.step_wait, 0
+
+    def step_wait(self: FusionSB3VecEnv) -> Any:
+        nonlocal counted
+        counted += 1
+        if counted == step:
+            if how == "killed":
+                raise Killed
+            os.kill(os.getpid(), signal.SIGINT)
+        return before(self)
+
+    monkeypatch.setattr(FusionSB3VecEnv, "step_wait", step_wait)
+
+
+def outcome(folder: Path, kind: str) -> dict[str, Any]:
+    """Weights of the models, validations, and what the summary says of them."""
+    summary = json.loads((folder / "summary.json").read_text())
+    models = {
+        name: TABLE[kind].model.load(folder / f"{name}_model.zip", device="cpu").policy.state_dict()
+        for name in ("best", "final")
+    }
+    return {
+        "timesteps": summary["timesteps"],
+        "best": summary["best_validation"],
+        "records": (folder / "validation.jsonl").read_text(),
+        **{
+            f"{name} {key}": value for name, model in models.items() for key, value in model.items()
+        },
+    }
+
+
+def assert_same(found: dict[str, Any], wanted: dict[str, Any]) -> None:
+    assert found.keys() == wanted.keys()
+    for key, value in wanted.items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(found[key], value), key
+        else:
+            assert found[key] == value, key
+
+
+CASES = [
+    pytest.param("ppo", "fixed", {}, marks=pytest.mark.slow),
+    pytest.param("ppo", "drawn", {}, marks=pytest.mark.slow),
+    ("ppo", "fixed", {"target_rate": 0.2}),
+    ("a2c", "fixed", {}),
+    ("dqn", "fixed", {}),
+    ("maskable_ppo", "drawn", {}),
+    ("recurrent_ppo", "fixed", {}),
+]
+
+
+@pytest.mark.parametrize(
+    ("kind", "price", "training"), CASES, ids=lambda value: value if isinstance(value, str) else ""
+)
+def test_a_resumed_training_is_the_uninterrupted_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, price: str, training: dict[str, Any]
+) -> None:
+    """Interrupted in the middle of a rollout, then killed after a checkpoint, then to the end."""
+    whole = experiment_of(tmp_path / "whole", kind, price, **training)
+    run.train(whole, quiet=True)
+    parts = experiment_of(tmp_path / "parts", kind, price, **training)
+    with monkeypatch.context() as patch:
+        end_at(patch, 45, "interrupted")
+        summary = run.train(parts, quiet=True)
+    assert 45 * 8 <= summary["timesteps"] < 512
+    assert not summary["finished"]
+    with monkeypatch.context() as patch:
+        end_at(patch, 60, "killed")
+        with pytest.raises(Killed):
+            run.train(parts, quiet=True, resume=True)
+    run.train(parts, quiet=True, resume=True)
+    assert_same(outcome(Path(parts.output), kind), outcome(Path(whole.output), kind))
+    assert len(outcome(Path(whole.output), kind)["records"].splitlines()) == 4
+
+
+def test_threads_timesteps_and_output_may_change_and_nothing_else(tmp_path: Path) -> None:
+    begun = experiment_of(tmp_path / "a", "ppo", timesteps=128, threads=2)
+    run.train(begun, quiet=True)
+    moved = Path(begun.output).rename(tmp_path / "moved")
+    longer = begun.changed(moved, timesteps=256, threads=1)
+    assert run.train(longer, quiet=True, resume=True)["timesteps"] == 256
+    before = {path: path.read_bytes() for path in moved.iterdir() if path.is_file()}
+    plain = longer.model_dump()
+    for place, name, value in (
+        ("training", "seed", 1),
+        ("training", "num_envs", 4),
+        ("training", "price_exponent", 0.5),
+        ("training", "target_rate", 0.3),
+        ("validation", "episodes", 5),
+        ("algorithm", "gamma", 0.5),
+        ("environment", "options", {"horizon": 30}),
+    ):
+        other = Experiment.model_validate(plain | {place: plain[place] | {name: value}})
+        with pytest.raises(ConfigurationError, match=f"^{place}.{name}.* differs from") as caught:
+            run.train(other, quiet=True, resume=True)
+        assert "\n" not in str(caught.value)
+    assert {path: path.read_bytes() for path in moved.iterdir() if path.is_file()} == before
+
+
+def test_the_best_model_outlives_a_kill_between_its_validation_and_the_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the file itself is lost: the checkpoint holds it."""
+    experiment = experiment_of(tmp_path / "a", "ppo", timesteps=512)
+    folder = Path(experiment.output)
+    with monkeypatch.context() as patch:
+        patch.setattr("agents.training.monitor.Progress._write_records", die_with_records(2))
+        with pytest.raises(Killed):
+            run.train(experiment, quiet=True)
+    assert (folder / "best_model.zip").exists()
+    (folder / "best_model.zip").unlink()
+    run.train(experiment, quiet=True, resume=True)
+    whole = experiment_of(tmp_path / "b", "ppo", timesteps=512)
+    run.train(whole, quiet=True)
+    assert_same(outcome(folder, "ppo"), outcome(Path(whole.output), "ppo"))
+
+
+def die_with_records(count: int) -> Any:
+    def write(self: Any) -> None:
+        if len(self.journal.records) == count:
+            raise Killed
+
+    return write
+
+
+def test_a_finished_training_is_not_repeated_and_its_files_are_mended(tmp_path: Path) -> None:
+    experiment = experiment_of(tmp_path / "a", "ppo", timesteps=256)
+    folder = Path(experiment.output)
+    summary = run.train(experiment, quiet=True)
+    wanted = outcome(folder, "ppo")
+    for name in ("best_model.zip", "final_model.zip", "summary.json", "validation.jsonl"):
+        (folder / name).write_text("damaged")
+    assert run.train(experiment, quiet=True, resume=True) == summary
+    assert_same(outcome(folder, "ppo"), wanted)
+
+
+def test_two_trainings_in_one_folder_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    experiment = experiment_of(tmp_path / "a", "ppo", timesteps=256)
+    tried: list[str] = []
+
+    def watch(_: Any) -> bool:
+        for resume in (False, True):
+            with pytest.raises(ConfigurationError, match="is in use by another process") as caught:
+                run.train(experiment, quiet=True, resume=resume)
+            tried.append(str(caught.value))
+        return False
+
+    run.train(experiment, quiet=True, watch=watch)
+    assert len(tried) == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"algorithm": {"name": "ppo", "batch_size": 1}}, "algorithm.batch_size = 1"),
+        (
+            {
+                "environment": {
+                    "id": "fusion_gym/TobitOscillator-v0",
+                    "options": {"access": "single"},
+                },
+                "algorithm": {"name": "ppo", "initial_rate": 0.9},
+            },
+            "initial_rate = 0.9",
+        ),
+        ({"training": {"timesteps": 64, "num_envs": 1}, "algorithm": {"name": "ppo", "n_steps": 1}},
+         "algorithm = 'ppo' is not allowed with these settings"),
+    ],
+)  # fmt: skip
+def test_a_refused_config_leaves_no_folder(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        run.train(load(Experiment, small_config(tmp_path, **changes)), quiet=True)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()

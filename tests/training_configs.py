@@ -1,0 +1,52 @@
+"""Configs of trainings that take a second."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from agents.training.algorithms import TABLE
+
+ENV = "fusion_gym/TobitOscillator-v0"
+SMALL: dict[str, dict[str, Any]] = {
+    "ppo": {"name": "ppo", "n_steps": 16, "batch_size": 128, "n_epochs": 1},
+    "maskable_ppo": {"name": "maskable_ppo", "n_steps": 16, "batch_size": 128, "n_epochs": 1},
+    "recurrent_ppo": {
+        "name": "recurrent_ppo",
+        "n_steps": 16,
+        "batch_size": 128,
+        "n_epochs": 1,
+        "memory": 8,
+    },
+    "a2c": {"name": "a2c", "n_steps": 8},
+    "dqn": {
+        "name": "dqn",
+        "buffer_size": 2000,
+        "learning_starts": 100,
+        "batch_size": 32,
+        "learning_rate_end": 1e-4,
+    },
+}
+
+
+def small_config(folder: Path, kind: str = "ppo", **changes: Any) -> Path:
+    content: dict[str, Any] = {
+        "environment": {"id": ENV, "options": {"filter": "tobit", "horizon": 20}},
+        "algorithm": SMALL[kind],
+        "training": {"timesteps": 1024, "num_envs": 8},
+        "validation": {"every": 512, "episodes": 4},
+        "output": str(folder / "run"),
+    }
+    if TABLE[kind].discrete_only:
+        content["environment"]["options"]["action"] = "discrete"
+    path = folder / "config.yaml"
+    path.write_text(yaml.safe_dump(content | changes))
+    return path
+
+
+def read_records(folder: Path) -> list[dict[str, Any]]:
+    """The validations that a training wrote."""
+    return [json.loads(line) for line in (folder / "validation.jsonl").read_text().splitlines()]
