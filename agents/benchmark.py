@@ -9,11 +9,12 @@ what is there. ``python -m agents.report`` makes tables and figures of it.
 
 from __future__ import annotations
 
-import json
+import os
 import shlex
 import signal
 import sys
 import time
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,14 +24,14 @@ from tqdm import tqdm
 
 from fusion_gym.core.system import covers
 from fusion_gym.evaluation.envelope import lower_envelope
-from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.validation import ConfigurationError, choice, integer
 
 from .command_line import Command, spelled, start
-from .output.files import load_results, write
+from .output.files import load_results, read_json, write
 from .suite.config import COMPARED_UP_TO, Setting, Suite, load_suite
-from .suite.jobs import Folders, Job, jobs, run, setting_task
+from .suite.jobs import Folders, Job, finished, jobs, setting_task
 from .suite.verdict import judge
+from .suite.work import run
 from .training.checked import parse
 
 
@@ -98,71 +99,83 @@ class Benchmark(Command):
             choice("modes", mode, suite.modes)
         modes = [mode for mode in suite.modes if not self.modes or mode in self.modes]
         work = list(jobs(suite, chosen, modes))
-        done = [
-            job for job in work if folders.report(job).exists() and folders.episodes(job).exists()
-        ]
-        if done and not self.resume:
-            raise ConfigurationError(
-                f"results = {str(folders.results)!r} holds {len(done)} finished pieces of work: go "
-                "on with --resume, or give another --results and --work"
-            )
         for setting in chosen:
             setting_task(setting)
-        execute(suite, [job for job in work if job not in done], folders, self.workers)
-        for setting in chosen:
-            conclude(suite, setting, folders)
+        with folders.alone():
+            present = sum(folders.hold(job) for job in work)
+            if present and not self.resume:
+                raise ConfigurationError(
+                    f"results = {str(folders.results)!r} holds {present} finished pieces of work: "
+                    "go on with --resume, or give another --results and --work"
+                )
+            # All of the settings' pieces, for the verdict is over all of them.
+            every = jobs(suite, chosen, suite.modes)
+            done = [job.place for job in every if finished(job, suite, folders)]
+            left = [job for job in work if job.place not in done]
+            execute(suite, left, folders, self.workers)
+            for setting in chosen:
+                conclude(suite, setting, folders)
         report = f"{spelled('report')} --results {folders.results}"
         print(f"results in {folders.results}: {report}")
 
 
 def conclude(suite: Suite, setting: Setting, folders: Folders) -> dict[str, Any] | None:
-    """The verdict over whatever agents of a setting are finished, written as ``verdict.json``."""
-    first = Job(setting, "baselines")
-    if not folders.report(first).exists():
+    """The verdict over whatever agents of a setting are finished, written as ``verdict.json``.
+
+    Raises:
+        ConfigurationError: results that are damaged or were made from other settings.
+    """
+    pieces = [job for job in jobs(suite, [setting], suite.modes) if finished(job, suite, folders)]
+    reports = {job.name: read_json(folders.report(job), "results") for job in pieces}
+    found = {
+        job.name: load_results(folders.episodes(job), reports[job.name]["made_from"])
+        for job in pieces
+    }
+    if "baselines" not in found:
         return None
-    report = json.loads(folders.report(first).read_text())
-    every = load_results(folders.episodes(first))
-    ahead = _finished(Job(setting, "informed"), folders)
-    known = _finished(Job(setting, "references"), folders)
-    clairvoyant = _finished(Job(setting, "hindsight"), folders)
-    references = {"sensors": ahead | known, "centre": known, "local": {}}
+    every, known = found["baselines"], found.get("references", {})
+    references = {"sensors": found.get("informed", {}) | known, "centre": known, "local": {}}
     always = float(every["always"].rate.mean())
     verdict: dict[str, Any] = {"setting": setting.name, "title": setting.title, "modes": {}}
     for mode in suite.modes:
-        done = [Job(setting, "agent", mode, seed) for seed in range(suite.training_seeds)]
-        done = [job for job in done if folders.report(job).exists()]
+        done = [job.name for job in pieces if job.mode == mode]
         if not done:
             continue
         comparable = {
             name: every[name]
-            for curve in report["curves"].values()
+            for curve in reports["baselines"]["curves"].values()
             if covers(COMPARED_UP_TO[mode], curve["knows"])
             for name in curve["policies"]
         }
-        agents = [list(load_results(folders.episodes(job)).values()) for job in done]
-        prices = json.loads(folders.report(done[0]).read_text())["prices"]
+        agents = [list(found[name].values()) for name in done]
+        prices = reports[done[0]]["prices"]
         verdict["modes"][mode] = judge(
-            agents, prices, comparable, references[mode], always, clairvoyant
+            agents, prices, comparable, references[mode], always, found.get("hindsight", {})
         ) | {"envelope": [point._asdict() for point in lower_envelope(comparable)]}
     write(folders.results / setting.name / "verdict.json", verdict)
     return verdict
 
 
-def _finished(job: Job, folders: Folders) -> dict[str, EpisodeResults]:
-    """The episodes of a job, none if it is not finished or not part of the setting."""
-    return load_results(folders.episodes(job)) if folders.report(job).exists() else {}
-
-
 def execute(suite: Suite, work: list[Job], folders: Folders, workers: int) -> None:
-    """Run the jobs on several cores, with an estimate of the remaining time."""
+    """Run the jobs on several cores, with an estimate of the remaining time.
+
+    Raises:
+        ConfigurationError: a job does not fit, or the system ended a worker.
+    """
     total = sum(job.weight for job in work)
     began = time.perf_counter()
     with tqdm(total=round(total), desc="benchmark", unit="s of work", smoothing=0.0) as bar:
-        finished = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")(
-            joblib.delayed(run)(job, suite, folders) for job in work
+        weights = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")(
+            joblib.delayed(run)(job, suite, folders, os.getpid()) for job in work
         )
-        for weight in finished:
-            bar.update(min(weight, bar.total - bar.n))
+        try:
+            for weight in weights:
+                bar.update(min(weight, bar.total - bar.n))
+        except BrokenProcessPool:
+            raise ConfigurationError(
+                f"workers = {workers}: the system ended one of them, perhaps for want of memory; "
+                "finished pieces of work are kept, go on with --resume"
+            ) from None
     print(f"{len(work)} pieces of work in {time.perf_counter() - began:.0f} s")
 
 

@@ -4,8 +4,9 @@
         --timesteps 1000000 --output runs/tune/tobit_oscillator
 
 The study is a SQLite file in the output folder: running the command again goes on with it until it
-has the trials asked for. Trials that fall behind at a validation are pruned. ``best.yaml`` is the
-config with what was found, and the command that found it.
+has the trials asked for, as if it had not been interrupted. Trials that fall behind at a validation
+are pruned, and so are those that diverge. ``best.yaml`` is the config with what was found, and the
+command that found it.
 """
 
 from __future__ import annotations
@@ -16,17 +17,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import optuna
 import yaml
+from optuna.exceptions import StorageInternalError
 from optuna.trial import TrialState
+from sqlalchemy.exc import SQLAlchemyError
+from tqdm import tqdm
 
 from fusion_gym.validation import ConfigurationError, integer
 
 from .command_line import Command, spelled, start
 from .output.files import write_text
+from .output.folders import alone_in, check_inputs, fingerprint
 from .training.checked import load, parse
 from .training.config import Experiment
-from .training.run import train
+from .training.run import Diverged, check, holds_training, train
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
@@ -62,13 +68,14 @@ class Tune(Command):
         if self.timesteps is not None:
             plain["training"]["timesteps"] = self.timesteps
             plain["validation"]["every"] = max(self.timesteps // 5, 1)
-        try:
-            study = tune(parse(Experiment, plain, "command line"), self.trials, self.output)
-            command = shlex.join([*spelled("tune").split(), *sys.argv[1:]])
-            path = self.output / "best.yaml"
-            write_text(path, best_config(study, experiment, command))
-        except ValueError as error:
-            raise ConfigurationError(str(error)) from None
+        study = tune(parse(Experiment, plain, "command line"), self.trials, self.output)
+        if not study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+            raise ConfigurationError(
+                f"trials = {self.trials} is not enough: all of them were pruned"
+            )
+        command = shlex.join([*spelled("tune").split(), *sys.argv[1:]])
+        path = self.output / "best.yaml"
+        write_text(path, best_config(study, experiment, command))
         print(f"best return {study.best_value:.4g} with {study.best_params}; config in {path}")
 
     def interrupted(self) -> str:
@@ -76,7 +83,7 @@ class Tune(Command):
         return "interrupted; the same command goes on"
 
 
-def suggest(trial: optuna.Trial, experiment: Experiment, folder: Path) -> Experiment:
+def suggest(trial: optuna.Trial, experiment: Experiment, output: Path) -> Experiment:
     """The experiment with a trial's hyper-parameters."""
     plain = experiment.model_dump()
     algorithm = plain["algorithm"]
@@ -90,7 +97,7 @@ def suggest(trial: optuna.Trial, experiment: Experiment, folder: Path) -> Experi
                 algorithm["network"]["hidden"] = [int(part) for part in value.split(",")]
             else:
                 algorithm[name] = value
-    plain["output"] = str(folder / f"trial_{trial.number}")
+    plain["output"] = str(output)
     return Experiment.model_validate(plain)
 
 
@@ -98,57 +105,117 @@ def tune(experiment: Experiment, trials: int, folder: Path) -> optuna.Study:
     """Trials until the study in the folder has so many that ended.
 
     A trial's value is its best validation return. With a target rate, which that does not
-    measure, tuning is refused.
+    measure, tuning is refused. A study that is gone on with makes the trials that it would have
+    made uninterrupted: each draws from a generator of its own, and an unfinished one is gone on
+    with.
 
     Raises:
-        ConfigurationError: a target rate, or an environment that is not allowed.
+        ConfigurationError: a target rate, an environment or algorithm that is not allowed, or a
+            study of another config.
     """
     if experiment.training.target_rate is not None:
         raise ConfigurationError(
             f"target_rate = {experiment.training.target_rate} is not allowed in tuning: trials "
             "are compared by their return at a fixed price"
         )
-    folder.mkdir(parents=True, exist_ok=True)
-    study = optuna.create_study(
-        study_name="tune",
-        storage=f"sqlite:///{folder / 'study.db'}",
-        load_if_exists=True,
-        direction="maximize",
-        sampler=optuna.samplers.TPESampler(seed=experiment.training.seed),
-        pruner=optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=1),
-    )
+    check(experiment)
+    with alone_in(folder, "output"):
+        study = open_study(experiment, folder)
+        for trial in study.get_trials(states=(TrialState.RUNNING,)):
+            study.tell(trial.number, state=TrialState.FAIL)  # its process is gone
+        with tqdm(
+            total=trials, desc="tuning", unit="trial", initial=min(ended(study), trials)
+        ) as bar:
+            while ended(study) < trials:
+                study.sampler = sampler(experiment, ended(study))
+                study.optimize(lambda trial: run_trial(trial, experiment, folder), n_trials=1)
+                bar.update()
+        return study
 
-    def objective(trial: optuna.Trial) -> float:
-        chosen = suggest(trial, experiment, folder)
-        best = -float("inf")
-        pruned = False
 
-        def watch(record: dict[str, Any]) -> bool:
-            nonlocal best, pruned
-            best = max(best, record["return"])
-            if record["timesteps"] >= chosen.training.timesteps:
-                return False  # the training ends with one more validation at the same step
-            trial.report(best, record["timesteps"])
-            pruned = trial.should_prune()
-            return pruned
+def open_study(experiment: Experiment, folder: Path) -> optuna.Study:
+    """The study in the folder, a new one if there is none.
 
-        summary = train(chosen, quiet=True, watch=watch)
-        if pruned:
-            raise optuna.TrialPruned
-        if not summary["finished"]:
-            raise KeyboardInterrupt
-        return best
-
-    ended = len(study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED)))
-    study.optimize(objective, n_trials=max(trials - ended, 0), show_progress_bar=True)
+    Raises:
+        ConfigurationError: it is damaged, or of another config.
+    """
+    path = folder / "study.db"
+    inputs = {"timesteps": experiment.training.timesteps} | experiment.inputs()
+    began = path.exists() and path.stat().st_size > 0
+    if not began and any(folder.glob("trial_*")):
+        raise ConfigurationError(
+            f"output = {str(folder)!r} holds trials without their study, study.db: give another "
+            "--output"
+        )
+    try:
+        study = optuna.create_study(
+            study_name="tune",
+            storage=f"sqlite:///{path}",
+            load_if_exists=True,
+            direction="maximize",
+            pruner=optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=1),
+        )
+        if study.get_trials(deepcopy=False) or "inputs" in study.user_attrs:
+            check_inputs(inputs, study.user_attrs.get("inputs"), f"the study in {str(folder)!r}")
+        study.set_user_attr("inputs", inputs)
+        study.set_user_attr("hash", fingerprint(inputs))
+    except (SQLAlchemyError, StorageInternalError) as error:
+        reason = str(error.__cause__ or error).splitlines()[0]
+        raise ConfigurationError(f"study = {str(path)!r} cannot be read: {reason}") from None
     return study
+
+
+def ended(study: optuna.Study) -> int:
+    """Number of trials that came to an end of their own, not by an interrupt."""
+    states = (TrialState.COMPLETE, TrialState.PRUNED)
+    return len(study.get_trials(deepcopy=False, states=states))
+
+
+def sampler(experiment: Experiment, place: int) -> optuna.samplers.BaseSampler:
+    """What chooses the study's trial of this place: its numbers depend on nothing but that."""
+    seeds = np.random.SeedSequence([experiment.training.seed, place])
+    return optuna.samplers.TPESampler(seed=int(seeds.generate_state(1)[0]))
+
+
+def run_trial(trial: optuna.Trial, experiment: Experiment, folder: Path) -> float:
+    """Train with a trial's hyper-parameters; returns the best validation return.
+
+    Raises:
+        TrialPruned: it fell behind, or diverged.
+        KeyboardInterrupt: it was interrupted.
+    """
+    output = folder / f"trial_{ended(trial.study)}"
+    trial.set_user_attr("folder", output.name)
+    chosen = suggest(trial, experiment, output)
+    best = -float("inf")
+    pruned = False
+
+    def watch(record: dict[str, Any]) -> bool:
+        nonlocal best, pruned
+        best = max(best, record["return"])
+        if record["timesteps"] >= chosen.training.timesteps:
+            return False  # the finished model's validation
+        trial.report(best, record["timesteps"])
+        pruned = trial.should_prune()
+        return pruned
+
+    try:
+        summary = train(chosen, resume=holds_training(output), quiet=True, watch=watch)
+    except Diverged:
+        pruned = True
+    if pruned:
+        raise optuna.TrialPruned
+    if not summary["finished"]:
+        raise KeyboardInterrupt
+    return best
 
 
 def best_config(study: optuna.Study, experiment: Experiment, command: str) -> str:
     """The config with the best trial's hyper-parameters, as YAML under the command."""
-    chosen = suggest(optuna.trial.FixedTrial(study.best_params), experiment, Path())  # type: ignore[arg-type]
-    plain = chosen.model_dump(mode="json", exclude_none=True) | {"output": experiment.output}
-    value = f"best of {len(study.trials)} trials, validation return {study.best_value:.4g}"
+    found = optuna.trial.FixedTrial(study.best_params)
+    chosen = suggest(found, experiment, Path(experiment.output))  # type: ignore[arg-type]
+    plain = chosen.model_dump(mode="json", exclude_none=True)
+    value = f"best of {ended(study)} trials, validation return {study.best_value:.4g}"
     return f"# Found by {command}: {value}.\n" + yaml.safe_dump(plain, sort_keys=False)
 
 

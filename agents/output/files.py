@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -82,21 +83,36 @@ def read_json(path: Path, name: str) -> dict[str, Any]:
     return found
 
 
-def save_results(path: Path, results: Mapping[str, EpisodeResults]) -> None:
-    """All results in one compressed file, written in one move."""
+def save_results(path: Path, results: Mapping[str, EpisodeResults], made_from: str = "") -> None:
+    """All results in one compressed file, with a hash of what they were made from."""
     arrays = {
         f"{place}/{field}": getattr(found, field)
         for place, found in enumerate(results.values())
         for field in FIELDS
     }
     with replacing(path) as partial:
-        np.savez_compressed(partial, names=np.array(list(results), dtype=np.str_), **arrays)
+        np.savez_compressed(
+            partial,
+            names=np.array(list(results), dtype=np.str_),
+            made_from=np.array(made_from, dtype=np.str_),
+            **arrays,
+        )
 
 
-def load_results(path: Path) -> dict[str, EpisodeResults]:
-    """What :func:`save_results` wrote."""
-    with np.load(path, allow_pickle=False) as arrays:
-        return {
-            str(name): EpisodeResults(**{field: arrays[f"{place}/{field}"] for field in FIELDS})
-            for place, name in enumerate(arrays["names"])
-        }
+def load_results(path: Path, made_from: str = "") -> dict[str, EpisodeResults]:
+    """What :func:`save_results` wrote.
+
+    Raises:
+        ConfigurationError: the file cannot be read, or was made from something else.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            if str(arrays["made_from"]) != made_from:
+                raise ValueError("they were made from something else")
+            return {
+                str(name): EpisodeResults(**{field: arrays[f"{place}/{field}"] for field in FIELDS})
+                for place, name in enumerate(arrays["names"])
+            }
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+        reason = getattr(error, "strerror", None) or str(error).splitlines()[0].strip("'\"")
+        raise ConfigurationError(f"episodes = {str(path)!r} cannot be read: {reason}") from None

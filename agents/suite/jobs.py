@@ -1,28 +1,21 @@
-"""The benchmark's pieces of work: tuned baselines, references, hindsight, one training each."""
+"""The benchmark's pieces of work: what they are made from, where they go, which are finished."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import contextlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-
-from fusion_gym.core.system import least_covering
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.evaluation.hindsight import run_hindsight
-from fusion_gym.evaluation.metrics import robust_summary, summarise
-from fusion_gym.policies.registry import make_policy
 
-from ..output.files import save_results, write
+from ..output.files import load_results, read_json
+from ..output.folders import alone_in, check_inputs
 from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, ValidationConfig
-from ..training.run import train
 from .config import Mode, Setting, Suite
-from .tuning import tune
 
 
 @dataclass(frozen=True)
@@ -40,6 +33,11 @@ class Job:
         """Name of its JSON, without the suffix."""
         return self.kind if self.mode is None else f"agent_{self.mode}_{self.seed}"
 
+    @property
+    def place(self) -> str:
+        """Path of its files in the folders, without the suffix."""
+        return f"{self.setting.name}/{self.name}"
+
 
 @dataclass(frozen=True)
 class Folders:
@@ -50,14 +48,31 @@ class Folders:
 
     def report(self, job: Job) -> Path:
         """The JSON of a job."""
-        return self.results / job.setting.name / f"{job.name}.json"
+        return self.results / f"{job.place}.json"
 
     def episodes(self, job: Job) -> Path:
         """The episodes of a job."""
-        return self.work / job.setting.name / f"{job.name}.npz"
+        return self.work / f"{job.place}.npz"
+
+    def hold(self, job: Job) -> bool:
+        """Whether results of a job are there."""
+        return self.report(job).exists() and self.episodes(job).exists()
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Both folders, made if they are not there, for this process alone.
+
+        Raises:
+            ConfigurationError: another process works there, or they cannot be written.
+        """
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(alone_in(self.results, "results"))
+            if self.work.resolve() != self.results.resolve():
+                stack.enter_context(alone_in(self.work, "work"))
+            yield
 
 
-def jobs(suite: Suite, settings: list[Setting], modes: list[Mode]) -> Iterator[Job]:
+def jobs(suite: Suite, settings: Sequence[Setting], modes: Sequence[Mode]) -> Iterator[Job]:
     """All work, what everything else needs first."""
     for setting in settings:
         yield Job(setting, "baselines", weight=200.0)
@@ -79,107 +94,61 @@ def computed(setting: Setting, kind: str) -> tuple[str, ...]:
     return setting.informed if kind == "informed" else setting.references
 
 
-def run(job: Job, suite: Suite, folders: Folders) -> float:
-    """Do a job and write its results; returns its weight."""
-    torch.set_num_threads(1)
-    if job.kind == "baselines":
-        _run_baselines(job, suite, folders)
-    elif job.kind in ("informed", "references"):
-        _run_references(job, suite, folders)
-    elif job.kind == "hindsight":
-        _run_hindsight(job, suite, folders)
-    else:
-        _run_agent(job, suite, folders)
-    return job.weight
-
-
 def setting_task(setting: Setting, mode: Mode = "sensors") -> Task:
     """The setting's task, with what a policy of this mode may know."""
     information = {"information": "centre"} if mode == "centre" else {}
     return make_task(setting.environment.id, **(setting.environment.options | information))
 
 
-def _test(task: Task, policies: list[str], suite: Suite) -> dict[str, EpisodeResults]:
-    return {
-        name: run_episodes(task, make_policy(name, task), suite.episodes, suite.seed)
-        for name in dict.fromkeys(policies)
+def training_of(experiment: Experiment) -> dict[str, Any]:
+    return experiment.model_dump(mode="json", exclude={"output"})
+
+
+def inputs_of(job: Job, suite: Suite) -> dict[str, Any]:
+    """All that the results of a job depend on."""
+    setting = job.setting
+    found: dict[str, Any] = {
+        "environment": setting.environment.model_dump(mode="json"),
+        "episodes": suite.episodes,
+        "seed": suite.seed,
     }
+    if job.kind == "baselines":
+        families = {
+            family.label: family.model_dump(mode="json") for family in suite.families_of(setting)
+        }
+        genie = setting.genie and setting.genie.model_dump(mode="json")
+        tuning = suite.tuning.model_dump(mode="json")
+        return found | {
+            "tuning": tuning,
+            "families": families,
+            "points": list(setting.points),
+            "genie": genie,
+        }
+    if job.kind in ("informed", "references"):
+        return found | {job.kind: list(computed(setting, job.kind))}
+    if job.kind == "hindsight":
+        assert setting.hindsight is not None
+        chosen = setting.hindsight.model_dump(mode="json")
+        return found | {"hindsight": chosen | {"episodes": suite.hindsight_episodes}}
+    assert job.mode is not None
+    experiment = experiment_of(suite, setting, job.mode, job.seed, Path())
+    tested = {"prices": suite.prices, "price_range": list(setting.price_range)}
+    return found | {"training": training_of(experiment)} | tested
 
 
-def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
-    """Tune every family, then test its curve, the single policies and the genie."""
-    setting, task = job.setting, setting_task(job.setting)
-    curves: dict[str, dict[str, Any]] = {}
-    found: dict[str, EpisodeResults] = {}
-    for family in suite.families_of(setting):
-        policies = tune(task, family, suite.tuning)
-        found |= _test(task, policies, suite)
-        curves[family.label] = _curve(task, policies)
-    curves |= {name: _curve(task, [name]) for name in setting.points}
-    found |= _test(task, list(setting.points), suite)
-    report: dict[str, Any] = {**_header(job, suite, task), "curves": curves}
-    if setting.genie is not None:
-        options = setting.environment.options | setting.genie.options
-        free = make_task(setting.environment.id, **options)
-        results = run_episodes(free, make_policy("always", free), suite.episodes, suite.seed)
-        report["genie"] = _summary(results) | {"assumes": setting.genie.assumes}
-    _keep(job, folders, found, report)
+def finished(job: Job, suite: Suite, folders: Folders) -> bool:
+    """Whether a job's results are there.
 
-
-def _curve(task: Task, policies: list[str]) -> dict[str, Any]:
-    """A baseline's policies, and who knows all that they look at."""
-    knows = least_covering(make_policy(name, task).knowledge for name in policies)
-    return {"knows": knows, "policies": policies}
-
-
-def _run_references(job: Job, suite: Suite, folders: Folders) -> None:
-    """Test policies that were computed."""
-    task = setting_task(job.setting)
-    found = _test(task, list(computed(job.setting, job.kind)), suite)
-    _keep(job, folders, found, _header(job, suite, task))
-
-
-def _run_hindsight(job: Job, suite: Suite, folders: Folders) -> None:
-    """Search a clairvoyant's schedules for the first test episodes."""
-    task, chosen = setting_task(job.setting), job.setting.hindsight
-    assert chosen is not None
-    episodes = min(suite.hindsight_episodes, suite.episodes)
-    found = {
-        f"hindsight at price {price:g}": run_hindsight(
-            task, price, chosen.width, episodes, suite.seed
-        )
-        for price in chosen.prices
-    }
-    header = _header(job, suite, task) | {"episodes": episodes, "width": chosen.width}
-    _keep(job, folders, found, header)
-
-
-def _run_agent(job: Job, suite: Suite, folders: Folders) -> None:
-    """Train one agent that sees the price, then test it at prices over the whole range."""
-    setting, mode = job.setting, job.mode
-    assert mode is not None
-    experiment = experiment_of(suite, setting, mode, job.seed, folders.work)
-    folder = Path(experiment.output)
-    summary = train(experiment, resume=(folder / "config.yaml").exists(), quiet=True)
-    if not summary["finished"]:
-        raise KeyboardInterrupt
-    task, model = setting_task(setting, mode), folder / "best_model.zip"
-    prices = [float(price) for price in np.geomspace(*setting.price_range, suite.prices)]
-    low, high = setting.price_range
-    names = [f"model:{model},price={min(max(price, low), high)!r}" for price in prices]
-    found = _test(task, names, suite)
-    report = {
-        **_header(job, suite, task),
-        "mode": mode,
-        "training_seed": job.seed,
-        "training": experiment.model_dump(mode="json", exclude={"output"}),
-        "seconds": summary["seconds"],
-        "best_validation": summary["best_validation"],
-        "prices": prices,
-        "points": [_summary(found[name]) for name in names],
-    }
-    save_results(folders.episodes(job), found)
-    write(folders.report(job), report)
+    Raises:
+        ConfigurationError: they are damaged, or were made from other settings; says which.
+    """
+    path = folders.report(job)
+    if not folders.hold(job):
+        return False
+    report = read_json(path, "results")
+    check_inputs(inputs_of(job, suite), report.get("inputs"), repr(str(path)))
+    load_results(folders.episodes(job), report.get("made_from", ""))
+    return True
 
 
 def experiment_of(suite: Suite, setting: Setting, mode: Mode, seed: int, work: Path) -> Experiment:
@@ -213,30 +182,3 @@ def experiment_of(suite: Suite, setting: Setting, mode: Mode, seed: int, work: P
         validation=ValidationConfig(every=max(timesteps // 8, 1), episodes=512),
         output=str(work / setting.name / f"{mode}_{seed}"),
     )
-
-
-def _keep(
-    job: Job, folders: Folders, found: dict[str, EpisodeResults], report: dict[str, Any]
-) -> None:
-    """Write the episodes, then the report with a summary of every policy."""
-    save_results(folders.episodes(job), found)
-    policies = {name: _summary(results) for name, results in found.items()}
-    write(folders.report(job), report | {"policies": policies})
-
-
-def _header(job: Job, suite: Suite, task: Task) -> dict[str, Any]:
-    return {
-        "setting": job.setting.name,
-        "title": job.setting.title,
-        "env": job.setting.environment.id,
-        "options": job.setting.environment.options,
-        "episodes": suite.episodes,
-        "seed": suite.seed,
-        "horizon": task.horizon,
-    }
-
-
-def _summary(results: EpisodeResults) -> dict[str, Any]:
-    found = summarise(results)
-    kept = {key: found[key] for key in ("mse", "return", "rate", "denied", "tokens", "nees")}
-    return kept | {"median": robust_summary(results)["median"]}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import time
 from collections.abc import Callable
@@ -33,6 +32,10 @@ from .monitor import Interrupt, Progress, Stop
 
 # Training seeds lie far from the validation's and from the small numbers that tests use.
 TRAINING_SEEDS = 1_000_000_000
+
+
+class Diverged(ConfigurationError):
+    """The weights of a training are no numbers any more."""
 
 
 def holds_training(folder: Path) -> bool:
@@ -88,6 +91,18 @@ def validation_task(experiment: Experiment, task: Task) -> Task:
     )
 
 
+def check(experiment: Experiment) -> tuple[BaseAlgorithm, FusionSB3VecEnv, Task]:
+    """A new model, what it trains in, and the task that it is validated on; nothing is written.
+
+    Raises:
+        ConfigurationError: a config or environment that does not fit.
+    """
+    task = make_task(experiment.environment.id, **experiment.environment.options)
+    scored = validation_task(experiment, task)
+    env = make_env(experiment, task)
+    return make_model(experiment, env), env, scored
+
+
 def train(
     experiment: Experiment,
     *,
@@ -108,11 +123,8 @@ def train(
             allowed leaves no folder.
     """
     folder = Path(experiment.output)
-    task = make_task(experiment.environment.id, **experiment.environment.options)
-    scored = validation_task(experiment, task)
+    model, env, scored = check(experiment)
     torch.set_num_threads(experiment.training.threads)
-    env = make_env(experiment, task)
-    model = make_model(experiment, env)
     if resume and not holds_training(folder):
         raise ConfigurationError(f"output = {str(folder)!r} holds no training: nothing to resume")
     with alone_in(folder, "output"):
@@ -146,8 +158,17 @@ def _learn(
             assert price is not None  # validation_task refuses a drawn price
             callbacks.append(TargetRate(experiment.training.target_rate, price))
         if begun < total:
-            with contextlib.suppress(Stop):
+            try:
                 model.learn(total - begun, CallbackList(callbacks), reset_num_timesteps=False)
+            except Stop:
+                pass
+            except ValueError:  # what torch's distributions make of weights that are not finite
+                if all(bool(part.isfinite().all()) for part in model.policy.parameters()):
+                    raise
+                raise Diverged(
+                    f"output = {str(folder)!r}: the training diverged after {model.num_timesteps} "
+                    "steps, its weights are not finite; lower learning_rate or max_grad_norm"
+                ) from None
         progress.num_timesteps = model.num_timesteps
         finished = model.num_timesteps >= total
         if finished:
