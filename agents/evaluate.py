@@ -26,7 +26,7 @@ from fusion_gym.validation import ConfigurationError
 
 from .command_line import Command, Words, start
 from .output import tables
-from .output.files import write
+from .output.files import read_json, write
 from .output.progress import progress_bar
 
 
@@ -163,7 +163,7 @@ def finished(path: Path | None, report: dict[str, Any]) -> dict[str, Any]:
         raise ConfigurationError("resume = True is not allowed without json: there is no file")
     if not path.exists():
         return {"policies": {}}
-    earlier: dict[str, Any] = json.loads(path.read_text())
+    earlier = read_json(path, "json")
     plain = json.loads(json.dumps(report))
     for key in ("env", "episodes", "seed", "horizon", "settings"):
         if earlier.get(key) != plain[key]:

@@ -11,7 +11,9 @@ command that found it.
 
 from __future__ import annotations
 
+import contextlib
 import shlex
+import sqlite3
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -148,6 +150,11 @@ def open_study(experiment: Experiment, folder: Path) -> optuna.Study:
             "--output"
         )
     try:
+        if began:
+            with contextlib.closing(sqlite3.connect(path)) as connection:
+                told = connection.execute("PRAGMA quick_check").fetchone()[0]
+            if told != "ok":
+                raise sqlite3.DatabaseError(told)
         study = optuna.create_study(
             study_name="tune",
             storage=f"sqlite:///{path}",
@@ -159,7 +166,7 @@ def open_study(experiment: Experiment, folder: Path) -> optuna.Study:
             check_inputs(inputs, study.user_attrs.get("inputs"), f"the study in {str(folder)!r}")
         study.set_user_attr("inputs", inputs)
         study.set_user_attr("hash", fingerprint(inputs))
-    except (SQLAlchemyError, StorageInternalError) as error:
+    except (sqlite3.Error, SQLAlchemyError, StorageInternalError) as error:
         reason = str(error.__cause__ or error).splitlines()[0]
         raise ConfigurationError(f"study = {str(path)!r} cannot be read: {reason}") from None
     return study

@@ -1,0 +1,156 @@
+"""Files of a run that are damaged: the command says what is wrong or goes on, and loses nothing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from small_suite import ENV, small_suite
+from training_configs import small_config
+
+from agents import benchmark, evaluate, train, tune
+from agents.suite import verdict
+
+DAMAGES: dict[str, Callable[[bytes, bytes], bytes]] = {
+    "cut short": lambda content, other: content[: len(content) * 2 // 3],
+    "empty": lambda content, other: b"",
+    "text": lambda content, other: "an answer, not a file: ±\n".encode(),
+    "another run's": lambda content, other: other,
+    "a changed byte": lambda content, other: (
+        content[: len(content) // 2]
+        + bytes([content[len(content) // 2] ^ 0xFF])
+        + content[len(content) // 2 + 1 :]
+    ),
+}
+# The files without which a command cannot go on.
+READ: dict[str, tuple[str, ...]] = {
+    "train": ("run/latest.zip",),
+    "tune": ("study/study.db",),
+    "benchmark": tuple(
+        f"{folder}/small/{name}.{suffix}"
+        for folder, suffix in (("results", "json"), ("work", "npz"))
+        for name in ("baselines", "informed", "references", "hindsight", "agent_sensors_0")
+    ),
+    "evaluate": ("result.json",),
+}
+# Those that it writes anew.
+WRITTEN = {
+    "train": tuple(
+        f"run/{name}"
+        for name in (
+            *("config.yaml", "best_model.zip", "final_model.zip", "validation.jsonl"),
+            "summary.json",
+        )
+    ),
+    "tune": ("study/best.yaml", "study/trial_0/latest.zip", "study/trial_0/config.yaml"),
+    "benchmark": ("results/small/verdict.json", "work/small/sensors_0/latest.zip"),
+    "evaluate": (),
+}
+MODULES: dict[str, Any] = {
+    "train": train,
+    "tune": tune,
+    "benchmark": benchmark,
+    "evaluate": evaluate,
+}
+
+
+def arguments(command: str, folder: Path, seed: int = 0) -> list[str]:
+    """A short run of the command into the folder; the seed makes another run."""
+    if command == "evaluate":
+        options = ["--env", ENV, "--set", "horizon=5", "--policies", "always", "never"]
+        return [*options, "--episodes", "3", "--seed", str(seed), "--json", f"{folder}/result.json"]
+    if command == "benchmark":
+        config = small_suite(folder, training_seeds=1, modes=["sensors"], seed=seed)
+        places = ["--results", str(folder / "results"), "--work", str(folder / "work")]
+        return ["--config", str(config), *places, "--workers", "1"]
+    training = {"timesteps": 256, "num_envs": 8, "seed": seed}
+    every = {"every": 128, "episodes": 2}
+    config = small_config(folder, training=training, validation=every)
+    if command == "tune":
+        return ["--config", str(config), "--trials", "1", "--output", str(folder / "study")]
+    return ["--config", str(config)]
+
+
+def call(command: str, words: list[str]) -> str:
+    """Run the command; what it ended with, empty for success."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["program", *words])
+        patch.setattr(verdict, "RESAMPLES", 5)
+        try:
+            MODULES[command].main()
+        except SystemExit as end:
+            return str(end.code)
+    return ""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, int], Path]:
+    """Folders of finished runs by command and seed, made when they are asked for."""
+    made: dict[tuple[str, int], Path] = {}
+
+    def find(command: str, seed: int) -> Path:
+        if (command, seed) not in made:
+            made[command, seed] = folder = tmp_path_factory.mktemp(command)
+            assert call(command, arguments(command, folder, seed)) == ""
+        return made[command, seed]
+
+    return find
+
+
+def cases() -> Iterator[Any]:
+    """Every file with every damage; in the short form the damages take turns."""
+    kinds, turn = list(DAMAGES), 0
+    for command, read in READ.items():
+        for file in (*read, *WRITTEN[command]):
+            for kind in kinds:
+                quick = kind == kinds[turn % len(kinds)] and not file.endswith("d/references.npz")
+                marks = () if quick else (pytest.mark.slow,)
+                yield pytest.param(command, file, kind, marks=marks, id=f"{command}-{file}-{kind}")
+            turn += 1
+
+
+@pytest.mark.parametrize(("command", "file", "kind"), list(cases()))
+def test_a_damaged_file_is_told_or_mended(
+    runs: Callable[[str, int], Path], tmp_path: Path, command: str, file: str, kind: str
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(runs(command, 0), folder)
+    other = runs(command, 1) / file if kind == "another run's" else folder / file
+    words = arguments(command, folder)
+    damaged = folder / file
+    damaged.write_bytes(DAMAGES[kind](damaged.read_bytes(), other.read_bytes()))
+    before = contents(folder)
+    said = call(command, words if command == "tune" else [*words, "--resume"])
+    if not said:
+        assert file not in READ[command] or kind == "a changed byte", "it went unnoticed"
+        assert meaning(folder) == meaning(runs(command, 0))
+        return
+    assert file in READ[command], said
+    assert said.startswith("error: ")
+    assert "\n" not in said
+    assert contents(folder) == before, "the rest is untouched"
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All that is in the folder, but for locks."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def meaning(folder: Path) -> dict[str, Any]:
+    """What the results of a run say, without what says where and how fast it was."""
+    found: dict[str, Any] = {}
+    for path in sorted(folder.rglob("*.json*")):
+        lines = [json.loads(line) for line in path.read_text().splitlines()] if (
+            path.suffix == ".jsonl"
+        ) else [json.loads(path.read_text())]  # fmt: skip
+        for line in lines:
+            for key in ("seconds", "steps_per_second"):
+                line.pop(key, None)
+        found[str(path.relative_to(folder))] = json.dumps(lines).replace(str(folder), "")
+    return found
