@@ -21,6 +21,7 @@ from training_configs import ENV, SMALL, read_records, small_config
 import fusion_gym
 from agents import demo, evaluate, reproduce
 from agents.command_line import read
+from agents.suite.config import Suite
 from agents.suite.sweep import Comparison, Sweep
 from agents.training import run as train
 from agents.training.algorithms import TABLE
@@ -81,6 +82,14 @@ def test_committed_sweep_and_comparison_name_policies_that_exist(
         ({"algorithm": {"name": "sac"}}, "sac"),
         ({"output": None}, "output = None"),
         ({"environment": {}}, "environment.id"),
+        ({"training": {"timesteps": "1000"}}, "training.timesteps = '1000'"),
+        ({"training": {"timesteps": 1000.0}}, "training.timesteps = 1000.0"),
+        ({"training": {"timesteps": 1000, "num_envs": True}}, "training.num_envs = True"),
+        ({"algorithm": {"name": "ppo", "learning_rate": math.inf}}, "learning_rate = inf"),
+        ({"algorithm": {"name": "ppo", "vf_coef": -1}}, "algorithm.vf_coef = -1"),
+        ({"algorithm": {"name": "ppo", "batch_size": 1}}, "algorithm.batch_size = 1"),
+        ({"algorithm": {"name": "ppo", "network": {"hidden": [64.0]}}}, "hidden.0 = 64.0"),
+        ({"environment": {"id": ENV, "local": "yes"}}, "environment.local = 'yes'"),
     ],
 )
 def test_a_config_that_is_not_allowed_names_the_field(
@@ -96,11 +105,36 @@ def test_a_config_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"absent\.yaml"):
         load(Experiment, tmp_path / "absent.yaml")
     (tmp_path / "broken.yaml").write_text("a: [1,")
-    with pytest.raises(ConfigurationError, match="no YAML"):
+    with pytest.raises(ConfigurationError, match="no YAML") as caught:
         load(Experiment, tmp_path / "broken.yaml")
+    assert "\n" not in str(caught.value)
+    (tmp_path / "bytes.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigurationError, match="no YAML") as caught:
+        load(Experiment, tmp_path / "bytes.yaml")
+    assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("algorithm", list(SMALL))
+@pytest.mark.parametrize("kind", [Experiment, Suite, Sweep, Comparison])
+def test_a_key_that_is_given_twice_is_refused_in_every_config(tmp_path: Path, kind: Any) -> None:
+    path = tmp_path / "twice.yaml"
+    path.write_text("a: &base {seed: 1}\nb:\n  <<: *base\n  seed: 2\nc:\n  seed: 1\n  seed: 2\n")
+    with pytest.raises(ConfigurationError, match="the key 'seed' is given twice") as caught:
+        load(kind, path)
+    assert "line 7" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_numbers_with_an_exponent_are_numbers(tmp_path: Path) -> None:
+    """YAML 1.1 takes 1e-3 for a word."""
+    path = small_config(tmp_path)
+    path.write_text(path.read_text().replace("name: ppo", "name: ppo\n  learning_rate: 1e-3"))
+    assert load(Experiment, path).algorithm.learning_rate == 0.001
+
+
+@pytest.mark.parametrize(
+    "algorithm",
+    ["ppo", *(pytest.param(name, marks=pytest.mark.slow) for name in SMALL if name != "ppo")],
+)
 def test_training_writes_its_results_and_resumes(tmp_path: Path, algorithm: str) -> None:
     experiment = load(Experiment, small_config(tmp_path, algorithm))
     summary = train.train(experiment)

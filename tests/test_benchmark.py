@@ -39,6 +39,7 @@ def run_main(monkeypatch: pytest.MonkeyPatch, module: Any, *arguments: str) -> N
 def test_from_tuning_to_report_and_zoo(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr("agents.suite.verdict.RESAMPLES", 50)
     results, work = tmp_path / "results", tmp_path / "work"
     arguments = [
         "--config", str(small_suite(tmp_path)), "--results", str(results), "--work", str(work),
@@ -53,6 +54,15 @@ def test_from_tuning_to_report_and_zoo(
         run_main(monkeypatch, benchmark, *arguments)
     run_main(monkeypatch, benchmark, *arguments, "--resume")
     assert (folder / "agent_sensors_0.json").stat().st_mtime_ns == stamp
+    (tmp_path / "other").mkdir()
+    other = small_suite(tmp_path / "other", episodes=13)
+    for option, value, message in (
+        ("--timesteps", "512", "training.training.timesteps = 512 differs"),
+        ("--config", str(other), "episodes = 13 differs"),
+    ):
+        with pytest.raises(SystemExit, match=message) as caught:
+            run_main(monkeypatch, benchmark, *arguments, "--resume", option, value)
+        assert "\n" not in str(caught.value)
     verdict = json.loads((folder / "verdict.json").read_text())
     assert {mode: front["seeds"] for mode, front in verdict["modes"].items()} == {
         "sensors": 2, "centre": 2, "local": 2,
@@ -363,6 +373,14 @@ def test_the_solved_case_is_trained_once_and_compared(
     assert "above the optimum" in capsys.readouterr().out
 
 
+def other_seed(config: Path) -> Path:
+    content = yaml.safe_load(config.read_text())
+    content["training"]["seed"] = 7
+    other = config.with_name("other.yaml")
+    other.write_text(yaml.safe_dump(content))
+    return other
+
+
 def test_tuning_goes_on_with_its_study(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -379,15 +397,41 @@ def test_tuning_goes_on_with_its_study(
         )
     )
     folder = tmp_path / "study"
-    for trials in (1, 2, 2):
-        run_main(
-            monkeypatch, tune, "--config", str(config), "--trials", str(trials), "--output",
-            str(folder),
-        )  # fmt: skip
+    arguments = ["--config", str(config), "--output"]
+
+    def trials_of(folder: Path) -> list[Any]:
+        study = optuna.load_study(study_name="tune", storage=f"sqlite:///{folder / 'study.db'}")
+        return [(t.params, t.value) for t in study.trials if t.state.is_finished() and t.values]
+
+    class Killed(BaseException):
+        """The process is gone."""
+
+    def killed(*_: Any) -> None:
+        raise Killed
+
+    run_main(monkeypatch, tune, *arguments, str(folder), "--trials", "1")
+    with monkeypatch.context() as patch:
+        patch.setattr("agents.training.monitor.Progress.finish", killed)
+        with pytest.raises(Killed):
+            run_main(monkeypatch, tune, *arguments, str(folder), "--trials", "3")
+    for trials in (2, 3, 3):
+        run_main(monkeypatch, tune, *arguments, str(folder), "--trials", str(trials))
+    run_main(monkeypatch, tune, *arguments, str(tmp_path / "whole"), "--trials", "3")
+    assert trials_of(folder) == trials_of(tmp_path / "whole")
+    rates = {parameters["learning_rate"] for parameters, _ in trials_of(folder)}
+    assert len(rates) == 3, "random trials are not repeated"
     study = optuna.load_study(study_name="tune", storage=f"sqlite:///{folder / 'study.db'}")
-    assert len(study.trials) == 2
+    assert len(study.trials) == 4, "the killed one is there, and counts for nothing"
     best = (folder / "best.yaml").read_text()
     assert best.startswith("# Found by python -m agents.tune --config")
+    assert ": best of 3 trials, " in best.splitlines()[0]
+    for words, message in (
+        (["--timesteps", "512"], "timesteps = 512 differs"),
+        (["--config", str(other_seed(config))], "training.seed = 7 differs"),
+    ):
+        with pytest.raises(SystemExit, match=message):
+            run_main(monkeypatch, tune, *arguments, str(folder), "--trials", "4", *words)
+    assert trials_of(folder) == trials_of(tmp_path / "whole")
     algorithm = yaml.safe_load(best)["algorithm"]
     assert algorithm["learning_rate"] == study.best_params["learning_rate"]
     with pytest.raises(SystemExit, match="trials = 0"):
