@@ -4,7 +4,8 @@
 
 Every piece of work (a setting's baselines, one training seed of one agent) writes its JSON into
 the results folder as it is finished, and its episodes into the work folder; ``--resume`` skips
-what is there. ``python -m agents.report`` makes tables and figures of it.
+what is there, if it was made from the same inputs, and goes on with trainings in the work folder,
+whose checkpoints hold pickles. ``python -m agents.report`` makes tables and figures of it.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class Benchmark(Command):
     quick: bool = False
     """Less of everything, in minutes."""
     resume: bool = False
-    """Skip what is finished."""
+    """Skip what is finished, go on with trainings of one's own: their checkpoints hold pickles."""
     results: Path | None = None
     """Folder for JSON, instead of results or results/quick."""
     work: Path | None = None

@@ -4,8 +4,15 @@
 
 Into the config's ``output`` folder go, as they are made: ``config.yaml``, ``latest.zip`` (the
 checkpoint), ``best_model.zip`` (best return on the validation seeds), ``validation.jsonl``,
-``tensorboard/`` and at the end ``final_model.zip`` and ``summary.json``. Ctrl-C and SIGTERM end
-the training after the current step with a checkpoint; ``--resume`` goes on from there.
+``tensorboard/`` and at the end ``final_model.zip`` and ``summary.json``.
+
+Ctrl-C and SIGTERM end the training after the current rollout with a checkpoint (a second Ctrl-C
+at once, without one), and there is one after every validation. ``--resume`` goes on from the last
+as if nothing had happened: on one machine, with the same packages and threads, the models are
+bitwise those of an uninterrupted training. The config must be the same; ``timesteps`` may be more
+(schedules then stretch over all of them), ``output`` may have moved, ``threads`` may change.
+
+A checkpoint holds pickles: resume your own trainings, not files from others.
 """
 
 from __future__ import annotations
@@ -33,7 +40,7 @@ class Train(Command):
     output: str | None = None
     """Folder for the results, instead of the config's."""
     resume: bool = False
-    """Go on from the last checkpoint."""
+    """Go on from the last checkpoint, one of your own: it holds pickles."""
 
     def experiment(self) -> Experiment:
         """The config with what the command line says instead, checked again.

@@ -24,7 +24,6 @@ import optuna
 import yaml
 from optuna.exceptions import StorageInternalError
 from optuna.trial import TrialState
-from sqlalchemy.exc import SQLAlchemyError
 from tqdm import tqdm
 
 from fusion_gym.validation import ConfigurationError, integer
@@ -121,55 +120,61 @@ def tune(experiment: Experiment, trials: int, folder: Path) -> optuna.Study:
             "are compared by their return at a fixed price"
         )
     check(experiment)
-    with alone_in(folder, "output"):
-        study = open_study(experiment, folder)
-        for trial in study.get_trials(states=(TrialState.RUNNING,)):
-            study.tell(trial.number, state=TrialState.FAIL)  # its process is gone
-        with tqdm(
-            total=trials, desc="tuning", unit="trial", initial=min(ended(study), trials)
-        ) as bar:
-            while ended(study) < trials:
-                study.sampler = sampler(experiment, ended(study))
-                study.optimize(lambda trial: run_trial(trial, experiment, folder), n_trials=1)
-                bar.update()
-        return study
+    try:
+        with alone_in(folder, "output"):
+            study = open_study(experiment, folder)
+            search(study, experiment, trials, folder)
+            return study
+    except (sqlite3.Error, StorageInternalError) as error:
+        reason = str(error.__cause__ or error).splitlines()[0]
+        raise ConfigurationError(
+            f"study = {str(folder / 'study.db')!r} cannot be read or written: {reason}"
+        ) from None
 
 
 def open_study(experiment: Experiment, folder: Path) -> optuna.Study:
     """The study in the folder, a new one if there is none.
 
     Raises:
-        ConfigurationError: it is damaged, or of another config.
+        ConfigurationError: it is of another config, or it is gone and its trials are there.
+        sqlite3.Error: it is damaged.
     """
     path = folder / "study.db"
     inputs = {"timesteps": experiment.training.timesteps} | experiment.inputs()
-    began = path.exists() and path.stat().st_size > 0
-    if not began and any(folder.glob("trial_*")):
+    if path.exists() and path.stat().st_size > 0:
+        with contextlib.closing(sqlite3.connect(path)) as connection:
+            told = connection.execute("PRAGMA quick_check").fetchone()[0]
+        if told != "ok":
+            raise sqlite3.DatabaseError(told)
+    elif any(folder.glob("trial_*")):
         raise ConfigurationError(
             f"output = {str(folder)!r} holds trials without their study, study.db: give another "
             "--output"
         )
-    try:
-        if began:
-            with contextlib.closing(sqlite3.connect(path)) as connection:
-                told = connection.execute("PRAGMA quick_check").fetchone()[0]
-            if told != "ok":
-                raise sqlite3.DatabaseError(told)
-        study = optuna.create_study(
-            study_name="tune",
-            storage=f"sqlite:///{path}",
-            load_if_exists=True,
-            direction="maximize",
-            pruner=optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=1),
-        )
-        if study.get_trials(deepcopy=False) or "inputs" in study.user_attrs:
-            check_inputs(inputs, study.user_attrs.get("inputs"), f"the study in {str(folder)!r}")
-        study.set_user_attr("inputs", inputs)
-        study.set_user_attr("hash", fingerprint(inputs))
-    except (sqlite3.Error, SQLAlchemyError, StorageInternalError) as error:
-        reason = str(error.__cause__ or error).splitlines()[0]
-        raise ConfigurationError(f"study = {str(path)!r} cannot be read: {reason}") from None
+    study = optuna.create_study(
+        study_name="tune",
+        storage=f"sqlite:///{path}",
+        load_if_exists=True,
+        direction="maximize",
+        pruner=optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=1),
+    )
+    if study.get_trials(deepcopy=False) or "inputs" in study.user_attrs:
+        check_inputs(inputs, study.user_attrs.get("inputs"), f"the study in {str(folder)!r}")
+    study.set_user_attr("inputs", inputs)
+    study.set_user_attr("made_from", fingerprint(inputs))
     return study
+
+
+def search(study: optuna.Study, experiment: Experiment, trials: int, folder: Path) -> None:
+    """Run trials until so many have ended."""
+    for trial in study.get_trials(states=(TrialState.RUNNING,)):
+        study.tell(trial.number, state=TrialState.FAIL)  # its process is gone
+    done = min(ended(study), trials)
+    with tqdm(total=trials, desc="tuning", unit="trial", initial=done) as bar:
+        while ended(study) < trials:
+            study.sampler = sampler(experiment, ended(study))
+            study.optimize(lambda trial: run_trial(trial, experiment, folder), n_trials=1)
+            bar.update()
 
 
 def ended(study: optuna.Study) -> int:
