@@ -104,10 +104,15 @@ def attempt(command: str, arguments: list[str], log: Path, seconds: float | None
         except BaseException:
             traceback.print_exc()
             os._exit(2)
-    if seconds is not None:
-        time.sleep(seconds)
-        os.kill(child, signal.SIGKILL)
-    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    deadline = time.perf_counter() + (float("inf") if seconds is None else seconds)
+    ended, status = 0, 0
+    while ended == 0:
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if time.perf_counter() > deadline:
+            os.kill(child, signal.SIGKILL)
+            deadline = float("inf")
+        time.sleep(0.005)
+    status = os.waitstatus_to_exitcode(status)
     if status not in (0, -signal.SIGKILL):
         raise SystemExit(f"{command} ended with {status}:\n{log.read_text()}")
     return "killed" if status else "finished"
