@@ -422,6 +422,8 @@ def test_tuning_goes_on_with_its_study(
     assert len(rates) == 3, "random trials are not repeated"
     study = optuna.load_study(study_name="tune", storage=f"sqlite:///{folder / 'study.db'}")
     assert len(study.trials) == 4, "the killed one is there, and counts for nothing"
+    trainings = sorted(path.name for path in folder.glob("trial_*"))
+    assert trainings == ["trial_0", "trial_1", "trial_2"], "it was gone on with"
     best = (folder / "best.yaml").read_text()
     assert best.startswith("# Found by python -m agents.tune --config")
     assert ": best of 3 trials, " in best.splitlines()[0]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,8 @@ from agents.training.checked import load
 from agents.training.config import Experiment
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import ConfigurationError
+
+ROOT = Path(__file__).parent.parent
 
 
 class Killed(BaseException):
@@ -113,6 +117,16 @@ def test_a_resumed_training_is_the_uninterrupted_one(
     run.train(parts, quiet=True, resume=True)
     assert_same(outcome(Path(parts.output), kind), outcome(Path(whole.output), kind))
     assert len(outcome(Path(whole.output), kind)["records"].splitlines()) == 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["train", "tune", "benchmark"])
+def test_kills_at_random_moments_lose_nothing(command: str) -> None:
+    line = [sys.executable, "tests/kills.py", command, "--kills", "3"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(line, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert f"{command}: 3 kills" in done.stdout
 
 
 def test_threads_timesteps_and_output_may_change_and_nothing_else(tmp_path: Path) -> None:

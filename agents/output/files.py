@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import re
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +19,11 @@ from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.validation import ConfigurationError
 
 FIELDS = tuple(EpisodeResults.__dataclass_fields__)
+# What reading a damaged archive raises; RuntimeError where a part says that it is encrypted.
+DAMAGED = (
+    *(OSError, EOFError, KeyError, TypeError, ValueError, RuntimeError),
+    *(struct.error, zipfile.BadZipFile, zlib.error),
+)
 _PARTIAL = re.compile(r"\.\d+\.part(\.\w+)?$")  # with the process that writes it
 
 
@@ -113,6 +120,6 @@ def load_results(path: Path, made_from: str = "") -> dict[str, EpisodeResults]:
                 str(name): EpisodeResults(**{field: arrays[f"{place}/{field}"] for field in FIELDS})
                 for place, name in enumerate(arrays["names"])
             }
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
-        reason = getattr(error, "strerror", None) or str(error).splitlines()[0].strip("'\"")
+    except DAMAGED as error:
+        reason = " ".join(str(error).split()).strip("'\"") or type(error).__name__
         raise ConfigurationError(f"episodes = {str(path)!r} cannot be read: {reason}") from None

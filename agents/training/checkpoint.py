@@ -25,7 +25,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import ConfigurationError
 
-from ..output.files import replacing
+from ..output.files import DAMAGED, replacing
 
 # Entries of the archive beside those of Stable-Baselines3.
 _JOURNAL, _STATE, _BEST = "journal.json", "state.pkl", "best_model.zip"
@@ -81,7 +81,7 @@ def read_journal(path: Path) -> Journal:
             told = json.loads(archive.read(_JOURNAL))
             best = archive.read(_BEST) if _BEST in archive.namelist() else None
         return Journal(**told, best=best)
-    except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
+    except DAMAGED as error:
         reason = " ".join(str(error).split()).strip("'\"")
         raise ConfigurationError(
             f"checkpoint = {str(path)!r} cannot be gone on with: {reason}"
