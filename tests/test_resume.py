@@ -179,6 +179,14 @@ def die_with_records(count: int) -> Any:
     return write
 
 
+def test_a_training_that_diverges_says_so(tmp_path: Path) -> None:
+    algorithm = {"name": "a2c", "n_steps": 8, "learning_rate": 1e30}
+    experiment = load(Experiment, small_config(tmp_path, algorithm=algorithm))
+    with pytest.raises(ConfigurationError, match="diverged after 128 steps") as caught:
+        run.train(experiment, quiet=True)
+    assert "\n" not in str(caught.value)
+
+
 def test_a_finished_training_is_not_repeated_and_its_files_are_mended(tmp_path: Path) -> None:
     experiment = experiment_of(tmp_path / "a", "ppo", timesteps=256)
     folder = Path(experiment.output)
