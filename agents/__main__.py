@@ -38,7 +38,7 @@ def main() -> None:
         missing = error.name or str(error)
         if missing.partition(".")[0] in ("fusion_gym", "agents"):
             raise
-        sys.exit(f"error: {missing} is missing: pip install fusion-gym[agents]")
+        sys.exit(f"error: {missing} is missing: pip install 'fusion-gym[agents]'")
     del sys.argv[1]  # as python -m agents.COMMAND has it
     module.main()
 

@@ -34,19 +34,25 @@ __all__ = [
     "zoo",
 ]
 
+# Faces whose package is part of the extra "agents", and their modules.
+_FACES = {
+    "FusionSB3VecEnv": "sb3",
+    "make_sb3_vec_env": "sb3",
+    "FusionParallelEnv": "parallel",
+    "parallel_env": "parallel",
+}
+
 register()
 
 
 def __getattr__(name: str) -> Any:
     """Stable-Baselines3, torch and PettingZoo are imported only where they are used."""
-    if name in ("FusionSB3VecEnv", "make_sb3_vec_env"):
-        from fusion_gym.envs import sb3
-
-        return getattr(sb3, name)
-    if name in ("FusionParallelEnv", "parallel_env"):
-        from fusion_gym.envs import parallel
-
-        return getattr(parallel, name)
+    if name in _FACES:
+        try:
+            return getattr(importlib.import_module(f"{__name__}.envs.{_FACES[name]}"), name)
+        except ModuleNotFoundError as error:
+            missing = f"{error}: pip install 'fusion-gym[agents]'"
+            raise ModuleNotFoundError(missing, name=error.name) from None
     if name in ("evaluation", "zoo"):
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

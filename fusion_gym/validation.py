@@ -6,7 +6,6 @@ and raises :class:`ConfigurationError` otherwise.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from typing import Any
 
@@ -14,30 +13,41 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym.arrays import Array
+from fusion_gym.errors import (
+    ConfigurationError,
+    UnexpectedArgumentError,
+    nearest,
+    refusal,
+    shown,
+)
 
-
-class ConfigurationError(ValueError):
-    """A setting that cannot be used; the message names the field, its value and what is allowed."""
-
-
-def _refuse(field: str, value: Any, allowed: str) -> ConfigurationError:
-    text = repr(value.tolist() if isinstance(value, np.ndarray) else value)
-    return ConfigurationError(f"{field} = {text} is not allowed: it must be {allowed}")
+# Filters square what they are given and divide by it: from here to there float64 can hold that.
+SMALLEST, LARGEST = 1e-15, 1e15
+LONGEST = 32  # entries of an axis of any length; matrices are multiplied entry by entry
+MOST_RUNS = 1_000_000  # each has a generator and a block of noise
+LONGEST_HORIZON = 50_000  # scales and tables are worked out step by step
 
 
 def _numbers(field: str, value: ArrayLike, allowed: str) -> Array:
-    """The value as a float64 array; text, booleans, complex numbers and ragged lists are none."""
+    """The value as a float64 array; text, booleans, complex numbers and ragged lists are none.
+
+    Infinity and what is no number are left to the caller.
+    """
     try:
         given = np.asarray(value)
     except ValueError:
-        raise _refuse(field, value, allowed) from None
+        raise refusal(field, value, allowed) from None
     if given.dtype.kind not in "iuf":
-        raise _refuse(field, value, allowed)
-    return np.array(given, dtype=np.float64)
+        raise refusal(field, value, allowed)
+    with np.errstate(over="ignore"):  # a longer kind of float than float64
+        result = np.array(given, dtype=np.float64)
+    if np.any((np.abs(result) > LARGEST) & np.isfinite(result)):
+        raise refusal(field, value, f"at most {LARGEST:g} in magnitude")
+    return result
 
 
 def array(field: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
-    """A finite float64 array of the given shape; ``None`` in the shape stands for any length >= 1.
+    """A finite float64 array of the given shape; ``None`` in it is any length from 1 to 32.
 
     Raises:
         ConfigurationError: not numeric, not finite, or of another shape.
@@ -45,13 +55,14 @@ def array(field: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
     result = _numbers(field, value, "an array of numbers")
     wanted = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
     matches = len(shape) == result.ndim and all(
-        have >= 1 if size is None else have == size
+        1 <= have <= LONGEST if size is None else have == size
         for size, have in zip(shape, result.shape, strict=False)
     )
     if not matches:
-        raise _refuse(field, value, f"an array of shape {wanted}, not {result.shape}")
+        limit = f" (any up to {LONGEST})" if max(result.shape, default=0) > LONGEST else ""
+        raise refusal(field, value, f"an array of shape {wanted}{limit}, not {result.shape}")
     if not np.all(np.isfinite(result)):
-        raise _refuse(field, value, "finite")
+        raise refusal(field, value, "finite")
     return result
 
 
@@ -68,11 +79,11 @@ def spread(field: str, value: ArrayLike, shape: tuple[int, ...], *, infinity: in
     try:
         result = np.broadcast_to(given, shape).copy()
     except ValueError:
-        raise _refuse(field, value, allowed) from None
+        raise refusal(field, value, allowed) from None
     valid = np.isfinite(result) | (np.isinf(result) & (np.sign(result) == infinity))
     if not valid.all():
         extra = {0: "", 1: " or infinity", -1: " or minus infinity"}[infinity]
-        raise _refuse(field, value, f"finite{extra}")
+        raise refusal(field, value, f"finite{extra}")
     return result
 
 
@@ -100,8 +111,15 @@ def number(
     ]
     allowed = "a finite number" + (" " + " and ".join(limits) if limits else "")
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise _refuse(field, value, allowed)
-    result = float(value)
+        raise refusal(field, value, allowed)
+    try:
+        result = float(value)
+    except OverflowError:
+        result = np.inf
+    if LARGEST < abs(result) < np.inf:
+        raise refusal(field, value, f"{allowed}, at most {LARGEST:g} in magnitude")
+    if above == 0.0 and 0.0 < result < SMALLEST:
+        raise refusal(field, value, f"{allowed}, at least {SMALLEST:g}")
     outside = (
         not np.isfinite(result)
         or (above is not None and result <= above)
@@ -109,7 +127,7 @@ def number(
         or (at_most is not None and result > at_most)
     )
     if outside:
-        raise _refuse(field, value, allowed)
+        raise refusal(field, value, allowed)
     return result
 
 
@@ -121,9 +139,9 @@ def integer(field: str, value: Any, *, at_least: int, at_most: int | None = None
     """
     allowed = f"a whole number >= {at_least}" + ("" if at_most is None else f" and <= {at_most}")
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise _refuse(field, value, allowed)
+        raise refusal(field, value, allowed)
     if value < at_least or (at_most is not None and value > at_most):
-        raise _refuse(field, value, allowed)
+        raise refusal(field, value, allowed)
     return int(value)
 
 
@@ -134,7 +152,7 @@ def boolean(field: str, value: Any) -> bool:
         ConfigurationError: anything else.
     """
     if not isinstance(value, (bool, np.bool_)):
-        raise _refuse(field, value, "True or False")
+        raise refusal(field, value, "True or False")
     return bool(value)
 
 
@@ -147,9 +165,9 @@ def choice(field: str, value: Any, options: Iterable[str]) -> str:
     names = list(options)
     if isinstance(value, str) and value in names:
         return value
-    near = difflib.get_close_matches(str(value), names, n=1)
-    hint = f" (did you mean {near[0]!r}?)" if near else ""
-    raise _refuse(field, value, "one of " + ", ".join(map(repr, names)) + hint)
+    near = nearest(value, names) if isinstance(value, str) else None
+    hint = f" (did you mean {near!r}?)" if near else ""
+    raise refusal(field, value, "one of " + ", ".join(map(repr, names)) + hint)
 
 
 def keys(kind: str, given: Iterable[str], known: Iterable[str]) -> None:
@@ -161,10 +179,25 @@ def keys(kind: str, given: Iterable[str], known: Iterable[str]) -> None:
     names = sorted(known)
     for key in given:
         if key not in names:
-            near = difflib.get_close_matches(str(key), names, n=1)
-            hint = f"did you mean {near[0]!r}? " if near else ""
-            listed = ", ".join(names) or "none"
-            raise ConfigurationError(f"unknown {kind} {key!r}: {hint}known are {listed}")
+            raise ConfigurationError(f"unknown {kind} {shown(key)}: {_known(key, names)}")
+
+
+def arguments(owner: str, given: Iterable[str], known: Iterable[str]) -> None:
+    """Every given keyword argument is one that ``owner`` takes.
+
+    Raises:
+        UnexpectedArgumentError: names the first that is not, the nearest match and all known ones.
+    """
+    names = sorted(known)
+    for key in given:
+        if key not in names:
+            raise UnexpectedArgumentError.of(owner, key, _known(key, names))
+
+
+def _known(key: Any, names: list[str]) -> str:
+    near = nearest(key, names)
+    hint = f"did you mean {near!r}? " if near else ""
+    return f"{hint}known are {', '.join(names) or 'none'}"
 
 
 def covariance(field: str, value: ArrayLike, size: int, *, definite: bool = False) -> Array:
@@ -175,15 +208,15 @@ def covariance(field: str, value: ArrayLike, size: int, *, definite: bool = Fals
     """
     matrix = array(field, value, (size, size))
     if not np.allclose(matrix, matrix.T, rtol=1e-10, atol=1e-14):
-        raise _refuse(field, matrix, "symmetric")
+        raise refusal(field, matrix, "symmetric")
     smallest = float(np.linalg.eigvalsh(matrix)[0])
-    scale = max(float(np.abs(matrix).max()), 1e-300)
-    if definite and smallest <= 1e-14 * scale:
-        raise _refuse(
+    scale = float(np.abs(matrix).max())
+    if definite and smallest <= max(1e-14 * scale, SMALLEST**2):
+        raise refusal(
             field, matrix, f"positive definite (its smallest eigenvalue is {smallest:.3g})"
         )
     if smallest < -1e-12 * scale:
-        raise _refuse(
+        raise refusal(
             field, matrix, f"positive semi-definite (its smallest eigenvalue is {smallest:.3g})"
         )
     return (matrix + matrix.T) / 2
@@ -197,7 +230,9 @@ def positive(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     """
     result = spread(field, value, shape)
     if np.any(result <= 0):
-        raise _refuse(field, value, "> 0 everywhere")
+        raise refusal(field, value, "> 0 everywhere")
+    if np.any(result < SMALLEST):
+        raise refusal(field, value, f"> 0 everywhere, at least {SMALLEST:g}")
     return result
 
 
@@ -209,8 +244,26 @@ def not_negative(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     """
     result = spread(field, value, shape)
     if np.any(result < 0):
-        raise _refuse(field, value, ">= 0 everywhere")
+        raise refusal(field, value, ">= 0 everywhere")
     return result
+
+
+def horizon(value: Any) -> int:
+    """The steps of an episode, from 1 to 50,000.
+
+    Raises:
+        ConfigurationError: anything else.
+    """
+    return integer("horizon", value, at_least=1, at_most=LONGEST_HORIZON)
+
+
+def runs(value: Any) -> int:
+    """The runs of a vector environment, from 1 to a million.
+
+    Raises:
+        ConfigurationError: anything else.
+    """
+    return integer("num_envs", value, at_least=1, at_most=MOST_RUNS)
 
 
 def one_or_each(value: ArrayLike) -> tuple[int, ...]:
@@ -229,12 +282,12 @@ def adaptive_thresholds(rho_bar: ArrayLike, rho_initial: ArrayLike, adaptation: 
     """
     limit = not_negative("rho_bar", rho_bar, one_or_each(rho_bar))
     if np.any(limit > 1.0):
-        raise _refuse("rho_bar", rho_bar, ">= 0 and <= 1")
+        raise refusal("rho_bar", rho_bar, ">= 0 and <= 1")
     initial = not_negative("rho_initial", rho_initial, one_or_each(rho_initial))
     if initial.ndim == limit.ndim == 1 and len(initial) != len(limit):
-        raise _refuse(
-            "rho_initial", rho_initial, f"a number, or as many as rho_bar = {rho_bar!r} has"
+        raise refusal(
+            "rho_initial", rho_initial, f"a number, or as many as rho_bar = {shown(rho_bar)} has"
         )
     if np.any(initial > limit):
-        raise _refuse("rho_initial", rho_initial, f"<= rho_bar = {rho_bar!r}")
+        raise refusal("rho_initial", rho_initial, f"<= rho_bar = {shown(rho_bar)}")
     positive("adaptation", adaptation, one_or_each(adaptation))

@@ -86,7 +86,39 @@ BAD_OPTIONS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
     ({"cost_weight": np.inf}, ("inf", "finite")),
     ({"state_weights": (1.0, 1.0, 1.0)}, ("(1.0, 1.0, 1.0)", "(2,)")),
     ({"state_weights": (1.0, -1.0)}, ("(1.0, -1.0)", ">= 0")),
-    ({"horizn": 5}, ("TobitOscillator-v0", "did you mean 'horizon'", "known are access, action")),
+    # Two options that contradict each other, one of them a default
+    ({"token_capacity": 10.0, "initial_tokens": 11.0}, ("token_capacity = 10", "11.0", "<= 10")),
+    ({"token_capacity": 9.5}, ("token_capacity = 9.5", "initial_tokens = 10.0")),
+    ({"token_cost": 50.0}, ("token_cost = 50.0", "token_capacity = 30", "at least 150")),
+    ({"transition": np.eye(3)}, ("process_gain", "(3)", "transition = [[1.0, 0.0, 0.0]")),
+    ({"token_cost": (1, 2), "transition": np.eye(2)}, ("(1, 2)", "(3,)")),
+    # Something else where a word, a number or a boolean belongs
+    ({"filter": np.ones((2, 2))}, ("[[1.0, 1.0], [1.0, 1.0]]", "'paper'")),
+    ({"silent": [np.ones((2, 2))], "filter": "tobit"}, ("[[[1.0, 1.0]", "'hold', 'predict'")),
+    ({"event_error": np.ones(2)}, ("[1.0, 1.0]", "True or False")),
+    ({"information": np.array(["sensors", "centre"])}, ("['sensors', 'centre']", "'centre'")),
+    ({"tokens": b"limited"}, ("b'limited'", "'limited', 'unlimited'")),
+    ({"random_start": {"yes": 1}}, ("{'yes': 1}", "True or False")),
+    ({"error_weight": 10**400}, ("finite number",)),
+    ({"token_rate": None}, ("None", "number")),
+    ({"process_variance": np.longdouble("1e4000")}, ("1e+4000", "finite")),
+    ({"trigger_decay": [np.ones((2, 2))] * 2}, ("[[[1.0, 1.0]", "(3,)")),
+    ({"transition": np.ones((40, 40))}, ("(any, any)", "up to 32", "(40, 40)")),
+    # Numbers that float64 cannot square, divide by or wait for
+    ({"measurement_variance": 1e308}, ("1e+308", "at most 1e+15")),
+    ({"measurement_variance": 1e-320}, ("1e-320", "at least 1e-15")),
+    ({"token_rate": -1e308}, ("-1e+308", "at most 1e+15")),
+    ({"process_variance": 1e-320}, ("1e-320", "at least 1e-15")),
+    ({"initial_covariance": np.diag([1e-32, 1e-32])}, ("1e-32", "positive definite")),
+    ({"horizon": 10**9}, ("1000000000", "<= 50000")),
+    ({"horizon": 10**400}, ("<= 50000",)),
+    ({"transition": ((1, 2), (3, 4))}, ("((1, 2), (3, 4))", "horizon = 100", "below 1e+30")),
+    (
+        {"error_weight": 1e15, "state_weights": (1e15, 1e15), "process_variance": 1e3},
+        ("1e+15", "state_weights = ", "1e+30"),
+    ),
+    ({"bound_epsilon": (1e-12,) * 14}, ("1e-12", "at least 1e-09")),
+    ({"trigger_decay": 1e6}, ("1000000.0", "trigger_divisor = 5.0", "horizon = 100", "1e+120")),
 ]
 
 
@@ -102,6 +134,52 @@ def test_options(options: dict[str, Any], parts: tuple[str, ...]) -> None:
     ]
     messages = {refused(way, ConfigurationError, (field, *parts)) for way in ways}
     assert len(messages) == 1
+    assert "\n" not in messages.pop()
+
+
+def test_an_unknown_option() -> None:
+    """Also a ``TypeError``, which gymnasium.make passes on with a remark of its own."""
+    for make in (make_task, gymnasium.make, lambda _, **given: make_vector(**given)):
+        for kind in (ConfigurationError, TypeError):
+            message = refused(
+                lambda make=make: make(ENV_ID, horizn=np.ones((2, 2))),
+                kind,
+                (f"{ENV_ID} got an unexpected keyword argument 'horizn'", "mean 'horizon'?"),
+            )
+            assert "\n" not in message
+
+
+# What a process noise of rank one leaves of it is no covariance that could be inverted.
+SINGULAR = ((0.0, 0.01, 5e-05), (0.0, 1.0, 0.01), (0.0, 0.0, 1.0))
+# Options of other environments.
+ELSEWHERE: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
+    ("RemoteEstimation", {"sensors": 10**9}, ("1000000000", "<= 1000")),
+    ("RemoteEstimation", {"sensors": 17, "action": "discrete"}, ("'discrete'", "17 sensors")),
+    ("RemoteEstimation", {"token_capacity": 0.5}, ("token_capacity = 0.5", "initial_tokens = 1.0")),
+    ("RemoteEstimation", {"coefficient": 9.0}, ("coefficient = 9.0", "horizon = 200", "1e+30")),
+    ("CorrelatedTracking", {"token_capacity": 3.5}, ("= 3.5", "initial_tokens = 10.0")),
+    ("CorrelatedTracking", {"noise_scale": np.ones(2)}, ("[1.0, 1.0]", "> 0")),
+    ("CorrelatedTracking", {"transition": SINGULAR}, ("((0.0, 0.01, 5e-05)", "singular")),
+    ("CorrelatedTracking", {"order": [np.ones((2, 2))] * 2}, ("[[[1.0, 1.0]", "(3)")),
+    ("UnknownInput", {"input_change": 1e154}, ("1e+154", "at most 1e+15")),
+    ("UnknownInput", {"sampling_period": 10**6}, ("1000000", "<= 1000")),
+    ("UnknownInput", {"input_amplitude": 0.0}, ("input_amplitude = 0.0", "nothing to estimate")),
+    ("UnknownInput", {"input_phase": np.ones(7)}, ("input_phase", "[1.0, 1.0")),
+    ("MarkovJumpTracking", {"transitions": np.zeros((1, 2, 2))}, ("process_gains", "[[[0.0, 0.0]")),
+    ("BiasedOscillator", {"censoring_threshold": 1e9}, ("1000000000.0", "censoring_upper")),
+    ("BiasedTracking", {"measurement_matrices": [[[1, 0]]]}, ("[[[1, 0]]]", "(1, 1)")),
+]
+
+
+@pytest.mark.parametrize(("name", "options", "parts"), ELSEWHERE, ids=lambda value: str(value)[:60])
+def test_options_elsewhere(name: str, options: dict[str, Any], parts: tuple[str, ...]) -> None:
+    message = refused(
+        lambda: make_task(f"fusion_gym/{name}-v0", **options),
+        ConfigurationError,
+        (next(iter(options)), *parts),
+    )
+    assert "\n" not in message
+    assert len(message) < 1000
 
 
 @pytest.mark.parametrize("render_mode", ["human", "rgb_array"])
@@ -237,6 +315,14 @@ def test_actions(kind: str, action: Any, parts: tuple[str, ...]) -> None:
     assert single.step(good)[1] == pytest.approx(expected, rel=1e-12)
     assert vector.step(np.array([good]))[1] == pytest.approx(expected, rel=1e-10)
     assert sb3.step(np.array([good]))[1] == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_single_environment_speaks_of_its_own_shape() -> None:
+    env = gymnasium.make(ENV_ID).unwrapped
+    env.reset(seed=0)
+    refused(lambda: env.step([1, 0]), ValueError, ("(2,)", "must be (3,)"))
+    refused(lambda: env.step([1, 0, 7]), ValueError, ("action [2] = 7",))
+    refused(lambda: env.step([[1, 0], [1]]), ValueError, ("[[1, 0], [1]]", "(3,)"))
 
 
 def test_the_first_bad_action_of_a_batch_is_named() -> None:

@@ -108,7 +108,7 @@ def test_a_missing_extra_is_told_in_one_line() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 1
-    assert done.stderr == "error: tyro is missing: pip install fusion-gym[agents]\n"
+    assert done.stderr == "error: tyro is missing: pip install 'fusion-gym[agents]'\n"
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import TimeLimit
 
-import fusion_gym  # noqa: F401  registers the environments
+import fusion_gym
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
 
@@ -49,6 +50,21 @@ def test_extreme_entries_are_clipped_to_their_bounds() -> None:
             np.testing.assert_array_equal(observation[entries][1:], bound[entries][1:])
 
 
+@pytest.mark.parametrize(
+    ("package", "face"), [("stable_baselines3", "make_sb3_vec_env"), ("pettingzoo", "parallel_env")]
+)
+def test_a_face_without_its_package_says_what_to_install(
+    package: str, face: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = {"make_sb3_vec_env": "sb3", "parallel_env": "parallel"}[face]
+    monkeypatch.delitem(sys.modules, f"fusion_gym.envs.{module}", raising=False)
+    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'fusion-gym\[agents\]'$"):
+        getattr(fusion_gym, face)
+
+
 def test_withheld_signals() -> None:
     env = make(information="centre").unwrapped
     env.reset(seed=0)
@@ -57,6 +73,10 @@ def test_withheld_signals() -> None:
     assert hidden == {"measurement", "innovation", "censored"}
     assert hidden.isdisjoint(signals)
     assert {"age", "held", "variance_reduction", "tokens", "observation"} <= set(signals)
+    assert "age" in signals
+    for name in ("nonsense", 3, *hidden):
+        assert name not in signals
+        assert signals.get(name) is None
     for name in hidden:
         with pytest.raises(LookupError, match=rf"'{name}'.*information='centre'"):
             signals[name]

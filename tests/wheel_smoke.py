@@ -136,7 +136,7 @@ def use(programs: Path, folder: Path) -> None:
     python, program = programs / "python", programs / "fusion-gym"
     call(python, "-c", LIBRARY, cwd=folder)
     lacking = call(python, "-c", WITHOUT_EXTRA, cwd=folder, status=1).stderr
-    assert lacking.strip() == "error: tyro is missing: pip install fusion-gym[agents]", lacking
+    assert lacking.strip() == "error: tyro is missing: pip install 'fusion-gym[agents]'", lacking
     call(python, "-c", HELP, cwd=folder)
     call(
         program, "evaluate", "--config", "tobit_oscillator_ppo", "--episodes", "5", "--policies",

@@ -17,8 +17,8 @@ from fusion_gym.validation import ConfigurationError
 SHIPPED = Path(__file__).parents[2] / "configs"
 
 Model = TypeVar("Model", bound=pydantic.BaseModel)
-Positive = Annotated[int, pydantic.Field(gt=0)]
-Several = Annotated[int, pydantic.Field(gt=1)]
+Positive = Annotated[int, pydantic.Field(gt=0, le=10**12)]
+Several = Annotated[int, pydantic.Field(gt=1, le=10**12)]
 Weight = Annotated[float, pydantic.Field(ge=0)]
 Rate = Annotated[float, pydantic.Field(gt=0)]
 Share = Annotated[float, pydantic.Field(ge=0, le=1)]

@@ -33,7 +33,7 @@ class TrainingConfig(Strict):
 
     timesteps: Positive
     num_envs: Positive = 256
-    seed: int = pydantic.Field(default=0, ge=0)
+    seed: int = pydantic.Field(default=0, ge=0, lt=2**32)
     threads: Positive = 1
     target_rate: float | None = pydantic.Field(default=None, gt=0, le=1)
     price_exponent: Share = 0.0

@@ -14,6 +14,37 @@ from fusion_gym.arrays import Array
 from fusion_gym.validation import ConfigurationError
 
 ERROR_KINDS = ("squared", "trace")
+_LARGEST = validation.LARGEST**2  # of squares; rewards are also handed on as float32
+
+
+def bounded_open_loop(open_loop: Array, horizon: int) -> Array:
+    """The error variances (n,) of a centre that never receives, if they can be worked with.
+
+    Raises:
+        ConfigurationError: they are not finite or beyond all bounds over the horizon.
+    """
+    if not np.all(open_loop <= _LARGEST):
+        raise ConfigurationError(
+            f"horizon = {horizon} is not allowed with this plant: without transmissions the "
+            f"squared error must stay below {_LARGEST:g} on average, and is "
+            f"{float(open_loop.max()):.3g}"
+        )
+    return open_loop
+
+
+def equal_weights(open_loop: Array) -> Array:
+    """Weights (n,) by which every state counts alike and open loop (n,) costs one.
+
+    Raises:
+        ConfigurationError: a state that is known without any transmission.
+    """
+    if not np.all(open_loop > 0.0):
+        raise ConfigurationError(
+            f"a squared error of {validation.shown(open_loop)} without transmissions is not "
+            "allowed: every "
+            "state must be moved by noise before the horizon, or be uncertain at the start"
+        )
+    return 1.0 / (len(open_loop) * open_loop)
 
 
 @dataclass(frozen=True)
@@ -44,16 +75,26 @@ class Reward:
         ``open_loop`` (n,) is the mean error variance of each state without any transmission.
 
         Raises:
-            ConfigurationError: an unknown kind, a negative weight, or a wrong shape.
+            ConfigurationError: an unknown kind, a negative weight, a wrong shape, or weights that
+                make of the error without transmissions more than can be worked with.
         """
+        if state_weights is None and not open_loop.sum() > 0.0:
+            equal_weights(open_loop)
         weights = (
             np.full(open_loop.shape, 1.0 / open_loop.sum())
             if state_weights is None
             else validation.not_negative("state_weights", state_weights, open_loop.shape)
         )
+        weight = validation.number("error_weight", error_weight, at_least=0.0)
+        if not weight * (weights @ open_loop) <= _LARGEST:
+            raise ConfigurationError(
+                f"error_weight = {weight:g} is not allowed with state_weights = "
+                f"{validation.shown(weights)}: without transmissions the error may cost up to "
+                f"{_LARGEST:g} a step, not {weight * (weights @ open_loop):g}"
+            )
         return cls(
             error=validation.choice("error", error, ERROR_KINDS),
-            error_weight=validation.number("error_weight", error_weight, at_least=0.0),
+            error_weight=weight,
             price=price,
             state_weights=weights[:, None],
         )

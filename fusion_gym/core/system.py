@@ -146,6 +146,13 @@ def numbered(count: int) -> tuple[str, ...]:
     return tuple(str(place) for place in range(count))
 
 
+class SignalError(KeyError):
+    """A signal that there is not, or that is withheld; a ``KeyError`` that shows plain text."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
 class Signals(Mapping[str, SignalArray]):
     """The signals of one step, in physical units, batch axis last.
 
@@ -153,7 +160,7 @@ class Signals(Mapping[str, SignalArray]):
     the signals that exist but that the environment's information mode withholds.
 
     Raises:
-        LookupError: (on access) an unknown or a withheld signal; the message says which.
+        SignalError: (on access) an unknown or a withheld signal; the message says which.
     """
 
     def __init__(
@@ -166,7 +173,7 @@ class Signals(Mapping[str, SignalArray]):
 
     def __getitem__(self, name: str) -> SignalArray:
         if name in self._hidden:
-            raise LookupError(
+            raise SignalError(
                 f"signal {name!r} is known to the sensors only; information='centre' withholds it "
                 "(use information='sensors', or a policy that looks at the centre's signals)"
             )
@@ -174,11 +181,14 @@ class Signals(Mapping[str, SignalArray]):
             value = self._values[name]
         except KeyError:
             known = ", ".join(sorted(self))
-            raise LookupError(f"unknown signal {name!r}: known are {known}") from None
+            raise SignalError(f"unknown signal {name!r}: known are {known}") from None
         if callable(value):
             value = value()
             self._values[name] = value
         return value
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._values and name not in self._hidden
 
     def __iter__(self) -> Iterator[str]:
         return (name for name in self._values if name not in self._hidden)

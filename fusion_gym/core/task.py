@@ -10,13 +10,15 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.access import ACCESS_RULES
 from fusion_gym.core.options import CommonOptions, Scenario, plain
-from fusion_gym.core.reward import Price, Reward
+from fusion_gym.core.reward import Price, Reward, bounded_open_loop
 from fusion_gym.core.system import Knowledge, System, covers
 from fusion_gym.core.token_bucket import TokenBucket
 
 # What a policy of each information mode may know.
 INFORMATION_MODES: dict[str, Knowledge] = {"sensors": "coordinator", "centre": "centre"}
 ACTION_KINDS = ("binary", "discrete")
+MOST_SENSORS = 1000  # the network serves them in a loop
+_MOST_DISCRETE = 16  # sensors whose requests are one number: that has 2^sensors values
 
 
 @dataclass(frozen=True)
@@ -46,8 +48,8 @@ class Task:
     policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        validation.integer("horizon", self.horizon, at_least=1)
-        if self.information == "local":
+        validation.horizon(self.horizon)
+        if isinstance(self.information, str) and self.information == "local":
             raise validation.ConfigurationError(
                 "information = 'local' is not allowed here: it must be one of "
                 f"{', '.join(map(repr, INFORMATION_MODES))}; sensors that decide by themselves are "
@@ -60,6 +62,11 @@ class Task:
             raise validation.ConfigurationError(
                 f"token_cost for {len(self.bucket.cost)} sensors is not allowed: the system has "
                 f"{self.system.sensor_count}"
+            )
+        if self.action == "discrete" and self.access != "single" and self.sensors > _MOST_DISCRETE:
+            raise validation.ConfigurationError(
+                f"action = 'discrete' is not allowed with {self.sensors} sensors: it numbers all "
+                f"sets of requests, of at most {_MOST_DISCRETE} sensors"
             )
         states = len(self.system.state_names)
         if self.reward.state_weights.shape != (states, 1):
@@ -78,18 +85,19 @@ class Task:
             ConfigurationError: a value that is not allowed.
         """
         chosen, system = scenario.options, scenario.system
+        horizon = validation.horizon(chosen.horizon)
         reward = Reward.create(
             chosen.error,
             chosen.error_weight,
             Price.create(chosen.cost_weight, chosen.price_range),
             scenario.state_weights if chosen.state_weights is None else chosen.state_weights,
-            system.open_loop(chosen.horizon),
+            bounded_open_loop(system.open_loop(horizon), horizon),
         )
         return cls(
             system=system,
             bucket=make_bucket(chosen, system.sensor_count),
             reward=reward,
-            horizon=chosen.horizon if limit is None else min(chosen.horizon, limit),
+            horizon=horizon if limit is None else min(horizon, limit),
             information=chosen.information,
             action=chosen.action,
             access=chosen.access,

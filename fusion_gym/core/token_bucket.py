@@ -78,12 +78,19 @@ class TokenBucket:
                 else f"at least the cost of a transmission, {needed:g}"
             )
             raise ConfigurationError(
-                f"token_capacity = {limit:g} is not allowed: it must be {reason}"
+                f"token_capacity = {limit:g} is not allowed: with token_cost = "
+                f"{validation.shown(cost)} it must be {reason}"
+            )
+        start = validation.number("initial_tokens", initial, at_least=0.0)
+        if start > limit:
+            raise ConfigurationError(
+                f"initial_tokens = {start} is not allowed: with token_capacity = {limit:g} it must "
+                f"be >= 0 and <= {limit:g}"
             )
         return cls(
             rate=validation.number("token_rate", rate, at_least=0.0),
             capacity=limit,
-            initial=validation.number("initial_tokens", initial, at_least=0.0, at_most=limit),
+            initial=start,
             cost=costs,
             sharing=rule,
             unlimited=validation.boolean("unlimited", unlimited),

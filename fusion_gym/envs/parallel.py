@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -15,6 +16,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.views import SensorView
+from fusion_gym.errors import shown
 
 Dict = dict[str, Any]
 
@@ -70,13 +72,13 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         """
         if not self.agents:
             raise gymnasium.error.ResetNeeded("the episode is over or never began: call reset")
-        if set(actions) != set(self.agents):
+        if not isinstance(actions, Mapping) or set(actions) != set(self.agents):
             raise ValueError(
-                f"actions of {sorted(actions)} are not allowed: there must be one of each of "
-                f"{self.agents}"
+                f"actions {shown(actions)} are not allowed: they must be a dictionary with one of "
+                f"each of {self.agents}"
             )
-        chosen = np.array([actions[agent] for agent in self.agents])
-        outcome = self.batch.step(self.view.requests(chosen, 1))
+        chosen = [actions[agent] for agent in self.agents]
+        outcome = self.batch.step(self.view.requests(chosen, None))
         reward, ended = float(outcome.reward[0]), bool(outcome.truncated[0])
         agents = self.agents
         costs = outcome.granted[:, 0] * self.task.bucket.cost[:, 0]

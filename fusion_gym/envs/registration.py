@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 import typing
 from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
 
 import gymnasium
+import numpy as np
 
 from fusion_gym import validation
 from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.core.rehearsal import rehearse
 from fusion_gym.core.task import Task
 from fusion_gym.validation import ConfigurationError
 
@@ -123,7 +126,31 @@ def make_task(env: str | CommonOptions, **options: Any) -> Task:
                 f"options of type {type(env).__name__} are not allowed: they belong to none of the "
                 "registered environments"
             )
-        return Task.create(build_of(env_id)(env), limit)
+        return _checked(build_of(env_id), env, limit)
     kind = options_of(env)
-    validation.keys(f"option of {env}", options, [field.name for field in fields(kind)])
-    return Task.create(build_of(env)(kind(**options)), limit)
+    validation.arguments(env, options, [field.name for field in fields(kind)])
+    return _checked(build_of(env), kind(**options), limit)
+
+
+def _checked(build: Build, chosen: CommonOptions, limit: int | None) -> Task:
+    """The task, rehearsed if options were given, which an error names in any case.
+
+    A default may be what does not fit beside them, as the 2 entries of ``initial_mean`` beside a
+    ``transition`` of 3 states.
+    """
+    given = {
+        field.name: value
+        for field in fields(chosen)
+        if (value := getattr(chosen, field.name)) is not field.default
+    }
+    try:
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # results are checked
+            task = Task.create(build(chosen), limit)
+            if given:
+                rehearse(task)
+    except ConfigurationError as error:
+        if not given or any(re.search(rf"\b{name}(\[\d+\])? ?=", str(error)) for name in given):
+            raise
+        listed = ", ".join(f"{name} = {validation.shown(value)}" for name, value in given.items())
+        raise ConfigurationError(f"{error} (given: {listed})") from None
+    return task

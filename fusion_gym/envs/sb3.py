@@ -54,7 +54,7 @@ class FusionSB3VecEnv(VecEnv):
         local: bool = False,
         price_exponent: float = 0.0,
     ) -> None:
-        self.runs = validation.integer("num_envs", num_envs, at_least=1)
+        self.runs = validation.runs(num_envs)
         self.task = task
         self.batch = EpisodeBatch(task, num_envs)
         self.view = make_view(task, validation.boolean("local", local))

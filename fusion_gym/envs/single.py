@@ -25,7 +25,7 @@ class FusionEnv(gymnasium.Env[Any, Any]):
     """
 
     def __init__(self, task: Task, render_mode: str | None = None) -> None:
-        refuse_rendering(render_mode)
+        refuse_rendering(type(self).__name__, render_mode)
         self.metadata = {"render_modes": []}
         self.render_mode = None
         self.task = task
@@ -58,7 +58,7 @@ class FusionEnv(gymnasium.Env[Any, Any]):
         """
         if self.batch.finished[0]:
             raise gymnasium.error.ResetNeeded("the episode is over or never began: call reset")
-        outcome = self.batch.step(self.view.requests(np.asarray(action)[None], 1))
+        outcome = self.batch.step(self.view.requests(action, None))
         observation = self.batch.observe()[0]
         infos = _first(step_infos(outcome))
         return observation, float(outcome.reward[0]), False, bool(outcome.truncated[0]), infos

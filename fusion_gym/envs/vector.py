@@ -40,8 +40,8 @@ class FusionVectorEnv(VectorEnv[Any, Any, Any]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
     ) -> None:
-        refuse_rendering(render_mode)
-        self.num_envs = validation.integer("num_envs", num_envs, at_least=1)
+        refuse_rendering(type(self).__name__, render_mode)
+        self.num_envs = validation.runs(num_envs)
         modes = [mode.value for mode in AutoresetMode]
         given = getattr(autoreset_mode, "value", autoreset_mode)
         self.autoreset_mode = AutoresetMode(validation.choice("autoreset_mode", given, modes))
@@ -148,15 +148,15 @@ class FusionVectorEnv(VectorEnv[Any, Any, Any]):
         return observation, reward, terminated, truncated, _with_mask(infos, self._everyone)
 
 
-def refuse_rendering(render_mode: str | None) -> None:
+def refuse_rendering(owner: str, render_mode: Any) -> None:
     """Nothing is drawn step by step; ``fusion_gym.evaluation`` draws whole episodes.
 
     Raises:
-        ConfigurationError: a render mode.
+        UnexpectedArgumentError: a render mode.
     """
     if render_mode is not None:
-        raise validation.ConfigurationError(
-            f"render_mode = {render_mode!r} is not allowed: it must be None"
+        raise validation.UnexpectedArgumentError.of(
+            owner, "render_mode", f"render_mode = {render_mode!r} is not allowed: it must be None"
         )
 
 

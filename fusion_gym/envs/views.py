@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.system import Knowledge
 from fusion_gym.core.task import Task
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.errors import ConfigurationError, shown
 
 Rows = NDArray[np.float32]
 Requests = NDArray[np.bool_]
@@ -53,8 +53,10 @@ class View(Protocol):
         """From observations (N, coordinator's entries) to rows (N·rows_per_run, entries)."""
         ...
 
-    def requests(self, actions: Any, runs: int) -> Requests:
+    def requests(self, actions: Any, runs: int | None) -> Requests:
         """Requests (sensors, N) from the rows' actions, N ``runs``.
+
+        ``None`` stands for one run, whose action comes without an axis of runs.
 
         Raises:
             ValueError: actions of another shape, not finite, or outside the action space.
@@ -104,27 +106,16 @@ class CoordinatorView:
         """The observations themselves."""
         return observation
 
-    def requests(self, actions: Any, runs: int) -> Requests:
+    def requests(self, actions: Any, runs: int | None) -> Requests:
         """See :class:`View`: actions (N, sensors) of 0 and 1, or (N,) of whole numbers."""
-        try:
-            given = np.asarray(actions)
-        except ValueError:
-            raise ValueError(f"action {actions!r} is not allowed: it must be an array") from None
-        if given.dtype.kind not in "biuf":
-            raise ValueError(
-                f"action {given.tolist()!r} of type {given.dtype} is not allowed: it must be "
-                "numbers"
-            )
-        wanted = (runs, *(self.actions.shape or ()))
-        if given.shape != wanted:
-            raise ValueError(f"action of shape {given.shape} is not allowed: it must be {wanted}")
+        shape = self.actions.shape or ()
+        given = _numbers(actions, shape if runs is None else (runs, *shape))
         if isinstance(self.actions, spaces.MultiBinary):
-            requests = given == 1
-            _check(given, requests | (given == 0), "0 or 1")
-            return np.ascontiguousarray(requests.T)
+            requests = _ones(given)
+            return np.ascontiguousarray((requests[None] if runs is None else requests).T)
         high = int(self.actions.n) - 1
         _check(given, (given >= 0) & (given <= high) & (given == np.floor(given)), f"0..{high}")
-        return self._decoded(given.astype(np.int64))
+        return self._decoded(given.astype(np.int64).reshape(-1))
 
     def masks(self, allowed: Requests) -> NDArray[np.bool_]:
         """See :class:`View`: two choices a sensor for ``MultiBinary``, silence and a request.
@@ -193,25 +184,48 @@ class SensorView:
         shared = np.broadcast_to(identity, (len(observation), *identity.shape))
         return np.concatenate((seen, shared), axis=-1).reshape(-1, len(self.names))
 
-    def requests(self, actions: Any, runs: int) -> Requests:
-        """See :class:`View`: actions (N·sensors,), 1 for a request."""
-        given = np.asarray(actions)
-        wanted = (runs * self.rows_per_run,)
-        if given.shape != wanted or not np.isin(given, (0, 1)).all():
-            raise ValueError(
-                f"actions of shape {given.shape} are not allowed: there must be one of 0 and 1 "
-                f"for each of {self.rows_per_run} sensors of each run"
-            )
-        return np.ascontiguousarray((given == 1).reshape(-1, self.rows_per_run).T)
+    def requests(self, actions: Any, runs: int | None) -> Requests:
+        """See :class:`View`: actions (N·sensors,), 1 for a request, run by run."""
+        given = _numbers(actions, ((1 if runs is None else runs) * self.rows_per_run,))
+        return np.ascontiguousarray(_ones(given).reshape(-1, self.rows_per_run).T)
 
     def masks(self, allowed: Requests) -> NDArray[np.bool_]:
         """See :class:`View`: silence, and a request, (N·sensors, 2)."""
         return np.stack((np.ones(allowed.size, dtype=np.bool_), allowed.T.ravel()), axis=1)
 
 
+def _numbers(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    """The actions as an array of numbers of this shape.
+
+    Raises:
+        ValueError: anything else.
+    """
+    try:
+        given = np.asarray(actions)
+    except ValueError:
+        given = np.array(None)
+    if given.dtype.kind not in "biuf":
+        raise ValueError(
+            f"action {shown(actions)} is not allowed: it must be numbers of shape {shape}, not "
+            f"{type(actions).__name__} of {given.dtype}"
+        )
+    if given.shape != shape:
+        raise ValueError(
+            f"action {shown(given)} of shape {given.shape} is not allowed: its shape must be "
+            f"{shape}"
+        )
+    return given
+
+
+def _ones(given: NDArray[Any]) -> Requests:
+    """Where the actions are 1; all others must be 0."""
+    requests: Requests = given == 1
+    _check(given, requests | (given == 0), "0 or 1")
+    return requests
+
+
 def _check(given: NDArray[Any], valid: NDArray[np.bool_], allowed: str) -> None:
     if not valid.all():
         place = tuple(int(i) for i in np.argwhere(~valid)[0])
-        raise ValueError(
-            f"action {list(place)} = {given[place]} is not allowed: it must be {allowed}"
-        )
+        where = f"action {list(place)}" if place else "action"
+        raise ValueError(f"{where} = {given[place]} is not allowed: it must be {allowed}")

@@ -122,8 +122,8 @@ def choose_rule(
         return rule.make(None)
     if not rule.ordered:
         raise ConfigurationError(
-            f"order = {order!r} is not allowed with fusion={name!r}: it belongs to the "
-            "sequential rules 'sici' and 'sci'"
+            f"order = {validation.shown(order)} is not allowed with fusion={name!r}: it belongs "
+            "to the sequential rules 'sici' and 'sci'"
         )
     arrival = _arrival(order, sensors)
     return rule.make((0, *(i + 1 for i in arrival)) if structure.prediction else arrival)
@@ -133,7 +133,7 @@ def _arrival(order: ArrayLike, sensors: int) -> tuple[int, ...]:
     given = validation.array("order", order, (sensors,))
     if sorted(given.tolist()) != list(range(sensors)):
         raise ConfigurationError(
-            f"order = {order!r} is not allowed: it must hold each of the sensors 0 to "
-            f"{sensors - 1} once"
+            f"order = {validation.shown(order)} is not allowed: it must hold each of the "
+            f"sensors 0 to {sensors - 1} once"
         )
     return tuple(int(sensor) for sensor in given)

@@ -15,7 +15,9 @@ from cases import IDS, Case, actions, each_case, each_default, each_lasting, req
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from own_system import OWN_ID, WalkOptions, build
 from pettingzoo.test import parallel_api_test, parallel_seed_test
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as sb3_check
+from stable_baselines3.common.env_util import make_vec_env
 
 import fusion_gym
 from fusion_gym.core.options import CommonOptions
@@ -170,10 +172,35 @@ def test_an_unknown_option_is_named(case: Case) -> None:
         lambda **options: fusion_gym.make_sb3_vec_env(case.env_id, 2, **options),
         lambda **options: fusion_gym.parallel_env(case.env_id, **options),
     ):
-        with pytest.raises(ConfigurationError, match=r"unknown option of .*'colour'"):
-            make(colour="red")
+        message = rf"{case.env_id} got an unexpected keyword argument 'colour': .*known are access"
+        for kind in (ConfigurationError, TypeError):
+            with pytest.raises(kind, match=message):
+                make(colour="red")
     with pytest.raises(ConfigurationError, match="information = 'nobody'"):
         fusion_gym.make_task(case.env_id, information="nobody")
+
+
+@each_id
+def test_stable_baselines_makes_an_environment_of_its_id(env_id: str) -> None:
+    """Both calls first try a ``render_mode``, and go on without it after a ``TypeError``."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*render_mode='rgb_array'")
+        vector = make_vec_env(env_id, n_envs=2, seed=0)
+        model = PPO("MlpPolicy", env_id, n_steps=4, batch_size=4, n_epochs=1, device="cpu")
+    vector.reset()
+    assert vector.step(np.array([vector.action_space.sample()] * 2))[1].shape == (2,)
+    assert model.learn(4).num_timesteps == 4
+
+
+@each_id
+@pytest.mark.parametrize("mode", ["human", "rgb_array", 3])
+def test_nothing_is_drawn(env_id: str, mode: Any) -> None:
+    made = getattr(registered, f"{class_name(env_id)}Env")
+    message = f"got an unexpected keyword argument 'render_mode': render_mode = {mode!r}"
+    for make in (made, getattr(registered, f"{class_name(env_id)}VectorEnv")):
+        for kind in (ConfigurationError, TypeError):
+            with pytest.raises(kind, match=message):
+                make(render_mode=mode)
 
 
 def test_an_environment_of_ones_own_is_registered_once() -> None:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.core.reward import equal_weights
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.correlated.filters import JointErrorCovariance, RobustKalmanFilter
 from fusion_gym.systems.correlated.sensors import CorrelatedSensors
@@ -78,11 +79,12 @@ def build(chosen: CorrelatedTrackingOptions) -> Scenario:
     Raises:
         ConfigurationError: a value that is not allowed.
     """
-    horizon = validation.integer("horizon", chosen.horizon, at_least=1)
+    horizon = validation.horizon(chosen.horizon)
     plant, sensors = _plant_and_sensors(chosen)
     open_loop = plant.open_loop(horizon)
+    equal = equal_weights(open_loop)
     weights = (
-        1.0 / (plant.size * open_loop)
+        equal
         if chosen.state_weights is None
         else validation.not_negative("state_weights", chosen.state_weights, open_loop.shape)
     )
@@ -125,11 +127,12 @@ def _plant_and_sensors(
 
 
 def _noise_scale(value: float | str) -> float | None:
-    if value == "random":
-        return None
     if isinstance(value, str):
+        if value == "random":
+            return None
         raise ConfigurationError(
-            f"noise_scale = {value!r} is not allowed: it must be a number > 0 and <= 1, or 'random'"
+            f"noise_scale = {validation.shown(value)} is not allowed: it must be a number > 0 "
+            "and <= 1, or 'random'"
         )
     return validation.number("noise_scale", value, above=0.0, at_most=1.0)
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.core.reward import equal_weights
 from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 from fusion_gym.systems.markov_jump.centralised_linear import (
     Belief,
@@ -123,9 +124,8 @@ class MarkovJumpCentralSystem:
         """
         model = AugmentedModel.create(plant, sensors)
         linear = CentralisedLinearFilter.create(model, horizon)
-        _, squares = model.state_moments(horizon)
-        reference = model.open_loop(horizon)
-        equal = 1.0 / (plant.size * reference)
+        reference, magnitude = model.scales(horizon)
+        equal = equal_weights(reference)
         return cls(
             plant=plant,
             sensors=sensors,
@@ -133,7 +133,7 @@ class MarkovJumpCentralSystem:
             estimator=InteractingModels.create(plant, sensors) if interacting else linear,
             state_names=state_names,
             state_weights=equal if state_weights is None else state_weights,
-            magnitude=np.sqrt(squares.mean(0)),
+            magnitude=magnitude,
             reference=reference,
             scale=_measured(linear, horizon),
         )

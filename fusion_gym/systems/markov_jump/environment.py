@@ -86,7 +86,7 @@ def build(chosen: MarkovJumpTrackingOptions) -> Scenario:
     Raises:
         ConfigurationError: a value that is not allowed.
     """
-    horizon = validation.integer("horizon", chosen.horizon, at_least=1)
+    horizon = validation.horizon(chosen.horizon)
     where = validation.choice("filter", chosen.filter, ("local", "centralised", "imm"))
     plant = MarkovJumpPlant.create(
         chosen.transitions,

@@ -118,8 +118,13 @@ class AugmentedModel:
 
     def open_loop(self, horizon: int) -> Array:
         """Mean variance (n,) of the state over k = 1..horizon: its error if nothing is known."""
+        return self.scales(horizon)[0]
+
+    def scales(self, horizon: int) -> tuple[Array, Array]:
+        """The mean variance (n,) over k = 1..horizon and the root mean square (n,) with k = 0."""
         means, squares = self.state_moments(horizon)
-        return np.asarray((squares - means * means)[1:].mean(0))
+        variance = np.asarray((squares - means * means)[1:].mean(0))
+        return variance, np.sqrt(squares.mean(0))
 
 
 def _diagonal_blocks(blocks: Array) -> Array:

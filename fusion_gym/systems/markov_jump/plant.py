@@ -32,8 +32,8 @@ def probabilities(field: str, value: ArrayLike, shape: tuple[int | None, ...]) -
         what = "rows add up" if given.ndim > 1 else "entries add up"
         sums = np.round(total[..., 0], 12).tolist()
         raise ConfigurationError(
-            f"{field} = {given.tolist()!r} is not allowed: it must have entries from 0 to 1 whose "
-            f"{what} to 1, not {sums}"
+            f"{field} = {validation.shown(given)} is not allowed: it must have entries from 0 "
+            f"to 1 whose {what} to 1, not {sums}"
         )
     return np.asarray(given / total)
 
@@ -113,7 +113,8 @@ class MarkovJumpPlant:
         radius = plant.second_moment_radius()
         if radius >= 1.0 - 1e-9:
             raise ConfigurationError(
-                f"transitions = {matrices.tolist()!r} are not allowed: with this mode_transition "
+                f"transitions = {validation.shown(matrices)} are not allowed: with this "
+                "mode_transition "
                 "the plant must be mean-square stable, and the spectral radius of its "
                 f"second-moment operator is {radius:.4g}, which must be < 1"
             )

@@ -67,13 +67,14 @@ class FadingSensors:
         period = validation.spread("sampling_periods", sampling_periods, (sensors,))
         if np.any(period < 1.0) or np.any(period != np.round(period)):
             raise ConfigurationError(
-                f"sampling_periods = {np.asarray(sampling_periods).tolist()!r} is not allowed: "
+                f"sampling_periods = {validation.shown(sampling_periods)} is not allowed: "
                 "each must be a whole number >= 1"
             )
         values = validation.array("fading_values", fading_values, (sensors, None))
         if np.any(values < 0.0) or np.any(values > 1.0):
             raise ConfigurationError(
-                f"fading_values = {values.tolist()!r} is not allowed: each must be from 0 to 1"
+                f"fading_values = {validation.shown(values)} is not allowed: each must be from "
+                "0 to 1"
             )
         variance = validation.positive("measurement_variance", measurement_variance, (sensors,))
         return cls(

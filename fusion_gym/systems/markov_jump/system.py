@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.core.reward import equal_weights
 from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
 from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagRecursion
@@ -65,9 +66,8 @@ class MarkovJumpSystem:
         """Tables for ``horizon`` steps; weights of ``None`` make open loop cost one."""
         model = AugmentedModel.create(plant, sensors)
         filters = LocalFilters.create(model, horizon)
-        squares = model.state_moments(horizon)[1]
-        reference = model.open_loop(horizon)
-        equal = 1.0 / (plant.size * reference)
+        reference, magnitude = model.scales(horizon)
+        equal = equal_weights(reference)
         return cls(
             plant=plant,
             sensors=sensors,
@@ -77,7 +77,7 @@ class MarkovJumpSystem:
             fusion=fusion,
             state_names=state_names,
             state_weights=equal if state_weights is None else state_weights,
-            magnitude=np.sqrt(squares.mean(0)),
+            magnitude=magnitude,
             reference=reference,
         )
 

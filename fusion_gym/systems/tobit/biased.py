@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import Scenario
+from fusion_gym.core.reward import equal_weights
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.tobit.options import (
     FILTERS,
@@ -126,7 +127,7 @@ def build_tracking(chosen: BiasedTrackingOptions) -> Scenario:
 
 
 def _build(chosen: BiasedOscillatorOptions) -> Scenario:
-    horizon = validation.integer("horizon", chosen.horizon, at_least=1)
+    horizon = validation.horizon(chosen.horizon)
     random_start = validation.boolean("random_start", chosen.random_start)
     plant, states = _augmented(chosen, aware=True)
     aware = validation.boolean("bias_aware", chosen.bias_aware)
@@ -152,8 +153,7 @@ def _build(chosen: BiasedOscillatorOptions) -> Scenario:
         scale=typical_magnitude(plant, horizon, random_start),
         reference=plant.open_loop(min(horizon, _REFERENCE_HORIZON)),
     )
-    # Every state counts alike, relative to its variance without any transmission.
-    weights = 1.0 / (plant.size * system.open_loop(horizon))
+    weights = equal_weights(system.open_loop(horizon))
     return Scenario(chosen, system, weights, stochastic_defaults(chosen))
 
 

@@ -108,8 +108,8 @@ class Feedback:
         weights = validation.array("information_shares", share, (sensors,))
         if np.any(weights <= 0) or abs(weights.sum() - 1.0) > 1e-9:
             raise ConfigurationError(
-                f"information_shares = {weights.tolist()} is not allowed: they must be > 0 "
-                f"with sum 1 (their sum is {weights.sum():.6g})"
+                f"information_shares = {validation.shown(weights)} is not allowed: they must be "
+                f"> 0 with sum 1 (their sum is {weights.sum():.6g})"
             )
         return cls(sensors, weights[:, None])
 

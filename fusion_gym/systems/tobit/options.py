@@ -9,12 +9,13 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from fusion_gym.core.options import CommonOptions, plain
+from fusion_gym.errors import ConfigurationError, shown
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.tobit.centre import Centre, Feedback, FeedbackCentre, SequentialCentre
 from fusion_gym.systems.tobit.filters import KalmanFilter, NodeFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
-from fusion_gym.validation import ConfigurationError, choice
+from fusion_gym.validation import choice
 
 _STRUCTURE = Structure(
     common="all nodes start from the same prediction", holds=("information shares",)
@@ -126,5 +127,5 @@ def _refuse(chosen: FeedbackOptions, names: tuple[str, ...], where: str, belongs
         value = getattr(chosen, name)
         if value is not None:
             raise ConfigurationError(
-                f"{name} = {value!r} is not allowed with {where}: it belongs to {belongs}"
+                f"{name} = {shown(value)} is not allowed with {where}: it belongs to {belongs}"
             )

@@ -35,6 +35,8 @@ from fusion_gym.validation import ConfigurationError
 
 _ANGLE = 0.052 * math.pi
 _COS, _SIN = math.cos(_ANGLE), math.sin(_ANGLE)
+_SMALLEST_EPSILON = 1e-9
+_LARGEST_EVENT_ERROR = 1e120  # its square must be a float64
 _IDENTITY = ((1.0, 0.0), (0.0, 1.0))
 
 
@@ -91,7 +93,7 @@ def build(chosen: TobitOscillatorOptions) -> Scenario:
     Raises:
         ConfigurationError: a value that is not allowed.
     """
-    horizon = validation.integer("horizon", chosen.horizon, at_least=1)
+    horizon = validation.horizon(chosen.horizon)
     plant = _plant(chosen)
     sensors = CensoredSensors.create(
         chosen.measurement_matrices,
@@ -144,6 +146,12 @@ def _centre(chosen: TobitOscillatorOptions, sensors: CensoredSensors) -> Centre:
 def _bound_filter(chosen: TobitOscillatorOptions, sensors: CensoredSensors) -> BoundTobitFilter:
     """The filter of the paper, with its constants and the trigger's Ξ."""
     constants = BoundConstants.create(chosen.bound_epsilon)
+    if np.min(chosen.bound_epsilon) < _SMALLEST_EPSILON:
+        raise validation.refusal(
+            "bound_epsilon",
+            chosen.bound_epsilon,
+            f"at least {_SMALLEST_EPSILON:g} everywhere: its inverse multiplies the bound",
+        )
     trigger = _trigger(chosen, sensors.count)
     error = EventError.create(**trigger, young=chosen.bound_young, sensors=sensors.count)
     if chosen.silent is not None:
@@ -152,7 +160,22 @@ def _bound_filter(chosen: TobitOscillatorOptions, sensors: CensoredSensors) -> B
         validation.boolean("event_error", chosen.event_error)
     with_error = chosen.event_error is None or chosen.event_error
     hold = chosen.silent != "predict"
+    if with_error and chosen.filter == "paper":
+        _refuse_explosion(chosen, error)
     return BoundTobitFilter(sensors, constants, error if with_error else None, hold=hold)
+
+
+def _refuse_explosion(chosen: TobitOscillatorOptions, error: EventError) -> None:
+    """The bound of the event error grows by a factor a step, which may be above one."""
+    reached = error.at(np.array([float(chosen.horizon)]))
+    if not np.all(reached <= _LARGEST_EVENT_ERROR):
+        names = ("trigger_threshold", "trigger_decay", "trigger_divisor", "trigger_initial")
+        given = {name: getattr(chosen, name) for name in (*names, "bound_young", "horizon")}
+        listed = ", ".join(f"{name} = {validation.shown(value)}" for name, value in given.items())
+        raise ConfigurationError(
+            f"{listed} are not allowed together: the bound of the event error must stay below "
+            f"{_LARGEST_EVENT_ERROR:g}; use a smaller decay, a larger divisor or event_error=False"
+        )
 
 
 _FILTERS = {

@@ -66,8 +66,8 @@ class CensoredSensors:
         high = validation.spread("censoring_upper", upper, shape, infinity=1)
         if np.any(low >= high):
             raise ConfigurationError(
-                f"censoring_threshold = {low.tolist()} is not allowed: each must be below "
-                f"censoring_upper = {high.tolist()}"
+                f"censoring_threshold = {validation.shown(low)} is not allowed: each must be below "
+                f"censoring_upper = {validation.shown(high)}"
             )
         uncensored = np.isneginf(low)
         noise = validation.positive("measurement_variance", variance, shape)[..., None]

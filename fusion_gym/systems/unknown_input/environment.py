@@ -100,7 +100,7 @@ def build(chosen: UnknownInputOptions) -> Scenario:
         ConfigurationError: a value that is not allowed.
     """
     chosen = _with_example(chosen)
-    horizon = validation.integer("horizon", chosen.horizon, at_least=1)
+    horizon = validation.horizon(chosen.horizon)
     plant = _plant(chosen)
     signal = _signal(chosen, plant.inputs, horizon)
     sensors = InputSensors.create(
@@ -110,12 +110,13 @@ def build(chosen: UnknownInputOptions) -> Scenario:
     open_loop = plant.open_loop(signal, horizon)
     if np.any(open_loop[plant.size :] <= 0.0):
         raise ConfigurationError(
-            "input_signal is not allowed: every input must differ from zero somewhere before the "
-            "horizon, or there is nothing to estimate"
+            f"input_signal = {validation.shown(chosen.input_signal)} is not allowed with "
+            f"input_amplitude = {validation.shown(chosen.input_amplitude)}: every input must "
+            "differ from zero somewhere before the horizon, or there is nothing to estimate"
         )
     if np.any(open_loop <= 0.0):
         raise ConfigurationError(
-            f"process_covariance = {np.asarray(chosen.process_covariance).tolist()} is not "
+            f"process_covariance = {validation.shown(chosen.process_covariance)} is not "
             "allowed: every state must be moved by the input or by noise before the horizon, or "
             "be uncertain at the start"
         )
@@ -183,8 +184,8 @@ def _signal(chosen: UnknownInputOptions, inputs: int, horizon: int) -> InputSign
         for name, value in shape.items():
             if value is not None:
                 raise ConfigurationError(
-                    f"{name} = {value!r} is not allowed with an array as input_signal: it must be "
-                    "None"
+                    f"{name} = {validation.shown(value)} is not allowed with an array as "
+                    "input_signal: it must be None"
                 )
         return GivenInput.create(inputs, kind, horizon)
     amplitude, period, phase = shape.values()
@@ -192,8 +193,8 @@ def _signal(chosen: UnknownInputOptions, inputs: int, horizon: int) -> InputSign
         return Sinusoids.create(inputs, amplitude, period, phase)
     if not (isinstance(phase, str) and phase == "random"):
         raise ConfigurationError(
-            f"input_phase = {phase!r} is not allowed with input_signal={kind!r}: phases belong to "
-            "'sinusoids'"
+            f"input_phase = {validation.shown(phase)} is not allowed with "
+            f"input_signal={kind!r}: phases belong to 'sinusoids'"
         )
     if kind == "steps":
         return Steps.create(inputs, amplitude, period)
@@ -216,8 +217,8 @@ def _nodes(
     fusion = NodeFusion(rule, plant.size, tracked=chosen.fusion == "ci")
     if chosen.hold_variance is not None and kind != "random_walk":
         raise ConfigurationError(
-            f"hold_variance = {chosen.hold_variance!r} is not allowed with filter={kind!r}: "
-            "it belongs to filter='random_walk'"
+            f"hold_variance = {validation.shown(chosen.hold_variance)} is not allowed with "
+            f"filter={kind!r}: it belongs to filter='random_walk'"
         )
     return FILTERS[kind](chosen, _Parts(model, sensors, joint, fusion, factor, horizon))
 

@@ -120,7 +120,8 @@ class InputModel:
         kept = validation.not_negative("input_memory", memory, (q,))
         if np.any(kept > 1.0):
             raise ConfigurationError(
-                f"input_memory = {memory!r} is not allowed: it must be >= 0 and <= 1"
+                f"input_memory = {validation.shown(memory)} is not allowed: it must be >= 0 and "
+                "<= 1"
             )
         steps = validation.positive("input_change", change, (q,))
         first = validation.positive("input_deviation", deviation, (q,))

@@ -17,6 +17,8 @@ from fusion_gym.arrays import Array
 from fusion_gym.systems.linear_plant import covariance_factor
 from fusion_gym.systems.unknown_input.signals import InputSignal
 
+_LONGEST_PERIOD = 1000  # small steps between two instants
+
 
 @dataclass(frozen=True)
 class UnknownInputPlant:
@@ -60,7 +62,7 @@ class UnknownInputPlant:
 
         Raises:
             ConfigurationError: a wrong shape, an entry that is not finite, a sampling period
-                below 1, more inputs than states, or a covariance that is not one
+                not from 1 to 1000, more inputs than states, or a covariance that is not one
                 (``initial_covariance``: not definite).
         """
         small = validation.array("transition", transition, (None, None))
@@ -73,7 +75,9 @@ class UnknownInputPlant:
         half = None
         if initial_half_width is not None:
             half = validation.not_negative("initial_half_width", initial_half_width, (n,))
-        steps = validation.integer("sampling_period", sampling_period, at_least=1)
+        steps = validation.integer(
+            "sampling_period", sampling_period, at_least=1, at_most=_LONGEST_PERIOD
+        )
         lifted, lifted_inputs, lifted_process = np.eye(n), np.zeros_like(inputs), np.zeros((n, n))
         for _ in range(steps):
             lifted_inputs += lifted @ inputs

@@ -115,7 +115,8 @@ def _seen_input(sensor: int, matrix: Array, plant: UnknownInputPlant) -> tuple[A
     rank = int(np.sum(values > _RANK * possible))
     if rank < q:
         raise ConfigurationError(
-            f"measurement_matrices[{sensor}] = {matrix.tolist()} is not allowed: the sensor must "
+            f"measurement_matrices[{sensor}] = {validation.shown(matrix)} is not allowed: the "
+            "sensor must "
             f"see every input, but rank(C B) is {rank} for {q} input{'s' if q > 1 else ''} (B is "
             "the input matrix over one sampling interval)"
         )

@@ -88,7 +88,8 @@ class Sinusoids:
         random = isinstance(phase, str)
         if random and phase != "random":
             raise ConfigurationError(
-                f"input_phase = {phase!r} is not allowed: it must be 'random' or radians"
+                f"input_phase = {validation.shown(phase)} is not allowed: it must be 'random' "
+                "or radians"
             )
         shape = (size, _terms(amplitude, period, 0.0 if random else phase))
         return cls(
@@ -249,8 +250,8 @@ def _scale_and_period(size: int, amplitude: ArrayLike, period: ArrayLike) -> tup
     instants = validation.positive("input_period", period, (size,))
     if np.any(instants < 1.0):
         raise ConfigurationError(
-            f"input_period = {instants.tolist()} is not allowed: it must be >= 1 everywhere, for "
-            "an input is constant between two sampling instants"
+            f"input_period = {validation.shown(instants)} is not allowed: it must be >= 1 "
+            "everywhere, for an input is constant between two sampling instants"
         )
     return scale[:, None], instants[:, None]
 
