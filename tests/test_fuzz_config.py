@@ -1,0 +1,104 @@
+"""Any value in any field of a training's YAML: one line that names the field, or a model."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pydantic
+import pytest
+from fuzzing import FREE, HOSTILE
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from agents.training.algorithms import TABLE
+from agents.training.checked import load, parse
+from agents.training.config import Experiment
+from agents.training.run import check
+from fusion_gym import ConfigurationError
+
+Content = dict[str, Any]
+_UNKNOWN = ("nobody_knows_this",)
+NAMES = {
+    "a2c": "tobit_oscillator_a2c",
+    "dqn": "remote_estimation_dqn",
+    "maskable_ppo": "tobit_oscillator_maskable_ppo",
+    "ppo": "remote_estimation_ppo",
+    "recurrent_ppo": "tobit_oscillator_recurrent_ppo",
+}
+
+
+def plain(kind: str) -> Content:
+    """A shipped config of this algorithm with all its fields, small enough to make in no time."""
+    content = load(Experiment, NAMES[kind]).model_dump(mode="json")
+    content["environment"]["options"]["horizon"] = 20
+    content["training"]["num_envs"] = 2
+    content["algorithm"] |= {"network": {"hidden": [4], "activation": "tanh"}, "batch_size": 8}
+    if kind == "a2c":
+        del content["algorithm"]["batch_size"]
+    if kind == "dqn":
+        content["algorithm"]["buffer_size"] = 100
+    else:
+        content["algorithm"]["n_steps"] = 8
+    return content
+
+
+def fields(model: pydantic.BaseModel, content: Content) -> Iterator[tuple[str, ...]]:
+    """The way to every field of a model, to those of models within it as well."""
+    for name in type(model).model_fields:
+        yield (name,)
+        inner = getattr(model, name)
+        if isinstance(inner, pydantic.BaseModel):
+            yield from ((name, *rest) for rest in fields(inner, content[name]))
+
+
+def values(default: Any) -> st.SearchStrategy[Any]:
+    """What may stand in YAML, mostly where it does not belong."""
+    numbers = HOSTILE.filter(lambda value: isinstance(value, (bool, int, float)))
+    fitting = numbers.filter(lambda value: not 10**4 < abs(value) < 2**62)  # sizes, in memory
+    words = st.sampled_from(("", "word", "two\nlines", "1000", "1e-3", "tanh", "ppo", "a2c", "dqn"))
+    near = st.just(default)
+    if isinstance(default, (int, float)) and not isinstance(default, bool):
+        near = st.sampled_from((default, default * 2, default / 2, -default, str(default)))
+    leaf = st.one_of(near, fitting, words, st.none())
+    mapping = st.sampled_from((dict.fromkeys(_UNKNOWN, 1), {}))
+    return st.one_of(leaf, leaf, st.lists(leaf, max_size=2), mapping)
+
+
+def flaw(content: Content, path: tuple[str, ...]) -> str | None:
+    """What is wrong with how a config is taken whose field at this path was changed."""
+    try:
+        model, env, _ = check(parse(Experiment, content, "fuzz.yaml"))
+    except ConfigurationError as error:
+        message = str(error)
+        named = any(name in message for name in (*path[-2:], *_UNKNOWN))
+        return None if named and "\n" not in message else f"names it not: {message}"
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return None if model.get_env() is env else "a model of another environment"
+
+
+@pytest.mark.parametrize("tries", [15, pytest.param(400, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", TABLE)
+@pytest.mark.filterwarnings("ignore::UserWarning:stable_baselines3")
+def test_any_value_in_any_field(kind: str, tries: int, tmp_path: Path) -> None:
+    base = plain(kind) | {"output": str(tmp_path / "run")}
+    assert flaw(base, ()) is None
+    ways = list(fields(parse(Experiment, base, "base.yaml"), base))
+
+    @settings(max_examples=tries, derandomize=True, phases=[Phase.generate], **FREE)
+    @given(st.data())
+    def sound(data: st.DataObject) -> None:
+        path = data.draw(st.sampled_from(ways))
+        content = copy.deepcopy(base)
+        place = content
+        for name in path[:-1]:
+            place = place[name]
+        place[path[-1]] = data.draw(values(place[path[-1]]))
+        found = flaw(content, path)
+        assert found is None, (found, path, place[path[-1]])
+        assert not (tmp_path / "run").exists()
+
+    sound()
