@@ -6,8 +6,12 @@ import ast
 import importlib
 import sys
 from pathlib import Path
+from types import ModuleType
 
 from fusion_gym.validation import ConfigurationError, choice
+
+from . import missing_extra
+from .output.ending import told
 
 FOLDER = Path(__file__).parent
 COMMANDS = sorted(file.stem for file in FOLDER.glob("[a-z]*.py") if file.stem != "command_line")
@@ -24,23 +28,36 @@ def usage() -> str:
 
 
 def main() -> None:
-    """Entry point of ``fusion-gym``; the commands need the packages of the extra ``agents``."""
+    """Entry point of ``fusion-gym``; the commands need the packages of the extra ``agents``.
+
+    Raises:
+        SystemExit: as :func:`told`; an unknown command (2).
+    """
     name = sys.argv[1] if sys.argv[1:] else "--help"
-    if name in ("-h", "--help"):
-        print(usage())
-        return
+    with told():
+        if name in ("-h", "--help"):
+            print(usage())
+            return
+        module = load(name)
+        del sys.argv[1]  # as python -m agents.COMMAND has it
+        module.main()
+
+
+def load(name: str) -> ModuleType:
+    """The module of a command.
+
+    Raises:
+        SystemExit: no such command (2), or a package that it needs is not installed (1).
+    """
     try:
-        module = importlib.import_module(f".{choice('command', name, COMMANDS)}", __package__)
+        return importlib.import_module(f".{choice('command', name, COMMANDS)}", __package__)
     except ConfigurationError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     except ModuleNotFoundError as error:
-        missing = error.name or str(error)
-        if missing.partition(".")[0] in ("fusion_gym", "agents"):
+        if missing_extra(error) is None:
             raise
-        sys.exit(f"error: {missing} is missing: pip install 'fusion-gym[agents]'")
-    del sys.argv[1]  # as python -m agents.COMMAND has it
-    module.main()
+        sys.exit(missing_extra(error))
 
 
 if __name__ == "__main__":

@@ -18,16 +18,17 @@ import time
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import joblib
 from tqdm import tqdm
 
 from fusion_gym.core.system import covers
 from fusion_gym.evaluation.envelope import lower_envelope
-from fusion_gym.validation import ConfigurationError, choice, integer
+from fusion_gym.validation import ConfigurationError, choice
 
 from .command_line import Command, spelled, start
+from .input.options import OutputFolder, Steps, Whole, writable_folder
 from .output.files import load_results, read_json, write
 from .suite.config import COMPARED_UP_TO, Setting, Suite, load_suite
 from .suite.jobs import Folders, Job, finished, jobs, setting_task
@@ -50,15 +51,15 @@ class Benchmark(Command):
     """Less of everything, in minutes."""
     resume: bool = False
     """Skip what is finished, go on with trainings of one's own: their checkpoints hold pickles."""
-    results: Path | None = None
+    results: Annotated[Path | None, OutputFolder()] = None
     """Folder for JSON, instead of results or results/quick."""
-    work: Path | None = None
+    work: Annotated[Path | None, OutputFolder()] = None
     """Folder for models and episodes, instead of runs/benchmark/full or quick."""
-    workers: int = 2
+    workers: Annotated[int, Whole(1, 512)] = 2
     """Processes side by side."""
-    seeds: int | None = None
+    seeds: Annotated[int | None, Whole(1, 10_000)] = None
     """Number of training seeds, instead of the config's."""
-    timesteps: int | None = None
+    timesteps: Steps = None
     """Steps of each training, instead of the config's."""
 
     def run(self) -> None:
@@ -93,7 +94,8 @@ class Benchmark(Command):
             self.results or Path("results/quick" if self.quick else "results"),
             self.work or Path("runs/benchmark/quick" if self.quick else "runs/benchmark/full"),
         )
-        integer("workers", self.workers, at_least=1)
+        writable_folder("results", folders.results)
+        writable_folder("work", folders.work)
         by_name = {setting.name: setting for setting in suite.settings}
         chosen = [by_name[choice("envs", name, by_name)] for name in self.envs or by_name]
         for mode in self.modes:

@@ -16,6 +16,9 @@ import tyro
 
 from fusion_gym.validation import ConfigurationError
 
+from .input.options import check_options
+from .output.ending import flush, told
+
 Words = tuple[tuple[str, ...], ...]  # of an option that may be given several times
 _Kind = TypeVar("_Kind", bound="Command")
 
@@ -46,16 +49,18 @@ def spelled(command: str) -> str:
 
 
 def read(kind: type[_Kind]) -> _Kind:
-    """The command with the options of the command line.
+    """The command with the options of the command line, each of them checked.
 
     Raises:
         SystemExit: help was asked for (status 0), or an option is not understood (2, after one
             line that says which).
+        ConfigurationError: an option's value that is not allowed.
     """
+    _refuse_empty_words()
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(
+            given = tyro.cli(
                 kind,
                 prog=spelled(kind.__name__.lower()),
                 config=(tyro.conf.FlagCreatePairsOff,),
@@ -63,24 +68,32 @@ def read(kind: type[_Kind]) -> _Kind:
     except SystemExit as end:
         if end.code:
             print(f"error: {_essence(said.getvalue())}", file=sys.stderr)
+        flush()
         raise
+    check_options(given)
+    return given
 
 
 def start(kind: type[Command]) -> None:
     """Read the command and do it.
 
     Raises:
-        SystemExit: an error (status 1, or 2 for an option that is not understood; one line says
-            what), or an interrupt (130).
+        SystemExit: as :func:`told`.
     """
-    command = read(kind)
-    try:
+    command: Command | None = None
+    with told(lambda: command.interrupted() if command else "interrupted"):
+        command = read(kind)
         command.run()
-    except ConfigurationError as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        print(command.interrupted(), file=sys.stderr)
-        sys.exit(130)
+
+
+def _refuse_empty_words() -> None:
+    """An empty word is a variable of the shell that is not set; a path of it would be here."""
+    option = "the command line"
+    for word in sys.argv[1:]:
+        named = word.startswith("--")
+        option = word.strip("-").partition("=")[0] if named else option
+        if not word or (named and word.endswith("=")):
+            raise ConfigurationError(f"{option} = '' is not allowed: it must not be empty")
 
 
 def _essence(message: str) -> str:

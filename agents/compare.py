@@ -12,11 +12,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.registry import make_policy
 
 from .command_line import Command, start
+from .input.options import Episodes, OutputFolder, Seed
 from .suite.comparison import compare, run_all
 from .suite.sweep import Sweep
 from .training.checked import load
@@ -33,16 +35,16 @@ class Compare(Command):
     """The baselines' YAML, or the name of a shipped one."""
     policy: str
     """The policy, for example model:PATH."""
-    output: Path
+    output: Annotated[Path, OutputFolder()]
     """Folder for the results."""
-    episodes: int = 1000
+    episodes: Episodes = 1000
     """Episodes of each policy."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the first episode."""
 
     def run(self) -> None:
         """Run all policies on the same seeds; write, print and draw the comparison."""
-        chosen, sweep = load(Experiment, self.config).environment, load(Sweep, self.sweep)
+        chosen, sweep = load(Experiment, self.config).environment, load(Sweep, self.sweep, "sweep")
         task = make_task(chosen.id, **chosen.options)
         make_policy(self.policy, task)
         baselines = run_all(task, sweep.policies, self.episodes, self.seed, "baselines")

@@ -13,12 +13,15 @@ import shutil
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import record_episode
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError
 
 from .command_line import Command, start
+from .input.options import Episodes, OutputFolder, Seed, Steps
 from .output import figures
 from .suite.comparison import compare, run_all
 from .suite.sweep import Sweep
@@ -54,15 +57,15 @@ SETTINGS = (
 class Demo(Command):
     """Baselines, a trained agent, and a fair comparison."""
 
-    output: Path = Path("runs/demo")
+    output: Annotated[Path, OutputFolder()] = Path("runs/demo")
     """Folder for the results."""
-    episodes: int = 1000
+    episodes: Episodes = 1000
     """Test episodes of each policy."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the first test episode."""
     sweep: str = "tobit_oscillator_sweep"
     """The baselines' YAML, or the name of a shipped one."""
-    timesteps: int | None = None
+    timesteps: Steps = None
     """Steps of each training, instead of the configs'."""
     fresh: bool = False
     """Remove earlier results first."""
@@ -70,9 +73,9 @@ class Demo(Command):
     def run(self) -> None:
         """Both settings from baselines to figures."""
         began = time.perf_counter()
+        sweep = load(Sweep, self.sweep, "sweep")
         for setting in SETTINGS if self.fresh else ():
-            shutil.rmtree(self.output / setting.name, ignore_errors=True)
-        sweep = load(Sweep, self.sweep)
+            remove(self.output / setting.name)
         for setting in SETTINGS:
             if not demonstrate(setting, load(Experiment, setting.config), sweep, self):
                 raise KeyboardInterrupt
@@ -82,6 +85,21 @@ class Demo(Command):
     def interrupted(self) -> str:
         """Nothing is lost."""
         return "interrupted: run the same command again to go on"
+
+
+def remove(folder: Path) -> None:
+    """Remove what an earlier demo left in a folder, and nothing else.
+
+    Raises:
+        ConfigurationError: the folder holds something else.
+    """
+    if not folder.exists():
+        return
+    if any(folder.iterdir()) and not (folder / "agent" / "config.yaml").exists():
+        raise ConfigurationError(
+            f"fresh = True is not allowed: {str(folder)!r} holds no results of a demo, and is kept"
+        )
+    shutil.rmtree(folder)
 
 
 def demonstrate(setting: Setting, experiment: Experiment, sweep: Sweep, given: Demo) -> bool:

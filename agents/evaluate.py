@@ -25,9 +25,12 @@ from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import Command, Words, start
+from .input.files import checked
+from .input.options import Episodes, OutputFile, Seed
 from .output import tables
 from .output.files import read_json, write
 from .output.progress import progress_bar
+from .suite.reports import Evaluation
 
 
 @dataclass(frozen=True)
@@ -46,13 +49,13 @@ class Evaluate(Command):
         Words, tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE …")
     ] = ()
     """Options of gym.make for the environment; they go before the config's."""
-    episodes: int = 1000
+    episodes: Episodes = 1000
     """Episodes of each policy."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the first episode."""
     reference: str | None = None
     """One of the policies: print paired differences to it."""
-    json: Path | None = None
+    json: Annotated[Path | None, OutputFile()] = None
     """Write the results to this file."""
     resume: bool = False
     """Keep what the JSON already holds."""
@@ -157,7 +160,7 @@ def finished(path: Path | None, report: dict[str, Any]) -> dict[str, Any]:
     """What an earlier run of the same evaluation has written.
 
     Raises:
-        ConfigurationError: no file is named, or it is of another evaluation.
+        ConfigurationError: no file is named, or it holds no evaluation, or another one.
     """
     if path is None:
         raise ConfigurationError("resume = True is not allowed without json: there is no file")
@@ -171,6 +174,7 @@ def finished(path: Path | None, report: dict[str, Any]) -> dict[str, Any]:
                 f"json {str(path)!r} holds another evaluation: its {key} is {earlier.get(key)!r}, "
                 f"asked for is {plain[key]!r}"
             )
+    checked(Evaluation, earlier, f"json = {str(path)!r}")
     return earlier
 
 

@@ -9,18 +9,19 @@ Reads the JSON in the results folder and writes ``README.md``, a figure for each
 from __future__ import annotations
 
 import base64
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import markdown
 
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import Command, spelled, start
+from .input.options import OutputFolder
 from .output import figures
 from .output.files import write_text
+from .suite.reports import read_setting
 
 LEAST_ROOM = 0.05  # below that the share of it that an agent closes says nothing
 MODES = {
@@ -34,16 +35,16 @@ MODES = {
 class Report(Command):
     """Tables and figures of the benchmark's results, as Markdown and as one HTML page."""
 
-    results: Path = Path("results")
+    results: Annotated[Path, OutputFolder()] = Path("results")
     """Folder of the benchmark's JSON, and for what is made of it."""
 
     def run(self) -> None:
         """Draw the figures, write README.md and report.html."""
         found = read(self.results)
-        for name, parts in found.items():
-            draw(self.results, name, parts)
         quick = " --quick" if self.results.name == "quick" else ""
         text = text_of(found, f"{spelled('benchmark')}{quick}", spelled("report"))
+        for name, parts in found.items():
+            draw(self.results, name, parts)
         page, readme = self.results / "report.html", self.results / "README.md"
         write_text(readme, text)
         write_text(page, page_of(text, self.results))
@@ -54,14 +55,10 @@ def read(results: Path) -> dict[str, dict[str, Any]]:
     """Verdict, baselines and informed references of every setting that is judged, by name.
 
     Raises:
-        ConfigurationError: there are none.
+        ConfigurationError: there are none, or a file that is no such JSON.
     """
     found = {
-        path.parent.name: {
-            "verdict": json.loads(path.read_text()),
-            "baselines": json.loads((path.parent / "baselines.json").read_text()),
-            "informed": _policies(path.parent / "informed.json"),
-        }
+        path.parent.name: read_setting(path.parent)
         for path in sorted(results.glob("*/verdict.json"))
     }
     if not found:
@@ -69,11 +66,6 @@ def read(results: Path) -> dict[str, dict[str, Any]]:
             f"results = {str(results)!r} is not allowed: it must hold results of the benchmark"
         )
     return found
-
-
-def _policies(path: Path) -> dict[str, Any]:
-    """The policies of a report, none if there is no such report."""
-    return dict(json.loads(path.read_text())["policies"]) if path.exists() else {}
 
 
 def share(interval: dict[str, float] | None) -> str:

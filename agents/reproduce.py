@@ -19,6 +19,7 @@ from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.registry import make_policy
 
 from .command_line import Command, start
+from .input.options import Episodes, Seed
 from .output import tables
 from .output.progress import progress_bar
 from .suite.sweep import Comparison
@@ -33,9 +34,9 @@ class Reproduce(Command):
 
     config: str = "tobit_oscillator_reproduce"
     """The rows: a YAML file, or the name of a shipped config."""
-    episodes: int = 2000
+    episodes: Episodes = 2000
     """Episodes of each row."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the first episode."""
     markdown: bool = False
     """Print the table as the documentation holds it."""

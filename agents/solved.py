@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich import box
 from rich.table import Table
@@ -22,6 +22,7 @@ from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.registry import make_policy
 
 from .command_line import Command, start
+from .input.options import Episodes, OutputFolder, Seed, TrainingSeeds
 from .output import tables
 from .output.files import write
 from .training.checked import load
@@ -35,13 +36,13 @@ class Solved(Command):
 
     config: str = "remote_estimation_ppo"
     """The training: a YAML file, or the name of a shipped config."""
-    seeds: tuple[int, ...] = (0, 1, 2)
+    seeds: TrainingSeeds = (0, 1, 2)
     """Seeds of the trainings."""
-    episodes: int = 4000
+    episodes: Episodes = 4000
     """Test episodes of each policy."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the first test episode."""
-    output: Path = Path("runs/solved")
+    output: Annotated[Path, OutputFolder()] = Path("runs/solved")
     """Folder for the results."""
 
     def run(self) -> None:

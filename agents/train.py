@@ -18,8 +18,11 @@ A checkpoint holds pickles: resume your own trainings, not files from others.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
 from .command_line import Command, start
+from .input.options import Between, OutputFolder, Steps, TrainingSeed, writable_folder
 from .training.checked import load
 from .training.config import Experiment
 from .training.run import train
@@ -31,13 +34,13 @@ class Train(Command):
 
     config: str
     """The experiment: a YAML file, or the name of a shipped config."""
-    timesteps: int | None = None
+    timesteps: Steps = None
     """Steps of all runs together, instead of the config's."""
-    seed: int | None = None
+    seed: TrainingSeed = None
     """Seed of the training, instead of the config's."""
-    target_rate: float | None = None
+    target_rate: Annotated[float | None, Between(0, 1)] = None
     """Average transmissions per sensor and step to train to."""
-    output: str | None = None
+    output: Annotated[str | None, OutputFolder()] = None
     """Folder for the results, instead of the config's."""
     resume: bool = False
     """Go on from the last checkpoint, one of your own: it holds pickles."""
@@ -54,7 +57,9 @@ class Train(Command):
 
     def run(self) -> None:
         """Train; an interrupted training has said how to go on."""
-        if not train(self.experiment(), resume=self.resume)["finished"]:
+        experiment = self.experiment()
+        writable_folder("output", Path(experiment.output))
+        if not train(experiment, resume=self.resume)["finished"]:
             raise KeyboardInterrupt
 
 

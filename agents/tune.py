@@ -17,7 +17,7 @@ import sqlite3
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import optuna
@@ -26,9 +26,10 @@ from optuna.exceptions import StorageInternalError
 from optuna.trial import TrialState
 from tqdm import tqdm
 
-from fusion_gym.validation import ConfigurationError, integer
+from fusion_gym.validation import ConfigurationError
 
 from .command_line import Command, spelled, start
+from .input.options import OutputFolder, Steps, Whole
 from .output.files import write_text
 from .output.folders import alone_in, check_inputs, fingerprint
 from .training.checked import load, parse
@@ -54,16 +55,15 @@ class Tune(Command):
 
     config: str
     """The experiment to begin with: a YAML file, or the name of a shipped config."""
-    output: Path
+    output: Annotated[Path, OutputFolder()]
     """Folder of the study."""
-    trials: int = 30
+    trials: Annotated[int, Whole(1, 1_000_000)] = 30
     """Trials of the study in all."""
-    timesteps: int | None = None
+    timesteps: Steps = None
     """Steps of a trial, instead of the config's."""
 
     def run(self) -> None:
         """Search, and write the best config under the command that found it."""
-        integer("trials", self.trials, at_least=1)
         experiment = load(Experiment, self.config)
         plain = experiment.model_dump()
         if self.timesteps is not None:

@@ -8,17 +8,18 @@ For each setting and mode the training seed with the best validation return goes
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from fusion_gym import zoo
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import Command, spelled, start
+from .input.options import InputFolder, OutputFolder
 from .output.files import replacing, write
+from .suite.reports import Agent, read
 
 LARGEST = 300_000  # bytes of a model
 
@@ -27,11 +28,11 @@ LARGEST = 300_000  # bytes of a model
 class Zoo(Command):
     """Put the benchmark's best agents into the model zoo, with their cards."""
 
-    results: Path = Path("results")
+    results: Annotated[Path, InputFolder()] = Path("results")
     """Folder of the benchmark's JSON."""
-    work: Path = Path("runs/benchmark/full")
+    work: Annotated[Path, InputFolder()] = Path("runs/benchmark/full")
     """Folder of its models."""
-    zoo: Path = Path(zoo.__file__).parent
+    zoo: Annotated[Path, OutputFolder()] = Path(zoo.__file__).parent
     """Folder of the model zoo."""
 
     def run(self) -> None:
@@ -41,8 +42,9 @@ class Zoo(Command):
             raise ConfigurationError(
                 f"results = {str(self.results)!r} is not allowed: it holds no agents"
             )
+        models = {name: model_of(report, self.work) for name, report in found.items()}
         for name, report in found.items():
-            add(name, report, self.work, self.zoo)
+            add(name, report, models[name], self.zoo)
             print(f"zoo:{name}")
 
 
@@ -50,7 +52,7 @@ def best_agents(results: Path) -> dict[str, dict[str, Any]]:
     """The report of the best training seed, by ``SETTING_MODE``."""
     found: dict[str, dict[str, Any]] = {}
     for path in sorted(results.glob("*/agent_*.json")):
-        report = json.loads(path.read_text())
+        report = read(Agent, path, "results")
         name = f"{report['setting']}_{report['mode']}"
         value = report["best_validation"]["return"]
         if name not in found or value > found[name]["best_validation"]["return"]:
@@ -58,8 +60,8 @@ def best_agents(results: Path) -> dict[str, dict[str, Any]]:
     return found
 
 
-def add(name: str, report: dict[str, Any], work: Path, folder: Path) -> None:
-    """Copy a model and write its card.
+def model_of(report: dict[str, Any], work: Path) -> Path:
+    """The model that a report speaks of.
 
     Raises:
         ConfigurationError: there is no such model, or it is too large.
@@ -72,9 +74,11 @@ def add(name: str, report: dict[str, Any], work: Path, folder: Path) -> None:
         raise ConfigurationError(
             f"{model} has {model.stat().st_size} bytes: it must have at most {LARGEST}"
         )
-    folder.mkdir(parents=True, exist_ok=True)
-    with replacing(folder / f"{name}.zip") as partial:
-        shutil.copyfile(model, partial)
+    return model
+
+
+def add(name: str, report: dict[str, Any], model: Path, folder: Path) -> None:
+    """Write a model's card, then copy it: a model that is there has a card."""
     training = report["training"] | {"output": f"runs/{name}"}
     card = {
         "env": report["env"],
@@ -91,6 +95,8 @@ def add(name: str, report: dict[str, Any], work: Path, folder: Path) -> None:
         },
     }
     write(folder / f"{name}.json", card)
+    with replacing(folder / f"{name}.zip") as partial:
+        shutil.copyfile(model, partial)
 
 
 def main() -> None:

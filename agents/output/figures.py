@@ -129,7 +129,7 @@ def fronts(
             rate, mse, style, marker="*", ms=9, color=_AGENT, zorder=3, label=f"agent, {mode}"
         )
     everything = [mse for points in (*agents.values(), informed) for _, mse in points]
-    bottom = 0.88 * min(everything)
+    bottom = 0.88 * min((mse for mse in everything if mse > 0.0), default=1.0)  # logarithmic
     if genie is not None:
         level = genie["mse"]["mean"]
         label = f"genie ({level:.3g}{', below' if level < bottom else ''})"

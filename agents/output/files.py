@@ -18,6 +18,8 @@ import numpy as np
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.validation import ConfigurationError
 
+from ..input.files import read_text
+
 FIELDS = tuple(EpisodeResults.__dataclass_fields__)
 # What reading a damaged archive raises; RuntimeError where a part says that it is encrypted.
 DAMAGED = (
@@ -48,6 +50,9 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         yield partial
         partial.replace(path)
+    except OSError as error:  # that of a full disk names no file
+        error.filename = str(path)
+        raise
     finally:
         partial.unlink(missing_ok=True)
 
@@ -77,13 +82,10 @@ def read_json(path: Path, name: str) -> dict[str, Any]:
     Raises:
         ConfigurationError: it cannot be read, or holds no JSON object; one line says which.
     """
+    text = read_text(name, path)
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigurationError(
-            f"{name} = {str(path)!r} cannot be read: {error.strerror or error}"
-        ) from None
-    except ValueError as error:  # no JSON, or no text
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
         raise ConfigurationError(f"{name} = {str(path)!r} holds no JSON: {error}") from None
     if not isinstance(found, dict):
         raise ConfigurationError(f"{name} = {str(path)!r} holds no JSON object")

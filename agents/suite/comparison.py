@@ -101,7 +101,8 @@ def comparison_table(comparison: Comparison, learned: EpisodeResults) -> Table:
         f"{learned.mse.mean():.4f}",
         f"{comparison.envelope:.4f}",
         tables.difference(comparison.difference),
-        f"{comparison.difference.mean / comparison.envelope:+.1%}",
+        # Whoever always transmits over a perfect channel has no error to compare with.
+        f"{comparison.difference.mean / comparison.envelope:+.1%}" if comparison.envelope else "–",
         "\n".join(comparison.between),
     )
     return table

@@ -157,4 +157,5 @@ def load_suite(path: str | Path, quick: bool = False) -> Suite:
         ConfigurationError: unreadable, an unknown key, or a value that is not allowed.
     """
     plain = read_yaml(path)
-    return parse(Suite, plain | QUICK if quick else plain, str(path))
+    changed = quick and isinstance(plain, dict)  # all else is refused
+    return parse(Suite, plain | QUICK if changed else plain, str(path))

@@ -19,7 +19,7 @@ class Curve(Strict):
     @property
     def policies(self) -> list[str]:
         """One policy text a value."""
-        return [self.policy.format(value=f"{value:g}") for value in self.values]
+        return [self.policy.replace("{value}", f"{value:g}") for value in self.values]
 
     @pydantic.field_validator("policy")
     @classmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Hashable, Mapping
 from pathlib import Path
@@ -12,6 +13,8 @@ import yaml
 
 from fusion_gym import validation
 from fusion_gym.validation import ConfigurationError
+
+from ..input.files import checked, read_text
 
 # Beside the folder of the commands, in a clone as in an installed package.
 SHIPPED = Path(__file__).parents[2] / "configs"
@@ -70,59 +73,49 @@ _Loader.add_implicit_resolver(
 )
 
 
-def config_path(name: str | Path) -> Path:
+def config_path(name: str | Path, option: str = "config") -> Path:
     """The file of that path, or the shipped config of that name (``tobit_oscillator_ppo``).
 
     Raises:
         ConfigurationError: a bare name that is neither; the message lists the shipped configs.
     """
     path = Path(name)
-    if path.is_file() or path.suffix or path.name != str(name):
+    if os.path.isfile(path) or path.suffix or path.name != str(name):
         return path
     shipped = sorted(file.stem for file in SHIPPED.glob("*.yaml"))
-    return SHIPPED / f"{validation.choice('config', str(name), shipped)}.yaml"
+    return SHIPPED / f"{validation.choice(option, str(name), shipped)}.yaml"
 
 
-def load(kind: type[Model], name: str | Path) -> Model:
-    """The config of a path or shipped name, checked.
+def load(kind: type[Model], name: str | Path, option: str = "config") -> Model:
+    """The config of a path or shipped name, checked; ``option`` is where the user named it.
 
     Raises:
         ConfigurationError: unreadable, an unknown key, or a value that is not allowed; names the
             file and the first such field.
     """
-    return parse(kind, read_yaml(name), str(name))
+    return parse(kind, read_yaml(name, option), str(name), option)
 
 
-def read_yaml(name: str | Path) -> Any:
+def read_yaml(name: str | Path, option: str = "config") -> Any:
     """What the config of a path or shipped name holds.
 
     Raises:
         ConfigurationError: no such file, or no YAML.
     """
+    text = read_text(option, config_path(name, option), str(name))
     try:
-        return yaml.load(config_path(name).read_text(encoding="utf-8"), _Loader)  # a safe loader
-    except OSError as error:
-        raise ConfigurationError(
-            f"config {str(name)!r} cannot be read: {error.strerror or error}"
-        ) from None
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
+        return yaml.load(text, _Loader)  # a safe loader
+    # PyYAML lets through what its types raise: a date of 31 February, tags without a value.
+    except (yaml.YAMLError, ValueError, AttributeError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())
-        raise ConfigurationError(f"config {str(name)!r} is no YAML: {reason}") from None
+        raise ConfigurationError(f"{option} {str(name)!r} is no YAML: {reason}") from None
 
 
-def parse(kind: type[Model], content: Any, source: str) -> Model:
+def parse(kind: type[Model], content: Any, source: str, option: str = "config") -> Model:
     """The content as a checked model.
 
     Raises:
         ConfigurationError: an unknown key or a value that is not allowed; names ``source`` and
             the first such field.
     """
-    try:
-        return kind.model_validate(content)
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"]) or "the whole file"
-        given = "" if first["type"] == "missing" else f" = {first['input']!r}"
-        raise ConfigurationError(
-            f"config {source!r}: {place}{given} is not allowed: {first['msg']}"
-        ) from None
+    return checked(kind, content, f"{option} {source!r}")

@@ -23,7 +23,8 @@ def parse_value(text: str) -> Any:
         if all(isinstance(part, (int, float)) for part in parts):
             return parts
     for read in (ast.literal_eval, float):
-        with contextlib.suppress(ValueError, SyntaxError):
+        # Of what is no literal: {[]: 1} raises a TypeError, too many brackets the last two.
+        with contextlib.suppress(ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
             return read(text)
     return text
 

@@ -1,0 +1,1 @@
+"""What a user hands in: options and files, checked before anything runs."""

@@ -1,0 +1,67 @@
+"""How every command ends: with one line for what is no bug, and an exit status."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import sys
+from collections.abc import Callable, Iterator
+
+from fusion_gym.validation import ConfigurationError
+
+
+@contextlib.contextmanager
+def told(interrupted: Callable[[], str] = lambda: "interrupted") -> Iterator[None]:
+    """Let what a user or the machine did wrong end the program with one line.
+
+    Anything else is an error of the program's own, and keeps its traceback.
+
+    Raises:
+        SystemExit: a setting that is not allowed, a file or the memory that the system refuses
+            (status 1, one line says what); an interrupt (130, after the line ``interrupted``
+            returns); nobody reads the output any more (141, and nothing is said).
+    """
+    try:
+        _write_anything()
+        yield
+        flush()
+    except ConfigurationError as error:
+        sys.exit(f"error: {_joined(error)}")
+    except KeyboardInterrupt:
+        print(interrupted(), file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:
+        _drop_output()
+        sys.exit(141)
+    except OSError as error:
+        _drop_output()
+        place = "" if error.filename is None else f"{str(error.filename)!r}: "
+        sys.exit(f"error: {place}{_joined(error.strerror or error)}")
+    except MemoryError as error:
+        sys.exit(f"error: there is not enough memory. {_joined(error)}".rstrip(". "))
+
+
+def flush() -> None:
+    """What was printed arrives, or an error says that it did not."""
+    if sys.stdout is not None:  # it is None where it was closed
+        sys.stdout.flush()
+
+
+def _drop_output() -> None:
+    """What cannot be printed is forgotten; the interpreter would try once more at its end."""
+    try:
+        flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _write_anything() -> None:
+    """Characters that the terminal does not know are printed as escapes."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def _joined(message: object) -> str:
+    """The message in one line."""
+    return " ".join(line.strip() for line in str(message).splitlines())

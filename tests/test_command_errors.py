@@ -1,0 +1,185 @@
+"""What a command cannot do it says in one line, before it does anything; and how it ends."""
+
+from __future__ import annotations
+
+import collections
+import errno
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from hostile_commands import BASES, ROOT, Try, call, contents, flaw, line, options, scratch, tries
+
+from agents import __main__ as everything
+from agents.command_line import Command, start
+from agents.demo import remove
+from agents.output.ending import told
+from agents.suite.sweep import Curve
+from fusion_gym.policies.settings import parse_value
+from fusion_gym.validation import ConfigurationError
+
+PER_OPTION = 2  # of the tries that run each time
+
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The folder of the tries, which others may enter (they may not enter pytest's)."""
+    with tempfile.TemporaryDirectory() as folder:
+        scratch(Path(folder))
+        monkeypatch.chdir(folder)
+        yield Path(folder)
+
+
+def selected() -> list[Try]:
+    """A few tries of each option, other values for each."""
+    found = collections.defaultdict(list)
+    for tried in tries():
+        found[tried.command, tried.option].append(tried)
+    return [
+        values[(place * PER_OPTION + turn) % len(values)]
+        for place, values in enumerate(found.values())
+        for turn in range(min(PER_OPTION, len(values)))
+    ]
+
+
+def test_every_option_of_every_command_is_tried() -> None:
+    assert BASES.keys() == set(everything.COMMANDS)
+    tried = {(one.command, one.option) for one in tries()}
+    for name in BASES:
+        for option, kind in options(name).items():
+            assert (name, option) in tried or kind is bool, option
+    assert len(list(tries())) > 500
+
+
+def test_what_is_not_allowed_is_told_in_one_line(here: Path) -> None:
+    assert {str(one): found for one in selected() if (found := flaw(one, here))} == {}
+
+
+@pytest.mark.slow
+def test_all_that_is_not_allowed_is_told_in_one_line(here: Path) -> None:
+    assert {str(one): found for one in tries() if (found := flaw(one, here))} == {}
+
+
+@pytest.mark.parametrize("name", ["evaluate", "report", "zoo"])
+def test_a_full_disk_is_told_and_leaves_nothing_half_written(here: Path, name: str) -> None:
+    """Files of no byte, and of a few: once in the trial and once in the work."""
+    before = contents(here)
+    for limit, part in ((0, "is not allowed: it must be a f"), (16, os.strerror(errno.EFBIG))):
+        ended = call(name, line(name, BASES[name]), limit=limit)
+        assert (ended.status, ended.trace) == (1, "")
+        last = ended.err.splitlines()[-1]
+        assert last.startswith("error: ")
+        assert part in last
+        assert "made" in last or "results" in last
+        assert {name for name, found in contents(here).items() if found is not None} == {
+            name for name, found in before.items() if found is not None
+        }
+    assert call(name, line(name, BASES[name])).status == 0
+
+
+def test_an_error_of_the_programs_own_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclass(frozen=True)
+    class Wrong(Command):
+        """A command with a bug."""
+
+        kind: str
+
+        def run(self) -> None:
+            """Fail."""
+            raise {"value": ValueError, "key": KeyError, "type": TypeError}[self.kind](self.kind)
+
+    for kind, error in (("value", ValueError), ("key", KeyError), ("type", TypeError)):
+        monkeypatch.setattr(sys, "argv", ["wrong", "--kind", kind])
+        with pytest.raises(error):
+            start(Wrong)
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (ConfigurationError("two\nlines"), "error: two lines"),
+        (OSError(errno.EROFS, "Read-only file system", "/a"), "error: '/a': Read-only file system"),
+        (OSError(errno.ENOSPC, "No space left on device"), "error: No space left on device"),
+        (MemoryError("Unable to allocate 1 TiB"), "error: there is not enough memory. Unable"),
+        (KeyboardInterrupt(), 130),
+        (BrokenPipeError(errno.EPIPE, "Broken pipe"), 141),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_what_the_machine_refuses_is_told(error: BaseException, status: int | str) -> None:
+    with pytest.raises(SystemExit) as caught, told():
+        raise error
+    if isinstance(status, str):
+        assert str(caught.value.code).startswith(status)
+    else:
+        assert caught.value.code == status
+
+
+def run(command: str) -> subprocess.CompletedProcess[str]:
+    """A line of the shell in the repository."""
+    path = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    return subprocess.run(
+        ["bash", "-c", command], cwd=ROOT, env=os.environ | path, capture_output=True, text=True
+    )
+
+
+def test_output_that_nobody_reads_or_takes() -> None:
+    gone = run("python -m agents | true; echo ${PIPESTATUS[0]}")
+    assert (gone.stdout, gone.stderr) == ("141\n", "")
+    full = run("python -m agents > /dev/full; echo $?")
+    assert (full.stdout, full.stderr) == ("1\n", "error: No space left on device\n")
+
+
+@pytest.mark.parametrize("line", ["-m agents.evaluate", "-m agents evaluate"])
+def test_an_interrupt_while_a_command_loads_has_no_traceback(line: str) -> None:
+    """Sent as soon as numpy is being imported, which the commands do first."""
+    process = subprocess.Popen(
+        [sys.executable, "-v", *line.split(), "--help"], cwd=ROOT, text=True,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stderr is not None
+    said = []
+    for text in process.stderr:
+        said.append(text)
+        if "import 'scipy" in text:
+            process.send_signal(signal.SIGINT)
+            break
+    said += process.stderr.readlines()
+    process.wait(timeout=60)
+    own = [text for text in said if text[0] not in "#" and not text.startswith("import ")]
+    assert "interrupted\n" in own
+    assert not any(text.startswith("Traceback") for text in own)
+    assert process.returncode in (130, -signal.SIGINT)
+
+
+def test_a_fresh_demo_removes_nothing_but_a_demo(here: Path) -> None:
+    """Neither what is not its own, nor anything when it is refused."""
+    (here / "agent").mkdir()
+    (here / "agent" / "config.yaml").touch()
+    (here / "benchmark").mkdir()
+    (here / "benchmark" / "notes").write_text("kept")
+    for folder in (here / "benchmark", here / "folder"):
+        with pytest.raises(ConfigurationError, match="fresh = True"):
+            remove(folder)
+    ended = call("demo", ["--fresh", "--output", ".", "--sweep", "absent.yaml"])
+    assert ended.status == 1
+    assert (here / "benchmark" / "notes").read_text() == "kept"
+    remove(here)
+    assert not here.exists()
+    here.mkdir()
+
+
+@pytest.mark.parametrize("text", ["{[]: 1}", "(" * 5000, "9" * 5000 + "x", "\0"])
+def test_what_is_no_literal_stays_text(text: str) -> None:
+    assert parse_value(text) == text
+
+
+def test_braces_of_a_swept_policy_are_its_own() -> None:
+    curve = Curve(label="a", policy="p:a={value},b={0}{other}", values=(1, 2.5))
+    assert curve.policies == ["p:a=1,b={0}{other}", "p:a=2.5,b={0}{other}"]
