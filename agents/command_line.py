@@ -49,18 +49,18 @@ def spelled(command: str) -> str:
 
 
 def read(kind: type[_Kind]) -> _Kind:
-    """The command with the options of the command line, each of them checked.
+    """The command with the options of the command line.
 
     Raises:
         SystemExit: help was asked for (status 0), or an option is not understood (2, after one
             line that says which).
-        ConfigurationError: an option's value that is not allowed.
+        ConfigurationError: an option's value is empty.
     """
     _refuse_empty_words()
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            given = tyro.cli(
+            return tyro.cli(
                 kind,
                 prog=spelled(kind.__name__.lower()),
                 config=(tyro.conf.FlagCreatePairsOff,),
@@ -70,12 +70,10 @@ def read(kind: type[_Kind]) -> _Kind:
             print(f"error: {_essence(said.getvalue())}", file=sys.stderr)
         flush()
         raise
-    check_options(given)
-    return given
 
 
 def start(kind: type[Command]) -> None:
-    """Read the command and do it.
+    """Read the command, check its options and do it.
 
     Raises:
         SystemExit: as :func:`told`.
@@ -83,6 +81,7 @@ def start(kind: type[Command]) -> None:
     command: Command | None = None
     with told(lambda: command.interrupted() if command else "interrupted"):
         command = read(kind)
+        check_options(command)
         command.run()
 
 

@@ -27,7 +27,7 @@ from .suite.comparison import compare, run_all
 from .suite.sweep import Sweep
 from .training.checked import load
 from .training.config import Experiment
-from .training.run import train
+from .training.run import holds_training, train
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def remove(folder: Path) -> None:
     """
     if not folder.exists():
         return
-    if any(folder.iterdir()) and not (folder / "agent" / "config.yaml").exists():
+    if any(folder.iterdir()) and not holds_training(folder / "agent"):
         raise ConfigurationError(
             f"fresh = True is not allowed: {str(folder)!r} holds no results of a demo, and is kept"
         )
@@ -109,7 +109,7 @@ def demonstrate(setting: Setting, experiment: Experiment, sweep: Sweep, given: D
     print(f"\n{setting.title}")
     baselines = run_all(task, sweep.policies, given.episodes, given.seed, "baselines")
     training = experiment.changed(folder / "agent", timesteps=given.timesteps)
-    if not train(training, resume=(folder / "agent" / "config.yaml").exists())["finished"]:
+    if not train(training, resume=holds_training(folder / "agent"))["finished"]:
         return False
     agent = f"model:{folder / 'agent' / 'best_model.zip'}"
     names = (experiment.environment.id, setting.title)

@@ -8,7 +8,6 @@ with. Costs are compared on the same test seeds, paired.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,14 +19,16 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError
 
 from .command_line import Command, start
 from .input.options import Episodes, OutputFolder, Seed, TrainingSeeds
 from .output import tables
-from .output.files import write
+from .output.files import read_json, write
+from .output.folders import fingerprint
 from .training.checked import load
 from .training.config import Experiment
-from .training.run import train
+from .training.run import holds_training, train
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,11 @@ class Solved(Command):
         name, chosen = experiment.algorithm.name, experiment.environment
         task = make_task(chosen.id, **chosen.options)
         best = run_episodes(task, make_policy("optimal", task), self.episodes, self.seed)
+        if best.returns.mean() == 0.0:
+            raise ConfigurationError(
+                f"config {self.config!r} is not allowed: its optimum costs nothing, so nothing can "
+                "be compared with it"
+            )
         table = Table(title=f"{self.config}: {self.episodes} episodes", box=box.SIMPLE_HEAD)
         for column in ("policy", "cost of an episode", "rate", "above the optimum [95 %]"):
             table.add_column(column, justify="left" if column == "policy" else "right")
@@ -72,19 +78,28 @@ class Solved(Command):
 
 
 def trained(experiment: Experiment, seed: int, folder: Path) -> Path:
-    """The final model of a training seed, trained if it is not there.
+    """The final model of a training seed, trained as far as it is not.
 
     Raises:
+        ConfigurationError: the folder holds another training.
         KeyboardInterrupt: the training was interrupted.
     """
     output = folder / f"{experiment.algorithm.name}_{seed}"
-    summary = output / "summary.json"
-    if not (summary.exists() and json.loads(summary.read_text())["finished"]):
-        chosen = experiment.changed(output, seed=seed)
-        found = train(chosen, resume=(output / "config.yaml").exists())
-        if not found["finished"]:
-            raise KeyboardInterrupt
+    chosen = experiment.changed(output, seed=seed)
+    if not is_finished(chosen) and not train(chosen, resume=holds_training(output))["finished"]:
+        raise KeyboardInterrupt
     return output / "final_model.zip"
+
+
+def is_finished(experiment: Experiment) -> bool:
+    """Whether this very training has been finished in its folder."""
+    folder = Path(experiment.output)
+    try:
+        summary = read_json(folder / "summary.json", "output")
+    except ConfigurationError:  # the training writes it anew
+        return False
+    same = summary.get("inputs") == fingerprint(experiment.inputs())
+    return same and summary.get("finished") is True and (folder / "final_model.zip").is_file()
 
 
 def excess(agent: EpisodeResults, best: EpisodeResults) -> dict[str, float]:

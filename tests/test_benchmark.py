@@ -309,7 +309,7 @@ def test_a_suite_that_is_not_allowed(tmp_path: Path, changes: Any, message: str)
     [
         (["--envs", "smal"], "did you mean 'small'"),
         (["--modes", "sensor"], "did you mean 'sensors'"),
-        (["--seeds", "0"], "training_seeds = 0 is not allowed"),
+        (["--seeds", "0"], "seeds = 0 is not allowed"),
         (["--workers", "0"], "workers = 0"),
         (["--timesteps", "-5"], "timesteps = -5 is not allowed"),
     ],

@@ -66,6 +66,16 @@ def test_all_that_is_not_allowed_is_told_in_one_line(here: Path) -> None:
     assert {str(one): found for one in tries() if (found := flaw(one, here))} == {}
 
 
+def test_a_full_disk_in_a_training_is_told(here: Path) -> None:
+    """The config fits, the first model does not."""
+    ended = call("train", line("train", BASES["train"]), limit=2_000)
+    assert (ended.status, ended.trace) == (1, "")
+    assert ended.err.splitlines()[-1].startswith("error: ")
+    assert f"made/best_model.zip': {os.strerror(errno.EFBIG)}" in ended.err
+    assert not [name for name in contents(here) if ".part" in name]
+    assert call("train", [*line("train", BASES["train"]), "--resume"]).status == 0
+
+
 @pytest.mark.parametrize("name", ["evaluate", "report", "zoo"])
 def test_a_full_disk_is_told_and_leaves_nothing_half_written(here: Path, name: str) -> None:
     """Files of no byte, and of a few: once in the trial and once in the work."""

@@ -22,10 +22,10 @@ def read_text(option: str, path: Path, name: str | None = None) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        raise ConfigurationError(f"{option} {shown!r} is no text in UTF-8: {error}") from None
+        raise ConfigurationError(f"{option} = {shown!r} is no text in UTF-8: {error}") from None
     except (OSError, ValueError) as error:  # a ValueError of a path that no system knows
         reason = getattr(error, "strerror", None) or error
-        raise ConfigurationError(f"{option} {shown!r} cannot be read: {reason}") from None
+        raise ConfigurationError(f"{option} = {shown!r} cannot be read: {reason}") from None
 
 
 def checked(shape: type[Shape], content: Any, source: str) -> Shape:
