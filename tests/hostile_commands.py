@@ -5,65 +5,19 @@ They are made from the commands' fields, so a new option is tried without a chan
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import importlib
-import io
-import os
-import re
-import resource
-import shutil
-import signal
-import sys
-import traceback
 import typing
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
+from hostile_folder import BROKEN, ENV
 
-from agents import __main__ as everything
 from agents.command_line import Command
 from agents.input.options import OutputFile, OutputFolder
 
-ROOT = Path(__file__).parent.parent
-ENV = "fusion_gym/RemoteEstimation-v0"
 LONG = "n" * 300
-SETTING = "remote_estimation"
-NOBODY = 65534
-
-TRAINING = {
-    "environment": {"id": ENV, "options": {"horizon": 4}},
-    "algorithm": {"name": "ppo", "n_steps": 8, "batch_size": 16, "network": {"hidden": [4]}},
-    "training": {"timesteps": 32, "num_envs": 2},
-    "validation": {"every": 32, "episodes": 2},
-    "output": "made",
-}
-SWEEP = {
-    "points": ["never", "always"],
-    "curves": [{"label": "a", "policy": "periodic:period={value}", "values": [2, 3]}],
-}
-ROWS = {"environment": ENV, "rows": [{"label": "a", "policy": "always"}]}
-SUITE = {
-    "episodes": 2,
-    "training_seeds": 1,
-    "timesteps": 32,
-    "num_envs": 2,
-    "prices": 2,
-    "modes": ["sensors"],
-    "tuning": {"trials": 2, "episodes": 2, "kept": 2},
-    "algorithm": TRAINING["algorithm"],
-    "families": [],
-    "settings": [
-        {
-            "name": "one",
-            "title": "one",
-            "environment": TRAINING["environment"],
-            "price_range": [0.1, 1.0],
-        }
-    ],
-}
+JSON = [name for name in BROKEN if name not in ("date", "tag")]  # which a JSON reader knows not
 
 # What a command needs beside the option that is tried. None of these tries may get so far.
 BASES: dict[str, dict[str, list[str]]] = {
@@ -89,25 +43,6 @@ BASES: dict[str, dict[str, list[str]]] = {
     },
 }  # fmt: skip
 
-# Files that are no config and no result, by name.
-BROKEN: dict[str, bytes] = {
-    "empty": b"",
-    "text": b"this is no structure: at: all\n\t- x",
-    "latin": "Größe: 1".encode("latin-1"),
-    "binary": bytes(range(256)),
-    "list": b"[1, 2]",
-    "number": b"3",
-    "null": b"null",
-    "half": b'{"policies": {"always": ',
-    "date": b"output: 2020-13-45",
-    "deep": b"[" * 1050,
-    "tag": b"!!python/object:os.system x",
-    "stamp": b"output: !!timestamp x",
-    "digits": b"output: " + b"9" * 5000,
-    "other": b'{"something": {"else": 1}}',
-}
-NAMES = {".yaml": BROKEN, ".json": {k: v for k, v in BROKEN.items() if k not in ("date", "tag")}}
-
 WORDS = ["nothing_of_that_name", "fusion_gym/Nothing-v0"]
 POLICIES = [
     "nothing", "nothing:a=1", "always:a=1", "random:rate=x", "random:rate=nan", "random:rate=2",
@@ -124,12 +59,12 @@ SETTINGS = [
 ]  # fmt: skip
 WHOLE = ["-1", "0", "nan", "1.5", "many", "9" * 30]
 REAL = ["-1", "0", "2", "nan", "inf", "much"]
+# No device is among these, for a command that is wrong would replace it.
 FOLDERS = ["text", "text/below", "locked/below", LONG, "loop/below", "/proc/self/made", "pipe"]
 FILES = ["folder", "text/made.json", "locked/made.json", f"{LONG}.json", "loop",
          "/proc/self/made.json"]  # fmt: skip
 UNREADABLE = ["absent.yaml", "absent", "folder", "locked/file.yaml", "text/below.yaml", LONG,
               "loop.yaml"]  # fmt: skip
-# No device is among these: an older version, run as root, replaced /dev/full by a plain file.
 # Numbers among the hostile ones that an option may have after all.
 ALLOWED = {("seed", "0"), ("seeds", "0"), ("seed", "9" * 30)}
 
@@ -160,7 +95,7 @@ def hostile(option: str, kind: Any, present: list[str] | None = None) -> list[st
     """Values that an option of this type cannot have; ``present`` is one that it has."""
     marks = {type(mark) for mark in getattr(kind, "__metadata__", ())}
     text = str(kind)
-    results = [f"bad_results/{name}" for name in NAMES[".json"]]
+    results = [f"bad_results/{name}" for name in JSON]
     if OutputFolder in marks:
         values = [*FOLDERS, *(results if present == ["results"] else [])]
     elif OutputFile in marks:
@@ -170,7 +105,7 @@ def hostile(option: str, kind: Any, present: list[str] | None = None) -> list[st
     elif option == "set":
         values = SETTINGS
     elif option in ("config", "sweep"):
-        values = [*UNREADABLE, *(f"{name}.yaml" for name in NAMES[".yaml"])]
+        values = [*UNREADABLE, *(f"{name}.yaml" for name in BROKEN)]
     elif "Path" in text:
         values = [*UNREADABLE, *results]
     elif "bool" in text:
@@ -193,7 +128,7 @@ def tries() -> Iterator[Try]:
         yield Try(command, "nothing", "nothing", [*line(command, base), "--nothing", "3"])
         yield Try(command, "", "stray", [*line(command, base), "stray"])
     evaluate = BASES["evaluate"]
-    for name in NAMES[".json"]:
+    for name in JSON:
         words = line("evaluate", evaluate | {"json": [f"{name}.json"]})
         yield Try("evaluate", "json", f"{name}.json", [*words, "--resume"])
     yield Try("evaluate", "resume", "json", [*line("evaluate", evaluate)[:-2], "--resume"])
@@ -208,137 +143,3 @@ def line(command: str, given: dict[str, list[str]]) -> list[str]:
         name = f"--{option.replace('_', '-')}"
         joined += [f"{name}={words[0]}"] if words[0].startswith("-") else [name, *words]
     return joined
-
-
-def scratch(folder: Path) -> None:
-    """A folder with what the tries need, where everybody may write."""
-    for name, content in (
-        ("training", TRAINING), ("sweep", SWEEP), ("rows", ROWS), ("suite", SUITE)
-    ):  # fmt: skip
-        (folder / f"{name}.yaml").write_text(yaml.safe_dump(content))
-    for name, raw in BROKEN.items():
-        for suffix in ("", ".yaml", ".json"):
-            (folder / f"{name}{suffix}").write_bytes(raw)
-        broken = folder / "bad_results" / name / SETTING
-        broken.mkdir(parents=True)
-        shutil.copy(ROOT / "results" / SETTING / "baselines.json", broken)
-        (broken / "verdict.json").write_bytes(raw)
-        (broken / "agent_sensors_0.json").write_bytes(raw)
-    made = folder / "results" / SETTING
-    made.mkdir(parents=True)
-    for name in ("verdict", "baselines", "agent_sensors_0"):
-        shutil.copy(ROOT / "results" / SETTING / f"{name}.json", made)
-    model = folder / "work" / SETTING / "sensors_0"
-    model.mkdir(parents=True)
-    (model / "best_model.zip").write_bytes(b"a model")
-    (folder / "folder").mkdir()
-    (folder / "folder" / "file").write_text("kept")
-    (folder / "locked").mkdir()
-    (folder / "locked" / "file.yaml").write_text("kept: 1")
-    for name in ("loop", "loop.yaml"):
-        (folder / name).symlink_to(name)
-    os.mkfifo(folder / "pipe")
-    for path in (folder, *folder.rglob("*")):
-        if not path.is_symlink():
-            path.chmod(0o777 if path.is_dir() else 0o666)
-    (folder / "locked").chmod(0)
-
-
-class Hung(BaseException):
-    """A try took too long."""
-
-
-class Ended(NamedTuple):
-    """How a command ended."""
-
-    status: int
-    out: str
-    err: str
-    trace: str
-
-
-def call(command: str, words: list[str], seconds: float = 20.0, limit: int | None = None) -> Ended:
-    """A command in this process, in the present folder; ``limit`` bytes are the longest file."""
-
-    def late(*_: object) -> None:
-        raise Hung
-
-    out, err, trace, status = io.StringIO(), io.StringIO(), "", 0
-    longest = resource.getrlimit(resource.RLIMIT_FSIZE)
-    before = sys.argv, signal.signal(signal.SIGALRM, late)
-    sys.argv = ["fusion-gym", command, *words]
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    if limit is not None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, longest[1]))
-    try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            everything.main()
-    except SystemExit as end:
-        status = end.code if isinstance(end.code, int) else 1
-        if isinstance(end.code, str):
-            err.write(end.code + "\n")
-        status = 0 if end.code is None else status
-    except BaseException:
-        status, trace = 1, traceback.format_exc()
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        resource.setrlimit(resource.RLIMIT_FSIZE, longest)
-        sys.argv = before[0]
-        signal.signal(signal.SIGALRM, before[1])
-    return Ended(status, out.getvalue(), err.getvalue(), trace)
-
-
-def contents(folder: Path) -> dict[str, bytes | None]:
-    """All that is in a folder."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
-        for path in sorted(folder.rglob("*"))
-    }
-
-
-@contextlib.contextmanager
-def without_rights(wanted: bool) -> Iterator[None]:
-    """As somebody who may not enter a locked folder, even if the tests run as root."""
-    if not wanted or os.geteuid() != 0:
-        yield
-        return
-    os.seteuid(NOBODY)
-    try:
-        yield
-    finally:
-        os.seteuid(0)
-
-
-def flaw(tried: Try, folder: Path) -> str | None:
-    """What is wrong with how the command refuses; ``None`` if nothing is."""
-    before = contents(folder)
-    with without_rights("locked" in tried.value):
-        ended = call(tried.command, tried.words)
-    if ended.trace:
-        return f"traceback: {ended.trace.strip().splitlines()[-1]}"
-    if ended.status == 0:
-        return "accepted"
-    lines = ended.err.splitlines()
-    if len(lines) != 1 or not lines[0].startswith("error: "):
-        return f"not one line: {ended.err[:300]!r}"
-    shown = lines[0].replace("\\\\", "\\")
-    spelled = {tried.option, tried.option.replace("_", "-")}
-    spec = tried.option in ("policies", "policy", "set")
-    part = re.split("[:=,]", tried.value)[0] if spec else tried.value
-    if part[:200] not in shown:
-        return f"does not name the value: {lines[0][:300]}"
-    if not any(name in shown for name in spelled | SAID.get(tried.option, set())):
-        return f"does not name the option: {lines[0][:300]}"
-    if contents(folder) != before:
-        return f"left {sorted(contents(folder).keys() ^ before.keys())}"
-    return None
-
-
-# Other words that name an option: those of the one thing that stands in its list.
-SAID = {
-    "policies": {"policy", "model", "zoo"},
-    "policy": {"policy", "model", "zoo"},
-    "set": {"option", "horizon", "cost_weight", "token_rate", "information", "access"},
-    "env": {"environment"},
-    "seeds": {"seed"},
-}

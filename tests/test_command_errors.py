@@ -14,7 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from hostile_commands import BASES, ROOT, Try, call, contents, flaw, line, options, scratch, tries
+from command_runs import call, flaw
+from hostile_commands import BASES, Try, line, options, tries
+from hostile_folder import ROOT, contents, scratch
 
 from agents import __main__ as everything
 from agents.command_line import Command, start

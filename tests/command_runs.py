@@ -1,0 +1,114 @@
+"""Commands in this process: how they end, and what is wrong with how they refuse."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import resource
+import signal
+import sys
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from hostile_commands import Try
+from hostile_folder import contents
+
+from agents import __main__ as everything
+
+NOBODY = 65534
+
+
+class Hung(BaseException):
+    """A try took too long."""
+
+
+class Ended(NamedTuple):
+    """How a command ended."""
+
+    status: int
+    out: str
+    err: str
+    trace: str
+
+
+def call(command: str, words: list[str], seconds: float = 20.0, limit: int | None = None) -> Ended:
+    """A command in this process, in the present folder; ``limit`` bytes are the longest file."""
+
+    def late(*_: object) -> None:
+        raise Hung
+
+    out, err, trace, status = io.StringIO(), io.StringIO(), "", 0
+    longest = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = sys.argv, signal.signal(signal.SIGALRM, late)
+    sys.argv = ["fusion-gym", command, *words]
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    if limit is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, longest[1]))
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            everything.main()
+    except SystemExit as end:
+        status = end.code if isinstance(end.code, int) else 1
+        if isinstance(end.code, str):
+            err.write(end.code + "\n")
+        status = 0 if end.code is None else status
+    except BaseException:
+        status, trace = 1, traceback.format_exc()
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        resource.setrlimit(resource.RLIMIT_FSIZE, longest)
+        sys.argv = before[0]
+        signal.signal(signal.SIGALRM, before[1])
+    return Ended(status, out.getvalue(), err.getvalue(), trace)
+
+
+@contextlib.contextmanager
+def without_rights(wanted: bool) -> Iterator[None]:
+    """As somebody who may not enter a locked folder, even if the tests run as root."""
+    if not wanted or os.geteuid() != 0:
+        yield
+        return
+    os.seteuid(NOBODY)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+
+
+# Other words that name an option: those of the one thing that stands in its list.
+SAID = {
+    "policies": {"policy", "model", "zoo"},
+    "policy": {"policy", "model", "zoo"},
+    "set": {"option", "horizon", "cost_weight", "token_rate", "information", "access"},
+    "env": {"environment"},
+    "seeds": {"seed"},
+}
+
+
+def flaw(tried: Try, folder: Path) -> str | None:
+    """What is wrong with how the command refuses; ``None`` if nothing is."""
+    before = contents(folder)
+    with without_rights("locked" in tried.value):
+        ended = call(tried.command, tried.words)
+    if ended.trace:
+        return f"traceback: {ended.trace.strip().splitlines()[-1]}"
+    if ended.status == 0:
+        return "accepted"
+    lines = ended.err.splitlines()
+    if len(lines) != 1 or not lines[0].startswith("error: "):
+        return f"not one line: {ended.err[:300]!r}"
+    shown = lines[0].replace("\\\\", "\\")
+    spelled = {tried.option, tried.option.replace("_", "-")}
+    spec = tried.option in ("policies", "policy", "set")
+    part = re.split("[:=,]", tried.value)[0] if spec else tried.value
+    if part[:200] not in shown:
+        return f"does not name the value: {lines[0][:300]}"
+    if not any(name in shown for name in spelled | SAID.get(tried.option, set())):
+        return f"does not name the option: {lines[0][:300]}"
+    if contents(folder) != before:
+        return f"left {sorted(contents(folder).keys() ^ before.keys())}"
+    return None

@@ -1,0 +1,105 @@
+"""A folder in which commands are tried: small configs and results, and much that is neither."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import yaml
+
+ROOT = Path(__file__).parent.parent
+ENV = "fusion_gym/RemoteEstimation-v0"
+SETTING = "remote_estimation"
+
+TRAINING = {
+    "environment": {"id": ENV, "options": {"horizon": 4}},
+    "algorithm": {"name": "ppo", "n_steps": 8, "batch_size": 16, "network": {"hidden": [4]}},
+    "training": {"timesteps": 32, "num_envs": 2},
+    "validation": {"every": 32, "episodes": 2},
+    "output": "made",
+}
+SWEEP = {
+    "points": ["never", "always"],
+    "curves": [{"label": "a", "policy": "periodic:period={value}", "values": [2, 3]}],
+}
+ROWS = {"environment": ENV, "rows": [{"label": "a", "policy": "always"}]}
+SUITE = {
+    "episodes": 2,
+    "training_seeds": 1,
+    "timesteps": 32,
+    "num_envs": 2,
+    "prices": 2,
+    "modes": ["sensors"],
+    "tuning": {"trials": 2, "episodes": 2, "kept": 2},
+    "algorithm": TRAINING["algorithm"],
+    "families": [],
+    "settings": [
+        {
+            "name": "one",
+            "title": "one",
+            "environment": TRAINING["environment"],
+            "price_range": [0.1, 1.0],
+        }
+    ],
+}
+
+# Files that are no config and no result, by name.
+BROKEN: dict[str, bytes] = {
+    "empty": b"",
+    "text": b"this is no structure: at: all\n\t- x",
+    "latin": "Größe: 1".encode("latin-1"),
+    "binary": bytes(range(256)),
+    "list": b"[1, 2]",
+    "number": b"3",
+    "null": b"null",
+    "half": b'{"policies": {"always": ',
+    "date": b"output: 2020-13-45",
+    "deep": b"[" * 1050,
+    "tag": b"!!python/object:os.system x",
+    "stamp": b"output: !!timestamp x",
+    "digits": b"output: " + b"9" * 5000,
+    "other": b'{"something": {"else": 1}}',
+}
+
+
+def scratch(folder: Path) -> None:
+    """A folder with what the tries need, where everybody may write."""
+    for name, content in (
+        ("training", TRAINING), ("sweep", SWEEP), ("rows", ROWS), ("suite", SUITE)
+    ):  # fmt: skip
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(content))
+    for name, raw in BROKEN.items():
+        for suffix in ("", ".yaml", ".json"):
+            (folder / f"{name}{suffix}").write_bytes(raw)
+        broken = folder / "bad_results" / name / SETTING
+        broken.mkdir(parents=True)
+        shutil.copy(ROOT / "results" / SETTING / "baselines.json", broken)
+        (broken / "verdict.json").write_bytes(raw)
+        (broken / "agent_sensors_0.json").write_bytes(raw)
+    made = folder / "results" / SETTING
+    made.mkdir(parents=True)
+    for name in ("verdict", "baselines", "agent_sensors_0"):
+        shutil.copy(ROOT / "results" / SETTING / f"{name}.json", made)
+    model = folder / "work" / SETTING / "sensors_0"
+    model.mkdir(parents=True)
+    (model / "best_model.zip").write_bytes(b"a model")
+    (folder / "folder").mkdir()
+    (folder / "folder" / "file").write_text("kept")
+    (folder / "locked").mkdir()
+    (folder / "locked" / "file.yaml").write_text("kept: 1")
+    for name in ("loop", "loop.yaml"):
+        (folder / name).symlink_to(name)
+    os.mkfifo(folder / "pipe")
+    for path in (folder, *folder.rglob("*")):
+        if not path.is_symlink():
+            path.chmod(0o777 if path.is_dir() else 0o666)
+    (folder / "locked").chmod(0)
+
+
+def contents(folder: Path) -> dict[str, bytes | None]:
+    """All that is in a folder."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+    }
