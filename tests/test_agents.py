@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from command_runs import call
 from stable_baselines3 import PPO
 from training_configs import ENV, SMALL, read_records, small_config
 
@@ -324,13 +325,11 @@ def test_evaluation_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     ],
 )
 def test_evaluation_refuses_with_one_line(arguments: list[str], message: str) -> None:
-    command = [sys.executable, "-m", "agents.evaluate", *arguments, "--policies", "always"]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert result.returncode == 1
-    error = result.stderr.strip().splitlines()[-1]
-    assert error.startswith("error: ")
-    assert message in error
-    assert "Traceback" not in result.stderr
+    ended = call("evaluate", [*arguments, "--policies", "always"])
+    assert (ended.status, ended.trace) == (1, "")
+    assert ended.err.startswith("error: ")
+    assert len(ended.err.splitlines()) == 1
+    assert message in ended.err
 
 
 def test_demo_from_baselines_to_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -351,6 +350,7 @@ def test_demo_from_baselines_to_figures(tmp_path: Path, monkeypatch: pytest.Monk
         assert verdict["difference"]["mean"] == pytest.approx(verdict["mse"] - verdict["envelope"])
         assert json.loads((folder / "agent" / "summary.json").read_text())["finished"]
     began = (output / "paper" / "agent" / "final_model.zip").stat().st_mtime
+    monkeypatch.setattr(demo, "SETTINGS", demo.SETTINGS[1:])
     demo.main()
     records = read_records(output / "paper" / "agent")
     assert len(records) == 1, "a finished training is not repeated"

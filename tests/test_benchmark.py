@@ -368,6 +368,16 @@ def test_the_solved_case_is_trained_once_and_compared(
     assert (tmp_path / "s" / "ppo_0" / "final_model.zip").stat().st_mtime_ns == stamp
     found = json.loads((tmp_path / "s" / "ppo.json").read_text())["agents"]
     assert set(found) == {"0", "1"}
+    # A damaged summary is written anew; a folder with another training is refused, and kept.
+    summary = tmp_path / "s" / "ppo_0" / "summary.json"
+    whole = json.loads(summary.read_text())
+    summary.write_text("{")
+    run_main(monkeypatch, solved, *arguments, "--seeds", "0")
+    assert json.loads(summary.read_text())["finished"]
+    summary.write_text(json.dumps(whole | {"inputs": "others"}))
+    config.write_text(config.read_text().replace("batch_size: 64", "batch_size: 32"))
+    with pytest.raises(SystemExit, match="batch_size = 32 differs"):
+        run_main(monkeypatch, solved, *arguments, "--seeds", "0")
     # Hardly trained, an agent costs more than the optimum.
     assert found["0"]["mean"] > 0.0
     assert "above the optimum" in capsys.readouterr().out
