@@ -54,9 +54,9 @@ def read(kind: type[_Kind]) -> _Kind:
     Raises:
         SystemExit: help was asked for (status 0), or an option is not understood (2, after one
             line that says which).
-        ConfigurationError: an option's value is empty.
+        ConfigurationError: a word is empty, or no text.
     """
-    _refuse_empty_words()
+    _check_words()
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
@@ -85,14 +85,22 @@ def start(kind: type[Command]) -> None:
         command.run()
 
 
-def _refuse_empty_words() -> None:
-    """An empty word is a variable of the shell that is not set; a path of it would be here."""
+def _check_words() -> None:
+    """Every word is text that can be written into a file, and not empty.
+
+    An empty word is a variable of the shell that is not set; as a path it would be this folder.
+
+    Raises:
+        ConfigurationError: one is not.
+    """
     option = "the command line"
     for word in sys.argv[1:]:
         named = word.startswith("--")
         option = word.strip("-").partition("=")[0] if named else option
         if not word or (named and word.endswith("=")):
             raise ConfigurationError(f"{option} = '' is not allowed: it must not be empty")
+        if any("\udc80" <= letter <= "\udcff" for letter in word):  # bytes that were no text
+            raise ConfigurationError(f"{option} = {word!r} is not allowed: it must be UTF-8")
 
 
 def _essence(message: str) -> str:

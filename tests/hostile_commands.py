@@ -116,7 +116,7 @@ def hostile(option: str, kind: Any, present: list[str] | None = None) -> list[st
         values = REAL
     else:
         values = WORDS
-    return ["", *(value for value in values if (option, value) not in ALLOWED)]
+    return ["", "\udcff", *(value for value in values if (option, value) not in ALLOWED)]
 
 
 def tries() -> Iterator[Try]:

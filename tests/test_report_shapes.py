@@ -65,6 +65,7 @@ def setting(tmp_path: Path) -> Path:
         ("verdict", "modes/sensors/closed", ABSENT, "room stands without closed"),
         ("verdict", "modes/sensors/envelope/0/name", "ghost", "no policy 'ghost'"),
         ("baselines", "curves/always/policies", ["ghost"], "no policy 'ghost'"),
+        ("baselines", "curves", {}, "curves = {}"),
         ("baselines", "policies/always/mse", 3, "policies.always.mse = 3"),
         ("baselines", "policies/always/rate", [], "policies.always.rate = []"),
         ("informed", "policies", [], "policies = []"),

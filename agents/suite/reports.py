@@ -70,7 +70,7 @@ class Baselines(Tested):
     env: str
     episodes: int
     seed: int
-    curves: dict[str, Curve]
+    curves: dict[str, Curve] = pydantic.Field(min_length=1)
     genie: Genie = Genie(mse=Mean(mean=0.0), assumes="")
 
 
