@@ -35,7 +35,7 @@ class Ended(NamedTuple):
     trace: str
 
 
-def call(command: str, words: list[str], seconds: float = 20.0, limit: int | None = None) -> Ended:
+def call(command: str, words: list[str], seconds: float = 60.0, limit: int | None = None) -> Ended:
     """A command in this process, in the present folder; ``limit`` bytes are the longest file."""
 
     def late(*_: object) -> None:

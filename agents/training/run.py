@@ -123,10 +123,10 @@ def train(
             allowed leaves no folder.
     """
     folder = Path(experiment.output)
-    model, env, scored = check(experiment)
-    torch.set_num_threads(experiment.training.threads)
     if resume and not holds_training(folder):
         raise ConfigurationError(f"output = {str(folder)!r} holds no training: nothing to resume")
+    model, env, scored = check(experiment)
+    torch.set_num_threads(experiment.training.threads)
     with alone_in(folder, "output"):
         journal = earlier(experiment, folder, resume)
         if journal is None:
