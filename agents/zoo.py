@@ -8,6 +8,7 @@ For each setting and mode the training seed with the best validation return goes
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,6 +82,7 @@ def add(name: str, report: dict[str, Any], model: Path, folder: Path) -> None:
     """Write a model's card, then copy it: a model that is there has a card."""
     training = report["training"] | {"output": f"runs/{name}"}
     card = {
+        "sha256": hashlib.sha256(model.read_bytes()).hexdigest(),
         "env": report["env"],
         "options": report["options"],
         "mode": report["mode"],

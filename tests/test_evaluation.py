@@ -387,7 +387,7 @@ def test_files_that_hold_no_fitting_agent(task: Task, tmp_path: Path) -> None:
         (tmp_path / "absent", "no such file"),
         (tmp_path, "no such file"),
         (text, "no Stable-Baselines3 model"),
-        (empty, "no observation space"),
+        (empty, "no Stable-Baselines3 model (it has no data)"),
         (misfit, "MultiBinary(5)"),
     ):
         with pytest.raises(ConfigurationError) as caught:

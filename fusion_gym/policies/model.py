@@ -1,13 +1,9 @@
-"""A saved Stable-Baselines3 agent as a policy.
-
-Loading a model unpickles parts of the file: load only files that you trust.
-"""
+"""A Stable-Baselines3 agent as a policy, and the card that is saved with it."""
 
 from __future__ import annotations
 
 import dataclasses
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,14 +11,13 @@ import sb3_contrib
 import stable_baselines3
 from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.save_util import load_from_zip_file
 
-from fusion_gym import validation
 from fusion_gym.core.reward import Price
 from fusion_gym.core.system import Knowledge, Signals, least_covering
-from fusion_gym.core.task import ACTION_KINDS, Task
+from fusion_gym.core.task import Task
 from fusion_gym.envs.views import make_view
 from fusion_gym.policies.base import Requests
+from fusion_gym.policies.card import ENTRY, card
 from fusion_gym.validation import ConfigurationError
 
 # Every algorithm of both libraries by its name in configs and saved models: MaskablePPO is
@@ -33,23 +28,15 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     for name, kind in vars(library).items()
     if isinstance(kind, type) and issubclass(kind, BaseAlgorithm)
 }
-_TAG = "fusion_gym_model"
 
 
 def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
-    """Write algorithm and observation layout into the model, to be saved with it.
+    """Write the model's card into it (:mod:`fusion_gym.policies.card`), to be saved with it.
 
     ``local`` marks a policy that every sensor runs on its own view.
     """
-    names = make_view(task, local).names
     algorithm = next(name for name, kind in ALGORITHMS.items() if type(model) is kind)
-    tag = {
-        "algorithm": algorithm,
-        "observation_names": list(names),
-        "local": local,
-        "price_range": task.reward.price.span,
-    }
-    setattr(model, _TAG, tag)
+    setattr(model, ENTRY, card(algorithm, model, task, local))
 
 
 class ModelPolicy:
@@ -75,7 +62,7 @@ class ModelPolicy:
         self.model = model
         self.deterministic = deterministic
         self._shown = task.reward.price.span is not None
-        self._task = _priced(task, price_range)
+        self._task = priced(task, price_range)
         self._view = make_view(self._task, local)
         self._memory: Any = None  # of a recurrent policy
         self.knowledge: Knowledge = self._view.knowledge
@@ -122,94 +109,9 @@ class ModelPolicy:
         return self._view.requests(action, len(observation))
 
 
-def _priced(task: Task, price_range: tuple[float, float] | None) -> Task:
+def priced(task: Task, price_range: tuple[float, float] | None) -> Task:
     """The task with the price in its observation, if the model saw one and the task shows none."""
     if price_range is None or task.reward.price.span is not None:
         return task
     price = Price(None, (price_range[0], price_range[1]))
     return dataclasses.replace(task, reward=dataclasses.replace(task.reward, price=price))
-
-
-def load_model_policy(
-    path: str, task: Task, deterministic: bool = True, price: float | None = None
-) -> ModelPolicy:
-    """The agent saved at ``path`` (with or without ``.zip``), checked against the task.
-
-    Raises:
-        ConfigurationError: no such file, no Stable-Baselines3 model of a known algorithm, or a
-            model of another observation layout or action space.
-    """
-    validation.boolean("deterministic", deterministic)
-    file = next((p for p in (Path(path), Path(f"{path}.zip")) if p.is_file()), None)
-    if file is None:
-        raise ConfigurationError(f"model {path!r} is not allowed: there is no such file")
-    try:
-        data, _, _ = load_from_zip_file(file, device="cpu", load_data=True)
-    except Exception as error:
-        raise ConfigurationError(
-            f"model {path!r} is not allowed: it is no Stable-Baselines3 model ({error})"
-        ) from None
-    if not data or "observation_space" not in data:
-        raise ConfigurationError(f"model {path!r} is not allowed: it has no observation space")
-    tag = data.get(_TAG, {})
-    local, price_range = bool(tag.get("local")), tag.get("price_range")
-    kind = _fitted(path, data, _priced(task, price_range), local).action
-    task = dataclasses.replace(task, action=kind)
-    return ModelPolicy(_load(path, file, data), task, deterministic, price, local, price_range)
-
-
-def _fitted(path: str, data: dict[str, Any], task: Task, local: bool) -> Task:
-    """The task with the kind of action that the model has, its observation layout checked."""
-    view = make_view(task, local)
-    names = data.get(_TAG, {}).get("observation_names")
-    if names is not None and list(names) != list(view.names):
-        missing = [name for name in names if name not in view.names]
-        extra = [name for name in view.names if name not in names]
-        raise ConfigurationError(
-            f"model {path!r} was trained for another observation layout: it expects {len(names)} "
-            f"entries, the task (information={task.information!r}) has {len(view.names)}; "
-            f"missing are {missing[:4] or 'none'}, unknown to the model {extra[:4] or 'none'}"
-            + ("" if missing or extra else " (the order differs)")
-        )
-    wanted = view.space
-    have = data["observation_space"]
-    if have.shape != wanted.shape:
-        raise ConfigurationError(
-            f"model {path!r} was trained for another observation layout: it expects shape "
-            f"{have.shape}, the task (information={task.information!r}) has {wanted.shape}"
-        )
-    if local:
-        return task
-    action = data["action_space"]
-    kinds = (
-        [task]
-        if task.access == "single"
-        else [dataclasses.replace(task, action=kind) for kind in ACTION_KINDS]
-    )
-    allowed = [make_view(kind).actions for kind in kinds]
-    if action not in allowed:
-        raise ConfigurationError(
-            f"model {path!r} has the action space {action}: the task has {task.sensors} sensors, "
-            f"so it must be {' or '.join(map(str, allowed))}"
-        )
-    return kinds[allowed.index(action)]
-
-
-def _load(path: str, file: Path, data: dict[str, Any]) -> BaseAlgorithm:
-    """Load with the algorithm that the file names, or the one that its policy class fits."""
-    tagged = data.get(_TAG, {}).get("algorithm")
-    if tagged in ALGORITHMS:
-        candidates = [tagged]
-    elif "q_net" in str(data) or "exploration_schedule" in data:
-        candidates = ["dqn"]
-    else:
-        candidates = ["ppo", "a2c"]
-    problems = []
-    for name in candidates:
-        try:
-            return ALGORITHMS[name].load(file, device="cpu")
-        except Exception as error:
-            problems.append(f"{name}: {error}")
-    raise ConfigurationError(
-        f"model {path!r} cannot be loaded as {' or '.join(candidates)} ({'; '.join(problems)})"
-    )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, TypedDict, get_args
 
 import numpy as np
 
@@ -18,16 +18,24 @@ from fusion_gym.core.system import KNOWLEDGE
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.settings import parse_settings
-from fusion_gym.validation import ConfigurationError, choice, keys
+from fusion_gym.validation import ConfigurationError, boolean, choice, keys
 
 Kind = Literal["rule", "reference", "agent"]
 Maker = Callable[..., Policy]
 
 
+class Context(TypedDict):
+    """What whoever asks for a policy gives to its maker, and its text never does."""
+
+    task: Task | None
+    trust: bool
+
+
 class Row(NamedTuple):
     """A policy's kind and its maker: a callable, or where to import it, as "module:attribute".
 
-    The maker takes the policy's parameters by name, and the task if it has a parameter ``task``.
+    The maker takes the policy's parameters by name, the task if it has a parameter ``task``, and
+    whether files may run code if it has a parameter ``trust``.
     A rule looks at signals alone, a reference takes the task and its model, an agent was trained;
     an agent's first parameter is the text behind its name.
     """
@@ -68,8 +76,9 @@ def register_policy(name: str, maker: Maker, kind: Kind = "rule") -> None:
     """Make a policy of your own known by a name, wherever policies are named.
 
     ``maker(**parameters)`` returns the policy, for example a class derived from
-    :class:`fusion_gym.policies.base.Rule`; if it has a parameter ``task`` it is given the task.
-    Its other parameters are those that ``name:key=value`` may set.
+    :class:`fusion_gym.policies.base.Rule`; if it has a parameter ``task`` it is given the task,
+    and with a parameter ``trust`` what :func:`make_policy` is given. Its other parameters are those
+    that ``name:key=value`` may set.
 
     Raises:
         ConfigurationError: a name that exists or cannot be written, or no callable.
@@ -96,18 +105,19 @@ def policy_names(kind: Kind | None = None) -> list[str]:
     return sorted(name for name, row in _ROWS.items() if kind in (None, row.kind))
 
 
-def make_policy(spec: str, task: Task) -> Policy:
+def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
     """The policy that ``NAME`` or ``NAME:key=value,…`` names, tried out on one run of the task.
 
     Parameters that the text does not set are the task's own (``task.policy_defaults``) or the
-    maker's.
+    maker's. ``trust`` lets ``model:PATH`` run code that the file holds: without it a file is data.
 
     Raises:
         ConfigurationError: an unknown policy or parameter, a value that is not allowed, a model
             that cannot be read or was trained for another observation layout, or a policy that
             looks at signals which the task withholds.
     """
-    policy = _make(spec, task.policy_defaults, task)
+    context: Context = {"task": task, "trust": boolean("trust", trust)}
+    policy = _make(spec, task.policy_defaults, context)
     if _ROWS[spec.partition(":")[0]].kind != "agent":  # loading it has checked all that it sees
         _try_out(spec, policy, task)
     return policy
@@ -124,10 +134,10 @@ def make_rule(spec: str, defaults: dict[str, dict[str, Any]] | None = None) -> P
     name = spec.partition(":")[0]
     if name in _ROWS and _ROWS[name].kind != "rule":
         raise ConfigurationError(f"policy {spec!r} is no rule: make_policy makes it for a task")
-    return _make(spec, defaults or {}, None)
+    return _make(spec, defaults or {}, {"task": None, "trust": False})
 
 
-def _make(spec: str, defaults: dict[str, dict[str, Any]], task: Task | None) -> Policy:
+def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> Policy:
     name, _, text = spec.partition(":")
     maker = _maker(name)
     known = _parameters(name, maker)
@@ -144,8 +154,8 @@ def _make(spec: str, defaults: dict[str, dict[str, Any]], task: Task | None) -> 
     for key in missing:
         if key not in given:
             raise ConfigurationError(f"policy {spec!r} needs a parameter {key!r}: write {key}=…")
-    if "task" in inspect.signature(maker).parameters:
-        given["task"] = task
+    wanted = inspect.signature(maker).parameters
+    given |= {key: value for key, value in context.items() if key in wanted}
     try:
         policy = maker(**given)
     except ConfigurationError as error:
@@ -170,7 +180,7 @@ def _maker(name: str) -> Maker:
 
 
 def _parameters(name: str, maker: Maker) -> dict[str, inspect.Parameter]:
-    """All but the task, in the maker's order.
+    """All but the task and the trust, in the maker's order.
 
     Raises:
         ConfigurationError: no callable whose parameters have names.
@@ -186,7 +196,9 @@ def _parameters(name: str, maker: Maker) -> dict[str, inspect.Parameter]:
             f"maker = {maker!r} of policy {name!r} is not allowed: it must be a callable with "
             "named parameters that returns a policy"
         )
-    return {key: parameter for key, parameter in found.items() if key != "task"}
+    return {
+        key: parameter for key, parameter in found.items() if key not in Context.__annotations__
+    }
 
 
 def _try_out(spec: str, policy: Policy, task: Task) -> None:

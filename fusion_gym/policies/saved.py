@@ -8,16 +8,21 @@ from fusion_gym.policies.base import Policy
 
 
 def saved_agent(
-    task: Task, path: str, deterministic: bool = True, price: float | None = None
+    task: Task,
+    path: str,
+    deterministic: bool = True,
+    price: float | None = None,
+    *,
+    trust: bool = False,
 ) -> Policy:
     """The agent saved at ``path``; torch is imported only here.
 
     Raises:
-        ConfigurationError: as :func:`fusion_gym.policies.model.load_model_policy`.
+        ConfigurationError: as :func:`fusion_gym.policies.loading.load_model_policy`.
     """
-    from fusion_gym.policies.model import load_model_policy
+    from fusion_gym.policies.loading import load_model_policy
 
-    return load_model_policy(path, task, deterministic, price)
+    return load_model_policy(path, task, deterministic, price, trust=trust)
 
 
 def zoo_agent(
@@ -26,6 +31,7 @@ def zoo_agent(
     """The agent of this name in :mod:`fusion_gym.zoo`.
 
     Raises:
-        ConfigurationError: no agent of that name, or one that does not fit the task.
+        ConfigurationError: no agent of that name, one whose file is not what its card says, or one
+            that does not fit the task.
     """
     return saved_agent(task, zoo.model_path(name), deterministic, price)

@@ -1,18 +1,19 @@
 """Trained agents, small and ready to use: ``zoo:NAME`` is a policy like any other.
 
-Beside each ``NAME.zip`` stands ``NAME.json``: its environment and options, how it was trained, and
-its test numbers. Loading runs Stable-Baselines3's loader, which unpickles parts of the file. That
-is safe for the files of this package, and for no file from elsewhere that you do not trust.
+Beside each ``NAME.zip`` stands ``NAME.json``: its environment and options, how it was trained, its
+test numbers, and the SHA-256 of the model. The models are ordinary files of Stable-Baselines3;
+``zoo:NAME`` reads their plain parts and weights alone.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from fusion_gym.validation import choice
+from fusion_gym.validation import ConfigurationError, choice
 
 
 def names() -> list[str]:
@@ -21,12 +22,20 @@ def names() -> list[str]:
 
 
 def model_path(name: str) -> str:
-    """Path of an agent's model.
+    """Path of an agent's model, which is the one that its card describes.
 
     Raises:
-        ConfigurationError: no agent of that name; the message lists all.
+        ConfigurationError: no agent of that name (the message lists all), or a file whose SHA-256
+            is not the card's.
     """
-    return str(_folder().joinpath(f"{choice('zoo', name, names())}.zip"))
+    told, path = card(name)["sha256"], _folder().joinpath(f"{name}.zip")
+    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    if found != told:
+        raise ConfigurationError(
+            f"zoo = {name!r} is not allowed: {path} has the SHA-256 {found}, its card says {told}; "
+            "install fusion-gym anew"
+        )
+    return str(path)
 
 
 def card(name: str) -> dict[str, Any]:

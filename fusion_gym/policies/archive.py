@@ -1,0 +1,104 @@
+"""The archive that Stable-Baselines3 writes, read as data: plain JSON and weights, nothing else.
+
+Its own loader unpickles what stands as ``:serialized:`` in the archive's ``data``, and whoever
+wrote the file decides what that runs. Here such text stays text, and of the ``.pth`` files the
+policy's alone is read, by torch's loader of plain weights.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fusion_gym.validation import ConfigurationError
+
+LARGEST = 256 * 2**20  # bytes of a part, and of all weights
+_MOST = 1_000  # tensors
+_DAMAGE = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, NotImplementedError)
+
+
+class NeedsTrust(ConfigurationError):
+    """A file that plain JSON and weights do not explain: only code of its own could load it."""
+
+
+def read_plain(file: Path) -> dict[str, Any]:
+    """The archive's ``data``, in which everything pickled is text beside readable attributes.
+
+    Raises:
+        ConfigurationError: no archive, or no plain JSON in it.
+        NeedsTrust: larger than any model here.
+    """
+    content = _part(file, "data")
+    try:
+        found = json.loads(content)
+    except (ValueError, RecursionError):
+        raise _none("its data is no JSON") from None
+    if not isinstance(found, dict):
+        raise _none("its data is no JSON object")
+    return found
+
+
+def read_weights(file: Path) -> dict[str, torch.Tensor]:
+    """The policy's weights by name: finite float32.
+
+    Raises:
+        ConfigurationError: no archive, or no weights in it.
+        NeedsTrust: anything but plain weights, or larger than any model here.
+    """
+    content = io.BytesIO(_part(file, "policy.pth"))
+    try:
+        with zipfile.ZipFile(content) as parts:
+            listed = parts.infolist()
+    except _DAMAGE:
+        raise NeedsTrust("its policy.pth has not the form that torch writes") from None
+    if any(part.compress_type != zipfile.ZIP_STORED for part in listed):
+        raise NeedsTrust("its weights are compressed")
+    content.seek(0)
+    try:
+        found = torch.load(content, map_location="cpu", weights_only=True)
+    except Exception:  # a crafted file raises whatever it likes; torch's advice is not ours
+        raise NeedsTrust("its policy.pth holds more than plain weights") from None
+    if not isinstance(found, dict) or len(found) > _MOST or not all(map(_is_plain, found.values())):
+        raise NeedsTrust("its policy.pth is no table of float32 weights")
+    size = 4 * sum(weight.numel() for weight in found.values())
+    if size > LARGEST:
+        raise NeedsTrust(f"its weights have {size} bytes, more than {LARGEST}")
+    if not all(bool(torch.isfinite(weight).all()) for weight in found.values()):
+        raise _none("its weights are not finite")
+    return {str(name): weight for name, weight in found.items()}
+
+
+def _part(file: Path, name: str) -> bytes:
+    """A part of the archive, never more of it than its size says."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            about = archive.getinfo(name)
+            if about.file_size > LARGEST:
+                raise NeedsTrust(f"its {name} has {about.file_size} bytes, more than {LARGEST}")
+            if about.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise NeedsTrust(f"its {name} is compressed in an unusual way")
+            with archive.open(about) as part:
+                return part.read(about.file_size)
+    except KeyError:
+        raise _none(f"it has no {name}") from None
+    except _DAMAGE as error:
+        raise _none(str(error)) from None
+
+
+def _is_plain(weight: Any) -> bool:
+    return (
+        type(weight) is torch.Tensor
+        and weight.layout is torch.strided
+        and weight.dtype is torch.float32
+        and weight.device.type == "cpu"
+    )
+
+
+def _none(reason: str) -> ConfigurationError:
+    return ConfigurationError(f"it is no Stable-Baselines3 model ({reason})")

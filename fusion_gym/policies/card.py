@@ -1,0 +1,184 @@
+"""What a saved agent says of itself, in plain JSON: its card.
+
+The card is the entry ``fusion_gym_model`` of the archive's ``data``, so it goes through saving and
+loading by Stable-Baselines3. A model without one, or with an earlier one that told less, is
+explained by what Stable-Baselines3 writes in readable form beside all that it pickles.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.dqn.policies import DQNPolicy
+
+from fusion_gym import validation
+from fusion_gym.core.reward import Price
+from fusion_gym.core.task import Task
+from fusion_gym.envs.views import make_view
+from fusion_gym.policies.archive import NeedsTrust
+from fusion_gym.policies.network import Network
+from fusion_gym.validation import ConfigurationError
+
+ENTRY = "fusion_gym_model"
+FORMAT = 1
+# The policies that are rebuilt from their weights, by algorithm.
+POLICIES: dict[str, type[BasePolicy]] = {
+    "a2c": ActorCriticPolicy,
+    "dqn": DQNPolicy,
+    "maskable_ppo": MaskableActorCriticPolicy,
+    "ppo": ActorCriticPolicy,
+    "recurrent_ppo": RecurrentActorCriticPolicy,
+}
+ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
+    "elu": torch.nn.ELU,
+    "gelu": torch.nn.GELU,
+    "leaky_relu": torch.nn.LeakyReLU,
+    "relu": torch.nn.ReLU,
+    "silu": torch.nn.SiLU,
+    "tanh": torch.nn.Tanh,
+}
+# What policy_kwargs may hold: an activation, what the weights' shapes tell, and what has no part
+# in a decision. A features_extractor_class, say, is code.
+_HARMLESS = {
+    "activation_fn", "enable_critic_lstm", "log_std_init", "lstm_hidden_size", "n_lstm_layers",
+    "net_arch", "normalize_images", "optimizer_class", "optimizer_kwargs", "ortho_init",
+    "share_features_extractor", "shared_lstm",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a model was trained to see: the entries by name (if the file says), whose, the price."""
+
+    observation_names: tuple[str, ...] | None = None
+    local: bool = False
+    price_range: tuple[float, float] | None = None
+
+    @classmethod
+    def read(cls, data: Mapping[str, Any]) -> Seen:
+        """As the card in an archive's data has it; without a card, a coordinator's whole view.
+
+        Raises:
+            ConfigurationError: an entry that is not allowed.
+        """
+        told = _entry(data)
+        names, span = told.get("observation_names"), told.get("price_range")
+        if names is not None and not _are_words(names):
+            raise ConfigurationError("observation_names is not allowed: it must be a list of words")
+        return cls(
+            None if names is None else tuple(names),
+            validation.boolean("local", told.get("local", False)),
+            None if span is None else Price.create("random", span).span,
+        )
+
+
+@dataclass(frozen=True)
+class Blueprint:
+    """What a policy is built from, beside its weights and the task's spaces."""
+
+    algorithm: str
+    activation: str
+    actions: str  # the action space, as Gymnasium writes it
+    network: Mapping[str, Any] | None = None  # as :meth:`Network.plain` says it
+
+    @classmethod
+    def read(cls, data: Mapping[str, Any]) -> Blueprint:
+        """From the card, or from Stable-Baselines3's own readable entries.
+
+        Raises:
+            ConfigurationError: a card of a later format, or with entries that are not allowed.
+            NeedsTrust: a policy that is none of :data:`POLICIES`, or made with code of its own.
+        """
+        told = _entry(data)
+        if "format" not in told:
+            return _inferred(data)
+        validation.integer("format", told["format"], at_least=FORMAT, at_most=FORMAT)
+        known = {"format", *Seen.__dataclass_fields__, *cls.__dataclass_fields__}
+        validation.keys("entry of the card", told, known)
+        if not isinstance(told.get("network"), dict):
+            raise ConfigurationError("network is not allowed: it must be a table of sizes")
+        return cls(
+            validation.choice("algorithm", told.get("algorithm"), POLICIES),
+            validation.choice("activation", told.get("activation"), ACTIVATIONS),
+            str(told.get("actions")),
+            told["network"],
+        )
+
+
+def card(algorithm: str, model: BaseAlgorithm, task: Task, local: bool) -> dict[str, Any]:
+    """A model's card; without a format, and less, if weights alone do not rebuild its policy."""
+    view = make_view(task, local)
+    told = {
+        "algorithm": algorithm,
+        "observation_names": list(view.names),
+        "local": local,
+        "price_range": task.reward.price.span,
+    }
+    policy: Any = model.policy
+    if type(policy) is not POLICIES.get(algorithm) or set(model.policy_kwargs) - _HARMLESS:
+        return told
+    names = [name for name, kind in ACTIVATIONS.items() if kind is policy.activation_fn]
+    if not names:
+        return told
+    network = Network.of({name: tuple(w.shape) for name, w in policy.state_dict().items()})
+    plain = {"activation": names[0], "actions": str(model.action_space), "network": network.plain()}
+    return {"format": FORMAT} | told | plain
+
+
+def algorithm_of(data: Mapping[str, Any]) -> str | None:
+    """The algorithm that the card names, or whose policy class the archive's plain entries name.
+
+    A2C and PPO have one policy class; what is neither, but has it too, decides as A2C does.
+    """
+    told = _entry(data).get("algorithm")
+    if isinstance(told, str):
+        return told
+    module = _table(data, "policy_class").get("__module__")
+    found = next((n for n, policy in POLICIES.items() if policy.__module__ == module), None)
+    return "ppo" if found == "a2c" and "clip_range" in data else found
+
+
+def _inferred(data: Mapping[str, Any]) -> Blueprint:
+    """The blueprint of a model without a card, or with an earlier one that tells less."""
+    algorithm, settings = algorithm_of(data), _table(data, "policy_kwargs")
+    module = _table(data, "policy_class").get("__module__")
+    if algorithm not in POLICIES or POLICIES[algorithm].__module__ != module:
+        raise NeedsTrust(f"its policy is none of those of {', '.join(POLICIES)}")
+    if "gymnasium.spaces.box.Box" not in str(_table(data, "observation_space").get(":type:")):
+        raise NeedsTrust("it observes no vector")
+    strange = sorted(set(settings) - _HARMLESS - {":type:", ":serialized:"})
+    if strange:
+        raise NeedsTrust(f"its policy was made with {strange}")
+    usual = ACTIVATIONS["relu" if algorithm == "dqn" else "tanh"]  # what the policies default to
+    given = settings.get("activation_fn", str(usual))
+    names = [n for n, kind in ACTIVATIONS.items() if str(kind) == given]
+    if not names:
+        raise NeedsTrust(f"its activation is {given!r}")
+    space = _table(data, "action_space")
+    kind = re.sub(r".*\.(\w+)'>$", r"\1", str(space.get(":type:")))
+    start = "" if str(space.get("start", 0)) == "0" else f", start={space['start']}"
+    return Blueprint(algorithm, names[0], f"{kind}({space.get('n')}{start})")
+
+
+def _entry(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The card in an archive's data, empty if there is none."""
+    return _table(data, ENTRY) if ENTRY in data else {}
+
+
+def _table(data: Mapping[str, Any], key: str) -> dict[str, Any]:
+    found = data.get(key)
+    if not isinstance(found, dict):
+        raise ConfigurationError(f"it is no Stable-Baselines3 model (its {key} is no table)")
+    return found
+
+
+def _are_words(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(word, str) for word in value)

@@ -1,0 +1,113 @@
+"""The networks of a policy, as the shapes of its weights tell them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from fusion_gym.policies.archive import NeedsTrust
+
+Shapes = Mapping[str, tuple[int, ...]]
+_HEADS = {"pi": "mlp_extractor.policy_net", "vf": "mlp_extractor.value_net"}
+_VALUES = "q_net.q_net"
+
+
+@dataclass(frozen=True)
+class Memory:
+    """The LSTM of a recurrent policy; its critic has one of its own, the actor's, or none."""
+
+    size: int
+    layers: int
+    critic: Literal["own", "shared", "none"]
+
+
+@dataclass(frozen=True)
+class Network:
+    """Sizes of the hidden layers: of policy and value ("pi", "vf"), or of the values ("q")."""
+
+    hidden: Mapping[str, tuple[int, ...]]
+    entries: int  # of an observation
+    memory: Memory | None = None
+
+    @classmethod
+    def of(cls, shapes: Shapes) -> Network:
+        """The networks that have weights of these shapes.
+
+        Every size is checked against its neighbours, so that what is built of them is about as
+        large as the weights are.
+
+        Raises:
+            NeedsTrust: weights of other networks.
+        """
+        if f"{_VALUES}.0.weight" in shapes:
+            *hidden, last = _chain(shapes, _VALUES)
+            entries = (hidden or [last])[0][1]
+            return cls({"q": tuple(outputs for outputs, _ in hidden)}, entries)
+        chains = {head: _chain(shapes, prefix) for head, prefix in _HEADS.items()}
+        memory = None
+        if "lstm_actor.weight_ih_l0" in shapes:
+            memory, entries = _memory(shapes)
+        else:
+            entries = (chains["pi"] or [_pair(shapes, "action_net.weight")])[0][1]
+        into = memory.size if memory else entries
+        if any(chain and chain[0][1] != into for chain in chains.values()):
+            raise NeedsTrust("its weights do not fit each other")
+        hidden_sizes = {head: tuple(o for o, _ in chain) for head, chain in chains.items()}
+        return cls(hidden_sizes, entries, memory)
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON."""
+        told: dict[str, Any] = {head: list(sizes) for head, sizes in self.hidden.items()}
+        return told | ({"memory": vars(self.memory).copy()} if self.memory else {})
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of Stable-Baselines3's policy class."""
+        if "q" in self.hidden:
+            return {"net_arch": list(self.hidden["q"])}
+        sizes = {head: list(sizes) for head, sizes in self.hidden.items()}
+        found: dict[str, Any] = {"net_arch": sizes, "ortho_init": False}
+        if self.memory:
+            found |= {
+                "lstm_hidden_size": self.memory.size,
+                "n_lstm_layers": self.memory.layers,
+                "shared_lstm": self.memory.critic == "shared",
+                "enable_critic_lstm": self.memory.critic == "own",
+            }
+        return found
+
+
+def _memory(shapes: Shapes) -> tuple[Memory, int]:
+    """The LSTM, and how many entries it is given."""
+    size = _pair(shapes, "lstm_actor.weight_hh_l0")[1]
+    layers = 0
+    while f"lstm_actor.weight_ih_l{layers}" in shapes:
+        layers += 1
+    entries = _pair(shapes, "lstm_actor.weight_ih_l0")[1]
+    for layer in range(layers):
+        wanted = {"ih": (4 * size, size if layer else entries), "hh": (4 * size, size)}
+        if any(_pair(shapes, f"lstm_actor.weight_{k}_l{layer}") != w for k, w in wanted.items()):
+            raise NeedsTrust("its weights do not fit each other")
+    critic: Literal["own", "shared", "none"] = "shared"
+    if "lstm_critic.weight_ih_l0" in shapes:
+        critic = "own"
+    elif "critic.weight" in shapes:
+        critic = "none"
+    return Memory(size, layers, critic), entries
+
+
+def _chain(shapes: Shapes, prefix: str) -> list[tuple[int, int]]:
+    """(outputs, inputs) of the linear layers, between which the activations stand."""
+    found: list[tuple[int, int]] = []
+    while f"{prefix}.{2 * len(found)}.weight" in shapes:
+        found.append(_pair(shapes, f"{prefix}.{2 * len(found)}.weight"))
+        if len(found) > 1 and found[-1][1] != found[-2][0]:
+            raise NeedsTrust("its weights do not fit each other")
+    return found
+
+
+def _pair(shapes: Shapes, name: str) -> tuple[int, int]:
+    shape = shapes.get(name, ())
+    if len(shape) != 2 or not all(shape):
+        raise NeedsTrust(f"its weights {name!r} are missing, or no matrix")
+    return shape[0], shape[1]
