@@ -41,15 +41,19 @@ class Compare(Command):
     """Episodes of each policy."""
     seed: Seed = 0
     """Seed of the first episode."""
+    trust: bool = False
+    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
 
     def run(self) -> None:
         """Run all policies on the same seeds; write, print and draw the comparison."""
         chosen, sweep = load(Experiment, self.config).environment, load(Sweep, self.sweep, "sweep")
         task = make_task(chosen.id, **chosen.options)
-        make_policy(self.policy, task)
-        baselines = run_all(task, sweep.policies, self.episodes, self.seed, "baselines")
+        make_policy(self.policy, task, trust=self.trust)
+        baselines = run_all(
+            task, sweep.policies, self.episodes, self.seed, "baselines", trust=self.trust
+        )
         names = (chosen.id, chosen.id)
-        compare(names, task, sweep, baselines, self.policy, self.seed, self.output)
+        compare(names, task, sweep, baselines, self.policy, self.seed, self.output, self.trust)
 
 
 def main() -> None:

@@ -3,15 +3,18 @@
     python -m agents.report [--results results]
 
 Reads the JSON in the results folder and writes ``README.md``, a figure for each setting, and
-``report.html`` with the figures inside.
+``report.html`` with the figures inside. What the JSON says is text there, never markup.
 """
 
 from __future__ import annotations
 
 import base64
+import html
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
+from urllib.parse import quote
 
 import markdown
 
@@ -68,6 +71,19 @@ def read(results: Path) -> dict[str, dict[str, Any]]:
     return found
 
 
+def plain(text: str) -> str:
+    """Free text in one line, no part of which Markdown or HTML takes for a mark."""
+    escaped = html.escape(" ".join(text.split()), quote=False)
+    return re.sub(r"[\\`*\[\]|]|(?<!\w)_|_(?!\w)", lambda mark: f"\\{mark[0]}", escaped)
+
+
+def code(text: str) -> str:
+    """Text as a span of code, also in a table."""
+    line = " ".join(text.split()).replace("|", "\\|")
+    fence = "`" * (1 + max(map(len, re.findall("`+", line)), default=0))
+    return f"{fence}{line}{fence}" if len(fence) == 1 else f"{fence} {line} {fence}"
+
+
 def share(interval: dict[str, float] | None) -> str:
     """A relative difference with its interval, in per cent."""
     if interval is None:
@@ -90,7 +106,8 @@ def summary_table(found: dict[str, dict[str, Any]]) -> list[str]:
             ahead = f"{-front['hindsight_room']:+.1%}" if "hindsight_room" in front else "–"
             worse, asked = above(front)
             lines.append(
-                f"| [{name}](#{name.replace('_', '-')}) | {mode} | {front['seeds']} | "
+                f"| [{plain(name)}](#{quote(name.replace('_', '-'))}) | {plain(mode)} | "
+                f"{front['seeds']:d} | "
                 f"{share(front.get('middle'))} | {worse} of {asked} | {room} | {closed} | "
                 f"{ahead} |"
             )
@@ -114,7 +131,8 @@ def headline_table(found: dict[str, dict[str, Any]]) -> list[str]:
         cells = [share(fronts.get(mode, {}).get("middle")) for mode in MODES]
         room = fronts.get("sensors", {}).get("room")
         cells.append("–" if room is None else f"{-room:+.1%}")
-        lines.append(f"| {parts['verdict']['title'].split(',')[0]} | {' | '.join(cells)} |")
+        title = plain(parts["verdict"]["title"].split(",")[0])
+        lines.append(f"| {title} | {' | '.join(cells)} |")
     return lines
 
 
@@ -128,12 +146,13 @@ def headline_count(found: dict[str, dict[str, Any]]) -> str:
 def setting_section(name: str, parts: dict[str, Any]) -> list[str]:
     """A setting's figure and the points of its fronts."""
     verdict, baselines = parts["verdict"], parts["baselines"]
-    lines = [f"## {name.replace('_', '-')}", "", f"{verdict['title']} (`{baselines['env']}`).", ""]
-    lines += [f"![Pareto front of {name}]({name}/pareto.png)", ""]
+    title = f"{plain(verdict['title'])} ({code(baselines['env'])})."
+    lines = [f"## {plain(name.replace('_', '-'))}", "", title, ""]
+    lines += [f"![Pareto front of {plain(name)}]({quote(name)}/pareto.png)", ""]
     if "genie" in baselines:
         genie = baselines["genie"]
         lines += [
-            f"Genie: MSE {genie['mse']['mean']:.4g}; {genie['assumes']}.",
+            f"Genie: MSE {genie['mse']['mean']:.4g}; {plain(genie['assumes'])}.",
             "",
         ]
     lines += [
@@ -147,8 +166,9 @@ def setting_section(name: str, parts: dict[str, Any]) -> list[str]:
             reference = f"{point['reference']:.4g}" if "reference" in point else "–"
             ahead = f"{point['hindsight']:.4g}" if "hindsight" in point else "–"
             lines.append(
-                f"| {mode} | {point['price']:.3g} | {point['rate']:.4f} | {point['mse']:.4g} | "
-                f"{envelope} | {share(point.get('difference'))} | {reference} | {ahead} |"
+                f"| {plain(mode)} | {point['price']:.3g} | {point['rate']:.4f} | "
+                f"{point['mse']:.4g} | {envelope} | {share(point.get('difference'))} | "
+                f"{reference} | {ahead} |"
             )
     best = {
         policy
@@ -162,7 +182,7 @@ def setting_section(name: str, parts: dict[str, Any]) -> list[str]:
         for policy in best
     )
     lines += [
-        f"| `{policy}` | {rate:.4f} | {mse['mean']:.4g} [{mse['low']:.4g}, {mse['high']:.4g}] |"
+        f"| {code(policy)} | {rate:.4f} | {mse['mean']:.4g} [{mse['low']:.4g}, {mse['high']:.4g}] |"
         for rate, policy, mse in rows
     ]
     return [*lines, ""]
@@ -239,12 +259,15 @@ def text_of(
 
 
 def page_of(text: str, results: Path) -> str:
-    """The Markdown as one HTML page with its figures inside."""
-    body = markdown.markdown(text, extensions=["tables", "toc"])
+    """The Markdown as one HTML page with its figures inside; HTML in it is shown, not obeyed."""
+    renderer = markdown.Markdown(extensions=["tables", "toc"])
+    renderer.preprocessors.deregister("html_block")
+    renderer.inlinePatterns.deregister("html")
+    body = renderer.convert(text)
     for path in results.glob("*/pareto.png"):
         data = base64.b64encode(path.read_bytes()).decode()
         body = body.replace(
-            f'src="{path.parent.name}/pareto.png"', f'src="data:image/png;base64,{data}"'
+            f'src="{quote(path.parent.name)}/pareto.png"', f'src="data:image/png;base64,{data}"'
         )
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'

@@ -40,10 +40,12 @@ class Reproduce(Command):
     """Seed of the first episode."""
     markdown: bool = False
     """Print the table as the documentation holds it."""
+    trust: bool = False
+    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
 
     def run(self) -> None:
         """Run every row and print the table."""
-        rows = table(load(Comparison, self.config), self.episodes, self.seed)
+        rows = table(load(Comparison, self.config), self.episodes, self.seed, trust=self.trust)
         if self.markdown:
             lines = [COLUMNS, ("---",) * len(COLUMNS), *rows]
             print("\n".join("| " + " | ".join(line) + " |" for line in lines))
@@ -56,8 +58,10 @@ class Reproduce(Command):
         tables.console().print(shown)
 
 
-def table(comparison: Comparison, episodes: int, seed: int) -> list[tuple[str, ...]]:
-    """One row of text for each of the config's rows.
+def table(
+    comparison: Comparison, episodes: int, seed: int, *, trust: bool = False
+) -> list[tuple[str, ...]]:
+    """One row of text for each of the config's rows; ``trust`` as in ``make_policy``.
 
     Raises:
         ConfigurationError: a row that is not allowed, before the first episode.
@@ -65,7 +69,7 @@ def table(comparison: Comparison, episodes: int, seed: int) -> list[tuple[str, .
     made = []
     for row in comparison.rows:
         task = make_task(row.environment or comparison.environment, **row.options)
-        made.append((row.label, task, make_policy(row.policy, task)))
+        made.append((row.label, task, make_policy(row.policy, task, trust=trust)))
     total = sum(episodes * task.horizon for _, task, _ in made)
     found = []
     with progress_bar(total, "reproducing") as bar:

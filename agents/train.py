@@ -12,7 +12,8 @@ as if nothing had happened: on one machine, with the same packages and threads, 
 bitwise those of an uninterrupted training. The config must be the same; ``timesteps`` may be more
 (schedules then stretch over all of them), ``output`` may have moved, ``threads`` may change.
 
-A checkpoint holds pickles: resume your own trainings, not files from others.
+A checkpoint holds pickles and is loaded by Stable-Baselines3's own loader: resume trainings of your
+own alone, for a foreign folder runs whatever code is in it.
 """
 
 from __future__ import annotations

@@ -21,10 +21,16 @@ from .sweep import Sweep
 
 
 def run_all(
-    task: Task, policies: list[str], episodes: int, seed: int, description: str
+    task: Task,
+    policies: list[str],
+    episodes: int,
+    seed: int,
+    description: str,
+    *,
+    trust: bool = False,
 ) -> dict[str, EpisodeResults]:
-    """Every policy on the same seeds, with a progress bar."""
-    made = {name: make_policy(name, task) for name in policies}
+    """Every policy on the same seeds, with a progress bar; ``trust`` as in ``make_policy``."""
+    made = {name: make_policy(name, task, trust=trust) for name in policies}
     total = len(policies) * episodes * task.horizon
     with progress_bar(total, description) as bar:
         return {
@@ -35,7 +41,7 @@ def run_all(
 
 def compare(
     names: tuple[str, str], task: Task, sweep: Sweep, baselines: dict[str, EpisodeResults],
-    agent: str, seed: int, folder: Path,
+    agent: str, seed: int, folder: Path, trust: bool = False,
 ) -> None:  # fmt: skip
     """Run the agent on the baselines' episodes; write, print and draw the comparison.
 
@@ -46,7 +52,7 @@ def compare(
     """
     env_id, title = names
     episodes = next(iter(baselines.values())).episodes
-    learned = run_all(task, [agent], episodes, seed, "agent")[agent]
+    learned = run_all(task, [agent], episodes, seed, "agent", trust=trust)[agent]
     comparison = compare_with_envelope(learned, baselines)
     envelope = lower_envelope(baselines)
     results = baselines | {agent: learned}
