@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import json
+import struct
 import zipfile
 import zlib
 from pathlib import Path
@@ -20,7 +21,16 @@ from fusion_gym.validation import ConfigurationError
 
 LARGEST = 256 * 2**20  # bytes of a part, and of all weights
 _MOST = 1_000  # tensors
-_DAMAGE = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, NotImplementedError)
+# What a damaged archive makes zipfile raise; RuntimeError where a part is encrypted.
+_DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    OSError,
+    EOFError,
+    RuntimeError,
+    UnicodeError,
+    struct.error,
+)
 
 
 class NeedsTrust(ConfigurationError):
@@ -88,7 +98,7 @@ def _part(file: Path, name: str) -> bytes:
     except KeyError:
         raise _none(f"it has no {name}") from None
     except _DAMAGE as error:
-        raise _none(str(error)) from None
+        raise _none(" ".join(str(error).split())[:100]) from None
 
 
 def _is_plain(weight: Any) -> bool:

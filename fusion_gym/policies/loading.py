@@ -71,6 +71,8 @@ def _rebuilt(
         raise ConfigurationError(
             f"its card's network is not that of its weights, {network.plain()}"
         )
+    if not network.fits(blueprint.algorithm):
+        raise NeedsTrust(f"its weights are not those of {blueprint.algorithm}")
     action, view = _fitted(task, seen, (network.entries,), blueprint.actions)
     model = _empty(blueprint.algorithm, view)
     model.policy = _policy(blueprint, network, view)

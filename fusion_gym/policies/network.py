@@ -56,6 +56,11 @@ class Network:
         hidden_sizes = {head: tuple(o for o, _ in chain) for head, chain in chains.items()}
         return cls(hidden_sizes, entries, memory)
 
+    def fits(self, algorithm: str) -> bool:
+        """Whether policies of this algorithm have such networks."""
+        values, remembers = "q" in self.hidden, self.memory is not None
+        return (values, remembers) == (algorithm == "dqn", algorithm == "recurrent_ppo")
+
     def plain(self) -> dict[str, Any]:
         """As JSON."""
         told: dict[str, Any] = {head: list(sizes) for head, sizes in self.hidden.items()}

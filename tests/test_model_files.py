@@ -1,0 +1,492 @@
+"""A model file is data: what is rebuilt from it decides as it did, and nothing in it runs."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import pickle
+import random
+import shutil
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cloudpickle
+import numpy as np
+import pytest
+import torch
+import yaml
+from sb3_contrib import QRDQN, MaskablePPO, RecurrentPPO
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common import save_util
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
+
+import fusion_gym
+from agents import compare, evaluate, reproduce
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.policies import archive
+from fusion_gym.policies.model import ALGORITHMS, tag_model
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError
+
+ENV = "fusion_gym/TobitOscillator-v0"
+OPTIONS: dict[str, Any] = {"filter": "tobit", "horizon": 20}
+DISCRETE = {"action": "discrete"}
+RELU = {"net_arch": {"pi": [8], "vf": [6, 5]}, "activation_fn": torch.nn.ReLU}
+SHARED = {"lstm_hidden_size": 6, "n_lstm_layers": 2, "shared_lstm": True}
+LINEAR = {"lstm_hidden_size": 6, "net_arch": []}
+# Algorithm, kind of policy, options of the environment, arguments.
+MODELS: dict[str, tuple[type[BaseAlgorithm], str, dict[str, Any], dict[str, Any]]] = {
+    "ppo": (PPO, "MlpPolicy", {}, {}),
+    "ppo_relu": (PPO, "MlpPolicy", DISCRETE, {"policy_kwargs": RELU}),
+    "a2c": (A2C, "MlpPolicy", {"information": "centre"}, {}),
+    "dqn": (DQN, "MlpPolicy", DISCRETE, {"buffer_size": 10}),
+    "maskable_ppo": (MaskablePPO, "MlpPolicy", {"access": "single"}, {}),
+    "recurrent_ppo": (RecurrentPPO, "MlpLstmPolicy", DISCRETE, {}),
+    "recurrent_ppo_shared": (
+        RecurrentPPO,
+        "MlpLstmPolicy",
+        DISCRETE,
+        {"policy_kwargs": SHARED | {"enable_critic_lstm": False}},
+    ),
+    "recurrent_ppo_linear": (
+        RecurrentPPO,
+        "MlpLstmPolicy",
+        DISCRETE,
+        {"policy_kwargs": LINEAR | {"enable_critic_lstm": False}},
+    ),
+}
+
+
+def made(
+    algorithm: type[BaseAlgorithm], policy: Any, options: dict[str, Any], arguments: dict[str, Any]
+) -> tuple[BaseAlgorithm, Task]:
+    env = fusion_gym.make_sb3_vec_env(ENV, 2, **OPTIONS, **options)
+    kind: Any = algorithm
+    return kind(policy, env, seed=0, device="cpu", **arguments), env.task
+
+
+class Saved(NamedTuple):
+    model: BaseAlgorithm
+    task: Task
+    plain: Path
+    carded: Path
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Saved]:
+    """New models by name, saved by plain Stable-Baselines3 and with our card, each made once."""
+    folder, done = tmp_path_factory.mktemp("models"), {}
+
+    def get(name: str) -> Saved:
+        if name not in done:
+            model, task = made(*MODELS[name])
+            with torch.no_grad():  # far enough from zero that decisions differ
+                for weight in model.policy.parameters():
+                    weight.mul_(3.0)
+            plain, carded = folder / f"{name}_plain.zip", folder / f"{name}.zip"
+            model.save(plain)
+            tag_model(model, task)
+            model.save(carded)
+            done[name] = Saved(model, task, plain, carded)
+        return done[name]
+
+    return get
+
+
+class ForbiddenUnpickler(pickle.Unpickler):
+    """Reads nothing."""
+
+    def load(self) -> Any:
+        raise AssertionError("something was unpickled")
+
+
+@pytest.fixture
+def no_unpickling(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever unpickles raises; torch's reader of plain weights has a reader of its own."""
+
+    def forbidden(*_: Any, **__: Any) -> Any:
+        raise AssertionError("something was unpickled")
+
+    for module in (pickle, cloudpickle):
+        for name in ("load", "loads"):
+            monkeypatch.setattr(module, name, forbidden)
+    monkeypatch.setattr(pickle, "Unpickler", ForbiddenUnpickler)
+    monkeypatch.setattr(save_util, "json_to_data", forbidden)
+    monkeypatch.setattr(base64, "b64decode", forbidden)
+
+
+def streams() -> list[Any]:
+    """Where the random numbers that all share stand: torch's, NumPy's and Python's."""
+    numpys: Any = np.random.get_state()  # noqa: NPY002
+    return [torch.get_rng_state().tolist(), numpys[1].tolist(), numpys[2], random.getstate()]
+
+
+def decisions(policy: Any, task: Task) -> list[Any]:
+    policy.reset(20, 5)
+    batch, found = EpisodeBatch.seeded(task, 20, 0), []
+    for _ in range(12):
+        found.append(policy(batch.signals()))
+        batch.step(found[-1])
+    return found
+
+
+@pytest.mark.parametrize("carded", [True, False], ids=["card", "plain"])
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.usefixtures("no_unpickling")
+def test_a_rebuilt_policy_decides_as_the_model_did(
+    saved: Callable[[str], Saved], name: str, carded: bool
+) -> None:
+    """The same weights, decisions and chances, and torch's and NumPy's random numbers stay."""
+    agent = saved(name)
+    path = agent.carded if carded else agent.plain
+    before = streams()
+    policy: Any = make_policy(f"model:{path}", agent.task)
+    assert streams() == before
+    assert type(policy.model) is type(agent.model)
+    wanted, found = agent.model.policy.state_dict(), policy.model.policy.state_dict()
+    assert wanted.keys() == found.keys()
+    assert all(torch.equal(weight, found[key]) for key, weight in wanted.items())
+    chance: Any = make_policy(f"model:{path},deterministic=false", agent.task)
+    for one in (policy, chance):
+        other: Any = make_policy(f"model:{path}", agent.task)
+        other.model, other.deterministic = agent.model, one.deterministic
+        first, second = decisions(one, agent.task), decisions(other, agent.task)
+        np.testing.assert_array_equal(first, second)
+    assert 0.0 < np.mean(decisions(policy, agent.task)) < 1.0
+
+
+def test_the_file_with_a_card_is_an_ordinary_one(saved: Callable[[str], Saved]) -> None:
+    agent = saved("ppo_relu")
+    again = PPO.load(agent.carded, device="cpu")
+    assert all(
+        torch.equal(weight, again.policy.state_dict()[name])
+        for name, weight in agent.model.policy.state_dict().items()
+    )
+    told = again.fusion_gym_model
+    assert told["network"] == {"pi": [8], "vf": [6, 5]}
+    assert (told["activation"], told["actions"]) == ("relu", "Discrete(8)")
+    memory = saved("recurrent_ppo_shared").model.fusion_gym_model["network"]["memory"]  # type: ignore[attr-defined]
+    assert memory == {"size": 6, "layers": 2, "critic": "shared"}
+
+
+@pytest.mark.parametrize("name", fusion_gym.zoo.names())
+def test_agents_of_the_zoo_decide_as_stable_baselines_loads_them(
+    name: str, request: pytest.FixtureRequest
+) -> None:
+    told = fusion_gym.zoo.card(name)
+    options = told["options"] | ({"information": "centre"} if told["mode"] == "centre" else {})
+    task = fusion_gym.make_task(told["env"], **options)
+    loaded = ALGORITHMS[told["training"]["algorithm"]["name"]].load(
+        fusion_gym.zoo.model_path(name), device="cpu"
+    )
+    request.getfixturevalue("no_unpickling")
+    policy: Any = make_policy(f"zoo:{name}", task)
+    loaded.observation_space.seed(0)
+    seen = np.array([loaded.observation_space.sample() for _ in range(500)])
+    first, second = (model.predict(seen, deterministic=True)[0] for model in (loaded, policy.model))
+    np.testing.assert_array_equal(first, second)
+    assert len(np.unique(first, axis=0)) > 1
+
+
+class Payload:
+    """Writes a file as soon as it is unpickled."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.write_text, (self.mark, "code ran")
+
+
+def repacked(path: Path, source: Path, **parts: bytes | None) -> Path:
+    """A copy of an archive with other parts (dots in their names written as ``__``)."""
+    changed = {name.replace("__", "."): content for name, content in parts.items()}
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(path, "w") as new:
+        for name in {*old.namelist(), *changed}:
+            content = changed[name] if name in changed else old.read(name)
+            if content is not None:
+                new.writestr(name, content)
+    return path
+
+
+def data_of(path: Path) -> dict[str, Any]:
+    with zipfile.ZipFile(path) as packed:
+        found: dict[str, Any] = json.loads(packed.read("data"))
+    return found
+
+
+def dumped(thing: Any, **options: Any) -> bytes:
+    stream = io.BytesIO()
+    torch.save(thing, stream, **options)
+    return stream.getvalue()
+
+
+def poisoned(data: dict[str, Any], payload: Payload) -> bytes:
+    """The data with the payload in the place of all that is pickled, and in a new entry."""
+    text = base64.b64encode(cloudpickle.dumps(payload)).decode()
+    for entry in data.values():
+        if isinstance(entry, dict) and ":serialized:" in entry:
+            entry[":serialized:"] = text
+    data["extra"] = {":type:": "<class 'dict'>", ":serialized:": text}
+    return json.dumps(data).encode()
+
+
+@pytest.mark.parametrize("carded", [True, False], ids=["card", "plain"])
+@pytest.mark.parametrize(
+    "part", ["data", "policy", "legacy", "script", "pickle", "variables", "optimizer"]
+)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch.jit, which attackers still have
+def test_a_crafted_file_runs_nothing(
+    saved: Callable[[str], Saved], tmp_path: Path, part: str, carded: bool
+) -> None:
+    agent, mark = saved("ppo"), tmp_path / "mark"
+    source, payload = agent.carded if carded else agent.plain, Payload(mark)
+    script = io.BytesIO()
+    torch.jit.save(torch.jit.script(torch.nn.Linear(2, 2)), script)
+    parts: dict[str, dict[str, bytes]] = {
+        "data": {"data": poisoned(data_of(source), payload)},
+        "policy": {"policy__pth": dumped({"action_net.weight": payload})},
+        "legacy": {"policy__pth": dumped(payload, _use_new_zipfile_serialization=False)},
+        "script": {"policy__pth": script.getvalue()},
+        "pickle": {"policy__pth": pickle.dumps(payload)},
+        "variables": {"pytorch_variables__pth": dumped(payload), "tensors__pth": dumped(payload)},
+        "optimizer": {"policy__optimizer__pth": dumped(payload)},
+    }
+    path = repacked(tmp_path / "crafted.zip", source, **parts[part])
+    if part in ("data", "variables", "optimizer"):
+        policy = make_policy(f"model:{path}", agent.task)
+        assert np.array_equal(
+            decisions(policy, agent.task),
+            decisions(make_policy(f"model:{source}", agent.task), agent.task),
+        )
+    else:
+        with pytest.raises(ConfigurationError, match="--trust") as caught:
+            make_policy(f"model:{path}", agent.task)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(ConfigurationError, match="unknown parameter"):
+        make_policy(f"model:{path},trust=true", agent.task)
+    assert not mark.exists()
+    if part == "data":  # the payload is a live one
+        with pytest.raises(ConfigurationError):
+            make_policy(f"model:{path}", agent.task, trust=True)
+        assert mark.read_text() == "code ran"
+
+
+class OwnPolicy(ActorCriticPolicy):
+    """Code of a user's own."""
+
+
+class OwnExtractor(FlattenExtractor):
+    """Code of a user's own that has no weights."""
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        return -super().forward(observations)
+
+
+@pytest.mark.parametrize("carded", [True, False], ids=["card", "plain"])
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ((QRDQN, "MlpPolicy", DISCRETE, {"buffer_size": 10}), "its policy is none of"),
+        ((PPO, OwnPolicy, {}, {}), "its policy is none of"),
+        (
+            (PPO, "MlpPolicy", {}, {"policy_kwargs": {"features_extractor_class": OwnExtractor}}),
+            "features_extractor_class",
+        ),
+        (
+            (PPO, "MlpPolicy", {}, {"policy_kwargs": {"activation_fn": torch.nn.Softplus}}),
+            "Softplus",
+        ),
+    ],
+    ids=["algorithm", "policy", "extractor", "activation"],
+)
+def test_what_weights_do_not_make_needs_trust(
+    tmp_path: Path, given: Any, reason: str, carded: bool
+) -> None:
+    model, task = made(*given)
+    if carded:
+        tag_model(model, task)
+    path = tmp_path / "model.zip"
+    model.save(path)
+    with pytest.raises(ConfigurationError) as caught:
+        make_policy(f"model:{path}", task)
+    assert all(part in str(caught.value) for part in (str(path), reason, "--trust"))
+    assert "\n" not in str(caught.value)
+    policy: Any = make_policy(f"model:{path}", task, trust=True)
+    assert type(policy.model.policy) is type(model.policy)
+    with pytest.raises(ConfigurationError, match="trust = 'yes'"):
+        make_policy(f"model:{path}", task, trust="yes")  # type: ignore[arg-type]
+
+
+Weights = dict[Any, Any]
+HEAD, FIRST = "action_net.weight", "mlp_extractor.policy_net.0.weight"
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda weights: {name: weights[name] for name in weights if name != HEAD}, "--trust"),
+        (lambda weights: weights | {"extra": torch.zeros(2, 2)}, "--trust"),
+        (lambda weights: weights | {HEAD: weights[HEAD].double()}, "--trust"),
+        (lambda weights: weights | {HEAD: weights[HEAD][:2]}, "--trust"),
+        (lambda weights: weights | {HEAD: weights[HEAD].to_sparse()}, "--trust"),
+        (lambda weights: weights | {HEAD: torch.zeros(1).expand(10**6, 10**6)}, "bytes"),
+        (lambda weights: weights | {FIRST: torch.zeros(1).expand(10**7, 1)}, "do not fit"),
+        (lambda weights: weights | {HEAD: weights[HEAD] * torch.nan}, "not finite"),
+        (lambda weights: [weights], "--trust"),
+        (lambda weights: dict.fromkeys(map(str, range(2000)), torch.zeros(1)), "--trust"),
+    ],
+    ids=["missing", "extra", "float64", "shape", "sparse", "huge", "wide", "nan", "list", "many"],
+)
+def test_weights_of_no_such_policy_are_refused(
+    saved: Callable[[str], Saved],
+    tmp_path: Path,
+    change: Callable[[Weights], Any],
+    reason: str,
+) -> None:
+    agent = saved("ppo")
+    weights = dumped(change(dict(agent.model.policy.state_dict())))
+    path = repacked(tmp_path / "crafted.zip", agent.plain, policy__pth=weights)
+    with pytest.raises(ConfigurationError) as caught:
+        make_policy(f"model:{path}", agent.task)
+    assert reason in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_parts_larger_than_any_model_are_not_read(
+    saved: Callable[[str], Saved], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither where they say so, nor in the archive of the weights inside."""
+    agent = saved("ppo")
+    inner = io.BytesIO()
+    with zipfile.ZipFile(inner, "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("archive/data.pkl", bytes(10**6))
+    path = repacked(tmp_path / "inner.zip", agent.plain, policy__pth=inner.getvalue())
+    with pytest.raises(ConfigurationError, match="its weights are compressed"):
+        make_policy(f"model:{path}", agent.task)
+    monkeypatch.setattr(archive, "LARGEST", 10_000)
+    with pytest.raises(ConfigurationError, match=r"its data has \d+ bytes, more than 10000"):
+        make_policy(f"model:{agent.plain}", agent.task)
+
+
+@pytest.mark.parametrize(
+    ("entry", "value", "reason"),
+    [
+        ("format", 2, "format = 2"),
+        ("format", "1", "format = '1'"),
+        ("algorithm", "sac", "algorithm = 'sac'"),
+        ("algorithm", ["ppo"], "algorithm = ['ppo']"),
+        ("algorithm", "dqn", "--trust"),
+        ("algorithm", "recurrent_ppo", "--trust"),
+        ("activation", "sine", "activation = 'sine'"),
+        ("actions", "Discrete(3)", "Discrete(3)"),
+        ("network", {"pi": [64, 64], "vf": [64, 65]}, "network"),
+        ("network", None, "network"),
+        ("observation_names", "all", "observation_names"),
+        ("observation_names", ["a", "b"], "missing are ['a', 'b']"),
+        ("local", "no", "local = 'no'"),
+        ("local", True, "layout"),
+        ("price_range", [1.0, 0.5], "price_range"),
+        ("price_range", "free", "price_range"),
+        ("extra", 1, "unknown entry of the card 'extra'"),
+    ],
+)
+def test_a_card_is_checked_entry_by_entry(
+    saved: Callable[[str], Saved], tmp_path: Path, entry: str, value: Any, reason: str
+) -> None:
+    agent = saved("ppo")
+    data = data_of(agent.carded)
+    data["fusion_gym_model"][entry] = value
+    path = repacked(tmp_path / "other.zip", agent.carded, data=json.dumps(data).encode())
+    with pytest.raises(ConfigurationError) as caught:
+        make_policy(f"model:{path}", agent.task)
+    assert reason in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_damaged_file_is_refused_or_harmless(
+    saved: Callable[[str], Saved], tmp_path: Path
+) -> None:
+    """Cut short, or with bytes changed: one line, or a policy."""
+    agent, path, stream = saved("ppo"), tmp_path / "damaged.zip", random.Random(0)
+    whole = agent.carded.read_bytes()
+    repacked(path, agent.carded, data=b"[" * 100_000)
+    with pytest.raises(ConfigurationError, match="its data is no JSON"):
+        make_policy(f"model:{path}", agent.task)
+    said = []
+    for trial in range(40):
+        content = bytearray(whole[: stream.randrange(len(whole))] if trial % 2 else whole)
+        for _ in range(20):
+            content[stream.randrange(len(content))] = stream.randrange(256)
+        path.write_bytes(content)
+        try:
+            make_policy(f"model:{path}", agent.task)
+        except ConfigurationError as error:
+            said.append(str(error))
+    assert len(said) > 20
+    assert max(map(len, said)) < 600
+    assert not any("\n" in line for line in said)
+
+
+def test_a_file_of_the_zoo_is_the_one_that_its_card_describes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = "biased_oscillator_local"
+    for suffix in ("zip", "json"):
+        source = Path(fusion_gym.zoo.__file__).with_name(f"{name}.{suffix}")
+        shutil.copyfile(source, tmp_path / source.name)
+    monkeypatch.setattr(fusion_gym.zoo, "_folder", lambda: tmp_path)
+    task = fusion_gym.make_task(fusion_gym.zoo.card(name)["env"])
+    make_policy(f"zoo:{name}", task)
+    content = bytearray((tmp_path / f"{name}.zip").read_bytes())
+    content[-1] ^= 1
+    (tmp_path / f"{name}.zip").write_bytes(content)
+    with pytest.raises(ConfigurationError, match=f"zoo = '{name}' .* SHA-256"):
+        make_policy(f"zoo:{name}", task)
+
+
+def test_commands_load_foreign_code_with_trust_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, _ = made(QRDQN, "MlpPolicy", DISCRETE, {"buffer_size": 10})
+    policy = f"model:{tmp_path / 'model.zip'}"
+    model.save(tmp_path / "model.zip")
+    files: dict[str, Any] = {
+        "config": {
+            "environment": {"id": ENV, "options": OPTIONS},
+            "algorithm": {"name": "ppo"},
+            "training": {"timesteps": 64},
+            "output": "unused",
+        },
+        "sweep": {
+            "points": ["never", "always", policy],
+            "curves": [{"label": "a", "policy": "paced:rate={value}", "values": [0.1, 0.5]}],
+        },
+        "rows": {
+            "environment": ENV,
+            "rows": [{"label": "foreign", "policy": policy, "options": OPTIONS}],
+        },
+    }
+    for name, content in files.items():
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
+    config, sweep = str(tmp_path / "config.yaml"), str(tmp_path / "sweep.yaml")
+    for command, arguments in (
+        (evaluate, ["--config", config, "--policies", policy]),
+        (compare, ["--config", config, "--sweep", sweep, "--policy", policy, "--output"]),
+        (reproduce, ["--config", str(tmp_path / "rows.yaml")]),
+    ):
+        if command is compare:
+            arguments.append(str(tmp_path / "comparison"))
+        line = ["program", *arguments, "--episodes", "3"]
+        monkeypatch.setattr(sys, "argv", line)
+        with pytest.raises(SystemExit, match="--trust"):
+            command.main()
+        monkeypatch.setattr(sys, "argv", [*line, "--trust"])
+        command.main()
