@@ -3,11 +3,17 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
+LOWEST := .venv-lowest
+# A part of the tests that touches every dependency.
+QUICK  := tests/conformance/test_faces.py tests/test_commands.py tests/test_environment_api.py \
+	tests/test_evaluation.py tests/test_gaussian.py tests/test_model_files.py tests/test_solvers.py \
+	tests/test_agents.py::test_training_writes_its_results_and_resumes \
+	tests/test_benchmark.py::test_from_tuning_to_report_and_zoo
 
-.PHONY: help demo test test-all wheel-test lint format bench clean
+.PHONY: help demo test test-all test-lowest wheel-test lint format bench clean
 
 help:  ## list the targets
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 13
 
 # torch comes first and at its pinned version: left to a range, an installer may take a build
 # with several GB of GPU libraries.
@@ -27,6 +33,19 @@ test: $(STAMP)  ## the tests, without the slow ones
 test-all: $(STAMP)  ## all tests
 	$(BIN)/python -m pytest -n 2
 
+# uv reads the lower bounds of pyproject.toml. torch keeps its pinned version: its oldest wheels bring
+# GPU libraries.
+$(LOWEST)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv --clear $(LOWEST)
+	$(LOWEST)/bin/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt torch uv
+	grep '^torch==' constraints.txt > $(LOWEST)/torch.txt
+	$(LOWEST)/bin/uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct \
+		--overrides $(LOWEST)/torch.txt --requirements pyproject.toml --extra agents --extra test
+	touch $@
+
+test-lowest: $(LOWEST)/.installed  ## quick tests with the lowest versions that pyproject.toml allows
+	$(LOWEST)/bin/python -m pytest -m "not slow" -n 2 $(QUICK)
+
 wheel-test: $(STAMP)  ## build the package and try it in an empty folder, outside the repository
 	$(BIN)/python tests/wheel_smoke.py
 
@@ -43,4 +62,4 @@ bench: $(STAMP)  ## steps per second beside the alternatives, as ratios of one r
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.throughput
 
 clean:  ## remove the virtual environment and caches (not runs/)
-	rm -rf $(VENV) build .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) $(LOWEST) build .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

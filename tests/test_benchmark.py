@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import shutil
 import sys
+import xml.etree.ElementTree
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +102,8 @@ def test_from_tuning_to_report_and_zoo(
     )  # fmt: skip
     card = json.loads((tmp_path / "zoo" / "small_sensors.json").read_text())
     assert card["env"] == ENV
+    content = (tmp_path / "zoo" / "small_sensors.zip").read_bytes()
+    assert card["sha256"] == hashlib.sha256(content).hexdigest()
     assert (tmp_path / "zoo" / "small_sensors.zip").stat().st_size < 300_000
     assert "zoo:small_local" in capsys.readouterr().out
 
@@ -322,6 +327,47 @@ def test_the_benchmark_refuses_with_one_line(
         run_main(monkeypatch, benchmark, *config, *arguments)
     assert str(caught.value).startswith("error: ")
     assert message in str(caught.value)
+
+
+def test_the_report_shows_what_it_is_told_as_text(tmp_path: Path) -> None:
+    """Titles, policies and folders in HTML, Markdown and with a table's bars stay what they are."""
+    committed = Path(__file__).parent.parent / "results" / "tobit_oscillator"
+    folder = tmp_path / "a<b>_[c](javascript:d)"
+    folder.mkdir()
+    for source in committed.glob("*.json"):
+        shutil.copyfile(source, folder / source.name)
+    title = 'x <script>alert(1)</script> | *y* [z](javascript:alert(2)) `<img src=x onerror="e">`'
+    verdict = json.loads((folder / "verdict.json").read_text())
+    baselines = json.loads((folder / "baselines.json").read_text())
+    verdict["title"] = title + "\n\n<script>alert(3)</script>"
+    baselines["env"] = "a`<script>alert(4)</script>|b"
+    first = verdict["modes"]["sensors"]["envelope"][0]
+    strange = "model:<b>`|x"
+    baselines["policies"][strange] = baselines["policies"][first["name"]]
+    first["name"] = strange
+    for name, content in (("verdict", verdict), ("baselines", baselines)):
+        (folder / f"{name}.json").write_text(json.dumps(content))
+    (folder / "pareto.png").write_bytes(b"image")
+    text = report.text_of(report.read(tmp_path), "one", "two")
+    page = report.page_of(text + "\n\n<script>alert(5)</script> <b onclick='f'>g</b>\n", tmp_path)
+    inside = page[page.index("<body>") :].partition("</html")[0]
+    body = xml.etree.ElementTree.fromstring(inside)
+    tags = {element.tag for element in body.iter()}
+    plain = {"body", "h1", "h2", "p", "ul", "li", "strong", "a", "code", "img"}
+    assert tags <= plain | {"table", "thead", "tbody", "tr", "th", "td"}
+    links = [element.get("href", "") for element in body.iter("a")]
+    assert links
+    assert all(link.startswith("#") for link in links)
+    images = [element.get("src", "") for element in body.iter("img")]
+    assert len(images) == 1
+    assert images[0].startswith("data:image/png;base64,")
+    said = "".join(body.itertext())
+    assert " ".join(verdict["title"].split()) in said
+    assert "a`<script>alert(4)</script>" in said
+    assert "<script>alert(5)</script>" in said
+    rows = [len(row) for table in body.iter("table") for row in table.iter("tr")]
+    widths = {len(table.find("thead/tr") or ()) for table in body.iter("table")}
+    assert set(rows) == widths
 
 
 def test_the_zoo_answers_by_name() -> None:
