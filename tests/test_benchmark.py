@@ -368,6 +368,7 @@ def test_the_report_shows_what_it_is_told_as_text(tmp_path: Path) -> None:
     rows = [len(row) for table in body.iter("table") for row in table.iter("tr")]
     widths = {len(table.find("thead/tr") or ()) for table in body.iter("table")}
     assert set(rows) == widths
+    assert report.code("a|b``c") == "``` a\\|b``c ```"  # a bar would end the cell on other pages
 
 
 def test_the_zoo_answers_by_name() -> None:

@@ -87,6 +87,8 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Saved]:
     def get(name: str) -> Saved:
         if name not in done:
             model, task = made(*MODELS[name])
+            if isinstance(model, DQN):
+                model.exploration_rate = 0.5  # a coin that decisions by chance throw
             with torch.no_grad():  # far enough from zero that decisions differ
                 for weight in model.policy.parameters():
                     weight.mul_(3.0)
