@@ -23,7 +23,7 @@ from fusion_gym.errors import (
 
 # Filters square what they are given and divide by it: from here to there float64 can hold that.
 SMALLEST, LARGEST = 1e-15, 1e15
-LONGEST = 32  # entries of an axis of any length; matrices are multiplied entry by entry
+LONGEST = 100  # entries of an axis of any length; matrices are multiplied entry by entry
 MOST_RUNS = 1_000_000  # each has a generator and a block of noise
 LONGEST_HORIZON = 50_000  # scales and tables are worked out step by step
 
@@ -47,7 +47,7 @@ def _numbers(field: str, value: ArrayLike, allowed: str) -> Array:
 
 
 def array(field: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
-    """A finite float64 array of the given shape; ``None`` in it is any length from 1 to 32.
+    """A finite float64 array of the given shape; ``None`` in it is any length from 1 to 100.
 
     Raises:
         ConfigurationError: not numeric, not finite, or of another shape.

@@ -103,7 +103,7 @@ BAD_OPTIONS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
     ({"token_rate": None}, ("None", "number")),
     ({"process_variance": np.longdouble("1e4000")}, ("1e+4000", "finite")),
     ({"trigger_decay": [np.ones((2, 2))] * 2}, ("[[[1.0, 1.0]", "(3,)")),
-    ({"transition": np.ones((40, 40))}, ("(any, any)", "up to 32", "(40, 40)")),
+    ({"transition": np.ones((140, 140))}, ("(any, any)", "up to 100", "(140, 140)")),
     # Numbers that float64 cannot square, divide by or wait for
     ({"measurement_variance": 1e308}, ("1e+308", "at most 1e+15")),
     ({"measurement_variance": 1e-320}, ("1e-320", "at least 1e-15")),
