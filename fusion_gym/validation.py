@@ -191,7 +191,9 @@ def arguments(owner: str, given: Iterable[str], known: Iterable[str]) -> None:
     names = sorted(known)
     for key in given:
         if key not in names:
-            raise UnexpectedArgumentError.of(owner, key, _known(key, names))
+            raise UnexpectedArgumentError.of(
+                owner, key, f"unknown option {key!r}: {_known(key, names)}"
+            )
 
 
 def _known(key: Any, names: list[str]) -> str:
