@@ -135,9 +135,10 @@ def test_what_the_machine_refuses_is_told(error: BaseException, status: int | st
 
 def run(command: str) -> subprocess.CompletedProcess[str]:
     """A line of the shell in the repository."""
-    path = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    env = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    env.pop("PYTHONUNBUFFERED", None)
     return subprocess.run(
-        ["bash", "-c", command], cwd=ROOT, env=os.environ | path, capture_output=True, text=True
+        ["bash", "-c", command], cwd=ROOT, env=env, capture_output=True, text=True
     )
 
 

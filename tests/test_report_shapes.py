@@ -87,7 +87,7 @@ def test_results_of_another_shape(
 
 def test_the_zoo_takes_all_agents_or_none(setting: Path, tmp_path: Path) -> None:
     """The second of two has no model; a setting's name is no path; then both are there."""
-    second = setting.parent / "second"
+    second = setting.parent / "zz"  # behind the other, in the order in which they are copied
     shutil.copytree(setting, second)
     file = second / "agent_sensors_0.json"
     agent = json.loads(file.read_text(encoding="utf-8"))
