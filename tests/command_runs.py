@@ -106,7 +106,7 @@ def flaw(tried: Try, folder: Path) -> str | None:
     spec = tried.option in ("policies", "policy", "set")
     part = re.split("[:=,]", tried.value)[0] if spec else tried.value
     part = repr(part)[1:-1]
-    if part[:200] not in shown:
+    if part[:100] not in shown:
         return f"does not name the value: {lines[0][:300]}"
     if not any(name in shown for name in spelled | SAID.get(tried.option, set())):
         return f"does not name the option: {lines[0][:300]}"
