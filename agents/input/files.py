@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import pydantic
 
+from fusion_gym.errors import shown
 from fusion_gym.validation import ConfigurationError
 
 Shape = TypeVar("Shape")
@@ -40,13 +41,7 @@ def checked(shape: type[Shape], content: Any, source: str) -> Shape:
     except pydantic.ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"]) or "the whole file"
-        given = "" if first["type"] == "missing" else f" = {_brief(first['input'])}"
+        given = "" if first["type"] == "missing" else f" = {shown(first['input'])}"
         raise ConfigurationError(
             f"{source}: {place}{given} is not allowed: {first['msg']}"
         ) from None
-
-
-def _brief(value: Any) -> str:
-    """A value as Python writes it, cut short."""
-    text = repr(value)
-    return text if len(text) <= 200 else f"{text[:200]}…"
