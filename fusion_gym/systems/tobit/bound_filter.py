@@ -151,6 +151,7 @@ class BoundTobitFilter:
         Source: tobit_token_bucket, equations (30) and (37). At the optimal gain (30) is
         κ₁ P - κ₁ P C̃ᵀ Φ⁻¹ C̃ P κ₁, with Φ = κ₁ C̃ P C̃ᵀ + S and C̃ = q C.
         """
+        covariance = self.sensors.shrunk(covariance)
         matrix = self.sensors.measurement_matrix
         cross = linalg.matmul(matrix, covariance)
         spread = linalg.matmul(cross, linalg.transpose(matrix))

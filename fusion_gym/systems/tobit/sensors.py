@@ -17,7 +17,7 @@ _STARVED = 1e6
 _HUGE = 1e10  # beyond it, small eigenvalues may be lost beside large ones
 _WIDEST = 1e12  # ratio of two eigenvalues of a covariance
 _NONE = np.empty(0, dtype=np.intp)
-_LARGEST = 1e13  # deviation: what a delivery leaves of a larger one would drown in its rounding
+_LARGEST = 1e26  # what a delivery leaves of a larger variance would drown in its rounding
 
 
 @dataclass(frozen=True)
@@ -128,12 +128,25 @@ class CensoredSensors:
         large = linalg.diagonal(covariance) > factor * self.resolution
         return np.flatnonzero(large.reshape(-1, large.shape[-1]).any(0))
 
+    def shrunk(self, covariance: Array) -> Array:
+        """Priors of the nodes (sensors, n, n, N), all of a run scaled down where one is above 10²⁶.
+
+        In units of the resolution. That much larger than any noise, an update depends on their
+        shape alone.
+        """
+        lanes = self.starved(covariance, _LARGEST)
+        if not lanes.size:
+            return covariance
+        variances = linalg.diagonal(covariance[..., lanes]) / self.resolution
+        result = covariance.copy()
+        result[..., lanes] *= _LARGEST / variances.max((0, 1))
+        return result
+
     def gram(self, factor: Array) -> Array:
         """F Fᵀ (…, n, n, N) of F (…, n, k, N), k >= n, as far as float64 can hold it.
 
         The eigenvalues, in units of the resolution, lie no further apart than a factor of 10¹²: the
-        largest come down first, but not below that, then the smallest go up. Where the largest is
-        above 10²⁶, all are scaled down together.
+        largest come down first, but not below that, then the smallest go up.
         """
         result = linalg.matmul(factor, linalg.transpose(factor))
         lanes = self.starved(result, _HUGE)
@@ -142,7 +155,7 @@ class CensoredSensors:
             vectors, values, _ = np.linalg.svd(
                 np.moveaxis(factor[..., lanes] / unit[:, None], -1, -3), full_matrices=False
             )
-            variances = (values * np.minimum(1.0, _LARGEST / values[..., :1])) ** 2
+            variances = values**2
             variances = np.minimum(variances, _WIDEST * np.maximum(variances[..., -1:], 1.0))
             variances = np.maximum(variances, variances[..., :1] / _WIDEST)
             root = vectors * np.sqrt(variances)[..., None, :]
