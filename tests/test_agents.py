@@ -110,7 +110,7 @@ def test_a_config_that_cannot_be_read(tmp_path: Path) -> None:
         load(Experiment, tmp_path / "broken.yaml")
     assert "\n" not in str(caught.value)
     (tmp_path / "bytes.yaml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigurationError, match="no YAML") as caught:
+    with pytest.raises(ConfigurationError, match="no text in UTF-8") as caught:
         load(Experiment, tmp_path / "bytes.yaml")
     assert "\n" not in str(caught.value)
 
