@@ -39,12 +39,16 @@ def equal_weights(open_loop: Array) -> Array:
         ConfigurationError: a state that is known without any transmission.
     """
     if not np.all(open_loop > 0.0):
-        raise ConfigurationError(
-            f"a squared error of {validation.shown(open_loop)} without transmissions is not "
-            "allowed: every "
-            "state must be moved by noise before the horizon, or be uncertain at the start"
-        )
+        raise _at_rest(open_loop)
     return 1.0 / (len(open_loop) * open_loop)
+
+
+def _at_rest(open_loop: Array) -> ConfigurationError:
+    """The error of a plant some of whose states are known without any transmission."""
+    return ConfigurationError(
+        f"a squared error of {validation.shown(open_loop)} without transmissions is not allowed: "
+        "every state must be moved by noise before the horizon, or be uncertain at the start"
+    )
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,7 @@ class Reward:
                 make of the error without transmissions more than can be worked with.
         """
         if state_weights is None and not open_loop.sum() > 0.0:
-            equal_weights(open_loop)
+            raise _at_rest(open_loop)
         weights = (
             np.full(open_loop.shape, 1.0 / open_loop.sum())
             if state_weights is None

@@ -199,9 +199,7 @@ class BoundTobitFilter:
         itself, which grows as 1/q, is never formed.
         """
         k1, k2, _, k4, k5, _, k7, _ = self.constants.kappa
-        grow, shift = self.constants.second_moment
-        matrix, latent = self.sensors.measurement_matrix, expectation.latent
-        threshold = self.sensors.finite_threshold
+        latent, threshold = expectation.latent, self.sensors.finite_threshold
         q = np.maximum(expectation.uncensored_probability, _SMALLEST_PROBABILITY)
         bias = expectation.hazard * self.sensors.deviation
         core = k1 * spread + k4 * moment + k2 * linalg.outer(bias, bias)
@@ -218,17 +216,35 @@ class BoundTobitFilter:
         )
         bound = k1 * covariance - k1**2 * linalg.matmul(linalg.transpose(cross), whitened)
         bound = linalg.symmetrise(bound)
-        if lanes.size:  # true for any gain, the one with the ridge too
-            prior, gain = covariance[..., lanes], k1 * linalg.transpose(whitened)[..., lanes]
-            seen = linalg.matmul(matrix, linalg.factor(prior))
-            offsets = np.stack((np.sqrt(k4 * shift) * latent, np.sqrt(k2) * bias), axis=-2)
-            noise = [
-                linalg.matmul(gain, np.sqrt(k4 * grow) * seen),
-                linalg.matmul(gain, offsets[..., lanes]),
-                k1 * linalg.matmul(linalg.transpose(cross), pinned)[..., lanes],
-            ]
-            bound[..., lanes] = joseph_form(self.sensors, k1 * prior, matrix, gain, noise)
+        if lanes.size:
+            pulled = k1 * linalg.matmul(linalg.transpose(cross), pinned)
+            bound[..., lanes] = self._held_squares(
+                covariance[..., lanes],
+                k1 * linalg.transpose(whitened)[..., lanes],
+                latent[..., lanes],
+                bias[..., lanes],
+                pulled[..., lanes],
+            )
         return mean + k1 * step, bound
+
+    def _held_squares(
+        self, covariance: Array, gain: Array, latent: Array, bias: Array, pulled: Array
+    ) -> Array:
+        """(30) with θ = 1 as the sum of squares that it is, true for any gain.
+
+        ``gain`` is K q, ``bias`` λ √R, and ``pulled`` K q F.
+        """
+        k1, k2, _, k4, _, _, _, _ = self.constants.kappa
+        grow, shift = self.constants.second_moment
+        matrix = self.sensors.measurement_matrix
+        seen = linalg.matmul(matrix, linalg.factor(covariance))
+        offsets = np.stack((np.sqrt(k4 * shift) * latent, np.sqrt(k2) * bias), axis=-2)
+        noise = [
+            linalg.matmul(gain, np.sqrt(k4 * grow) * seen),
+            linalg.matmul(gain, offsets),
+            pulled,
+        ]
+        return joseph_form(self.sensors, k1 * covariance, matrix, gain, noise)
 
 
 def _pinned_columns(
