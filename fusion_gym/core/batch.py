@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, merge_runs
 from fusion_gym.core.access import access_mask, first_request
+from fusion_gym.core.beliefs import Beliefs
+from fusion_gym.core.memory import Memory, Owner, Shadows
 from fusion_gym.core.observation import Network, ObservationLayout
+from fusion_gym.core.signals import memory_signals
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 
@@ -46,14 +49,20 @@ class EpisodeBatch:
     seed fixes an episode's noise (common random numbers), and a run does not depend on what
     stands beside it (batch invariance).
 
+    ``remember`` says whose memory is kept, the coordinator's or every sensor's own; ``None`` is
+    the coordinator's in a task with memory, and nothing in one without.
+
     ``state`` is the system's after sensing, ``delivered`` its state after the last delivery,
-    for metrics and figures.
+    for metrics and figures; ``shadows`` is what is remembered, or ``None``.
     """
 
-    def __init__(self, task: Task, num_envs: int) -> None:
+    def __init__(self, task: Task, num_envs: int, remember: Owner | None = None) -> None:
         self.task = task
         self.num_envs = num_envs
-        self.layout = ObservationLayout(task)
+        self.memory = Memory(task, "coordinator" if remember is None else remember)
+        self.layout = ObservationLayout(task, self.memory.owner)
+        self.shadows: Shadows | None = Shadows() if self.memory.keeps else None
+        self._beliefs: Beliefs | None = None
         self.generators: list[np.random.Generator | None] = [None] * num_envs
         self._episode_starts: list[Any] = [None] * num_envs
         self.state: Any = None
@@ -72,9 +81,11 @@ class EpisodeBatch:
         self._block_start = np.zeros(num_envs, dtype=np.int64)
 
     @classmethod
-    def seeded(cls, task: Task, episodes: int, seed: int) -> EpisodeBatch:
+    def seeded(
+        cls, task: Task, episodes: int, seed: int, remember: Owner | None = None
+    ) -> EpisodeBatch:
         """Episodes side by side, sensed once, with the seeds ``seed``, ``seed + 1``, …"""
-        batch = cls(task, episodes)
+        batch = cls(task, episodes, remember)
         batch.seed(np.arange(episodes), [seed + i for i in range(episodes)])
         batch.reset()
         return batch
@@ -107,10 +118,17 @@ class EpisodeBatch:
             drawn = np.array([self._far_uniform(run) for run in runs.tolist()])
             self.price = merge_runs(self.price, self.task.reward.price.draw(drawn), runs)
         self._draw(runs)
-        fresh = system.start(np.ascontiguousarray(noise.T))
-        row = self.noise()
-        fresh = system.sense(fresh, row if everyone else row[:, runs])
+        first = np.ascontiguousarray(noise.T)
+        fresh = system.start(first)
+        row = self.noise() if everyone else self.noise()[:, runs]
+        if self.shadows is not None:
+            shadows = self.memory.sense(self.memory.start(first, fresh), row)
+            if not everyone:
+                shadows = self.memory.merge(self.shadows, shadows, runs, self.num_envs)
+            self.shadows = shadows
+        fresh = system.sense(fresh, row)
         self.state = fresh if everyone else merge_runs(self.state, fresh, runs)
+        self._beliefs = None
         self.tokens = merge_runs(self.tokens, self.task.bucket.start(len(runs)), runs)
         self.steps[runs] = 0
         self.finished[runs] = False
@@ -138,6 +156,8 @@ class EpisodeBatch:
             admitted = requests & self.admitted()
         granted, spent, tokens = task.bucket.grant(self.tokens, admitted, self.steps)
         state = system.deliver(self.state, granted)
+        if task.packet == "estimate":
+            state = self._adopted(state, np.asarray(granted.any(0)))
         mean, covariance = system.fused(state)
         error = system.truth(state) - mean
         squared_error = error * error
@@ -151,8 +171,11 @@ class EpisodeBatch:
         used_up = ~self.finished & (self._cursor - self._block_start >= self._block)
         if used_up.any():
             self._draw(np.flatnonzero(used_up))
-        self.delivered = state
-        self.state = system.sense(state, self.noise())
+        self.delivered, noise = state, self.noise()
+        if self.shadows is not None:
+            self.shadows = self.memory.sense(self.memory.deliver(self.beliefs(), granted), noise)
+        self.state = system.sense(state, noise)
+        self._beliefs = None
         self.finished = truncated.copy()
         return Outcome(
             reward=reward_error + reward_communication,
@@ -168,7 +191,14 @@ class EpisodeBatch:
 
     def observe(self) -> NDArray[np.float32]:
         """Observations (N, entries) of all runs, a fresh array."""
-        return self.layout.encode(self.state, Network(self.tokens, self.admitted, self.price))
+        network = Network(self.tokens, self.admitted, self.price)
+        return self.layout.encode(self.state, network, self.beliefs)
+
+    def beliefs(self) -> Beliefs:
+        """What the owner of the memory believes before anything is sent."""
+        if self._beliefs is None:
+            self._beliefs = self.memory.beliefs(self.state, self.shadows or Shadows())
+        return self._beliefs
 
     def admitted(self) -> NDArray[np.bool_]:
         """The sensors (sensors, N) that the network's access rule admits in the coming step."""
@@ -196,7 +226,8 @@ class EpisodeBatch:
         a token, ``step`` (N,),
         the steps taken in the episode, ``start`` (N,) bool, ``admitted`` and
         ``grantable`` (sensors, N) bool, ``observation`` (N, entries), and ``model``, the system's
-        state without what no policy may know, for policies that plan with the system's own moves.
+        state without what no policy may know, for policies that plan with the system's own moves;
+        and what is believed (:mod:`fusion_gym.core.signals`).
         """
         system, state = self.task.system, self.state
         values = dict(system.read(state))
@@ -211,15 +242,24 @@ class EpisodeBatch:
             "observation": self.observe,
             "model": lambda: system.visible(state),
         }
+        values |= memory_signals(self.memory.owner, self.beliefs)
         return Signals(values, self.task.hidden_signals)
 
     def snapshot(self) -> dict[str, Any]:
         """Where all runs are, without the task, for :meth:`restore`; valid until the next step."""
-        return {key: value for key, value in vars(self).items() if key not in ("task", "layout")}
+        made = ("task", "layout", "memory", "_beliefs")
+        return {key: value for key, value in vars(self).items() if key not in made}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Put the runs where they were at a :meth:`snapshot` of a batch like this one."""
         vars(self).update(snapshot)
+        self._beliefs = None
+
+    def _adopted(self, state: Any, arrived: NDArray[np.bool_]) -> Any:
+        """The delivered state whose centre goes on from x* where a packet arrived, (N,) bool."""
+        best = self.beliefs().best
+        system: Any = self.task.system
+        return system.adopt(state, best.mean[0], best.covariance[0], arrived)
 
     def _next_episode(self, run: int) -> np.random.Generator:
         """The run's generator at the start of its next episode.

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
+from fusion_gym.core.beliefs import Beliefs
+from fusion_gym.core.memory import Owner
 from fusion_gym.core.system import Block, covers, numbered
 from fusion_gym.core.task import Task
 from fusion_gym.validation import ConfigurationError
+
+# What is believed is shown by odd functions that tell small differences apart and never saturate
+# where a run was starved.
+_DIFFERENCE, _DIFFERENCE_LIMIT = 4.0, 10.0
+_VALUE, _VALUE_LIMIT = 2.0, 20.0
 
 
 class Network(NamedTuple):
@@ -27,13 +35,14 @@ class Entry(NamedTuple):
     """One number of an observation.
 
     ``sensor`` is the sensor that sees it by itself, under the name ``own_name``; ``told`` says
-    that every sensor does.
+    that every sensor does, ``centre`` that the centre knows it.
     """
 
     name: str
     own_name: str
     sensor: int | None
     told: bool
+    centre: bool
 
 
 def network_blocks(task: Task) -> tuple[Block, ...]:
@@ -59,8 +68,66 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
     )
 
 
+def memory_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
+    """What memory adds to a system's own blocks; their values are made of `Beliefs`."""
+    if not task.memory:
+        return ()
+    deviation = np.sqrt(task.open_loop)
+    whole = float((task.relative_weights * task.open_loop).sum())
+
+    def difference(beliefs: Beliefs) -> Array:
+        return np.arcsinh(_DIFFERENCE * beliefs.difference / deviation)
+
+    def value(beliefs: Beliefs) -> Array:
+        silent = np.broadcast_to(beliefs.loss(), (task.sensors, beliefs.loss().shape[-1]))
+        both = np.stack((silent, beliefs.value()), axis=1) / whole
+        return _VALUE * np.sign(both) * np.sqrt(np.abs(both))
+
+    states, nodes = task.system.state_names, numbered(task.sensors)
+    apart = (
+        f"arsinh of {_DIFFERENCE:g} times what is believed beyond the centre's estimate, in "
+        "open-loop deviations"
+    )
+    worth = (
+        f"{_VALUE:g} times the signed root of the squared norm of that, and of what a packet is "
+        "expected to take off it, over open loop"
+    )
+    if owner == "own":
+        own = partial(Block, knowledge="own_memory", node="own")
+        found = {
+            "difference": own(
+                "own_difference", apart, difference, (nodes, states), limit=_DIFFERENCE_LIMIT
+            ),
+            "value": own(
+                "own_value", worth, value, (nodes, ("nobody", "itself")), limit=_VALUE_LIMIT
+            ),
+        }
+    else:
+        every = partial(Block, knowledge="coordinator_memory")
+        found = {
+            "difference": every(
+                "belief_difference",
+                apart,
+                lambda b: difference(b)[0],
+                (states,),
+                limit=_DIFFERENCE_LIMIT,
+            ),
+            "value": every(
+                "transmission_value",
+                worth,
+                lambda b: np.concatenate((value(b)[:1, 0], value(b)[:, 1])),
+                (("nobody", *nodes),),
+                limit=_VALUE_LIMIT,
+            ),
+        }
+    return tuple(found[name] for name in task.memory_features)
+
+
 class ObservationLayout:
     """Which entries an agent's observation has, by name, and how it is filled.
+
+    ``owner`` says whose memory is shown, where there is one: the coordinator's, or every sensor's
+    own, for a view of its own.
 
     ``blocks`` are those that the task's information mode shows, the network's last; ``entries``
     and ``names`` have one item an entry, ``low`` and ``high`` (entries,) float32 are its bounds.
@@ -69,13 +136,14 @@ class ObservationLayout:
         ConfigurationError: two blocks of one name.
     """
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: Task, owner: Owner = "coordinator") -> None:
         def shown(blocks: tuple[Block, ...]) -> tuple[Block, ...]:
             return tuple(block for block in blocks if covers(task.knowledge, block.knowledge))
 
-        self._task = task
+        self._task, self._owner = task, owner
         self._own, self._network = shown(task.system.observation), shown(network_blocks(task))
-        self.blocks = self._own + self._network
+        self._memory = shown(memory_blocks(task, owner))
+        self.blocks = self._own + self._memory + self._network
         names = [block.name for block in self.blocks]
         for name in names:
             if names.count(name) > 1:
@@ -85,17 +153,22 @@ class ObservationLayout:
         bounds = [block.bounds for block in self.blocks for _ in block.places]
         self.low, self.high = np.array(bounds, dtype=np.float32).T.copy()
 
-    def __reduce__(self) -> tuple[type[ObservationLayout], tuple[Task]]:
+    def __reduce__(self) -> tuple[type[ObservationLayout], tuple[Task, Owner]]:
         """Pickled as the task that it belongs to: the blocks' values are functions."""
-        return ObservationLayout, (self._task,)
+        return ObservationLayout, (self._task, self._owner)
 
-    def encode(self, state: Any, network: Network) -> NDArray[np.float32]:
+    def encode(
+        self, state: Any, network: Network, beliefs: Callable[[], Beliefs]
+    ) -> NDArray[np.float32]:
         """Observations (N, entries) float32, clipped to their bounds.
+
+        ``beliefs`` are only looked at where memory is shown.
 
         Raises:
             ValueError: a block's value has not the declared shape.
         """
         filled = [block.fill(state) for block in self._own]
+        filled += [block.fill(beliefs()) for block in self._memory]
         filled += [block.fill(network) for block in self._network]
         rows = np.concatenate(filled, dtype=np.float64)
         with np.errstate(over="ignore"):  # what float32 cannot hold lies beyond every bound
@@ -114,6 +187,7 @@ def _entries(block: Block) -> list[Entry]:
                 own_name=_named(block.name, rest),
                 sensor=block.labels[0].index(place[0]) if own else None,
                 told=block.node == "told",
+                centre=covers("centre", block.knowledge),
             )
         )
     return found

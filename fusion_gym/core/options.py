@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +16,8 @@ from fusion_gym.core.system import System
 class CommonOptions:
     """The options that every environment has; each gives them its own defaults.
 
-    Network, access and token bucket; episode, observation, action and reward.
+    Network, access and token bucket; what a packet holds and who hears what; memory; episode,
+    observation, action and reward.
     """
 
     access: str = "any"
@@ -25,6 +27,11 @@ class CommonOptions:
     initial_tokens: float = 10.0
     token_cost: ArrayLike = 3.0
     sharing: str = "rotating"
+    packet: str = "measurement"
+    broadcast: str | None = None
+    memory: bool = False
+    memory_filter: str | None = None
+    memory_features: Sequence[str] | None = None
     horizon: int = 100
     information: str = "sensors"
     action: str = "binary"
@@ -42,12 +49,22 @@ class Scenario:
     ``state_weights`` (n,) weigh the squared errors in the reward if the options give none; ``None``
     weighs all states alike, so that open loop costs one a step. ``policy_defaults`` are the
     scenario's own parameters of named policies.
+
+    ``feedback`` says that every node hears the centre's estimate by construction.
+    ``memory_system`` is the system, on the same noise, whose filter remembers what was not sent;
+    ``None`` is the system itself, and with ``nodes_remember`` there is no need of it: every node's
+    packet holds all that the node has ever measured. ``no_estimates`` is why a packet cannot hold
+    an estimate, where it cannot.
     """
 
     options: CommonOptions
     system: System[Any]
     state_weights: ArrayLike | None = None
     policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
+    feedback: bool = False
+    memory_system: System[Any] | None = None
+    nodes_remember: bool = False
+    no_estimates: str | None = None
 
 
 def plain(value: Any) -> Any:

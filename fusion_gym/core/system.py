@@ -285,6 +285,21 @@ class LossySystem(System[StateT], Protocol[StateT]):
         """
         ...
 
+    def arriving(self, state: StateT, packets: NDArray[np.bool_]) -> StateT:
+        """The state in which these packets (sensors, N), if they are sent now, are not lost."""
+        ...
+
+
+@runtime_checkable
+class AdoptingSystem(System[StateT], Protocol[StateT]):
+    """A system whose centre can go on from an estimate that a packet brings. Optional."""
+
+    def adopt(
+        self, state: StateT, mean: Array, covariance: Array, runs: NDArray[np.bool_]
+    ) -> StateT:
+        """A delivered state with the centre's estimate (n, N), (n, n, N) replaced in ``runs``."""
+        ...
+
 
 @runtime_checkable
 class PredictableSystem(System[StateT], Protocol[StateT]):

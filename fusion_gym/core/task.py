@@ -6,18 +6,26 @@ import functools
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import numpy as np
+
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.access import ACCESS_RULES
+from fusion_gym.core.communication import communication
 from fusion_gym.core.options import CommonOptions, Scenario, plain
 from fusion_gym.core.reward import Price, Reward, bounded_open_loop
-from fusion_gym.core.system import Knowledge, System, covers
+from fusion_gym.core.system import Knowledge, System, covers, least_covering
 from fusion_gym.core.token_bucket import TokenBucket
 
 # What a policy of each information mode may know.
 INFORMATION_MODES: dict[str, Knowledge] = {"sensors": "coordinator", "centre": "centre"}
 ACTION_KINDS = ("binary", "discrete")
 MOST_SENSORS = 1000  # the network serves them in a loop
+# Signals beside the system's own that only who sees the sensors may have.
+SENSORS_ONLY = (
+    "model", "beliefs", "belief_difference", "transmission_value", "own_beliefs",
+    "own_difference", "own_value",
+)  # fmt: skip
 _MOST_DISCRETE = 16  # sensors whose requests are one number: that has 2^sensors values
 
 
@@ -30,6 +38,9 @@ class Task:
     ``"binary"`` (one bit a sensor) or ``"discrete"`` (the bits as one number, sensor 0 the lowest).
     ``access`` is a rule of :mod:`fusion_gym.core.access`; with ``"single"`` the action is
     0 for nobody or the number of the sensor, counted from 1.
+    ``packet``, ``broadcast``, ``memory``, ``shadow`` and ``memory_features`` are those of
+    :mod:`fusion_gym.core.communication`; ``feedback`` says that the nodes get the centre's
+    estimate back.
     ``settings`` is what a user chose, for reports; ``policy_defaults`` the scenario's own
     parameters of named policies.
 
@@ -44,6 +55,12 @@ class Task:
     information: str = "sensors"
     action: str = "binary"
     access: str = "any"
+    packet: str = "measurement"
+    broadcast: str = "none"
+    memory: bool = False
+    shadow: System[Any] | None = None
+    memory_features: tuple[str, ...] = ()
+    feedback: bool = False
     settings: dict[str, Any] = field(default_factory=dict)
     policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
 
@@ -93,6 +110,7 @@ class Task:
             scenario.state_weights if chosen.state_weights is None else chosen.state_weights,
             bounded_open_loop(system.open_loop(horizon), horizon),
         )
+        how = communication(scenario)
         return cls(
             system=system,
             bucket=make_bucket(chosen, system.sensor_count),
@@ -101,6 +119,12 @@ class Task:
             information=chosen.information,
             action=chosen.action,
             access=chosen.access,
+            packet=how.packet,
+            broadcast=how.broadcast,
+            memory=how.memory,
+            shadow=how.shadow,
+            memory_features=how.features,
+            feedback=scenario.feedback,
             settings=plain(asdict(chosen)),
             policy_defaults=scenario.policy_defaults,
         )
@@ -108,7 +132,8 @@ class Task:
     @property
     def knowledge(self) -> Knowledge:
         """What a policy may know, in the one vocabulary."""
-        return INFORMATION_MODES[self.information]
+        known = INFORMATION_MODES[self.information]
+        return least_covering((known, "coordinator_memory")) if self.memory else known
 
     @property
     def sensors(self) -> int:
@@ -116,16 +141,33 @@ class Task:
         return self.system.sensor_count
 
     @functools.cached_property
+    def open_loop(self) -> Array:
+        """Mean error variances (n, 1) of a centre that never receives."""
+        return self.system.open_loop(self.horizon)[:, None]
+
+    @functools.cached_property
     def divergence_level(self) -> Array:
         """Squared errors (n, 1) beyond which a run counts as diverged: 100 times open loop."""
-        return 100.0 * self.system.open_loop(self.horizon)[:, None]
+        return 100.0 * self.open_loop
+
+    @functools.cached_property
+    def error_scale(self) -> float:
+        """What a squared error counts in the reward, in the mean over the states."""
+        return float(self.reward.error_weight * self.reward.state_weights.mean())
+
+    @functools.cached_property
+    def relative_weights(self) -> Array:
+        """The reward's weights of the states (n, 1), scaled to a mean of 1; 1 if all are zero."""
+        weights = self.reward.state_weights
+        mean = float(weights.mean())
+        return weights / mean if mean > 0.0 else np.ones_like(weights)
 
     @property
     def hidden_signals(self) -> tuple[str, ...]:
-        """Names of the system's signals that the information mode withholds."""
+        """Names of the signals that the information mode withholds."""
         signals = self.system.signals
         hidden = (s.name for s in signals if not covers(self.knowledge, s.knowledge))
-        return (*hidden, *(() if self.knowledge == "coordinator" else ("model",)))
+        return (*hidden, *(() if covers(self.knowledge, "coordinator") else SENSORS_ONLY))
 
 
 def make_bucket(chosen: CommonOptions, sensors: int) -> TokenBucket:

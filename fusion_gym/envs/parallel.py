@@ -35,8 +35,8 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        self.batch = EpisodeBatch(task, 1)
         self.view = SensorView(task)
+        self.batch = EpisodeBatch(task, 1, self.view.owner)
         self.observation_names = self.view.names
         self.render_mode = None
         self.possible_agents = [f"sensor_{sensor}" for sensor in range(task.sensors)]

@@ -56,8 +56,8 @@ class FusionSB3VecEnv(VecEnv):
     ) -> None:
         self.runs = validation.runs(num_envs)
         self.task = task
-        self.batch = EpisodeBatch(task, num_envs)
         self.view = make_view(task, validation.boolean("local", local))
+        self.batch = EpisodeBatch(task, num_envs, self.view.owner)
         self._rows = self.view.rows_per_run
         self.observation_names = self.view.names
         self.stagger = validation.boolean("stagger", stagger)

@@ -12,7 +12,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from fusion_gym.core.observation import ObservationLayout
+from fusion_gym.core.memory import Owner
+from fusion_gym.core.observation import Entry, ObservationLayout
 from fusion_gym.core.system import Knowledge
 from fusion_gym.core.task import Task
 from fusion_gym.errors import ConfigurationError, shown
@@ -47,6 +48,11 @@ class View(Protocol):
     @property
     def knowledge(self) -> Knowledge:
         """What a row shows, in the one vocabulary."""
+        ...
+
+    @property
+    def owner(self) -> Owner | None:
+        """Whose memory a batch must keep for it, where the task has memory."""
         ...
 
     def rows(self, observation: Rows) -> Rows:
@@ -89,6 +95,7 @@ class CoordinatorView:
     """
 
     rows_per_run = 1
+    owner: Owner | None = None
 
     def __init__(self, task: Task) -> None:
         layout = ObservationLayout(task)
@@ -139,25 +146,33 @@ class SensorView:
     """One row for each sensor of each run: what it sees by itself, and its own decision.
 
     A sensor sees the entries that its own node knows, what all nodes are told (the token level,
-    the price, an estimate that is fed back) and its own number. Row run · sensors + sensor belongs
-    to that sensor of that run; ``names`` are without the sensor's index. The action space is
-    ``Discrete(2)``, 1 for a request: one shared policy, honest for deployment.
+    the price, an estimate that is fed back) and its own number. With ``broadcast="estimate"`` it
+    also sees the centre's own entries, with ``"packets"`` all that the centre knows.
+
+    Row run · sensors + sensor belongs to that sensor of that run; ``names`` are without the
+    sensor's index. The action space is ``Discrete(2)``, 1 for a request: one shared policy, honest
+    for deployment.
 
     Raises:
-        ConfigurationError: a task whose information is not "sensors", or whose sensors do not see
-            the same kinds of entries.
+        ConfigurationError: a task whose information is not "sensors", whose packets only a
+            coordinator can fill, or whose sensors do not see the same kinds of entries.
     """
 
-    knowledge: Knowledge = "own"
-
     def __init__(self, task: Task) -> None:
-        if task.knowledge != "coordinator":
+        self.knowledge: Knowledge = "own_memory" if task.memory else "own"
+        self.owner: Owner | None = "own" if task.memory else None
+        if task.packet == "estimate":
+            raise ConfigurationError(
+                "packet = 'estimate' is not allowed with a local view: it must be 'measurement', "
+                "for the estimate is the coordinator's, of all sensors"
+            )
+        if task.information != "sensors":
             raise ConfigurationError(
                 f"information = {task.information!r} is not allowed with a local view: it must be "
                 "'sensors', for a sensor sees its own measurement"
             )
-        layout, count = ObservationLayout(task), task.sensors
-        told = [place for place, entry in enumerate(layout.entries) if entry.told]
+        layout, count = ObservationLayout(task, "own"), task.sensors
+        told = [p for p, entry in enumerate(layout.entries) if _heard(entry, task.broadcast)]
         columns, names = [], []
         for sensor in range(count):
             own = [place for place, entry in enumerate(layout.entries) if entry.sensor == sensor]
@@ -192,6 +207,12 @@ class SensorView:
     def masks(self, allowed: Requests) -> NDArray[np.bool_]:
         """See :class:`View`: silence, and a request, (N·sensors, 2)."""
         return np.stack((np.ones(allowed.size, dtype=np.bool_), allowed.T.ravel()), axis=1)
+
+
+def _heard(entry: Entry, broadcast: str) -> bool:
+    """Whether every sensor sees an entry."""
+    told = {"none": False, "estimate": entry.centre and entry.sensor is None}
+    return entry.told or told.get(broadcast, entry.centre)
 
 
 def _numbers(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:

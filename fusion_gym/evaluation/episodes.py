@@ -13,7 +13,7 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Policy
+from fusion_gym.policies.base import Policy, owner_of
 
 _BATCH = 1024  # episodes side by side; fixed, so that results do not depend on the machine
 
@@ -81,7 +81,7 @@ def run_episodes(
 def _run_batch(
     task: Task, policy: Policy, episodes: int, seed: int, progress: Callable[[int], Any] | None
 ) -> EpisodeResults:
-    batch = EpisodeBatch.seeded(task, episodes, seed)
+    batch = EpisodeBatch.seeded(task, episodes, seed, owner_of(policy))
     policy.reset(episodes, seed)
     states, sensors, horizon = len(task.system.state_names), task.sensors, task.horizon
     mse, trace, nees = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
@@ -145,7 +145,7 @@ def record_episode(task: Task, policy: Policy, seed: int) -> Trajectory:
         LookupError: the policy looks at a signal that the task withholds.
     """
     validation.integer("seed", seed, at_least=0)
-    batch = EpisodeBatch.seeded(task, 1, seed)
+    batch = EpisodeBatch.seeded(task, 1, seed, owner_of(policy))
     policy.reset(1, seed)
     rows: dict[str, list[NDArray[Any]]] = {field.name: [] for field in fields(Trajectory)}
     for _ in range(task.horizon):

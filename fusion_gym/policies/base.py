@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.memory import Owner
 from fusion_gym.core.system import Knowledge, Signals
 
 Requests = NDArray[np.bool_]
@@ -24,6 +25,9 @@ class Policy(Protocol):
     ``reset(runs, seed)`` comes before the first call; ``seed`` is for policies that draw. A call
     takes the signals of one step and returns requests (sensors, N) bool. A run begins a new
     episode wherever ``signals["start"]`` is true.
+
+    A policy that looks at what is believed (:mod:`fusion_gym.core.signals`) has an attribute
+    ``remember`` as well, ``"coordinator"`` or ``"own"``: whose beliefs.
     """
 
     @property
@@ -38,6 +42,20 @@ class Policy(Protocol):
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N) for these signals."""
         ...
+
+
+def owner_of(policy: Policy) -> Owner | None:
+    """Whose beliefs a policy looks at; ``None`` for one that looks at none.
+
+    Raises:
+        ConfigurationError: an attribute ``remember`` that is neither.
+    """
+    found = getattr(policy, "remember", None)
+    if found is None:
+        return None
+    validation.choice("remember", found, get_args(Owner))
+    owner: Owner = found
+    return owner
 
 
 class Rule:

@@ -66,6 +66,7 @@ class ModelPolicy:
         self._view = make_view(self._task, local)
         self._memory: Any = None  # of a recurrent policy
         self.knowledge: Knowledge = self._view.knowledge
+        self.remember = self._view.owner
         if isinstance(model, RecurrentPPO) and self.knowledge != "centre":
             self.knowledge = least_covering((self.knowledge, "own_memory"))
         span = self._task.reward.price.span

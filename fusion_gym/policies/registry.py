@@ -16,7 +16,7 @@ import numpy as np
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import KNOWLEDGE
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Policy
+from fusion_gym.policies.base import Policy, owner_of
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError, boolean, choice, keys
 
@@ -52,8 +52,10 @@ _ROWS: dict[str, Row] = {
     "always": Row("rule", f"{_RULES}.constant:Always"),
     "centre_variance": Row("rule", f"{_RULES}.centre_variance:CentreVariance"),
     "dynamic_event": Row("rule", f"{_RULES}.dynamic_event:DynamicEvent"),
+    "estimate_difference": Row("reference", f"{_RULES}.estimate_difference:EstimateDifference"),
     "information_gain": Row("rule", f"{_RULES}.information_gain:InformationGain"),
     "innovation_threshold": Row("rule", f"{_RULES}.innovation_threshold:InnovationThreshold"),
+    "kullback_leibler": Row("reference", f"{_RULES}.kullback_leibler:KullbackLeibler"),
     "local_variance": Row("rule", f"{_RULES}.local_variance:LocalVariance"),
     "lookahead": Row("reference", f"{_HERE}.lookahead:Lookahead"),
     "model": Row("agent", f"{_HERE}.saved:saved_agent"),
@@ -66,6 +68,7 @@ _ROWS: dict[str, Row] = {
     "round_robin": Row("rule", f"{_RULES}.periodic:RoundRobin"),
     "send_on_delta": Row("rule", f"{_RULES}.send_on_delta:SendOnDelta"),
     "stochastic_event": Row("rule", f"{_RULES}.stochastic_event:StochasticEvent"),
+    "value_of_information": Row("reference", f"{_RULES}.value_of_information:ValueOfInformation"),
     "variance_threshold": Row("rule", f"{_RULES}.variance_threshold:VarianceThreshold"),
     "whittle": Row("reference", f"{_HERE}.whittle:WhittleIndex"),
     "zoo": Row("agent", f"{_HERE}.saved:zoo_agent"),
@@ -203,7 +206,7 @@ def _parameters(name: str, maker: Maker) -> dict[str, inspect.Parameter]:
 
 def _try_out(spec: str, policy: Policy, task: Task) -> None:
     """One call on one run, so that a misfit is told before anything long begins."""
-    batch = EpisodeBatch(task, 1)
+    batch = EpisodeBatch(task, 1, owner_of(policy))
     batch.reset()
     policy.reset(1)
     try:

@@ -35,7 +35,7 @@ def observed(batch: EpisodeBatch, state: Any) -> NDArray[np.float32]:
         lambda: np.repeat(batch.admitted()[:, :1], runs, axis=1),
         np.repeat(batch.price[:1], runs),
     )
-    return batch.layout.encode(state, network)
+    return batch.layout.encode(state, network, batch.beliefs)
 
 
 @each_case
@@ -87,7 +87,8 @@ def test_nothing_shown_depends_on_the_truth(case: Case) -> None:
         found = read(case.task(), state)
         for name, value in read(case.task(), batch.state).items():
             np.testing.assert_array_equal(found[name], value, err_msg=name)
-        np.testing.assert_array_equal(batch.layout.encode(state, _network(batch)), batch.observe())
+        seen = batch.layout.encode(state, _network(batch), batch.beliefs)
+        np.testing.assert_array_equal(seen, batch.observe())
         nobody = np.zeros_like(wanted)
         for granted in (wanted, nobody):
             seen = system.fused(system.deliver(state, granted))

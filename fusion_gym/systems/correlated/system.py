@@ -264,6 +264,19 @@ class CorrelatedTrackingSystem:
         hidden = np.full_like(state.truth, np.nan)
         return replace(state, truth=hidden, scale=hidden[0], joint=None)
 
+    def adopt(
+        self,
+        state: CorrelatedTrackingState,
+        mean: Array,
+        covariance: Array,
+        runs: NDArray[np.bool_],
+    ) -> CorrelatedTrackingState:
+        """The fused estimate goes on from this one in ``runs`` (N,); the nodes' do not."""
+        means, covariances = state.mean.copy(), state.covariance.copy()
+        means[0] = np.where(runs, mean, means[0])
+        covariances[0] = np.where(runs, covariance, covariances[0])
+        return replace(state, mean=means, covariance=covariances)
+
     def truth(self, state: CorrelatedTrackingState) -> Array:
         """The plant's state (n, N)."""
         return state.truth

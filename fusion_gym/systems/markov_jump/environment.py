@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
+from fusion_gym.arrays import Array
 from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.table import Structure, choose_rule
@@ -21,6 +22,8 @@ from fusion_gym.systems.markov_jump.system import MarkovJumpSystem
 from fusion_gym.validation import ConfigurationError
 
 _T = 0.5  # the paper's sampling time in seconds
+FILTERS = ("local", "centralised", "imm")
+_ESTIMATES_ALREADY = "packets carry the nodes' estimates already, which remember every measurement"
 _STRUCTURE = Structure(common="all contain the same process noise", holds=("joint covariance",))
 
 
@@ -87,7 +90,7 @@ def build(chosen: MarkovJumpTrackingOptions) -> Scenario:
         ConfigurationError: a value that is not allowed.
     """
     horizon = validation.horizon(chosen.horizon)
-    where = validation.choice("filter", chosen.filter, ("local", "centralised", "imm"))
+    where = validation.choice("filter", chosen.filter, FILTERS)
     plant = MarkovJumpPlant.create(
         chosen.transitions,
         chosen.process_gains,
@@ -111,17 +114,43 @@ def build(chosen: MarkovJumpTrackingOptions) -> Scenario:
         if chosen.state_weights is None
         else validation.not_negative("state_weights", chosen.state_weights, (plant.size,))
     )
+    system = _system(where, chosen.fusion, plant, sensors, weights, horizon)
+    remembering = None
+    if chosen.memory_filter is not None:
+        kind = validation.choice("memory_filter", chosen.memory_filter, FILTERS)
+        fusion = chosen.fusion if kind == where else None
+        remembering = _system(kind, fusion, plant, sensors, weights, horizon)
+    defaults, refusal = {}, None
+    if isinstance(system, MarkovJumpSystem):
+        defaults = {"local_variance": {"reference": float(system.full_rate_traces().mean())}}
+        refusal = _ESTIMATES_ALREADY
+    return Scenario(
+        chosen,
+        system,
+        system.state_weights,
+        defaults,
+        memory_system=remembering,
+        nodes_remember=refusal is not None,
+        no_estimates=refusal,
+    )
+
+
+def _system(
+    where: str,
+    kind: str | None,
+    plant: MarkovJumpPlant,
+    sensors: FadingSensors,
+    weights: Array | None,
+    horizon: int,
+) -> MarkovJumpSystem | MarkovJumpCentralSystem:
+    """The system of a filter and a fusion rule."""
     names = _state_names(plant.size)
-    fusion = _fusion(chosen.fusion, where, sensors.count)
+    fusion = _fusion(kind, where, sensors.count)
     if fusion is None:
-        central = MarkovJumpCentralSystem.create(
+        return MarkovJumpCentralSystem.create(
             plant, sensors, where == "imm", names, weights, horizon
         )
-        return Scenario(chosen, central, central.state_weights)
-    system = MarkovJumpSystem.create(plant, sensors, fusion, names, weights, horizon)
-    reference = float(system.full_rate_traces().mean())
-    defaults = {"local_variance": {"reference": reference}}
-    return Scenario(chosen, system, system.state_weights, defaults)
+    return MarkovJumpSystem.create(plant, sensors, fusion, names, weights, horizon)
 
 
 def _fusion(kind: str | None, where: str, sensors: int) -> FusionRule | None:

@@ -89,7 +89,13 @@ def build(chosen: RemoteEstimationOptions) -> Scenario:
         error_scale=_error_scale(chosen, deviation, weights),
         state_weights=weights,
     )
-    return Scenario(chosen, system, weights)
+    return Scenario(
+        chosen,
+        system,
+        weights,
+        nodes_remember=True,  # a source's value is all that there is to know of it
+        no_estimates="a packet carries the source's value itself",
+    )
 
 
 def _channel(chosen: RemoteEstimationOptions, sensors: int) -> Channel:

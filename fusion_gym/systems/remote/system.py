@@ -220,6 +220,12 @@ class RemoteEstimationSystem:
         """Probability (sensors, N) that a packet sent now arrives, given the channel before."""
         return self._arrival_probability(state.channel) if self.channel.loses else None
 
+    def arriving(
+        self, state: RemoteEstimationState, packets: NDArray[np.bool_]
+    ) -> RemoteEstimationState:
+        """The state in which these packets (sensors, N), if they are sent now, are not lost."""
+        return replace(state, lost=state.lost & ~packets) if self.channel.loses else state
+
     def truth(self, state: RemoteEstimationState) -> Array:
         """The sources (n, N)."""
         return state.truth

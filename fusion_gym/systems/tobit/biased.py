@@ -24,6 +24,7 @@ from fusion_gym.systems.tobit.options import (
     FeedbackOptions,
     at_the_nodes,
     make_centre,
+    remembering_system,
     stochastic_defaults,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -154,7 +155,15 @@ def _build(chosen: BiasedOscillatorOptions) -> Scenario:
         reference=plant.open_loop(min(horizon, _REFERENCE_HORIZON)),
     )
     weights = equal_weights(system.open_loop(horizon))
-    return Scenario(chosen, system, weights, stochastic_defaults(chosen))
+    remembering = remembering_system(system, chosen.memory_filter, _FILTERS, chosen, sensors)
+    return Scenario(
+        chosen,
+        system,
+        weights,
+        stochastic_defaults(chosen),
+        feedback=True,
+        memory_system=remembering,
+    )
 
 
 def _augmented(chosen: BiasedOscillatorOptions, aware: bool) -> tuple[LinearPlant, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from numpy.typing import ArrayLike
@@ -14,6 +14,7 @@ from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.tobit.centre import Centre, Feedback, FeedbackCentre, SequentialCentre
 from fusion_gym.systems.tobit.filters import KalmanFilter, NodeFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
+from fusion_gym.systems.tobit.system import CensoredSystem
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
 from fusion_gym.validation import choice
 
@@ -66,6 +67,29 @@ def make_centre(
         if name != kind:
             _refuse(chosen, row.own, f"filter={kind!r}", f"filter={name!r}")
     return filters[kind].make(chosen, sensors)
+
+
+def remembering_system(
+    system: CensoredSystem,
+    kind: str | None,
+    filters: Mapping[str, Filter],
+    chosen: FeedbackOptions,
+    sensors: CensoredSensors,
+) -> CensoredSystem | None:
+    """The same plant with the filter of the option ``memory_filter``; ``None`` is the system's own.
+
+    It takes the options of the system's filter where it has the same, and defaults elsewhere.
+
+    Raises:
+        ConfigurationError: an unknown filter, or one that lacks an option.
+    """
+    if kind is None:
+        return None
+    row = filters[choice("memory_filter", kind, filters)]
+    others: dict[str, Any] = {"filter": kind}
+    if kind == "adf":
+        others |= {"fusion": None, "information_shares": None, "order": None}
+    return replace(system, centre=row.make(replace(chosen, **others), sensors))
 
 
 def feedback_centre(chosen: FeedbackOptions, node: NodeFilter) -> FeedbackCentre:

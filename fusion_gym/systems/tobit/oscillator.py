@@ -26,6 +26,7 @@ from fusion_gym.systems.tobit.options import (
     at_the_nodes,
     feedback_centre,
     make_centre,
+    remembering_system,
     stochastic_defaults,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -37,6 +38,7 @@ _ANGLE = 0.052 * math.pi
 _COS, _SIN = math.cos(_ANGLE), math.sin(_ANGLE)
 _SMALLEST_EPSILON = 1e-9
 _LARGEST_EVENT_ERROR = 1e120  # its square must be a float64
+_HELD = "the silent filter goes on from the last delivered measurement (silent='hold')"
 _IDENTITY = ((1.0, 0.0), (0.0, 1.0))
 
 
@@ -103,6 +105,10 @@ def build(chosen: TobitOscillatorOptions) -> Scenario:
     )
     random_start = validation.boolean("random_start", chosen.random_start)
     trigger = _trigger(chosen, sensors.count)
+    holds = chosen.filter == "paper" and chosen.silent != "predict"
+    remembering = chosen.memory_filter
+    if remembering is None and chosen.filter == "paper":
+        remembering = "adf"  # the paper's minimises a bound; with every measurement it errs thrice
     system = CensoredSystem(
         plant=plant,
         model=plant,
@@ -113,7 +119,14 @@ def build(chosen: TobitOscillatorOptions) -> Scenario:
         reference=plant.open_loop(horizon),
     )
     defaults = {"dynamic_event": trigger} | stochastic_defaults(chosen)
-    return Scenario(chosen, system, policy_defaults=defaults)
+    return Scenario(
+        chosen,
+        system,
+        policy_defaults=defaults,
+        feedback=True,
+        memory_system=remembering_system(system, remembering, _FILTERS, chosen, sensors),
+        no_estimates=_HELD if holds else None,
+    )
 
 
 def _plant(chosen: TobitOscillatorOptions) -> LinearPlant:

@@ -253,6 +253,17 @@ class CensoredSystem:
         """The state without the truth; nothing else is hidden."""
         return replace(state, truth=np.full_like(state.truth, np.nan))
 
+    def adopt(
+        self, state: CensoredState, mean: Array, covariance: Array, runs: NDArray[np.bool_]
+    ) -> CensoredState:
+        """The centre, and by its feedback the nodes, go on from this estimate in ``runs`` (N,)."""
+        return replace(
+            state,
+            mean=np.where(runs, mean, state.mean),
+            covariance=np.where(runs, covariance, state.covariance),
+            local_mean=np.where(runs, mean, state.local_mean),
+        )
+
     def truth(self, state: CensoredState) -> Array:
         """The plant's state (n, N)."""
         return state.truth

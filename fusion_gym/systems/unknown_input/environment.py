@@ -130,7 +130,31 @@ def build(chosen: UnknownInputOptions) -> Scenario:
         magnitude=plant.magnitude(signal, horizon),
         reference=open_loop,
     )
-    return Scenario(chosen, system, weights, {"adaptive_threshold": trigger})
+    return Scenario(
+        chosen,
+        system,
+        weights,
+        {"adaptive_threshold": trigger},
+        memory_system=_remembering(chosen, system, sensors, horizon),
+        no_estimates="the centre makes its estimate anew from what each node sent",
+    )
+
+
+def _remembering(
+    chosen: UnknownInputOptions, system: UnknownInputSystem, sensors: InputSensors, horizon: int
+) -> UnknownInputSystem | None:
+    """The system with the filter of ``memory_filter``; ``None`` is its own.
+
+    With the paper's filter, which minimises a bound, the random walk's.
+    """
+    kind = chosen.memory_filter
+    if kind is None:
+        if chosen.filter != "paper":
+            return None
+        kind = "random_walk"
+    validation.choice("memory_filter", kind, FILTERS)
+    other = replace(chosen, filter=kind, hold_variance=None)
+    return replace(system, nodes=_nodes(other, system.plant, sensors, horizon))
 
 
 def _with_example(chosen: UnknownInputOptions) -> UnknownInputOptions:

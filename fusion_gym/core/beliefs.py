@@ -1,0 +1,267 @@
+"""What could be known, what the centre knows, and what every transmission would be worth.
+
+x* is the best estimate of whoever looks, x̂ the centre's if nobody transmits, x̂(s) if s alone does.
+Value of a transmission: v(s) = ‖x* - x̂‖² - E‖x* - x̂(s)‖², the expectation over arrival; it can be
+negative. With memory x* holds everything that its owner measured and heard
+(:mod:`fusion_gym.core.memory`), without it what the centre knows and this step's measurements.
+
+Sources: Y. Xu and J. P. Hespanha, "Optimal communication logics in networked control systems",
+IEEE CDC 2004, and G. M. Lipsa and N. C. Martins, "Remote state estimation with communication costs
+for first-order LTI systems", IEEE Trans. Automatic Control 56, 2011, who send when the two
+estimates differ; A. Molin and S. Hirche, "On the optimality of certainty equivalence for
+event-triggered control systems", IEEE Trans. Automatic Control 58, 2013, and T. Soleymani,
+J. S. Baras and S. Hirche, "Value of information in feedback control: quantification", IEEE Trans.
+Automatic Control 67, 2022, for its value.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym.arrays import Array, take_runs
+from fusion_gym.core.system import LossySystem, System
+from fusion_gym.core.task import Task
+from fusion_gym.fusion.intersection import covariance_intersection
+
+if TYPE_CHECKING:
+    from fusion_gym.core.memory import Shadows
+
+Packets = NDArray[np.bool_]
+
+
+class Estimate(NamedTuple):
+    """``mean`` (k, n, N) and ``covariance`` (k, n, n, N): k = 1 for all, or one a sensor."""
+
+    mean: Array
+    covariance: Array
+
+
+class Beliefs(ABC):
+    """The estimates before anything is sent, of N runs, each computed when first looked at.
+
+    ``arrival`` (sensors, N) is the probability that a packet sent now arrives; None: surely.
+    """
+
+    def __init__(self, task: Task, state: Any, shadows: Shadows) -> None:
+        self.task, self.shadows, self._state = task, shadows, state
+        system = task.system
+        self.arrival: Array | None = None
+        if isinstance(system, LossySystem):
+            self.arrival = system.arrival_probability(state)
+        self._runs = system.truth(state).shape[-1]
+
+    @property
+    @abstractmethod
+    def silent(self) -> Estimate:
+        """x̂, the centre's estimate if nobody transmits, as far as its owner knows it."""
+
+    @property
+    @abstractmethod
+    def sent(self) -> Estimate:
+        """x̂(s), k = sensors, the centre's estimate if the packet of s alone arrives."""
+
+    @property
+    @abstractmethod
+    def best(self) -> Estimate:
+        """x*, with all that its owner knows."""
+
+    @property
+    @abstractmethod
+    def remembered(self) -> Any:
+        """The shadow with its owner's new measurements."""
+
+    @property
+    def difference(self) -> Array:
+        """x* - x̂ (k, n, N)."""
+        return self.best.mean - self.silent.mean
+
+    def loss(self, steps: int = 1) -> Array:
+        """‖x* - x̂‖² (k, N), weighted by ``task.relative_weights``."""
+        return self._weighted(self.difference)
+
+    def value(self, steps: int = 1) -> Array:
+        """v(s) (sensors, N), weighted by ``task.relative_weights``."""
+        return self._expected(self.loss(), self._weighted(self.best.mean - self.sent.mean))
+
+    def _expected(self, silent: Array, sent: Array) -> Array:
+        gain = silent - sent
+        return gain if self.arrival is None else self.arrival * gain
+
+    def _weighted(self, difference: Array) -> Array:
+        return (self.task.relative_weights * (difference * difference)).sum(-2)
+
+    def _nobody(self, runs: int) -> Packets:
+        return np.zeros((self.task.sensors, runs), dtype=np.bool_)
+
+
+class CoordinatorBeliefs(Beliefs):
+    """Of whoever sees all sensors' new measurements and knows all that the centre knows."""
+
+    @cached_property
+    def silent(self) -> Estimate:
+        """See :class:`Beliefs`."""
+        return _of(self.task.system, self._silent)
+
+    @cached_property
+    def sent(self) -> Estimate:
+        """See :class:`Beliefs`; with ``packet="estimate"`` every packet carries x*."""
+        if self.task.packet == "estimate":
+            return Estimate(*(np.repeat(part, self.task.sensors, axis=0) for part in self.best))
+        each = [_of(self.task.system, delivered) for delivered in self._sent]
+        return Estimate(
+            np.concatenate([one.mean for one in each]),
+            np.concatenate([one.covariance for one in each]),
+        )
+
+    @cached_property
+    def best(self) -> Estimate:
+        """See :class:`Beliefs`."""
+        return _of(self.task.shadow or self.task.system, self.remembered)
+
+    @cached_property
+    def remembered(self) -> Any:
+        """See :class:`Beliefs`; without memory the centre's, had all packets arrived."""
+        everyone = ~self._nobody(self._runs)
+        if self.shadows.every is None:
+            return _delivered(self.task.system, self._state, everyone)
+        assert self.task.shadow is not None
+        return _delivered(self.task.shadow, self.shadows.every, everyone)
+
+    def loss(self, steps: int = 1) -> Array:
+        """See :class:`Beliefs`; summed over ``steps`` times without noise and transmissions."""
+        if steps == 1:
+            return super().loss()
+        return self._weighted(self._path(self._silent, steps) - self._best_path(steps)).sum(0)[None]
+
+    def value(self, steps: int = 1) -> Array:
+        """See :class:`Beliefs`; summed over ``steps`` times without noise and transmissions."""
+        if steps == 1:
+            return super().value()
+        best = self._best_path(steps)
+        if self.task.packet == "estimate":
+            left = np.zeros((self.task.sensors, self._runs))
+        else:
+            left = np.stack(
+                [self._weighted(self._path(sent, steps) - best).sum(0) for sent in self._sent]
+            )
+        return self._expected(self.loss(steps), left)
+
+    @cached_property
+    def _silent(self) -> Any:
+        return self.task.system.deliver(self._state, self._nobody(self._runs))
+
+    @cached_property
+    def _sent(self) -> list[Any]:
+        """The centre's states after each sensor's packet alone."""
+        found = []
+        for sensor in range(self.task.sensors):
+            alone = self._nobody(self._runs)
+            alone[sensor] = True
+            found.append(_delivered(self.task.system, self._state, alone))
+        return found
+
+    def _best_path(self, steps: int) -> Array:
+        return self._path(self.remembered, steps, self.task.shadow)
+
+    def _path(self, delivered: Any, steps: int, system: System[Any] | None = None) -> Array:
+        """Fused means (steps, n, N) from a delivered state on."""
+        system = system or self.task.system
+        still = np.zeros((system.noise_channels, self._runs))
+        means = [system.fused(delivered)[0]]
+        for _ in range(steps - 1):
+            delivered = system.deliver(system.sense(delivered, still), self._nobody(self._runs))
+            means.append(system.fused(delivered)[0])
+        return np.stack(means)
+
+
+class OwnBeliefs(Beliefs):
+    """Of every sensor by itself (k = sensors), by its own measurements and what it hears."""
+
+    @cached_property
+    def silent(self) -> Estimate:
+        """See :class:`Beliefs`."""
+        system, sensors = self.task.system, self.task.sensors
+        if self.task.broadcast == "none":
+            nobody = self._nobody(sensors * self._runs)
+            return self._each(system, system.deliver(self.shadows.alone, nobody))
+        told = _of(system, system.deliver(self._state, self._nobody(self._runs)))
+        return Estimate(
+            np.repeat(told.mean, sensors, axis=0), np.repeat(told.covariance, sensors, axis=0)
+        )
+
+    @cached_property
+    def sent(self) -> Estimate:
+        """See :class:`Beliefs`."""
+        system, itself = self.task.system, self._itself
+        if self.shadows.alone is None:
+            every = np.tile(np.arange(self._runs), self.task.sensors)
+            return self._each(system, _delivered(system, take_runs(self._state, every), itself))
+        own = self._each(system, _delivered(system, self.shadows.alone, itself))
+        return own if self.task.broadcast == "none" else _joined(self.silent, own)
+
+    @cached_property
+    def best(self) -> Estimate:
+        """See :class:`Beliefs`."""
+        if self.task.shadow is None:
+            return self.sent
+        own = self._each(self.task.shadow, self.remembered)
+        if self.task.broadcast != "estimate":
+            return own
+        return _joined(self.sent if self.task.feedback else self.silent, own)
+
+    @cached_property
+    def remembered(self) -> Any:
+        """See :class:`Beliefs`."""
+        assert self.task.shadow is not None
+        return _delivered(self.task.shadow, self.shadows.own, self._itself)
+
+    @property
+    def _itself(self) -> Packets:
+        """Each sensor's packet in its own runs (sensors, sensors · N)."""
+        return np.repeat(np.eye(self.task.sensors, dtype=np.bool_), self._runs, axis=-1)
+
+    def _each(self, system: System[Any], delivered: Any) -> Estimate:
+        """From sensors · N runs to an estimate a sensor."""
+        mean, covariance = system.fused(delivered)
+        shape = (self.task.sensors, self._runs)
+        return Estimate(
+            np.moveaxis(mean.reshape(*mean.shape[:-1], *shape), -2, 0),
+            np.moveaxis(covariance.reshape(*covariance.shape[:-1], *shape), -2, 0),
+        )
+
+
+def arriving(system: System[Any], state: Any, packets: Packets) -> Any:
+    """The state of a system in which these packets (sensors, N), if they are sent, arrive."""
+    return system.arriving(state, packets) if isinstance(system, LossySystem) else state
+
+
+def _delivered(system: System[Any], state: Any, packets: Packets) -> Any:
+    """The state after the arrival of these packets and no others."""
+    return system.deliver(arriving(system, state, packets), packets)
+
+
+def _of(system: System[Any], delivered: Any) -> Estimate:
+    mean, covariance = system.fused(delivered)
+    return Estimate(mean[None], covariance[None])
+
+
+def _joined(first: Estimate, second: Estimate) -> Estimate:
+    """Covariance intersection of two estimates, each sensor's by itself."""
+    sensors, states, runs = first.mean.shape
+
+    def flat(array: Array) -> Array:
+        return np.moveaxis(array, 0, -2).reshape(*array.shape[1:-1], sensors * runs)
+
+    fused = covariance_intersection(
+        flat(first.mean), flat(first.covariance), flat(second.mean), flat(second.covariance)
+    )
+    shape = (sensors, runs)
+    return Estimate(
+        np.moveaxis(fused.mean.reshape(states, *shape), -2, 0),
+        np.moveaxis(fused.covariance.reshape(states, states, *shape), -2, 0),
+    )

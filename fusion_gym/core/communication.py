@@ -1,0 +1,99 @@
+"""The communication model: what a packet holds, what a node hears, whether it remembers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from fusion_gym import validation
+from fusion_gym.core.options import Scenario
+from fusion_gym.core.system import AdoptingSystem, LossySystem, System
+from fusion_gym.validation import ConfigurationError
+
+PACKETS = ("measurement", "estimate")
+BROADCASTS = ("none", "estimate", "packets")
+FEATURES = ("difference", "value")
+
+
+class Communication(NamedTuple):
+    """A scenario's model: ``packet`` and ``broadcast`` of the options, the latter never ``None``;
+    whether there is ``memory``, and its ``features`` in the observation; ``shadow``, the system
+    that remembers beside the run, ``None`` where it is not needed."""
+
+    packet: str
+    broadcast: str
+    memory: bool
+    shadow: System[Any] | None
+    features: tuple[str, ...]
+
+
+def communication(scenario: Scenario) -> Communication:
+    """The model of a scenario's options, checked.
+
+    Raises:
+        ConfigurationError: a value that is not allowed, alone or with the others.
+    """
+    chosen = scenario.options
+    remembers = validation.boolean("memory", chosen.memory)
+    packet = validation.choice("packet", chosen.packet, PACKETS)
+    shadow = scenario.memory_system
+    if shadow is None and not scenario.nodes_remember:
+        shadow = scenario.system
+    if remembers and chosen.information == "centre":
+        raise ConfigurationError(
+            "memory = True is not allowed with information='centre': it must be False, for the "
+            "centre has nothing to remember but what was sent"
+        )
+    for name in ("memory_filter", "memory_features"):
+        value = getattr(chosen, name)
+        if value is not None and not remembers:
+            raise validation.refusal(name, value, "None unless memory=True")
+    if chosen.memory_filter is not None and scenario.memory_system is None:
+        raise validation.refusal(
+            "memory_filter", chosen.memory_filter, "None here, for this system has one filter"
+        )
+    if packet == "estimate":
+        _check_estimates(scenario, remembers)
+    return Communication(
+        packet,
+        _broadcast(scenario),
+        remembers,
+        shadow if remembers else None,
+        _features(chosen.memory_features),
+    )
+
+
+def _check_estimates(scenario: Scenario, remembers: bool) -> None:
+    reason = scenario.no_estimates
+    if not remembers:
+        reason = "it holds what the coordinator remembers, which takes memory=True"
+    elif isinstance(scenario.system, LossySystem) or not isinstance(
+        scenario.system, AdoptingSystem
+    ):
+        reason = reason or "this system's centre cannot go on from an estimate that is sent to it"
+    if reason is not None:
+        raise ConfigurationError(
+            f"packet = 'estimate' is not allowed here: it must be 'measurement', for {reason}"
+        )
+
+
+def _broadcast(scenario: Scenario) -> str:
+    given = scenario.options.broadcast
+    if given is None:
+        return "estimate" if scenario.feedback else "none"
+    broadcast = validation.choice("broadcast", given, BROADCASTS)
+    if broadcast == "none" and scenario.feedback:
+        raise ConfigurationError(
+            "broadcast = 'none' is not allowed here: it must be 'estimate' or 'packets', for the "
+            "nodes get the centre's estimate back"
+        )
+    return broadcast
+
+
+def _features(value: Any) -> tuple[str, ...]:
+    given = FEATURES if value is None else (value,) if isinstance(value, str) else value
+    if not isinstance(given, Sequence):
+        raise validation.refusal("memory_features", value, f"a list of some of {FEATURES}")
+    for name in given:
+        validation.choice("memory_features", name, FEATURES)
+    return tuple(name for name in FEATURES if name in given)

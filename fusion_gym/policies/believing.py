@@ -1,0 +1,47 @@
+"""What the rules share that look at what is believed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fusion_gym.core.beliefs import Beliefs
+from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.task import Task
+from fusion_gym.envs.views import SensorView
+from fusion_gym.validation import ConfigurationError, refusal
+
+
+def knows(task: Task, own: bool) -> Knowledge:
+    """The class of a rule that looks at all that is believed, in a task with or without memory."""
+    if task.memory:
+        return "own_memory" if own else "coordinator_memory"
+    return "own" if own else "coordinator"
+
+
+def check_owner(task: Task, own: bool, **only_together: Any) -> None:
+    """Whether a task lets its policies see the sensors, or every sensor decide by itself.
+
+    ``only_together`` are parameters that take more than one sensor to decide: with ``own`` they
+    must be ``None`` or 1.
+
+    Raises:
+        ConfigurationError: it does not, or such a parameter beside ``own``.
+    """
+    if task.information != "sensors":
+        raise ConfigurationError(
+            f"information = {task.information!r} is not allowed with this rule: it must be "
+            "'sensors', for it weighs the new measurements"
+        )
+    if not own:
+        return
+    SensorView(task)  # refuses what a sensor cannot do by itself
+    for name, value in only_together.items():
+        if value not in (None, 1):
+            raise refusal(name, value, "left out with own=True, for every sensor decides by itself")
+
+
+def beliefs_of(signals: Signals, own: bool) -> Beliefs:
+    """The coordinator's beliefs, or every sensor's own."""
+    found: Any = signals["own_beliefs" if own else "beliefs"]
+    beliefs: Beliefs = found
+    return beliefs

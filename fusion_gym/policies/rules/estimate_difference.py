@@ -1,0 +1,68 @@
+"""Transmit when the estimate that could be made differs enough from the centre's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.beliefs import Beliefs
+from fusion_gym.core.memory import Owner
+from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.task import Task
+from fusion_gym.policies.base import Requests, Rule, check_at_most, parameter, strongest
+from fusion_gym.policies.believing import beliefs_of, check_owner, knows
+
+
+@dataclass
+class EstimateDifference(Rule):
+    """Request when |x* - x̂| >= ``threshold``; of the sensors, those of the highest value.
+
+    x* is the estimate that could be made and x̂ the centre's if nobody transmits
+    (:mod:`fusion_gym.core.beliefs`). The norm is weighted as in the reward, by weights of mean 1,
+    in the unit of the states; ``whitened`` by the centre's claimed covariance, without a unit.
+    ``at_most`` limits a step to the sensors whose transmission is worth most (None: all). With
+    ``own`` every sensor decides by itself, on its own memory and what it hears: without memory
+    that is a threshold on what its own measurement would change.
+
+    Sources: Y. Xu and J. P. Hespanha, "Optimal communication logics in networked control systems",
+    IEEE CDC 2004; G. M. Lipsa and N. C. Martins, "Remote state estimation with communication costs
+    for first-order LTI systems", IEEE Trans. Automatic Control 56, 2011.
+
+    Raises:
+        ConfigurationError: a value that is not allowed, ``at_most`` with ``own``, or a task whose
+            policies do not see the sensors.
+    """
+
+    task: Task = field(repr=False)
+    threshold: float = parameter(0.2, validation.number, at_least=0.0)
+    whitened: bool = parameter(False, validation.boolean)
+    at_most: int | None = parameter(1, check_at_most)
+    own: bool = parameter(False, validation.boolean)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_owner(self.task, self.own, at_most=self.at_most)
+        self.remember: Owner = "own" if self.own else "coordinator"
+
+    @property
+    def knowledge(self) -> Knowledge:
+        """By the task's memory and by who decides."""
+        return knows(self.task, self.own)
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Requests (sensors, N)."""
+        beliefs, age = beliefs_of(signals, self.own), signals["age"]
+        squared = _whitened(beliefs) if self.whitened else beliefs.loss()
+        wanted = np.broadcast_to(squared >= self.threshold * self.threshold, age.shape)
+        if self.own or self.at_most is None:
+            return wanted.copy()
+        return strongest(beliefs.value(), wanted, self.at_most, age)
+
+
+def _whitened(beliefs: Beliefs) -> Array:
+    """(x* - x̂)ᵀ P⁻¹ (x* - x̂), P the covariance that the centre claims of x̂; (k, N)."""
+    difference, covariance = beliefs.difference, beliefs.silent.covariance
+    return linalg.dot(difference, linalg.solve_vector(covariance, difference))

@@ -1,0 +1,71 @@
+"""Transmit when what could be known diverges from what the centre will claim."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.beliefs import Estimate
+from fusion_gym.core.memory import Owner
+from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.task import Task
+from fusion_gym.policies.base import Requests, Rule, check_at_most, parameter, strongest
+from fusion_gym.policies.believing import beliefs_of, check_owner, knows
+
+
+@dataclass
+class KullbackLeibler(Rule):
+    """Request where the divergence of the centre's two densities is at least ``threshold`` nats.
+
+    D(s) = ½ (tr P⁻¹ P_s - n + δᵀ P⁻¹ δ + ln det P - ln det P_s): from the Gaussian N(x̂(s), P_s)
+    that the centre would hold after the packet of s alone to N(x̂, P), its prediction, with
+    δ = x̂(s) - x̂. With ``own`` and memory x*, with all that the sensor remembers, stands for x̂(s).
+    It counts what a packet teaches, variance included, whether or not the estimate moves.
+    ``at_most`` limits a step to the sensors of highest divergence (None: no limit). With ``own``
+    every sensor decides by itself.
+
+    Source: J. W. Marck and J. Sijs, "Relevant sampling applied to event-based state-estimation",
+    SENSORCOMM 2010.
+
+    Raises:
+        ConfigurationError: a value that is not allowed, ``at_most`` with ``own``, or a task whose
+            policies do not see the sensors.
+    """
+
+    task: Task = field(repr=False)
+    threshold: float = parameter(0.5, validation.number, at_least=0.0)
+    at_most: int | None = parameter(None, check_at_most)
+    own: bool = parameter(False, validation.boolean)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_owner(self.task, self.own, at_most=self.at_most)
+        self.remember: Owner = "own" if self.own else "coordinator"
+
+    @property
+    def knowledge(self) -> Knowledge:
+        """By the task's memory and by who decides."""
+        return knows(self.task, self.own)
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Requests (sensors, N)."""
+        beliefs = beliefs_of(signals, self.own)
+        divergence = _divergence(beliefs.best if self.own else beliefs.sent, beliefs.silent)
+        return strongest(divergence, divergence >= self.threshold, self.at_most, signals["age"])
+
+
+def _divergence(estimate: Estimate, silent: Estimate) -> Array:
+    """From one Gaussian to another, in nats (sensors, N)."""
+    difference = estimate.mean - silent.mean
+    size = difference.shape[-2]
+    spread = linalg.trace(linalg.solve(silent.covariance, estimate.covariance))
+    distance = linalg.dot(difference, linalg.solve_vector(silent.covariance, difference))
+    volume = _log_determinant(silent.covariance) - _log_determinant(estimate.covariance)
+    return 0.5 * (spread - size + distance + volume)
+
+
+def _log_determinant(covariance: Array) -> Array:
+    return 2.0 * np.log(linalg.diagonal(linalg.cholesky(covariance))).sum(-2)
