@@ -17,14 +17,14 @@ FLOORS = {
     "linalg": 0,
     "validation": 0,
     "version": 0,
-    "core": 1,
     "fusion": 1,
-    "systems": 2,
-    "envs": 3,
-    "solvers": 3,
-    "zoo": 3,
-    "policies": 4,
-    "evaluation": 5,
+    "core": 2,
+    "systems": 3,
+    "envs": 4,
+    "solvers": 4,
+    "zoo": 4,
+    "policies": 5,
+    "evaluation": 6,
 }
 TOOLS = {f"fusion_gym.{name}" for name, floor in FLOORS.items() if floor == 0}
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, merge_runs
 from fusion_gym.core.access import access_mask, first_request
-from fusion_gym.core.beliefs import Beliefs
-from fusion_gym.core.memory import Memory, Owner, Shadows
+from fusion_gym.core.beliefs import Beliefs, Shadows
+from fusion_gym.core.memory import Memory, Owner
 from fusion_gym.core.observation import Network, ObservationLayout
 from fusion_gym.core.signals import memory_signals
 from fusion_gym.core.system import Signals

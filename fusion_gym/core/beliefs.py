@@ -17,8 +17,9 @@ Automatic Control 67, 2022, for its value.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,10 +29,21 @@ from fusion_gym.core.system import LossySystem, System
 from fusion_gym.core.task import Task
 from fusion_gym.fusion.intersection import covariance_intersection
 
-if TYPE_CHECKING:
-    from fusion_gym.core.memory import Shadows
-
 Packets = NDArray[np.bool_]
+
+
+@dataclass(slots=True)
+class Shadows:
+    """What is kept of N runs, states after sensing; ``None`` where it is not needed.
+
+    ``every`` (N runs) has taken in all measurements · ``own`` (sensors · N runs, those of a sensor
+    together) one sensor's, and what it heard · ``alone`` (the same) is the centre to which that
+    sensor alone has sent.
+    """
+
+    every: Any = None
+    own: Any = None
+    alone: Any = None
 
 
 class Estimate(NamedTuple):

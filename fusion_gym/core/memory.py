@@ -15,31 +15,22 @@ What follows from the shadows is in :mod:`fusion_gym.core.beliefs`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, merge_runs, take_runs
-from fusion_gym.core.beliefs import Beliefs, CoordinatorBeliefs, OwnBeliefs, arriving
+from fusion_gym.core.beliefs import (
+    Beliefs,
+    CoordinatorBeliefs,
+    OwnBeliefs,
+    Shadows,
+    arriving,
+)
 from fusion_gym.core.task import Task
 
 Owner = Literal["coordinator", "own"]
-
-
-@dataclass(slots=True)
-class Shadows:
-    """What is kept of N runs, states after sensing; ``None`` where it is not needed.
-
-    ``every`` (N runs) has taken in all measurements · ``own`` (sensors · N runs, those of a sensor
-    together) one sensor's, and what it heard · ``alone`` (the same) is the centre to which that
-    sensor alone has sent.
-    """
-
-    every: Any = None
-    own: Any = None
-    alone: Any = None
 
 
 class Memory:
