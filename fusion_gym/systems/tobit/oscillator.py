@@ -105,6 +105,7 @@ def build(chosen: TobitOscillatorOptions) -> Scenario:
     )
     random_start = validation.boolean("random_start", chosen.random_start)
     trigger = _trigger(chosen, sensors.count)
+    centre = _centre(chosen, sensors)
     holds = chosen.filter == "paper" and chosen.silent != "predict"
     remembering = chosen.memory_filter
     if remembering is None and chosen.filter == "paper":
@@ -112,7 +113,7 @@ def build(chosen: TobitOscillatorOptions) -> Scenario:
     system = CensoredSystem(
         plant=plant,
         model=plant,
-        centre=_centre(chosen, sensors),
+        centre=centre,
         random_start=random_start,
         state_names=tuple(f"x{i + 1}" for i in range(plant.size)),
         scale=typical_magnitude(plant, horizon, random_start),
