@@ -16,7 +16,7 @@ from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import Signals
 from fusion_gym.envs.registration import make_task
-from fusion_gym.policies.registry import make_rule
+from fusion_gym.policies.registry import make_policy, make_rule
 from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
 from fusion_gym.policies.rules.random import Random
 from fusion_gym.validation import ConfigurationError
@@ -298,6 +298,6 @@ def test_configs_are_of_this_environment() -> None:
     for spec in (*sweep["points"], *specs):
         batch = EpisodeBatch(task, 2)
         batch.reset()
-        policy = make_rule(spec, task.policy_defaults)
+        policy = make_policy(spec, task)
         policy.reset(2)
         assert policy(batch.signals()).shape == (3, 2), spec
