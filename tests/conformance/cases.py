@@ -13,6 +13,7 @@ from own_system import OWN_ID
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.memory import Owner
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import ENVIRONMENTS
 
@@ -32,6 +33,8 @@ LOSSY: Options = {"sensors": 3, "channel": "gilbert_elliott", "coefficient": (0.
 GIVEN = np.sin(np.arange(41.0) / 3.0)[:, None].tolist()
 STARVED: Options = {"bias_aware": False, "access": "round_robin", **LIMITED}
 UNCENSORED: Options = {"filter": "kalman", "censoring_threshold": -np.inf, "random_start": True}
+REMEMBERING: Options = {"memory": True}
+ESTIMATES: Options = {"memory": True, "packet": "estimate"}
 UNALIKE: Options = {"token_cost": (1.0, 2.0, 4.0), "process_noise": "full", "sharing": "fixed"}
 
 # Options that change what an environment is made of.
@@ -45,6 +48,9 @@ VARIANTS: dict[str, list[Options]] = {
         {"silent": "predict", "event_error": False, **UNALIKE},
         UNCENSORED,
         {"filter": "tobit", "measurement_matrices": (((1.0, 0.0),),)},
+        {"filter": "tobit", "random_start": True} | REMEMBERING | LIMITED,
+        REMEMBERING | {"memory_features": "value", "access": "single"} | DRAWN,
+        UNCENSORED | ESTIMATES | {"memory_features": ("difference",), "action": "discrete"},
     ],
     CORRELATED: [
         {"fusion": "sci", "order": (2, 0, 1), "information": "centre", **LIMITED},
@@ -59,6 +65,8 @@ VARIANTS: dict[str, list[Options]] = {
             "trigger_offset": 0.2,
             "trigger_sensitivity": 0.9,
         },
+        REMEMBERING | {"access": "round_robin", "noise_scale": "random"} | DRAWN,
+        ESTIMATES | LIMITED,
     ],
     JUMP: [
         {"fusion": "ci", "access": "single", **DRAWN},
@@ -66,6 +74,8 @@ VARIANTS: dict[str, list[Options]] = {
         {"filter": "centralised", "access": "round_robin"},
         {"filter": "imm"},
         {"filter": "imm", "information": "centre", "action": "discrete"},
+        REMEMBERING | LIMITED,
+        REMEMBERING | {"filter": "centralised", "memory_filter": "imm"},
     ],
     INPUT: [
         {"filter": "predict", "fusion": "exact_ci", "access": "random", **DRAWN},
@@ -74,22 +84,31 @@ VARIANTS: dict[str, list[Options]] = {
         {"example": "paper", "input_phase": "random", "action": "discrete", "error": "trace"},
         {"example": "paper", "input_signal": "steps", "filter": "random_walk", "fusion": "ici"},
         {"input_signal": GIVEN, "horizon": 40, "fusion": "sci"},
+        REMEMBERING | {"filter": "predict"} | LIMITED,
+        REMEMBERING | {"filter": "paper", "error": "trace"},
     ],
     BIASED: [
         {"filter": "adf", "access": "any", "information": "centre"},
         {"filter": "kalman", "access": "random", "random_start": True, **DRAWN},
         STARVED,
+        ESTIMATES | {"memory_filter": "kalman"},
     ],
     TRACKING: [
         {"filter": "stochastic", "stochastic_weight": 1.0, "access": "any", "fusion": "ici"},
         {"filter": "adf", "access": "round_robin", "error": "trace"},
+        REMEMBERING | {"access": "round_robin"} | DRAWN,
     ],
     REMOTE: [
         LOSSY | {"access": "single", "initial_deviation": 1.0} | DRAWN,
         {"sensors": 2, "channel": "independent", "action": "discrete", "error": "trace"},
         LOSSY | LIMITED | {"information": "centre"},
+        LOSSY | REMEMBERING | DRAWN,
     ],
-    OWN_ID: [{"access": "random", **DRAWN}, {"information": "centre", **LIMITED}],
+    OWN_ID: [
+        {"access": "random", **DRAWN},
+        {"information": "centre", **LIMITED},
+        REMEMBERING | LIMITED,
+    ],
 }
 
 
@@ -112,15 +131,26 @@ class Case:
         chosen = {name: value for name, value in other.items() if value is not None}
         return fusion_gym.make_task(self.env_id, **self.options | chosen)
 
-    def batch(self, seeds: list[int], horizon: int | None = None) -> EpisodeBatch:
+    @property
+    def not_local(self) -> str | None:
+        """Why no sensor can decide by itself, as the message begins; ``None`` where one can."""
+        for name, value in (("information", "centre"), ("packet", "estimate")):
+            if self.options.get(name) == value:
+                return f"{name} = {value!r}"
+        return None
+
+    def batch(
+        self, seeds: list[int], horizon: int | None = None, owner: Owner | None = None
+    ) -> EpisodeBatch:
         """Runs with these seeds, each at the start of an episode."""
-        batch = EpisodeBatch(self.task(horizon), len(seeds))
+        batch = EpisodeBatch(self.task(horizon), len(seeds), owner)
         batch.seed(np.arange(len(seeds)), seeds)
         batch.reset()
         return batch
 
     def __str__(self) -> str:
         words = [value for value in self.options.values() if isinstance(value, str)]
+        words += ["memory"] * ("memory" in self.options)
         return "-".join([self.env_id.partition("/")[2].removesuffix("-v0"), *words])
 
 

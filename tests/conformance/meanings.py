@@ -7,6 +7,7 @@ what there is to see of a batch and returns the entries (…, N), not yet clippe
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -175,6 +176,60 @@ def held_difference(see: Seen) -> Array:
     return moved / np.sqrt(noises * noise_variances(see))
 
 
+def arrival(see: Seen) -> Any:
+    """Probability (sensors, N) that a packet sent now arrives."""
+    channel = getattr(see.system, "channel", None)
+    if channel is None or not channel.loses:
+        return 1.0
+    kept = channel.transition @ (1.0 - channel.drop)  # (states before, sensors)
+    each = [[kept[before, s] for before in row] for s, row in enumerate(see.state.channel)]
+    return np.array(each)
+
+
+def delivered(system: Any, state: Any, *sensors: int) -> Array:
+    """The centre's mean (n, N) after these packets, none of which is lost."""
+    if hasattr(state, "lost"):
+        state = replace(state, lost=np.zeros_like(state.lost))
+    granted = np.zeros((system.sensor_count, system.truth(state).shape[-1]), dtype=np.bool_)
+    granted[list(sensors)] = True
+    mean: Array = system.fused(system.deliver(state, granted))[0]
+    return mean
+
+
+def remembered(see: Seen) -> Array:
+    """x* (n, N): with the shadow, or where packets hold all that was measured, without."""
+    everyone = range(see.system.sensor_count)
+    if see.batch.task.shadow is None:
+        return delivered(see.system, see.state, *everyone)
+    shadows: Any = see.batch.shadows
+    return delivered(see.batch.task.shadow, shadows.every, *everyone)
+
+
+def belief_difference(see: Seen) -> Array:
+    """x* - x̂ in open-loop deviations, as ln(z + √(z² + 1)) of four times that."""
+    apart = remembered(see) - delivered(see.system, see.state)
+    z = np.abs(4.0 * apart / np.sqrt(see.open_loop))
+    return np.sign(apart) * np.log(z + np.sqrt(z * z + 1.0))
+
+
+def transmission_value(see: Seen) -> Array:
+    """For nobody and for each sensor; a packet with an estimate leaves nothing."""
+    weights = see.batch.task.reward.state_weights
+    weights = weights / weights.mean()
+    best, sensors = remembered(see), range(see.system.sensor_count)
+
+    def left(mean: Array) -> Array:
+        squared: Array = np.einsum("i,ir->r", weights[:, 0], (best - mean) ** 2)
+        return squared
+
+    silent = left(delivered(see.system, see.state))
+    after = np.array([left(delivered(see.system, see.state, s)) for s in sensors])
+    if see.batch.task.packet == "estimate":
+        after = np.zeros_like(after)
+    every = np.concatenate((silent[None], arrival(see) * (silent - after)))
+    return 2.0 * np.sign(every) * np.sqrt(np.abs(every) / (weights * see.open_loop).sum())
+
+
 NETWORK: dict[str, Formula] = {
     "tokens": lambda see: see.batch.tokens / see.batch.task.bucket.capacity,
     "admitted": lambda see: see.batch.admitted(),
@@ -182,6 +237,10 @@ NETWORK: dict[str, Formula] = {
         np.log(see.batch.price / see.batch.task.reward.price.span[0])
         / np.diff(np.log(see.batch.task.reward.price.span))
     ),
+}
+MEMORY: dict[str, Formula] = {
+    "belief_difference": belief_difference,
+    "transmission_value": transmission_value,
 }
 # By the class of the system.
 FORMULAS: dict[str, dict[str, Formula]] = {
@@ -257,12 +316,12 @@ FORMULAS: dict[str, dict[str, Formula]] = {
 
 
 def formula(system: Any, name: str) -> Formula:
-    """The formula of a block of a system, or of the network.
+    """The formula of a block of a system, of the network, or of what is remembered.
 
     Raises:
         LookupError: there is none; write one.
     """
-    known = NETWORK | FORMULAS.get(type(system).__name__, {})
+    known = NETWORK | MEMORY | FORMULAS.get(type(system).__name__, {})
     if name not in known:
         raise LookupError(f"no formula for block {name!r} of {type(system).__name__}")
     return known[name]

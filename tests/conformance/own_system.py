@@ -76,7 +76,9 @@ class RandomWalk:
         return replace(
             state,
             age=np.where(granted, 0.0, state.age),
-            mean=state.prior + gain * (state.measurement - state.prior),
+            mean=np.where(
+                granted, state.prior + gain * (state.measurement - state.prior), state.prior
+            ),
             variance=(1.0 - gain) * state.prior_variance,
         )
 

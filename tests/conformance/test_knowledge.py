@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cases import CASES, Case, each_case, requests
+from moments import Moment, unseeing
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import take_runs
@@ -25,17 +26,6 @@ def read(task: Task, state: Any) -> dict[str, NDArray[Any]]:
     """All signals of a state, withheld ones too."""
     offered = task.system.read(state)
     return {name: np.asarray(Signals(dict(offered))[name]) for name in offered}
-
-
-def observed(batch: EpisodeBatch, state: Any) -> NDArray[np.float32]:
-    """Observations of a state with as many runs as it has, and the batch's first run's network."""
-    runs = batch.task.system.truth(state).shape[-1]
-    network = Network(
-        np.repeat(batch.tokens[:1], runs),
-        lambda: np.repeat(batch.admitted()[:, :1], runs, axis=1),
-        np.repeat(batch.price[:1], runs),
-    )
-    return batch.layout.encode(state, network, batch.beliefs)
 
 
 @each_case
@@ -87,7 +77,8 @@ def test_nothing_shown_depends_on_the_truth(case: Case) -> None:
         found = read(case.task(), state)
         for name, value in read(case.task(), batch.state).items():
             np.testing.assert_array_equal(found[name], value, err_msg=name)
-        seen = batch.layout.encode(state, _network(batch), batch.beliefs)
+        blind = batch.memory.beliefs(state, unseeing(batch))
+        seen = batch.layout.encode(state, _network(batch), lambda blind=blind: blind)
         np.testing.assert_array_equal(seen, batch.observe())
         nobody = np.zeros_like(wanted)
         for granted in (wanted, nobody):
@@ -110,18 +101,18 @@ def test_whoever_is_shown_something_can_know_it(case: Case) -> None:
     nodes are told nothing of the state, not even a delivery changes another sensor's view later.
     """
     task = case.task()
-    system, batch = task.system, case.batch([3])
-    view = SensorView(task) if task.knowledge == "coordinator" else None
+    system, view = task.system, None if case.not_local else SensorView(task)
+    batch = case.batch([3], owner=None if view is None else view.owner)
     told = any(block.node == "told" for block in system.observation)
     noticed = np.zeros(task.sensors, dtype=np.bool_)
-    before = system.start(np.random.default_rng(0).standard_normal((system.start_channels, 1)))
+    before = Moment.start(batch, np.random.default_rng(0))
     draw, channels = np.random.default_rng(1), system.noise_channels
     for wanted in requests(task, 1, STEPS):
         # Run 0 as drawn, run c + 1 with another normal in channel c.
         noise = np.repeat(draw.standard_normal((channels, 1)), channels + 1, axis=1)
         noise[np.arange(channels), np.arange(1, channels + 1)] *= -1.5
-        state = system.sense(take_runs(before, np.zeros(channels + 1, dtype=np.int64)), noise)
-        signals = read(case.task(), state)
+        moment = before.repeated(channels + 1).sensed(noise)
+        signals = read(case.task(), moment.state)
         measured = _changed(signals["measurement"]).reshape(task.sensors, -1, channels).any(1)
         alone = measured.sum(0) == 1
         for signal in system.signals:
@@ -131,19 +122,19 @@ def test_whoever_is_shown_something_can_know_it(case: Case) -> None:
             elif signal.axes.startswith("(sensors"):
                 by_sensor = changed.reshape(task.sensors, -1, channels).any(1)
                 assert not (by_sensor & ~measured)[:, alone].any(), signal.name
-        observation = observed(batch, state)
-        if view is None:
-            assert not _changed(observation.T).any()
-        else:
-            changed = _changed_rows(view, observation)
+        if view is not None:
+            changed = _changed_rows(view, moment.observed())
             assert not (changed & ~measured)[:, alone].any()
             noticed |= (changed & measured)[:, alone].any(1)
             everyone = np.ones((task.sensors, channels + 1), dtype=np.bool_)
-            later = system.sense(system.deliver(state, everyone), noise[:, :1] * everyone[:1])
-            changed = _changed_rows(view, observed(batch, later))
-            alone &= ~_changed(system.truth(later)).any(0)  # a normal of the sensor, not the plant
+            later = moment.delivered(everyone).sensed(noise[:, :1] * everyone[:1])
+            changed = _changed_rows(view, later.observed())
+            # a normal of the sensor, not the plant
+            alone &= ~_changed(system.truth(later.state)).any(0)
             assert told or not (changed & ~measured)[:, alone].any()
-        before = system.deliver(take_runs(state, np.zeros(1, dtype=np.int64)), wanted)
+        elif task.information == "centre":
+            assert not _changed(moment.observed().T).any()
+        before = moment.first().delivered(wanted)
     assert view is None or noticed.all()
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import LASTING, Case, actions, each_case, each_lasting, requests
+from cases import LASTING, TOBIT, Case, actions, each_case, each_lasting, requests
 from endurance import endure
 
 import fusion_gym
@@ -19,7 +19,9 @@ from fusion_gym.envs.registration import class_name
 
 SILENT, RUNS = 1000, 32
 ANSWERED = {"tokens": "unlimited", "access": "any"}
-SLOW = [case for case in LASTING if "fusion" in case.options]
+SLOW = [
+    c for c in LASTING if "fusion" in c.options or (c.options.get("memory") and c.env_id != TOBIT)
+]
 STARVED = [case for case in LASTING if case not in SLOW]
 STARVED += [pytest.param(case, marks=pytest.mark.slow) for case in SLOW]
 
