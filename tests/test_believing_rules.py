@@ -1,0 +1,252 @@
+"""The rules that look at what is believed: their units, their limits, their figures."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import multivariate_normal
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.beliefs import Beliefs
+from fusion_gym.core.system import Signals
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation import run_episodes
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.rules.estimate_difference import EstimateDifference
+from fusion_gym.policies.rules.kullback_leibler import KullbackLeibler
+from fusion_gym.policies.rules.value_of_information import ValueOfInformation
+from fusion_gym.validation import ConfigurationError
+
+TOBIT = "fusion_gym/TobitOscillator-v0"
+CORRELATED = "fusion_gym/CorrelatedTracking-v0"
+BENCHMARK = {"filter": "tobit", "random_start": True, "token_rate": 2.0}
+Array = NDArray[Any]
+
+
+@functools.cache
+def task_of(env_id: str = TOBIT, **options: Any) -> Task:
+    return fusion_gym.make_task(env_id, **(BENCHMARK if env_id == TOBIT else {}) | options)
+
+
+def later(task: Task, owner: Any = "coordinator", runs: int = 40, steps: int = 6) -> EpisodeBatch:
+    """Runs after a few steps with few deliveries."""
+    batch, draw = EpisodeBatch.seeded(task, runs, 0, owner), np.random.default_rng(0)
+    for _ in range(steps):
+        batch.step(draw.random((task.sensors, runs)) < 0.1)
+    return batch
+
+
+def weighted(task: Task, difference: Array) -> Array:
+    """‖·‖² by weights of mean 1."""
+    weights = task.reward.state_weights[:, 0] / task.reward.state_weights.mean()
+    return np.asarray(np.einsum("i,...ir->...r", weights, difference**2))
+
+
+def after(task: Task, state: Any, *sensors: int) -> tuple[Array, Array]:
+    """The centre's mean and covariance when these transmit."""
+    granted = np.zeros((task.sensors, task.system.truth(state).shape[-1]), dtype=np.bool_)
+    granted[list(sensors)] = True
+    return task.system.fused(task.system.deliver(state, granted))
+
+
+def share(asked: Array) -> None:
+    """Neither none nor all."""
+    assert 0.0 < asked.mean() < 1.0
+
+
+@pytest.mark.parametrize("memory", [False, True])
+def test_the_value_is_in_squared_units_of_the_states(memory: bool) -> None:
+    """‖x* - x̂‖² - ‖x* - x̂(s)‖² at least the threshold; equality is enough."""
+    task = task_of(memory=memory, state_weights=(1.0, 3.0))
+    batch = later(task)
+    best = after(task, batch.state, *range(3))[0]
+    if memory:
+        best = after(task, batch.shadows.every, *range(3))[0]  # type: ignore[union-attr]
+    silent = weighted(task, best - after(task, batch.state)[0])
+    each = [weighted(task, best - after(task, batch.state, s)[0]) for s in range(3)]
+    value = silent - np.array(each)
+    np.testing.assert_allclose(batch.signals()["transmission_value"], value, rtol=1e-9, atol=1e-12)
+    asked = ValueOfInformation(task, threshold=0.02)(batch.signals())
+    share(asked)
+    np.testing.assert_array_equal(asked, value >= 0.02)
+    highest = float(batch.signals()["transmission_value"].max())
+    assert ValueOfInformation(task, threshold=highest)(batch.signals()).sum() == 1
+    assert not ValueOfInformation(task, threshold=np.nextafter(highest, 9.0))(batch.signals()).any()
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_a_price_is_a_threshold_in_the_rewards_units(own: bool) -> None:
+    """The tokens of a packet times their price, over what a squared error counts."""
+    task = task_of(memory=True, token_cost=(1.0, 2.0, 4.0), error_weight=7.0)
+    signals = later(task, "own" if own else "coordinator").signals()
+    price, costs = 0.05, np.array([1.0, 2.0, 4.0])
+    asked = ValueOfInformation(task, price=price, own=own)(signals)
+    share(asked)
+    for sensor, cost in enumerate(costs):
+        threshold = (
+            price * cost / (7.0 * task.reward.state_weights.mean() / task.reward.error_weight)
+        )
+        other = ValueOfInformation(task, threshold=threshold, own=own)(signals)
+        np.testing.assert_array_equal(asked[sensor], other[sensor])
+
+
+def test_at_most_takes_the_most_valuable_and_ties_go_to_the_longest_silent() -> None:
+    task = task_of(memory=True)
+    signals = later(task, runs=200).signals()
+    value = signals["transmission_value"]
+    every = ValueOfInformation(task, threshold=0.001)(signals)
+    assert every.sum(0).max() == 3
+    for most in (1, 2):
+        asked = ValueOfInformation(task, threshold=0.001, at_most=most)(signals)
+        assert asked.sum(0).max() == most
+        ranks = (value[:, None] < value[None]).sum(1)  # how many are worth more
+        clear = np.diff(np.sort(value, axis=0), axis=0).min(0) > 0.0
+        np.testing.assert_array_equal(asked[:, clear], (every & (ranks < most))[:, clear])
+    tied = dict(signals) | {
+        "beliefs": Tied(task),
+        "age": np.array([[1.0, 4.0], [3.0, 4.0], [3.0, 2.0]]),
+    }
+    asked = ValueOfInformation(task, threshold=0.5, at_most=1)(Signals(tied))
+    np.testing.assert_array_equal(asked.T, [[False, True, False], [True, False, False]])
+
+
+class Tied:
+    """Beliefs by which all transmissions are worth the same."""
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+
+    def value(self, steps: int = 1) -> Array:
+        """One."""
+        return np.ones((self.task.sensors, 2))
+
+
+def test_steps_ahead_sum_what_is_left_of_the_difference() -> None:
+    """Without noise and transmissions every estimate is moved by the plant alone."""
+    task = task_of(memory=True, filter="kalman", censoring_threshold=-np.inf)
+    batch = later(task)
+    matrix = np.array(task.system.plant.transition)[..., 0]  # type: ignore[attr-defined]
+    best = after(task, batch.shadows.every, 0, 1, 2)[0]  # type: ignore[union-attr]
+    total = np.zeros((4, batch.num_envs))
+    centres = [after(task, batch.state)[0], *(after(task, batch.state, s)[0] for s in range(3))]
+    for power in range(3):
+        moved = np.linalg.matrix_power(matrix, power)
+        total += np.array([weighted(task, moved @ (best - centre)) for centre in centres])
+    value = total[0] - total[1:]
+    np.testing.assert_allclose(batch.beliefs().value(3), value, rtol=1e-9, atol=1e-12)
+    asked = ValueOfInformation(task, threshold=0.1, steps=3)(batch.signals())
+    share(asked)
+    np.testing.assert_array_equal(asked, value >= 0.1)
+
+
+def test_what_differs_is_measured_in_the_states_unit_or_whitened() -> None:
+    task = task_of(memory=True, state_weights=(1.0, 3.0))
+    batch = later(task)
+    signals, silent = batch.signals(), after(task, batch.state)
+    apart = signals["belief_difference"]
+    norm = np.sqrt(weighted(task, apart))
+    white = np.sqrt([
+        apart[:, run] @ np.linalg.solve(silent[1][..., run], apart[:, run])
+        for run in range(batch.num_envs)
+    ])  # fmt: skip
+    for whitened, size, threshold in ((False, norm, 0.2), (True, white, 0.5)):
+        share(size >= threshold)
+        parameters: Any = {"threshold": threshold, "whitened": whitened}
+        every = EstimateDifference(task, at_most=None, **parameters)(signals)
+        np.testing.assert_array_equal(every, np.broadcast_to(size >= threshold, every.shape))
+        one = EstimateDifference(task, **parameters)(signals)
+        np.testing.assert_array_equal(one.sum(0), size >= threshold)
+        chosen = one.any(0)
+        value = signals["transmission_value"]
+        np.testing.assert_array_equal(value.T[one.T], value.max(0)[chosen])
+
+
+@pytest.mark.parametrize("env_id", [TOBIT, "fusion_gym/BiasedOscillator-v0"])
+def test_a_sensor_without_memory_looks_at_what_its_measurement_would_change(env_id: str) -> None:
+    """A threshold on |W^½ (x̂(s) - x̂)|."""
+    task = task_of(env_id, access="any")
+    batch = later(task, "own", runs=8)
+    assert batch.shadows is None
+    silent = after(task, batch.state)[0]
+    each = [after(task, batch.state, s)[0] - silent for s in range(task.sensors)]
+    size = np.sqrt(weighted(task, np.array(each)))
+    threshold = float(np.median(size))
+    asked = EstimateDifference(task, threshold=threshold, own=True)(batch.signals())
+    share(asked)
+    np.testing.assert_array_equal(asked, size >= threshold)
+
+
+@pytest.mark.parametrize(
+    ("own", "memory"), [(False, False), (False, True), (True, False), (True, True)]
+)
+def test_the_divergence_is_that_of_two_gaussians(own: bool, memory: bool) -> None:
+    """As the mean of the logarithm of their ratio, by three-point quadrature in each direction."""
+    task = task_of(CORRELATED, memory=memory, broadcast="packets")
+    batch = later(task, "own" if own else "coordinator", runs=6)
+    beliefs: Beliefs = batch.beliefs()
+    estimates = beliefs.best if own else beliefs.sent
+    found = np.zeros((task.sensors, 6))
+    for sensor in range(task.sensors):
+        for run in range(6):
+            known = len(beliefs.silent.mean) > 1
+            mean, spread = (part[sensor][..., run] for part in estimates)
+            other, wide = (part[sensor if known else 0][..., run] for part in beliefs.silent)
+            steps = np.sqrt(len(mean)) * np.linalg.cholesky(spread).T
+            points = np.concatenate((mean + steps, mean - steps))  # exact for squares
+            ratio = multivariate_normal(mean, spread).logpdf(points)
+            ratio -= multivariate_normal(other, wide).logpdf(points)
+            found[sensor, run] = ratio.mean()
+    threshold = float(np.median(found)) * (1.0 + 1e-9)
+    asked = KullbackLeibler(task, threshold=threshold, own=own)(batch.signals())
+    share(asked)
+    np.testing.assert_array_equal(asked, found >= threshold)
+
+
+@pytest.mark.parametrize(
+    ("spec", "options", "message"),
+    [
+        ("value_of_information:threshold=0.1,price=0.1", {}, "price = 0.1 .*beside threshold"),
+        ("value_of_information:threshold=-1", {}, "threshold = -1"),
+        ("value_of_information:at_most=0", {}, "at_most = 0"),
+        ("value_of_information:steps=0", {}, "steps = 0"),
+        ("value_of_information:own=true,at_most=2", {}, "at_most = 2 .*own=True"),
+        ("value_of_information:own=true,steps=2", {}, "steps = 2 .*own=True"),
+        ("estimate_difference:own=true,at_most=2", {}, "at_most = 2 .*own=True"),
+        ("estimate_difference:threshold=nan", {}, "threshold = nan"),
+        ("estimate_difference:whitened=1", {}, "whitened = 1"),
+        ("kullback_leibler:own=true,at_most=3", {}, "at_most = 3 .*own=True"),
+        ("kullback_leibler:threshold=-0.1", {}, "threshold = -0.1"),
+        ("value_of_information", {"information": "centre"}, "information = 'centre'"),
+        ("estimate_difference:own=true", {"information": "centre"}, "information = 'centre'"),
+        ("kullback_leibler", {"information": "centre"}, "information = 'centre'"),
+    ],
+)
+def test_what_cannot_be_decided_is_refused(spec: str, options: Any, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message) as caught:
+        make_policy(spec, task_of(**options))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("packet", "episodes", "mse", "rate"),
+    [
+        ("measurement", 200, (0.070, 0.006), (0.029, 0.002)),
+        ("estimate", 200, (0.064, 0.006), (0.030, 0.003)),
+        pytest.param("measurement", 1000, (0.070, 0.003), (0.029, 0.002), marks=pytest.mark.slow),
+        pytest.param("estimate", 1000, (0.064, 0.003), (0.030, 0.002), marks=pytest.mark.slow),
+    ],
+)
+def test_memory_halves_the_error_of_the_benchmarks_oscillator(
+    packet: str, episodes: int, mse: tuple[float, float], rate: tuple[float, float]
+) -> None:
+    """Its tuned rules without memory leave about .145 at this rate."""
+    task = task_of(memory=True, packet=packet)
+    rule = make_policy("value_of_information:threshold=0.03,at_most=1", task)
+    results = run_episodes(task, rule, episodes, 0)
+    assert results.mse.mean() == pytest.approx(mse[0], abs=mse[1])
+    assert results.requests.mean() == pytest.approx(rate[0], abs=rate[1])

@@ -1,0 +1,192 @@
+"""What a packet holds, who hears what: the estimates against Kalman's, and what is refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import filterpy.kalman
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.memory import Owner
+from fusion_gym.core.task import Task
+from fusion_gym.validation import ConfigurationError
+
+TOBIT = "fusion_gym/TobitOscillator-v0"
+CORRELATED = "fusion_gym/CorrelatedTracking-v0"
+JUMP = "fusion_gym/MarkovJumpTracking-v0"
+INPUT = "fusion_gym/UnknownInput-v0"
+REMOTE = "fusion_gym/RemoteEstimation-v0"
+LINEAR = {"filter": "kalman", "censoring_threshold": -np.inf, "tokens": "unlimited"}
+LINEAR |= {"memory": True, "token_rate": 2.0}
+RUNS, STEPS = 3, 20
+Array = NDArray[Any]
+
+
+class Kalman:
+    """FilterPy's filter of every run, with the numbers of a task's plant and sensors."""
+
+    def __init__(self, batch: EpisodeBatch) -> None:
+        system: Any = batch.task.system
+        plant, self.sensors = system.plant, system.centre.sensors
+        self.filters = []
+        for run in range(batch.num_envs):
+            one = filterpy.kalman.KalmanFilter(dim_x=plant.size, dim_z=self.sensors.size)
+            one.F, one.Q = np.array(plant.transition)[..., 0], plant.process_covariance[..., 0]
+            one.x = np.array(batch.state.prior_mean)[:, run]
+            one.P = np.array(batch.state.prior_covariance)[..., run]
+            self.filters.append(one)
+
+    def update(self, measurement: Array, taken: Array) -> tuple[Array, Array]:
+        """Posterior means (n, N) and covariances (n, n, N) with what was ``taken`` (sensors, N)."""
+        for run, one in enumerate(self.filters):
+            for sensor in np.flatnonzero(taken[:, run]):
+                noise = np.diag(np.ravel(self.sensors.variance[sensor]))
+                matrix = np.array(self.sensors.measurement_matrix[sensor])[..., 0]
+                one.update(measurement[sensor, :, run], R=noise, H=matrix)
+        means = np.stack([one.x for one in self.filters], -1)
+        return means, np.stack([one.P for one in self.filters], -1)
+
+    def predict(self) -> None:
+        """One step on."""
+        for one in self.filters:
+            one.predict()
+
+
+def linear(owner: Owner = "coordinator", **options: Any) -> EpisodeBatch:
+    """Runs of an oscillator whose sensors censor nothing."""
+    task = fusion_gym.make_task(TOBIT, **LINEAR | options)
+    return EpisodeBatch.seeded(task, RUNS, 5, owner)
+
+
+def asked(batch: EpisodeBatch, rate: float = 0.15) -> Array:
+    """Random requests (steps, sensors, N)."""
+    return np.random.default_rng(1).random((STEPS, batch.task.sensors, RUNS)) < rate
+
+
+def test_what_is_remembered_is_kalmans_estimate_from_every_measurement() -> None:
+    batch = linear()
+    kalman, everything = Kalman(batch), np.ones((3, RUNS), dtype=np.bool_)
+    for wanted in asked(batch):
+        mean, covariance = kalman.update(batch.signals()["measurement"], everything)
+        best = batch.beliefs().best
+        np.testing.assert_allclose(best.mean[0], mean, rtol=1e-9)
+        np.testing.assert_allclose(best.covariance[0], covariance, rtol=1e-9)
+        assert (batch.signals()["belief_difference"] != 0.0).any()
+        batch.step(wanted)
+        kalman.predict()
+
+
+def test_a_sensor_that_overhears_has_kalmans_estimate_from_its_own_and_what_it_heard() -> None:
+    batch = linear("own", broadcast="packets")
+    kalmans = [Kalman(batch) for _ in range(3)]
+    for wanted in asked(batch):
+        best, measurement = batch.beliefs().best, batch.signals()["measurement"]
+        for sensor, kalman in enumerate(kalmans):
+            itself = np.arange(3)[:, None] == np.full(RUNS, sensor)
+            mean, covariance = kalman.update(measurement, itself)
+            np.testing.assert_allclose(best.mean[sensor], mean, rtol=1e-9)
+            np.testing.assert_allclose(best.covariance[sensor], covariance, rtol=1e-9)
+            kalman.update(measurement, wanted & ~itself)
+            kalman.predict()
+        batch.step(wanted)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options"),
+    [
+        (TOBIT, LINEAR),
+        (TOBIT, {"filter": "tobit", "memory_filter": "adf"}),
+        ("fusion_gym/BiasedOscillator-v0", {}),
+        (CORRELATED, {}),
+        (CORRELATED, {"fusion": "ci"}),
+    ],
+)
+def test_after_a_packet_with_the_estimate_the_centre_has_it(
+    env_id: str, options: dict[str, Any]
+) -> None:
+    """Mean and covariance, and where nothing was granted it goes on by itself."""
+    common = {"memory": True, "tokens": "unlimited", "packet": "estimate", "access": "any"}
+    task = fusion_gym.make_task(env_id, **options | common)
+    batch, met = EpisodeBatch.seeded(task, RUNS, 5), [0, 0]
+    for wanted in asked(batch, 0.1):
+        beliefs = batch.beliefs()
+        (best, silent), squared = (beliefs.best, beliefs.silent), beliefs.loss()[0]
+        np.testing.assert_array_equal(beliefs.value(), np.broadcast_to(squared, wanted.shape))
+        heard = batch.step(wanted).granted.any(0)
+        mean, covariance = task.system.fused(batch.delivered)
+        for place, (runs, estimate) in enumerate(((heard, best), (~heard, silent))):
+            np.testing.assert_array_equal(mean[:, runs], estimate.mean[0][:, runs])
+            np.testing.assert_array_equal(covariance[..., runs], estimate.covariance[0][..., runs])
+            met[place] += int(runs.sum())
+    assert min(met) > 5
+
+
+def test_with_the_estimate_nothing_is_lost_by_silence() -> None:
+    batch = linear(packet="estimate")
+    kalman, everything, met = Kalman(batch), np.ones((3, RUNS), dtype=np.bool_), 0
+    for wanted in asked(batch):
+        mean, covariance = kalman.update(batch.signals()["measurement"], everything)
+        heard = batch.step(wanted).granted.any(0)
+        found = batch.task.system.fused(batch.delivered)
+        np.testing.assert_allclose(found[0][:, heard], mean[:, heard], rtol=1e-9)
+        np.testing.assert_allclose(found[1][..., heard], covariance[..., heard], rtol=1e-9)
+        kalman.predict()
+        met += int(heard.sum())
+    assert met > RUNS
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options", "message"),
+    [
+        (TOBIT, {"memory": 1}, "memory = 1 "),
+        (TOBIT, {"packet": "raw"}, "packet = 'raw' .*'measurement', 'estimate'"),
+        (TOBIT, {"broadcast": "all"}, "broadcast = 'all' .*'none', 'estimate', 'packets'"),
+        (TOBIT, {"broadcast": "none"}, "broadcast = 'none' .*'estimate' or 'packets'"),
+        (TOBIT, {"memory": True, "information": "centre"}, "memory = True .*it must be False"),
+        (TOBIT, {"memory_filter": "adf"}, "memory_filter = 'adf' .*unless memory=True"),
+        (TOBIT, {"memory_features": []}, r"memory_features = \[\] .*unless memory=True"),
+        (TOBIT, {"memory": True, "memory_filter": "best"}, "memory_filter = 'best' .*'adf'"),
+        (TOBIT, {"memory": True, "memory_features": 3}, "memory_features = 3 .*a list of"),
+        (TOBIT, {"memory": True, "memory_features": "x"}, "memory_features = 'x' .*'difference'"),
+        (TOBIT, {"packet": "estimate", "filter": "tobit"}, "packet = 'estimate' .*memory=True"),
+        (TOBIT, {"packet": "estimate", "memory": True}, "packet = 'estimate' .*silent='hold'"),
+        (JUMP, {"packet": "estimate", "memory": True}, "packet = 'estimate' .*already"),
+        (INPUT, {"packet": "estimate", "memory": True}, "packet = 'estimate' .*anew"),
+        (REMOTE, {"packet": "estimate", "memory": True}, "packet = 'estimate' .*itself"),
+        (CORRELATED, {"memory": True, "memory_filter": "imm"}, "memory_filter = 'imm' .*one filt"),
+        (REMOTE, {"memory": True, "memory_filter": "adf"}, "memory_filter = 'adf' .*one filter"),
+    ],
+)  # fmt: skip
+def test_what_has_no_meaning_is_refused(env_id: str, options: Any, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message) as caught:
+        fusion_gym.make_task(env_id, **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_sensor_by_itself_cannot_send_the_coordinators_estimate() -> None:
+    options = {"memory": True, "packet": "estimate"}
+    message = "packet = 'estimate' .*local view.* 'measurement'"
+    for make in (
+        lambda: fusion_gym.make_sb3_vec_env(CORRELATED, 2, local=True, **options),
+        lambda: fusion_gym.parallel_env(CORRELATED, **options),
+        lambda: fusion_gym.make_policy(
+            "value_of_information:own=true", fusion_gym.make_task(CORRELATED, **options)
+        ),
+    ):
+        with pytest.raises(ConfigurationError, match=message):
+            make()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "broadcast"),
+    [(TOBIT, "estimate"), (CORRELATED, "none"), (JUMP, "none"), (INPUT, "none"), (REMOTE, "none")],
+)
+def test_nodes_hear_by_default_what_the_papers_let_them_hear(env_id: str, broadcast: str) -> None:
+    task: Task = fusion_gym.make_task(env_id)
+    assert task.broadcast == broadcast
+    assert (task.memory, task.packet, task.shadow) == (False, "measurement", None)
+    assert EpisodeBatch(task, 1).shadows is None
