@@ -88,9 +88,7 @@ def test_a_price_is_a_threshold_in_the_rewards_units(own: bool) -> None:
     asked = ValueOfInformation(task, price=price, own=own)(signals)
     share(asked)
     for sensor, cost in enumerate(costs):
-        threshold = (
-            price * cost / (7.0 * task.reward.state_weights.mean() / task.reward.error_weight)
-        )
+        threshold = price * cost / (7.0 * task.reward.state_weights.mean())
         other = ValueOfInformation(task, threshold=threshold, own=own)(signals)
         np.testing.assert_array_equal(asked[sensor], other[sensor])
 

@@ -20,10 +20,13 @@ import fusion_gym
 from fusion_gym import zoo
 from fusion_gym.arrays import merge_runs, take_runs
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.beliefs import Beliefs
+from fusion_gym.core.memory import Memory, Owner, Shadows
+from fusion_gym.core.signals import MEMORY_SIGNALS
 from fusion_gym.core.system import Knowledge, Signals, covers
 from fusion_gym.core.task import Task
 from fusion_gym.policies import registry
-from fusion_gym.policies.base import Policy, Rule
+from fusion_gym.policies.base import Policy, Rule, owner_of
 from fusion_gym.policies.registry import make_policy, policy_names, register_policy
 from fusion_gym.validation import ConfigurationError
 
@@ -47,12 +50,34 @@ ENVIRONMENTS: dict[str, tuple[str, Values]] = {
         {"sensors": 2, "cost_weight": 0.3, "access": "single", "noise_deviation": (1.0, 1.5)},
     ),
 }
+# What a sensor remembers and hears, and what a coordinator does.
+REMEMBERING: dict[str, tuple[str, Values]] = {
+    "tobit, memory": ("TobitOscillator-v0", {"filter": "tobit", "memory": True}),
+    "biased, memory, estimates": ("BiasedTracking-v0", {"memory": True, "packet": "estimate"}),
+    "correlated, memory, told": (
+        "CorrelatedTracking-v0",
+        {"token_rate": 1.0, "memory": True, "broadcast": "estimate"},
+    ),
+    "correlated, memory, overheard": (
+        "CorrelatedTracking-v0",
+        {"token_rate": 1.0, "memory": True, "broadcast": "packets"},
+    ),
+    "correlated, told": ("CorrelatedTracking-v0", {"token_rate": 1.0, "broadcast": "estimate"}),
+    "remote, losses, memory": (
+        "RemoteEstimation-v0",
+        {"sensors": 2, "channel": "gilbert_elliott", "memory": True},
+    ),
+}
+# Policies that look at what is believed are tried where that differs.
+BELIEVING = ("estimate_difference", "kullback_leibler", "value_of_information")
+BELIEVED = (*REMEMBERING, "tobit", "tobit, centre", "correlated", "remote, one link")
 POLICIES: dict[str, list[str]] = {
     "adaptive_innovation": ["", "threshold=3,sensitivity=0.9", "sensitivity=0"],
     "adaptive_threshold": ["", "scale=20,rho_initial=0", "rho_bar=0.5,rho_initial=0.5"],
     "always": [""],
     "centre_variance": ["threshold=0.5", "threshold=0.5,at_most=1"],
     "dynamic_event": ["threshold=1,decay=0.9", "threshold=0.3,decay=0"],
+    "estimate_difference": ["threshold=0.3", "threshold=1,whitened=true,own=true"],
     "information_gain": ["threshold=0.1", "threshold=0.02,at_most=none"],
     "innovation_threshold": [
         "",
@@ -60,6 +85,7 @@ POLICIES: dict[str, list[str]] = {
         "threshold=0.5,at_most=1",
         "threshold=0.3,whitened=true,at_most=2",
     ],
+    "kullback_leibler": ["threshold=0.3,at_most=1", "threshold=0.3,own=true"],
     "local_variance": ["", "m=0.3"],
     "lookahead": ["price=0.02,steps=1"],
     "model": [f"{zoo.model_path('tobit_oscillator_sensors')}"],
@@ -72,6 +98,11 @@ POLICIES: dict[str, list[str]] = {
     "round_robin": ["", "period=2"],
     "send_on_delta": ["", "threshold=0.4"],
     "stochastic_event": ["", "weight=0.4,whitened=true"],
+    "value_of_information": [
+        "threshold=0.03,at_most=1",
+        "price=0.003,steps=3",
+        "threshold=0.03,own=true",
+    ],
     "variance_threshold": ["threshold=0.2", "threshold=0.4,at_most=none"],
     "whittle": ["", "at_most=1"],
     "zoo": [f"tobit_oscillator_{mode}" for mode in ("sensors", "local", "centre")],
@@ -82,30 +113,109 @@ TOLD = (*CLOCK, "tokens", "price")
 
 @functools.cache
 def task_of(name: str) -> Task:
-    env_id, options = ENVIRONMENTS[name]
+    env_id, options = (ENVIRONMENTS | REMEMBERING)[name]
     return fusion_gym.make_task(f"fusion_gym/{env_id}", **options)
 
 
 # --- other values of what must not matter -------------------------------------------------------
 
 
-def read(signals: Signals) -> Values:
-    return {name: signals[name] for name in signals}
+class Believed:
+    """Beliefs as plain arrays (…, N), so that some of them can be changed."""
+
+    parts = ("difference", "best", "silent", "sent")
+
+    def __init__(self, values: Values) -> None:
+        self.values = values
+
+    @classmethod
+    def of(cls, beliefs: Any, steps: int) -> Believed:
+        """All that a policy may ask of beliefs, over so many steps."""
+        values = {name: getattr(beliefs, name) for name in cls.parts}
+        return cls(values | {"value": beliefs.value(steps), "loss": beliefs.loss(steps)})
+
+    def with_each(self, change: Callable[..., Any], *others: Believed) -> Believed:
+        """``change`` of every array, and of the others' of the same name."""
+        result: Values = {}
+        for name, value in self.values.items():
+            parts = (value, *(other.values[name] for other in others))
+            if isinstance(value, tuple):
+                result[name] = type(value)(*(change(*same) for same in zip(*parts, strict=True)))
+            else:
+                result[name] = change(*parts)
+        return Believed(result)
+
+    def __getattr__(self, name: str) -> Any:
+        if name in self.parts:
+            return self.values[name]
+        raise AttributeError(name)
+
+    def value(self, steps: int = 1) -> Any:
+        """As of the beliefs."""
+        return self.values["value"]
+
+    def loss(self, steps: int = 1) -> Any:
+        """As of the beliefs."""
+        return self.values["loss"]
 
 
-def moved_otherwise(batch: EpisodeBatch, rng: np.random.Generator) -> EpisodeBatch:
-    """The same history, but the last move and all new measurements are made of other noise."""
+def read(signals: Signals, policy: Any) -> Values:
+    """All signals; what is believed only for a policy that looks at it, for it takes long."""
+    beliefs = ("beliefs", "own_beliefs", *(signal.name for signal in MEMORY_SIGNALS))
+    believes, steps = owner_of(policy) is not None, getattr(policy, "steps", 1)
+    found: Values = {name: signals[name] for name in signals if believes or name not in beliefs}
+    return {n: Believed.of(v, steps) if isinstance(v, Beliefs) else v for n, v in found.items()}
+
+
+def with_shadows(batch: EpisodeBatch, state: Any, shadows: Shadows | None) -> EpisodeBatch:
+    """The batch with another state and memory."""
     result = copy.copy(batch)
-    if batch.delivered is not None:
-        noise = rng.standard_normal((batch.task.system.noise_channels, batch.num_envs))
-        result.state = batch.task.system.sense(batch.delivered, noise)
+    result.state, result.shadows, result._beliefs = state, shadows, None
+    return result
+
+
+def moved_otherwise(
+    batch: EpisodeBatch, remembered: Shadows | None, rng: np.random.Generator
+) -> EpisodeBatch:
+    """The same history, but the last move and all new measurements are made of other noise.
+
+    ``remembered`` is what there was before the last move.
+    """
+    if batch.delivered is None:
+        return batch
+    noise = rng.standard_normal((batch.task.system.noise_channels, batch.num_envs))
+    shadows = None if remembered is None else batch.memory.sense(remembered, noise)
+    return with_shadows(batch, batch.task.system.sense(batch.delivered, noise), shadows)
+
+
+def forgotten(batch: EpisodeBatch) -> EpisodeBatch:
+    """Without what was measured and not sent."""
+    task = dataclasses.replace(batch.task, shadow=None)
+    shadows = None if batch.shadows is None else Shadows(alone=batch.shadows.alone)
+    result = with_shadows(batch, batch.state, shadows)
+    result.memory = Memory(task, batch.memory.owner)
     return result
 
 
 def with_other_truth(batch: EpisodeBatch, rng: np.random.Generator) -> EpisodeBatch:
     """All that the system's visible state hides is changed: the truth, coming losses."""
-    state = batch.state
-    visible = batch.task.system.visible(state)
+    system, kept = batch.task.system, batch.shadows
+    state, shadows = tampered(system, batch.state, rng), kept
+    if kept is not None:
+        shadow = batch.task.shadow
+        shadows = Shadows(
+            tampered(shadow, kept.every, rng),
+            tampered(shadow, kept.own, rng),
+            tampered(system, kept.alone, rng),
+        )
+    return with_shadows(batch, state, shadows)
+
+
+def tampered(system: Any, state: Any, rng: np.random.Generator) -> Any:
+    """A state with other values of what the visible one hides."""
+    if state is None:
+        return None
+    visible = system.visible(state)
     changed = {}
     for field in dataclasses.fields(state):
         value = getattr(state, field.name)
@@ -114,13 +224,12 @@ def with_other_truth(batch: EpisodeBatch, rng: np.random.Generator) -> EpisodeBa
         if value.dtype == np.bool_:
             changed[field.name] = ~value
         elif value.dtype == np.float64:
-            changed[field.name] = value + rng.standard_normal(value.shape)
+            other = rng.standard_normal(value.shape)
+            changed[field.name] = value * np.exp(other) if (value > 0.0).all() else value + other
         else:
             changed[field.name] = np.roll(value, 1, axis=-1)
     assert changed
-    result = copy.copy(batch)
-    result.state = dataclasses.replace(state, **changed)
-    return result
+    return dataclasses.replace(state, **changed)
 
 
 def other_runs(values: Values, rng: np.random.Generator) -> Values:
@@ -129,6 +238,9 @@ def other_runs(values: Values, rng: np.random.Generator) -> Values:
     for name, value in values.items():
         if name == "model":
             result[name] = value
+            continue
+        if isinstance(value, Believed):
+            result[name] = value.with_each(lambda array: np.roll(1.5 * array, 1, axis=-1))
             continue
         rolled = np.roll(value, 1, axis=0 if name == "observation" else -1)
         if rolled.dtype == np.bool_:
@@ -141,12 +253,21 @@ def other_runs(values: Values, rng: np.random.Generator) -> Values:
 
 def of_sensor(sensor: int, true: Values, other: Values, batch: EpisodeBatch) -> Values:
     """``true`` where the sensor knows it by itself or everyone is told, ``other`` elsewhere."""
-    declared = {signal.name: signal.axes for signal in batch.task.system.signals}
+    own = [signal for signal in MEMORY_SIGNALS if signal.knowledge == "own_memory"]
+    signals = (*batch.task.system.signals, *own)
+    declared = {signal.name: signal.axes for signal in signals if signal.name in true}
+
+    def with_own(all_other: Any, all_true: Any) -> Any:
+        result = all_other.copy()
+        result[sensor] = all_true[sensor]
+        return result
+
     result = {name: true[name] if name in TOLD else other[name] for name in true}
     for name, value in true.items():
         if name in ("admitted", "grantable") or declared.get(name, "").startswith("(sensors"):
-            result[name] = result[name].copy()
-            result[name][sensor] = value[sensor]
+            result[name] = with_own(result[name], value)
+        elif name == "own_beliefs":
+            result[name] = other[name].with_each(with_own, value)
     known = [entry.told or entry.sensor == sensor for entry in batch.layout.entries]
     result["observation"] = np.where(known, true["observation"], other["observation"])
     return result
@@ -158,6 +279,10 @@ def in_runs(runs: np.ndarray[Any, Any], true: Values, other: Values) -> Values:
     for name, value in true.items():
         if name == "observation":
             result[name] = merge_runs(value.T, other[name][runs].T, runs).T
+        elif isinstance(value, Believed):
+            result[name] = value.with_each(
+                lambda array, another: merge_runs(array, another[..., runs], runs), other[name]
+            )
         elif name == "model":
             result[name] = merge_runs(value, take_runs(other[name], runs), runs)
         elif name not in CLOCK:
@@ -200,7 +325,8 @@ def may_matter(knowledge: Knowledge) -> set[str]:
 def what_matters(policy: Policy, task: Task) -> set[str]:
     """Play episodes with the policy and see which changes move its copies' requests."""
     rng, seed = np.random.default_rng(1), 3
-    batch = EpisodeBatch.seeded(task, RUNS, seed)
+    batch = EpisodeBatch.seeded(task, RUNS, seed, owner_of(policy))
+    remembered = None
     timed, blind, forgetful, honest, *alone = (
         copy.deepcopy(policy) for _ in range(4 + task.sensors)
     )
@@ -215,8 +341,8 @@ def what_matters(policy: Policy, task: Task) -> set[str]:
     for step in range(STEPS):
         signals = batch.signals()
         asked = policy(signals)
-        elsewhere = moved_otherwise(batch, rng)
-        true, other = read(batch.signals()), read(elsewhere.signals())
+        elsewhere = moved_otherwise(batch, remembered, rng)
+        true, other = (read(one.signals(), policy) for one in (batch, elsewhere))
         foreign = other_runs(other, rng)
         clock = {name: true[name] if name in CLOCK else foreign[name] for name in true}
         compare(ANYTHING, timed(Signals(clock)), asked)
@@ -225,7 +351,10 @@ def what_matters(policy: Policy, task: Task) -> set[str]:
         for sensor, each in enumerate(alone):
             answer = each(Signals(of_sensor(sensor, true, foreign, batch)))
             compare(OTHERS, answer[sensor], asked[sensor])
-        granted = batch.step(asked).granted
+        if task.shadow is not None:
+            compare(PAST, copy.deepcopy(forgetful)(forgotten(batch).signals()), asked)
+        believed, granted = batch.beliefs(), batch.step(asked).granted
+        remembered = batch.memory.deliver(believed, granted)
         if step % 2 == 0:
             compare(PAST, forgetful(signals), asked)
         else:
@@ -238,7 +367,7 @@ def what_matters(policy: Policy, task: Task) -> set[str]:
 def tried(name: str) -> list[tuple[str, Knowledge, set[str]]]:
     """(where and what, declared class, what matters) of a policy in all environments."""
     results = []
-    for place in ENVIRONMENTS:
+    for place in BELIEVED if name in BELIEVING else ENVIRONMENTS:
         for text in POLICIES[name]:
             spec = f"{name}:{text}" if text else name
             try:
@@ -278,8 +407,13 @@ def test_its_class_is_the_least(name: str) -> None:
 class Liar(Rule):
     """Requests where a number is positive, and declares whatever it likes."""
 
-    def __init__(self, knowledge: Knowledge, number: Callable[[Signals], Any]) -> None:
-        self.declared, self.number = knowledge, number
+    def __init__(
+        self,
+        knowledge: Knowledge,
+        number: Callable[[Signals], Any],
+        remember: Owner | None = None,
+    ) -> None:
+        self.declared, self.number, self.remember = knowledge, number, remember
 
     @property
     def knowledge(self) -> Knowledge:
@@ -313,6 +447,19 @@ LIARS: dict[str, tuple[Liar, str]] = {
     "sees_the_centre": (Liar("own", lambda s: s["prior_mean"][0]), OTHERS),
     "remembers": (Rememberer("own", lambda s: 0.0), PAST),
     "remembers_all": (Rememberer("coordinator", lambda s: 0.0), PAST),
+    "keeps_what_it_measured": (Liar("own", lambda s: s["own_value"] - 0.1, "own"), PAST),
+    "keeps_what_all_measured": (
+        Liar("coordinator", lambda s: s["transmission_value"] - 0.1, "coordinator"),
+        PAST,
+    ),
+    "believes_with_others": (
+        Liar("own_memory", lambda s: s["own_value"][::-1] - 0.1, "own"),
+        OTHERS,
+    ),
+    "remembers_with_all": (
+        Liar("own_memory", lambda s: s["transmission_value"] - 0.1, "coordinator"),
+        OTHERS,
+    ),
     "knows_the_truth": (Liar("coordinator", lambda s: dug_up(s, "truth")), HIDDEN),
     "knows_losses": (Liar("coordinator_memory", lambda s: dug_up(s, "lost")), HIDDEN),
 }
@@ -329,6 +476,8 @@ def test_a_policy_that_lies_is_caught(name: str) -> None:
     liar, what = LIARS[name]
     register_policy(name, lambda: copy.deepcopy(liar))
     task = task_of("remote, losses" if name == "knows_losses" else "tobit")
+    if liar.remember is not None:
+        task = task_of("tobit, memory")
     found = what_matters(make_policy(name, task), task)
     assert what in found
     assert what not in may_matter(liar.knowledge)
@@ -375,7 +524,8 @@ def test_a_maker_is_given_the_task_and_says_what_is_missing() -> None:
 
     register_policy("gains", make, "reference")
     assert policy_names("reference") == [
-        "gains", "lookahead", "optimal", "periodic_optimum", "whittle",
+        "estimate_difference", "gains", "kullback_leibler", "lookahead", "optimal",
+        "periodic_optimum", "value_of_information", "whittle",
     ]  # fmt: skip
     policy: Any = make_policy("gains:gain=2", task_of("tobit"))
     assert policy.number(None) == 2

@@ -15,7 +15,7 @@ from fusion_gym.core.access import access_mask, first_request
 from fusion_gym.core.beliefs import Beliefs, Shadows
 from fusion_gym.core.memory import Memory, Owner
 from fusion_gym.core.observation import Network, ObservationLayout
-from fusion_gym.core.signals import memory_signals
+from fusion_gym.core.signals import memory_signals, missing_signals
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 
@@ -242,8 +242,9 @@ class EpisodeBatch:
             "observation": self.observe,
             "model": lambda: system.visible(state),
         }
-        values |= memory_signals(self.memory.owner, self.beliefs)
-        return Signals(values, self.task.hidden_signals)
+        owner = self.memory.owner
+        values |= memory_signals(owner, self.beliefs)
+        return Signals(values, self.task.hidden_signals, missing_signals(owner))
 
     def snapshot(self) -> dict[str, Any]:
         """Where all runs are, without the task, for :meth:`restore`; valid until the next step."""

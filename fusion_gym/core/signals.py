@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
-
 from fusion_gym.core.beliefs import Beliefs
 from fusion_gym.core.memory import Owner
-from fusion_gym.core.system import Signal, SignalError
+from fusion_gym.core.system import Signal
 
 # Knowledge as in a task with memory; without it these need no more than "coordinator" and "own".
 MEMORY_SIGNALS = (
@@ -30,27 +28,26 @@ MEMORY_SIGNALS = (
 )
 
 
+_OWN = ("own_beliefs", "own_difference", "own_value")
+_EVERY = ("beliefs", "belief_difference", "transmission_value")
+
+
 def memory_signals(owner: Owner, beliefs: Callable[[], Beliefs]) -> Mapping[str, Callable[[], Any]]:
-    """The values of ``MEMORY_SIGNALS``, and the beliefs themselves for policies that plan.
+    """The values of those of ``MEMORY_SIGNALS`` that are the owner's, and the beliefs themselves.
 
-    Those of the other owner than the batch's raise a :class:`SignalError` when looked at.
+    The latter are for policies that plan.
     """
+    if owner == "own":
+        values = (beliefs, lambda: beliefs().difference, lambda: beliefs().value())
+        return dict(zip(_OWN, values, strict=True))
+    values = (beliefs, lambda: beliefs().difference[0], lambda: beliefs().value())
+    return dict(zip(_EVERY, values, strict=True))
 
-    def missing() -> Any:
-        raise SignalError(
-            "this batch does not keep what these beliefs need: a policy that looks at what is "
-            "believed declares whose beliefs as an attribute, remember = 'coordinator' or 'own'"
-        )
 
-    own = {
-        "own_beliefs": beliefs,
-        "own_difference": lambda: beliefs().difference,
-        "own_value": lambda: beliefs().value(),
-    }
-    every = {
-        "beliefs": beliefs,
-        "belief_difference": lambda: np.asarray(beliefs().difference[0]),
-        "transmission_value": lambda: beliefs().value(),
-    }
-    other = every if owner == "own" else own
-    return own | every | dict.fromkeys(other, missing)
+def missing_signals(owner: Owner) -> Mapping[str, str]:
+    """What is believed by others than the owner of a batch's memory, and why it is not there."""
+    why = (
+        "is not there, for this batch does not keep what it needs: a policy that looks at what is "
+        "believed declares whose beliefs as an attribute, remember = 'coordinator' or 'own'"
+    )
+    return {name: f"signal {name!r} {why}" for name in (_EVERY if owner == "own" else _OWN)}

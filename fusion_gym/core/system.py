@@ -157,7 +157,8 @@ class Signals(Mapping[str, SignalArray]):
     """The signals of one step, in physical units, batch axis last.
 
     A value may be given as a function; it is then computed when first looked at. ``hidden`` names
-    the signals that exist but that the environment's information mode withholds.
+    the signals that exist but that the environment's information mode withholds, ``missing`` those
+    that are not kept, and why.
 
     Raises:
         SignalError: (on access) an unknown or a withheld signal; the message says which.
@@ -167,16 +168,18 @@ class Signals(Mapping[str, SignalArray]):
         self,
         values: Mapping[str, SignalArray | Callable[[], SignalArray]],
         hidden: Sequence[str] = (),
+        missing: Mapping[str, str] | None = None,
     ) -> None:
         self._values = dict(values)
-        self._hidden = frozenset(hidden)
+        self._withheld = dict(missing or {}) | {
+            name: f"signal {name!r} is known to the sensors only; information='centre' withholds "
+            "it (use information='sensors', or a policy that looks at the centre's signals)"
+            for name in hidden
+        }
 
     def __getitem__(self, name: str) -> SignalArray:
-        if name in self._hidden:
-            raise SignalError(
-                f"signal {name!r} is known to the sensors only; information='centre' withholds it "
-                "(use information='sensors', or a policy that looks at the centre's signals)"
-            )
+        if name in self._withheld:
+            raise SignalError(self._withheld[name])
         try:
             value = self._values[name]
         except KeyError:
@@ -188,10 +191,10 @@ class Signals(Mapping[str, SignalArray]):
         return value
 
     def __contains__(self, name: object) -> bool:
-        return name in self._values and name not in self._hidden
+        return name in self._values and name not in self._withheld
 
     def __iter__(self) -> Iterator[str]:
-        return (name for name in self._values if name not in self._hidden)
+        return (name for name in self._values if name not in self._withheld)
 
     def __len__(self) -> int:
         return sum(1 for _ in self)

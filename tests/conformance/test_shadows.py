@@ -17,6 +17,8 @@ from meanings import Seen, arrival
 from fusion_gym.arrays import take_runs
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.memory import Owner, Shadows
+from fusion_gym.core.signals import MEMORY_SIGNALS
+from fusion_gym.core.system import SignalError
 from fusion_gym.core.task import Task
 from fusion_gym.envs.views import SensorView
 from fusion_gym.fusion.intersection import covariance_intersection
@@ -186,6 +188,24 @@ def test_a_sensors_entries_hold_what_their_names_say(setting: Setting) -> None:
                 shown = 2 * np.sign(one) * np.sqrt(abs(one) / (weights * spread).sum())
                 close(row[f"own_value[{name}]"], np.clip(shown, -20, 20), 1e-6)
         runs.company.step(wanted)
+
+
+@pytest.mark.parametrize("owner", ["coordinator", "own"])
+@each(WITH)
+def test_what_is_believed_is_offered_to_whom_it_is_kept_for(setting: Setting, owner: Owner) -> None:
+    """With the axes that are declared; the others' is missed by name."""
+    task = setting.task()
+    signals = begun(task, [1, 2], owner).signals()
+    sizes = {"N": 2, "sensors": task.sensors, "n": len(task.system.state_names)}
+    for signal in MEMORY_SIGNALS:
+        theirs = signal.knowledge == f"{owner}_memory"
+        assert (signal.name in set(signals)) == (signal.name in signals) == theirs
+        if theirs:
+            axes = signal.axes.strip("()").split(", ")
+            assert signals[signal.name].shape == tuple(sizes[axis] for axis in axes)
+            continue
+        with pytest.raises(SignalError, match=rf"'{signal.name}' .* remember = 'coordinator'"):
+            signals[signal.name]
 
 
 def close(found: Array, expected: Array, size: float = 1e-9) -> None:

@@ -224,7 +224,7 @@ class RemoteEstimationSystem:
         self, state: RemoteEstimationState, packets: NDArray[np.bool_]
     ) -> RemoteEstimationState:
         """The state in which these packets (sensors, N), if they are sent now, are not lost."""
-        return replace(state, lost=state.lost & ~packets) if self.channel.loses else state
+        return replace(state, lost=state.lost & ~packets)
 
     def truth(self, state: RemoteEstimationState) -> Array:
         """The sources (n, N)."""
