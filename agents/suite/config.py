@@ -55,19 +55,20 @@ class Tuning(Strict):
 
     Each of ``seeds`` searches runs by itself, on ``episodes`` episodes of its own from ``seed`` on:
     ``trials`` policies over the whole range, then ``refined`` at each of ``prices`` prices of the
-    setting's range, for the least error plus price times tokens. What lies within ``near`` (a share
+    setting's range, for the least error plus price times tokens, both times the number of
+    parameters (3 at most; one of each sensor counts as one of each sensor). What lies within ``near`` (a share
     of the error) of a search's lower envelope, its ``finalists`` at most beside the envelope's own
     policies, is run again on the episodes of all searches.
     """
 
-    trials: Positive = 24
+    trials: Positive = 12
     prices: Positive = 8
-    refined: Positive = 4
-    episodes: Positive = 128
+    refined: Positive = 1
+    episodes: Positive = 80
     seeds: Positive = 3
     seed: int = pydantic.Field(default=600_000_000, ge=0)
     near: Share = 0.02
-    finalists: Positive = 12
+    finalists: Positive = 8
 
 
 class Genie(Strict):
@@ -169,7 +170,7 @@ QUICK: dict[str, Any] = {
     "timesteps": 600_000,
     "prices": 5,
     "hindsight_episodes": 10,
-    "tuning": {"trials": 8, "prices": 4, "refined": 1, "episodes": 64, "seeds": 2},
+    "tuning": {"trials": 4, "prices": 4, "refined": 1, "episodes": 32, "seeds": 2},
 }
 
 

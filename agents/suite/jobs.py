@@ -46,6 +46,14 @@ class Folders:
     results: Path
     work: Path
 
+    @classmethod
+    def chosen(cls, results: Path | None, work: Path | None, quick: bool) -> Folders:
+        """The folders that a command line names, or those of the full or the quick benchmark."""
+        return cls(
+            results or Path("results/quick" if quick else "results"),
+            work or Path("runs/benchmark/quick" if quick else "runs/benchmark/full"),
+        )
+
     def report(self, job: Job) -> Path:
         """The JSON of a job."""
         return self.results / f"{job.place}.json"

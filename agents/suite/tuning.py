@@ -16,7 +16,6 @@ from optuna.distributions import (
     IntDistribution,
 )
 
-from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.beside import Brief, run_beside
 from fusion_gym.evaluation.envelope import EnvelopePoint, height, lower_hull
@@ -26,6 +25,7 @@ from .config import Choices, Family, Range, Tuning
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 _RUNS = 1024  # beside each other; fixed, so that results do not depend on the machine
+_MOST = 3  # parameters of a rule that multiply its trials
 _WORST = 1e300  # the error of a policy whose error is no number
 
 
@@ -142,11 +142,12 @@ def search(
         for text, brief in zip(new, briefs, strict=True):
             tried[text] = Trial(text, texts[text], *_means(brief))
 
-    run(first_values(family, tuning.trials if space else 1, task.sensors, seed))
+    effort = min(len(space), _MOST)
+    run(first_values(family, max(effort * tuning.trials, 1), task.sensors, seed))
     if not space:
         return list(tried.values())
     slopes = [error_per_rate(task, price) for price in np.geomspace(*price_range, tuning.prices)]
-    for turn in range(tuning.refined):
+    for turn in range(effort * tuning.refined):
         run(
             ask(space, list(tried.values()), slope, [seed, turn, place])
             for place, slope in enumerate(slopes)
