@@ -20,9 +20,9 @@ import fusion_gym
 from agents import benchmark, report, solved, tune, zoo
 from agents.output.files import load_results, save_results
 from agents.suite import jobs
-from agents.suite.config import COMPARED_UP_TO, Choices, Family, Range, Tuning, load_suite
-from agents.suite.tuning import suggest
-from agents.suite.tuning import tune as tune_family
+from agents.suite.config import Choices, Family, Range, Tuning, load_suite
+from agents.suite.tuning import first_values, policy_text, search
+
 from agents.training.algorithms import PPOConfig
 from fusion_gym.core.system import covers, least_covering
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes

@@ -37,7 +37,7 @@ class Choices(Strict):
 
 
 class Family(Strict):
-    """A rule with parameters to tune; ``policy`` may fix others (``value_of_information:own=true``).
+    """A rule with parameters to tune; ``policy`` may fix others (``paced:rate=0.1``).
 
     ``tuned_in`` says where: ``"setting"`` once in each setting, for what the rule looks at depends
     neither on memory nor on what is broadcast; ``"sensors"`` or ``"local"`` anew in each class of
@@ -56,9 +56,9 @@ class Tuning(Strict):
     Each of ``seeds`` searches runs by itself, on ``episodes`` episodes of its own from ``seed`` on:
     ``trials`` policies over the whole range, then ``refined`` at each of ``prices`` prices of the
     setting's range, for the least error plus price times tokens, both times the number of
-    parameters (3 at most; one of each sensor counts as one of each sensor). What lies within ``near`` (a share
-    of the error) of a search's lower envelope, its ``finalists`` at most beside the envelope's own
-    policies, is run again on the episodes of all searches.
+    parameters, 3 at most (one for each sensor counts as many). The policies on a search's lower
+    envelope, and those within ``near`` (a share of the error) of it up to ``finalists`` in all, are
+    run again on the episodes of all searches.
     """
 
     trials: Positive = 12

@@ -63,7 +63,8 @@ def text_of(results: Path, command: str) -> str:
         "that remember nothing, of those that do, of one improvement on the best rule (rollout), "
         "and a lower bound; – where there is none.",
         "",
-        "| setting | class | rate | envelope before | envelope now | with memory | rollout | bound |",
+        "| setting | class | rate | envelope before | envelope now | with memory | rollout "
+        "| bound |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for envelopes in found:
@@ -78,9 +79,8 @@ def rows_of(envelopes: dict[str, Any], results: Path) -> Iterator[str]:
     """A setting's rows."""
     name, classes = envelopes["setting"], envelopes["classes"]
     rates = [round(share * envelopes["always"], 4) for share in SHARES]
-    beside = {
-        kind: measured(results / kind / f"{name}.json", name) for kind in ("rollout", "bounds")
-    }
+    rollout = measured(results / "rollout" / f"{name}.json", name)
+    bound = measured(results / "bounds" / f"{name}.json", name)
     baselines = results / name / "baselines.json"
     before = read(Baselines, baselines, "results") if baselines.exists() else None
     pairs = {(content["mode"], content["broadcast"]) for content in classes.values()}
@@ -99,7 +99,7 @@ def rows_of(envelopes: dict[str, Any], results: Path) -> Iterator[str]:
         )
         default = mode != "local" or broadcast == envelopes["inputs"]["broadcasts"][0]
         old = old_hull(before, mode) if before and default else []
-        own = [beside["rollout"], beside["bounds"]] if mode == "sensors" else [[], beside["bounds"]]
+        own = [rollout if mode == "sensors" else [], bound]
         label = mode if broadcast is None else f"{mode}, {broadcast}"
         for rate in rates:
             cells = [cell(hull, rate) for hull in (old, plain, remembering, *own)]
@@ -147,11 +147,9 @@ def measured(path: Path, setting: str) -> list[EnvelopePoint]:
 
 def cell(points: list[EnvelopePoint], rate: float) -> str:
     """The error at a rate between the points, or a dash."""
-    if not points or not points[0].rate <= rate <= points[-1].rate:
-        # An envelope goes on to the right of its last policy; what was computed point by point
-        # does not, and of the two only an envelope begins at a rate of zero.
-        if not points or rate < points[0].rate or points[0].rate > 0.0:
-            return "–"
+    computed = bool(points) and points[0].rate > 0.0  # point by point: it ends with the last one
+    if not points or (computed and rate > points[-1].rate):
+        return "–"
     found = height(points, rate)
     return "–" if found is None else f"{found:.4g}"
 
