@@ -1,8 +1,10 @@
-"""The benchmark of policies: tuned baselines, learned fronts and references in every setting.
+"""The benchmark of policies: tuned envelopes, learned fronts and references in every setting.
 
     python -m agents.benchmark [--envs NAME …] [--modes sensors …] [--quick] [--resume]
 
-Every piece of work (a setting's baselines, one training seed of one agent) writes its JSON into
+Envelopes that are missing are tuned first, as ``python -m agents.envelope`` does; every agent keeps
+the hash of the one that it is compared with. Every piece of work (one training seed of one agent,
+say) writes its JSON into
 the results folder as it is finished, and its episodes into the work folder; ``--resume`` skips
 what is there, if it was made from the same inputs, and goes on with trainings in the work folder,
 whose checkpoints hold pickles. ``python -m agents.report`` makes tables and figures of it.
@@ -10,30 +12,26 @@ whose checkpoints hold pickles. ``python -m agents.report`` makes tables and fig
 
 from __future__ import annotations
 
-import os
 import shlex
 import signal
 import sys
-import time
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import joblib
-from tqdm import tqdm
-
-from fusion_gym.core.system import covers
-from fusion_gym.evaluation.envelope import lower_envelope
+from fusion_gym.evaluation.envelope import points_of
 from fusion_gym.validation import ConfigurationError, choice
 
 from .command_line import Command, spelled, start
 from .input.options import OutputFolder, Steps, Whole, writable_folder
 from .output.files import load_results, read_json, write
-from .suite.config import COMPARED_UP_TO, Setting, Suite, load_suite
-from .suite.jobs import Folders, Job, finished, jobs, setting_task
+from .suite.classes import class_of
+from .suite.committed import FOLDER, complete, present
+from .suite.config import Setting, Suite, load_suite
+from .suite.jobs import Folders, finished, jobs, setting_task
 from .suite.verdict import judge
 from .suite.work import run
+from .suite.workers import Work, side_by_side
 from .training.checked import parse
 
 
@@ -90,10 +88,7 @@ class Benchmark(Command):
 
     def _run(self) -> None:
         suite = self.suite()
-        folders = Folders(
-            self.results or Path("results/quick" if self.quick else "results"),
-            self.work or Path("runs/benchmark/quick" if self.quick else "runs/benchmark/full"),
-        )
+        folders = Folders.chosen(self.results, self.work, self.quick)
         writable_folder("results", folders.results)
         writable_folder("work", folders.work)
         by_name = {setting.name: setting for setting in suite.settings}
@@ -101,21 +96,34 @@ class Benchmark(Command):
         for mode in self.modes:
             choice("modes", mode, suite.modes)
         modes = [mode for mode in suite.modes if not self.modes or mode in self.modes]
-        work = list(jobs(suite, chosen, modes))
         for setting in chosen:
             setting_task(setting)
         with folders.alone():
-            present = sum(folders.hold(job) for job in work)
-            if present and not self.resume:
+            names = [f"{s.name}/*.json" for s in chosen] + [
+                f"{FOLDER}/{s.name}.json" for s in chosen
+            ]
+            there = [path for name in names for path in folders.results.glob(name)]
+            if there and not self.resume:
                 raise ConfigurationError(
-                    f"results = {str(folders.results)!r} holds {present} finished pieces of work: "
-                    "go on with --resume, or give another --results and --work"
+                    f"results = {str(folders.results)!r} holds {len(there)} finished pieces of "
+                    "work: go on with --resume, or give another --results and --work"
                 )
+            for setting in chosen:
+                compared = [class_of(setting, mode).name for mode in suite.modes]
+                complete(suite, [setting], compared, folders.results, folders.work, self.workers)
+            work = jobs(suite, chosen, modes, folders.results)
             # All of the settings' pieces, for the verdict is over all of them.
-            every = jobs(suite, chosen, suite.modes)
+            every = jobs(suite, chosen, suite.modes, folders.results)
             done = [job.place for job in every if finished(job, suite, folders)]
-            left = [job for job in work if job.place not in done]
-            execute(suite, left, folders, self.workers)
+            side_by_side(
+                [
+                    Work(job.weight, run, (job, suite, folders))
+                    for job in work
+                    if job.place not in done
+                ],
+                self.workers,
+                "benchmark",
+            )
             for setting in chosen:
                 conclude(suite, setting, folders)
         report = f"{spelled('report')} --results {folders.results}"
@@ -128,7 +136,8 @@ def conclude(suite: Suite, setting: Setting, folders: Folders) -> dict[str, Any]
     Raises:
         ConfigurationError: results that are damaged or were made from other settings.
     """
-    pieces = [job for job in jobs(suite, [setting], suite.modes) if finished(job, suite, folders)]
+    every = jobs(suite, [setting], suite.modes, folders.results)
+    pieces = [job for job in every if finished(job, suite, folders)]
     reports = {job.name: read_json(folders.report(job), "results") for job in pieces}
     found = {
         job.name: load_results(folders.episodes(job), reports[job.name]["made_from"])
@@ -136,50 +145,29 @@ def conclude(suite: Suite, setting: Setting, folders: Folders) -> dict[str, Any]
     }
     if "baselines" not in found:
         return None
-    every, known = found["baselines"], found.get("references", {})
+    rules, known = found["baselines"], found.get("references", {})
     references = {"sensors": found.get("informed", {}) | known, "centre": known, "local": {}}
-    always = float(every["always"].rate.mean())
+    always = float(rules["always"].rate.mean())
+    classes = present(suite, setting, folders.results)
     verdict: dict[str, Any] = {"setting": setting.name, "title": setting.title, "modes": {}}
     for mode in suite.modes:
         done = [job.name for job in pieces if job.mode == mode]
         if not done:
             continue
-        comparable = {
-            name: every[name]
-            for curve in reports["baselines"]["curves"].values()
-            if covers(COMPARED_UP_TO[mode], curve["knows"])
-            for name in curve["policies"]
-        }
-        agents = [list(found[name].values()) for name in done]
+        name = class_of(setting, mode).name
+        envelope = {vertex["name"]: rules[vertex["name"]] for vertex in classes[name]["vertices"]}
+        agents = [list(found[job].values()) for job in done]
         prices = reports[done[0]]["prices"]
         verdict["modes"][mode] = judge(
-            agents, prices, comparable, references[mode], always, found.get("hindsight", {})
-        ) | {"envelope": [point._asdict() for point in lower_envelope(comparable)]}
+            agents, prices, envelope, references[mode], always, found.get("hindsight", {}),
+            classes[name]["searches"],
+        ) | {
+            "class": name,
+            "sha256": classes[name]["sha256"],
+            "envelope": [point._asdict() for point in points_of(envelope)],
+        }  # fmt: skip
     write(folders.results / setting.name / "verdict.json", verdict)
     return verdict
-
-
-def execute(suite: Suite, work: list[Job], folders: Folders, workers: int) -> None:
-    """Run the jobs on several cores, with an estimate of the remaining time.
-
-    Raises:
-        ConfigurationError: a job does not fit, or the system ended a worker.
-    """
-    total = sum(job.weight for job in work)
-    began = time.perf_counter()
-    with tqdm(total=round(total), desc="benchmark", unit="s of work", smoothing=0.0) as bar:
-        weights = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")(
-            joblib.delayed(run)(job, suite, folders, os.getpid()) for job in work
-        )
-        try:
-            for weight in weights:
-                bar.update(min(weight, bar.total - bar.n))
-        except BrokenProcessPool:
-            raise ConfigurationError(
-                f"workers = {workers}: the system ended one of them, perhaps for want of memory; "
-                "finished pieces of work are kept, go on with --resume"
-            ) from None
-    print(f"{len(work)} pieces of work in {time.perf_counter() - began:.0f} s")
 
 
 def main() -> None:

@@ -24,8 +24,16 @@ from .command_line import Command, spelled, start
 from .input.options import OutputFolder
 from .output import figures
 from .output.files import write_text
+from .suite.committed import FOLDER
 from .suite.reports import read_setting
+from .suite.verdict import RATES
 
+# What is said of verdicts that were made before there were committed envelopes.
+OLDER = (
+    "Rows without a number of prices are older: their envelope was chosen on the test seeds, of "
+    "rules that may remember what a sensor did not send and that were tuned less well, and their "
+    "mean is the interquartile mean over seeds and prices together, which leaves prices out. "
+)
 LEAST_ROOM = 0.05  # below that the share of it that an agent closes says nothing
 MODES = {
     "sensors": "a coordinator that sees all sensors' new signals",
@@ -95,8 +103,9 @@ def summary_table(found: dict[str, dict[str, Any]]) -> list[str]:
     """One row a setting and mode: the middle of the front against the tuned baselines."""
     lines = [
         "| setting | agent | trainings | MSE against the envelope, middle of the front | "
-        "prices above the envelope | room to the reference | share of it closed | in hindsight |",
-        "|---|---|---|---|---|---|---|---|",
+        "prices there | rates of the grid | prices above the envelope | room to the reference | "
+        "share of it closed | in hindsight |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, parts in found.items():
         for mode, front in parts["verdict"]["modes"].items():
@@ -108,10 +117,18 @@ def summary_table(found: dict[str, dict[str, Any]]) -> list[str]:
             lines.append(
                 f"| [{plain(name)}](#{quote(name.replace('_', '-'))}) | {plain(mode)} | "
                 f"{front['seeds']:d} | "
-                f"{share(front.get('middle'))} | {worse} of {asked} | {room} | {closed} | "
+                f"{share(front.get('middle'))} | {reached(front)} | "
+                f"{worse} of {asked} | {room} | {closed} | "
                 f"{ahead} |"
             )
     return lines
+
+
+def reached(front: dict[str, Any]) -> str:
+    """How many prices lie in the middle and how many rates of the grid count, in two cells."""
+    if "rates" not in front:
+        return "– | –"
+    return f"{front['prices']} of {len(front['points'])} | {len(front['rates'])} of {RATES}"
 
 
 def above(front: dict[str, Any]) -> tuple[int, int]:
@@ -222,6 +239,7 @@ def text_of(
 ) -> str:
     """The report in Markdown, made by these two commands."""
     first = next(iter(found.values()))["baselines"]
+    fronts = [front for parts in found.values() for front in parts["verdict"]["modes"].values()]
     lines = [
         "# Results of the benchmark",
         "",
@@ -229,19 +247,23 @@ def text_of(
         f"{first['episodes']:,} test episodes a policy, seeds {first['seed']} to "
         f"{first['seed'] + first['episodes'] - 1:,}, the same noise for all.",
         "",
-        "Every rule's parameters were tuned with one budget of trials on other seeds, for its "
-        "whole curve. An agent is one policy that sees the price of a token, asked at several "
-        "prices, and is compared at its own rate with the lower envelope (convex hull, mixtures "
-        "included) of the rules that know no more than it does, except that a rule may remember "
-        "what a sensor did not send:",
+        "An agent is one policy that sees the price of a token, asked at several prices, and is "
+        "compared at its own rate with the envelope of its class: the lower convex hull, mixtures "
+        "included, of the tuned rules that know no more than it does, chosen on tuning seeds and "
+        "measured on the test seeds, committed with a hash before any agent was trained "
+        f"(`{FOLDER}/`):",
         "",
         *(f"- **{mode}**: {meaning}." for mode, meaning in MODES.items()),
         "",
         "Differences are relative, of the mean squared error: interquartile means over training "
-        "seeds, and over the prices at which the rate is 5 % to 50 % of what always transmitting "
-        "gets, with 95 % intervals bootstrapped over training seeds (stratified by price) and "
-        "paired episodes. A price counts as above the envelope where the whole interval does. "
-        "The reference of a coordinator is a lookahead that knows the model and all sensors' new "
+        f"seeds at each price, and then the plain mean over a grid of {RATES} rates, evenly spaced "
+        "in the logarithm from 5 % to 50 % of what always transmitting gets and as far as the "
+        "front reaches, between prices interpolated in the logarithm of the rate. The 95 % "
+        "intervals resample training seeds, paired episodes, rates and tuning seeds at once. A "
+        "price counts as above the envelope where the whole interval does. "
+        + OLDER
+        * any("rates" not in front for front in fronts)
+        + "The reference of a coordinator is a lookahead that knows the model and all sensors' new "
         "signals, neither an optimum nor a bound, and in remote estimation the optimum itself; "
         "that of the centre is the best of all periodic schedules, where covariances do not depend "
         "on data. "

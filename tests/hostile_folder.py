@@ -31,7 +31,7 @@ SUITE = {
     "num_envs": 2,
     "prices": 2,
     "modes": ["sensors"],
-    "tuning": {"trials": 2, "episodes": 2, "kept": 2},
+    "tuning": {"trials": 2, "prices": 2, "episodes": 2, "seeds": 2},
     "algorithm": TRAINING["algorithm"],
     "families": [],
     "settings": [

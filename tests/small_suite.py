@@ -14,7 +14,7 @@ SMALL: dict[str, Any] = {
     "timesteps": 256,
     "num_envs": 4,
     "prices": 3,
-    "tuning": {"trials": 4, "episodes": 4, "kept": 3},
+    "tuning": {"trials": 4, "prices": 2, "episodes": 4, "seeds": 2},
     "algorithm": {"name": "ppo", "n_steps": 8, "batch_size": 32, "n_epochs": 1},
     "families": [
         {
@@ -37,6 +37,7 @@ SMALL: dict[str, Any] = {
             "title": "a small setting",
             "environment": {"id": ENV, "options": {"filter": "tobit", "horizon": 10}},
             "price_range": [0.001, 0.1],
+            "broadcasts": ["estimate", "packets"],
             "informed": ["lookahead:steps=1,price=0.01", "lookahead:steps=1,price=1e9"],
             "references": ["periodic:period=7"],
             "genie": {"options": {"tokens": "unlimited"}, "assumes": "everything arrives"},

@@ -20,11 +20,11 @@ import fusion_gym
 from agents import benchmark, report, solved, tune, zoo
 from agents.output.files import load_results, save_results
 from agents.suite import jobs
-from agents.suite.config import COMPARED_UP_TO, Choices, Family, Range, Tuning, load_suite
-from agents.suite.tuning import suggest
-from agents.suite.tuning import tune as tune_family
+from agents.suite.classes import classes_of
+from agents.suite.config import load_suite
+from agents.suite.envelopes import searches_of
 from agents.training.algorithms import PPOConfig
-from fusion_gym.core.system import covers, least_covering
+from fusion_gym.core.system import KNOWLEDGE, covers, least_covering
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.periodic_optimum import Schedule
 from fusion_gym.policies.registry import make_policy
@@ -77,6 +77,13 @@ def test_from_tuning_to_report_and_zoo(
     assert (hindsight["episodes"], hindsight["width"]) == (5, 4)
     dear = hindsight["policies"]["hindsight at price 0.1"]["tokens"]["mean"]
     assert dear < hindsight["policies"]["hindsight at price 0.001"]["tokens"]["mean"]
+    # The envelope that an agent was compared with, and that it is one of the agent's inputs.
+    committed = json.loads((results / "envelopes" / "small.json").read_text())["classes"]
+    front = verdict["modes"]["local"]
+    assert front["class"] == "local_estimate"
+    assert front["sha256"] == committed["local_estimate"]["sha256"]
+    kept = json.loads((folder / "agent_local_1.json").read_text())["inputs"]["envelope"]
+    assert kept == {"class": "local_estimate", "sha256": front["sha256"]}
     in_local = {point["name"] for point in verdict["modes"]["local"]["envelope"]}
     assert not any(name.startswith("information_gain") for name in in_local)
     agent = json.loads((folder / "agent_local_1.json").read_text())
@@ -122,9 +129,8 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
         for name in (*setting.points, *setting.informed, *setting.references):
             if name not in optima[1:]:
                 make_policy(name, task)
-        for family in suite.families_of(setting):
-            trial = optuna.create_study().ask()
-            make_policy(suggest(trial, family, task.sensors), task)
+        for one in searches_of(suite, setting, list(classes_of(setting))):
+            one.check()
         if setting.genie is not None:
             fusion_gym.make_task(
                 setting.environment.id, **(setting.environment.options | setting.genie.options)
@@ -134,13 +140,12 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize(
     "path", sorted((ROOT / "results").glob("*/baselines.json")), ids=lambda path: path.parent.name
 )
-def test_agents_were_compared_with_the_rules_that_know_no_more(path: Path) -> None:
-    """What the stored results say of a rule's knowledge decides as the rule's own word does."""
+def test_stored_results_say_what_the_rules_know(path: Path) -> None:
     stored = json.loads(path.read_text())
     task = fusion_gym.make_task(stored["env"], **stored["options"])
     for curve in stored["curves"].values():
         known = least_covering(make_policy(name, task).knowledge for name in curve["policies"])
-        for limit in COMPARED_UP_TO.values():
+        for limit in KNOWLEDGE:
             assert covers(limit, curve["knows"]) == covers(limit, known)
 
 
@@ -166,51 +171,6 @@ def test_trainings_of_the_committed_suite(tmp_path: Path) -> None:
             for key, value in setting.algorithm.items():
                 if key != "batch_size":
                     assert getattr(algorithm, key) == value
-
-
-def test_tuned_policies_are_a_curve() -> None:
-    task = fusion_gym.make_task(ENV, filter="tobit", horizon=20)
-    family = Family(
-        label="x", policy="innovation_threshold",
-        parameters={"threshold": Range(low=0.1, high=5), "whitened": Choices(values=(True, False))},
-    )  # fmt: skip
-    policies = tune_family(task, family, Tuning(trials=12, episodes=30, kept=5))
-    assert 2 <= len(policies) <= 5
-    found = [run_episodes(task, make_policy(p, task), 30, 600_000_000) for p in policies]
-    rates = [r.rate.mean() for r in found]
-    errors = [r.mse.mean() for r in found]
-    assert rates == sorted(rates)
-    assert errors == sorted(errors, reverse=True)
-    assert tune_family(task, family, Tuning(trials=12, episodes=30, kept=5)) == policies
-
-
-def test_tuning_begins_with_values_that_all_sensors_share(monkeypatch: pytest.MonkeyPatch) -> None:
-    task = fusion_gym.make_task(ENV, filter="tobit", horizon=5)
-    space = Range(low=0.1, high=10, per_sensor=True)
-    family = Family(
-        label="x", policy="innovation_threshold",
-        parameters={"threshold": space, "whitened": Choices(values=(True, False))},
-    )  # fmt: skip
-    asked: list[str] = []
-
-    def spy(text: str, task: Any) -> Any:
-        asked.append(text)
-        return make_policy(text, task)
-
-    monkeypatch.setattr("agents.suite.tuning.make_policy", spy)
-    tune_family(task, family, Tuning(trials=24, episodes=2, kept=5))
-    assert len(asked) == 24
-    shared = [text for text in asked[:8] if len(set(thresholds(text))) == 1]
-    assert len(shared) == 8
-    for kind in ("true", "false"):
-        values = [thresholds(t)[0] for t in shared if t.endswith(f"whitened={kind}")]
-        assert len(values) == 4
-        assert np.diff(np.log(values)) == pytest.approx(np.log(100) / 4, rel=1e-3)
-    assert any(len(set(thresholds(text))) > 1 for text in asked[8:])
-
-
-def thresholds(text: str) -> list[float]:
-    return [float(value) for value in text.split(":threshold=")[1].split(",")[0].split("/")]
 
 
 def test_results_survive_the_disk(tmp_path: Path) -> None:

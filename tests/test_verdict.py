@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.suite.verdict import judge
+from agents.suite.verdict import Front, interval, judge
 from fusion_gym.evaluation.episodes import EpisodeResults
 
 
@@ -40,9 +40,18 @@ def test_the_verdict_is_the_arithmetic_that_it_says() -> None:
     assert point["hindsight"] == pytest.approx(0.4 * noise.mean())
     assert verdict["hindsight_room"] == pytest.approx(1.0 - 0.4 / 1.7)
     assert point["envelope"] == pytest.approx(1.7 * noise.mean())
-    assert verdict["middle"]["mean"] == pytest.approx(-0.25)
-    assert verdict["middle"]["low"] == pytest.approx(-0.3)
-    assert verdict["middle"]["high"] == pytest.approx(-0.2)
+    assert point["difference"]["mean"] == pytest.approx(-0.25)
+    assert point["difference"]["low"] == pytest.approx(-0.3)
+    assert point["difference"]["high"] == pytest.approx(-0.2)
+    # The front reaches the last three parts of the grid, from 0.25 on: the first is moved to 0.3.
+    edges = np.geomspace(0.05, 0.5, 11)
+    grid = np.maximum(np.sqrt(edges[:-1] * edges[1:])[-3:], 0.3)
+    assert verdict["rates"] == pytest.approx(grid)
+    assert verdict["prices"] == 1
+    shares = np.log(grid / 0.3) / np.log(0.8 / 0.3)
+    assert verdict["middle"]["mean"] == pytest.approx(
+        np.mean((1 - shares) * -0.25 + shares * (1 / 1.2 - 1))
+    )
     room = 1.7 - 0.5
     assert verdict["room"] == pytest.approx(room / 1.7)
     assert verdict["closed"] == pytest.approx((1.7 - 0.75 * 1.7) / room)
@@ -64,7 +73,7 @@ def test_the_middle_of_the_front_is_from_a_twentieth_to_half_of_always(
         verdict = judge(agents, list(rates), baselines, {}, always=always)
         return verdict["middle"]["mean"] if "middle" in verdict else None
 
-    assert middle(0.049, 0.501) is None
+    assert middle(0.049, 0.501) is None, "no price in the middle"
     assert middle(0.051) == pytest.approx(-0.1)
     assert middle(0.499) == pytest.approx(-0.1)
 
@@ -78,3 +87,67 @@ def test_the_interval_covers_the_difference_between_episodes() -> None:
     deviation = 0.2 * np.sqrt((1 + 0.9**2) / 2000)
     width = (found["high"] - found["low"]) / (2 * 1.96)
     assert width == pytest.approx(deviation, rel=0.1)
+
+
+def front_of(differences: Any, rates: Any) -> Front:
+    """A front of given relative differences (seeds, P) without any noise of episodes."""
+    shares = np.asarray(differences, dtype=np.float64)
+    learned = (1.0 + shares)[..., None] * np.ones(3)
+    own = np.broadcast_to(rates, shares.shape)
+    return Front(learned, np.ones_like(learned), own, np.ones((1, *shares.shape)))
+
+
+def test_no_price_is_trimmed_away() -> None:
+    """Seeds are trimmed at each price; a price that stands out counts as every other one."""
+    differences = np.array([[-0.9, -0.1, -0.1, -0.1]] * 3 + [[-0.9, -0.1, -0.1, 9.0]])
+    rates = np.array([0.1, 0.2, 0.3, 0.4])
+    found = interval(front_of(differences, rates), rates)
+    assert found["mean"] == pytest.approx(np.mean([-0.9, -0.1, -0.1, -0.1]))
+    assert found["low"] < -0.4, "the grid's rates are drawn anew"
+    assert found["high"] > -0.2
+
+
+def test_the_interval_counts_what_tuning_seeds_change() -> None:
+    """The mean stays, and the width is that of the envelope's mean over drawn searches."""
+    shares, rates = np.full((1, 1), -0.2), np.array([0.2])
+    front = front_of(shares, rates)
+    still = interval(front, rates)
+    assert still["low"] == still["high"] == pytest.approx(-0.2)
+    spread = np.array([0.9, 1.0, 1.1])[:, None, None]
+    moved = interval(Front(front.learned, front.envelope, front.rates, spread), rates)
+    assert moved["mean"] == pytest.approx(-0.2)
+    assert moved["low"] == pytest.approx(0.8 / 1.1 - 1.0, abs=0.02)
+    assert moved["high"] == pytest.approx(0.8 / 0.9 - 1.0, abs=0.02)
+
+
+def test_searches_are_compared_at_the_agents_rates() -> None:
+    noise = np.random.default_rng(0).uniform(0.9, 1.1, 60)
+    envelope = {"never": made_up(0.0, 2 * noise), "always": made_up(1.0, noise)}
+    agents = [[made_up(0.2, 1.8 * noise)]]
+    searches = [[(0.0, 1.8), (1.0, 0.9)], [(0.0, 2.2), (1.0, 1.1)]]
+    found = judge(agents, [1.0], envelope, {}, always=1.0, searches=searches)["middle"]
+    assert found["mean"] == pytest.approx(0.0)
+    assert found["low"] == pytest.approx(1 / 1.1 - 1, abs=1e-6)
+    assert found["high"] == pytest.approx(1 / 0.9 - 1, abs=1e-6)
+
+
+def test_one_table_as_rliable_has_it() -> None:
+    """Interquartile means over seeds at each of four prices, and their mean; bootstrapped too."""
+    library = pytest.importorskip("rliable.library")
+    metrics = pytest.importorskip("rliable.metrics")
+    means = np.array([-0.1, -0.09, -0.12, -0.07])
+    shares = np.random.default_rng(3).normal(means, 0.05, (8, 4))
+    rates = np.array([0.1, 0.2, 0.3, 0.4])
+    found = interval(front_of(shares, rates), rates)
+
+    def mean_of_prices(scores: Any) -> Any:
+        columns = [metrics.aggregate_iqm(scores[:, [place]]) for place in range(scores.shape[1])]
+        return np.array([np.mean(columns)])
+
+    point, ends = library.get_interval_estimates(
+        {"agent": shares}, mean_of_prices, reps=2000, task_bootstrap=True, random_state=0
+    )
+    assert found["mean"] == pytest.approx(point["agent"][0])
+    width = ends["agent"][1, 0] - ends["agent"][0, 0]
+    assert found["high"] - found["low"] == pytest.approx(width, rel=0.15)
+    assert (found["low"], found["high"]) == pytest.approx(ends["agent"][:, 0], abs=0.15 * width)

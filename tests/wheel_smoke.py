@@ -34,7 +34,7 @@ SUITE = {
     "num_envs": 4,
     "prices": 2,
     "modes": ["sensors"],
-    "tuning": {"trials": 4, "episodes": 4, "kept": 3},
+    "tuning": {"trials": 4, "prices": 2, "episodes": 4, "seeds": 2},
     "algorithm": {"name": "ppo", "n_steps": 8, "batch_size": 32},
     "families": [
         {"label": "rule", "policy": "paced", "parameters": {"rate": {"low": 0.1, "high": 1}}}
@@ -45,6 +45,7 @@ SUITE = {
             "title": "a small setting",
             "environment": {"id": "fusion_gym/TobitOscillator-v0", "options": {"horizon": 10}},
             "price_range": [0.001, 0.1],
+            "broadcasts": ["estimate"],
         }
     ],
 }

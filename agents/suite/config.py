@@ -7,20 +7,12 @@ from typing import Any, Literal
 
 import pydantic
 
-from fusion_gym.core.system import Knowledge
-
 from ..training.algorithms import AlgorithmConfig, AnyAlgorithm, settings
 from ..training.checked import Positive, Rate, Share, Strict, parse, read_yaml
 from ..training.config import EnvironmentConfig
 
 Mode = Literal["sensors", "centre", "local"]
-# With which rules an agent of this mode is compared: those that know no more than this. Rules may
-# remember what a sensor did not send, and these agents do not: the envelope favours the rules.
-COMPARED_UP_TO: dict[Mode, Knowledge] = {
-    "sensors": "coordinator_memory",
-    "centre": "centre",
-    "local": "own_memory",
-}
+Broadcast = Literal["none", "estimate", "packets"]
 
 
 class Range(Strict):
@@ -45,20 +37,38 @@ class Choices(Strict):
 
 
 class Family(Strict):
-    """A rule with parameters to tune."""
+    """A rule with parameters to tune; ``policy`` may fix others (``paced:rate=0.1``).
+
+    ``tuned_in`` says where: ``"setting"`` once in each setting, for what the rule looks at depends
+    neither on memory nor on what is broadcast; ``"sensors"`` or ``"local"`` anew in each class of
+    the coordinator or of sensors that decide by themselves, for it does.
+    """
 
     label: str
     policy: str
     parameters: dict[str, Range | Choices]
+    tuned_in: Literal["setting", "sensors", "local"] = "setting"
 
 
 class Tuning(Strict):
-    """One budget of trials for every rule, on seeds that no test uses."""
+    """One budget of trials for every rule, on seeds that no test uses.
 
-    trials: Positive = 40
-    episodes: Positive = 200
+    Each of ``seeds`` searches runs by itself, on ``episodes`` episodes of its own from ``seed`` on:
+    ``trials`` policies over the whole range, then ``refined`` at each of ``prices`` prices of the
+    setting's range, for the least error plus price times tokens, both times the number of
+    parameters, 3 at most (one for each sensor counts as many). The policies on a search's lower
+    envelope, and those within ``near`` (a share of the error) of it up to ``finalists`` in all, are
+    run again on the episodes of all searches.
+    """
+
+    trials: Positive = 12
+    prices: Positive = 8
+    refined: Positive = 1
+    episodes: Positive = 80
+    seeds: Positive = 3
     seed: int = pydantic.Field(default=600_000_000, ge=0)
-    kept: Positive = 14
+    near: Share = 0.02
+    finalists: Positive = 8
 
 
 class Genie(Strict):
@@ -80,7 +90,8 @@ class Setting(Strict):
 
     ``informed`` are policies that know the model and all new signals, ``references`` computed
     ones that know no more than the centre. ``longer`` multiplies the length of its trainings,
-    ``price_exponent`` and ``algorithm`` replace the suite's.
+    ``price_exponent``, ``algorithm`` and ``tuning`` replace the suite's. ``broadcasts`` are what a
+    sensor by itself may hear, by rising knowledge, the environment's default first.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
@@ -94,6 +105,8 @@ class Setting(Strict):
     longer: float = pydantic.Field(default=1.0, gt=0)
     price_exponent: Share | None = None
     algorithm: dict[str, Any] = pydantic.Field(default_factory=dict)
+    tuning: dict[str, Any] = pydantic.Field(default_factory=dict)
+    broadcasts: tuple[Broadcast, ...] = pydantic.Field(default=("none",), min_length=1)
     genie: Genie | None = None
     hindsight: Hindsight | None = None
 
@@ -123,6 +136,14 @@ class Suite(Strict):
         """
         return settings(self.algorithm.model_dump() | setting.algorithm)
 
+    def tuning_of(self, setting: Setting) -> Tuning:
+        """The setting's budget of tuning, checked again.
+
+        Raises:
+            ValueError: an entry that is unknown or not allowed.
+        """
+        return Tuning(**(self.tuning.model_dump() | setting.tuning))
+
     def families_of(self, setting: Setting) -> list[Family]:
         """The setting's baselines."""
         names = setting.families
@@ -131,8 +152,11 @@ class Suite(Strict):
     @pydantic.model_validator(mode="after")
     def _named(self) -> Suite:
         labels = [family.label for family in self.families]
+        if len(set(labels)) < len(labels):
+            raise ValueError(f"labels of families must differ: {labels}")
         for setting in self.settings:
             self.algorithm_of(setting)
+            self.tuning_of(setting)
             for name in setting.families or ():
                 if name not in labels:
                     raise ValueError(f"families of {setting.name}: {name!r} is none of {labels}")
@@ -146,7 +170,7 @@ QUICK: dict[str, Any] = {
     "timesteps": 600_000,
     "prices": 5,
     "hindsight_episodes": 10,
-    "tuning": {"trials": 10, "episodes": 60, "kept": 8},
+    "tuning": {"trials": 4, "prices": 4, "refined": 1, "episodes": 32, "seeds": 2},
 }
 
 

@@ -11,22 +11,29 @@ from typing import Any
 
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
+from fusion_gym.validation import ConfigurationError
 
 from ..output.files import load_results, read_json
 from ..output.folders import alone_in, check_inputs
 from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, ValidationConfig
+from .classes import class_of
+from .committed import path_of, present
 from .config import Mode, Setting, Suite
 
 
 @dataclass(frozen=True)
 class Job:
-    """One piece of work; ``weight`` is about how long it takes, in seconds on one core."""
+    """One piece of work; ``weight`` is about how long it takes, in seconds on one core.
+
+    ``envelopes`` are the classes of committed envelopes that it depends on, with their hashes.
+    """
 
     setting: Setting
     kind: str
     mode: Mode | None = None
     seed: int = 0
     weight: float = 1.0
+    envelopes: tuple[tuple[str, str], ...] = ()
 
     @property
     def name(self) -> str:
@@ -45,6 +52,14 @@ class Folders:
 
     results: Path
     work: Path
+
+    @classmethod
+    def chosen(cls, results: Path | None, work: Path | None, quick: bool) -> Folders:
+        """The folders that a command line names, or those of the full or the quick benchmark."""
+        return cls(
+            results or Path("results/quick" if quick else "results"),
+            work or Path("runs/benchmark/quick" if quick else "runs/benchmark/full"),
+        )
 
     def report(self, job: Job) -> Path:
         """The JSON of a job."""
@@ -72,10 +87,18 @@ class Folders:
             yield
 
 
-def jobs(suite: Suite, settings: Sequence[Setting], modes: Sequence[Mode]) -> Iterator[Job]:
-    """All work, what everything else needs first."""
+def jobs(
+    suite: Suite, settings: Sequence[Setting], modes: Sequence[Mode], results: Path
+) -> Iterator[Job]:
+    """All work, what everything else needs first; the settings' envelopes are there.
+
+    Raises:
+        ConfigurationError: a class that an agent would be compared with is not there.
+    """
+    hashes = {setting.name: _hashes(suite, setting, results) for setting in settings}
     for setting in settings:
-        yield Job(setting, "baselines", weight=200.0)
+        kept = tuple(hashes[setting.name].values())
+        yield Job(setting, "baselines", weight=60.0, envelopes=kept)
     for setting in settings:
         for kind in ("informed", "references"):
             if computed(setting, kind):
@@ -86,7 +109,22 @@ def jobs(suite: Suite, settings: Sequence[Setting], modes: Sequence[Mode]) -> It
         for mode in modes:
             for setting in settings:
                 length = suite.timesteps * setting.longer
-                yield Job(setting, "agent", mode, seed, weight=30.0 + length / 40_000)
+                weight = 30.0 + length / 40_000
+                kept = (hashes[setting.name][mode],)
+                yield Job(setting, "agent", mode, seed, weight, kept)
+
+
+def _hashes(suite: Suite, setting: Setting, results: Path) -> dict[Mode, tuple[str, str]]:
+    """The class of each mode's agents, with its hash."""
+    there = present(suite, setting, results)
+    names = {mode: class_of(setting, mode).name for mode in suite.modes}
+    for name in names.values():
+        if name not in there:
+            path = str(path_of(results, setting.name))
+            raise ConfigurationError(
+                f"envelopes = {path!r} is not allowed: it has no class {name!r}"
+            )
+    return {mode: (name, there[name]["sha256"]) for mode, name in names.items()}
 
 
 def computed(setting: Setting, kind: str) -> tuple[str, ...]:
@@ -113,14 +151,9 @@ def inputs_of(job: Job, suite: Suite) -> dict[str, Any]:
         "seed": suite.seed,
     }
     if job.kind == "baselines":
-        families = {
-            family.label: family.model_dump(mode="json") for family in suite.families_of(setting)
-        }
         genie = setting.genie and setting.genie.model_dump(mode="json")
-        tuning = suite.tuning.model_dump(mode="json")
         return found | {
-            "tuning": tuning,
-            "families": families,
+            "envelopes": dict(job.envelopes),
             "points": list(setting.points),
             "genie": genie,
         }
@@ -133,7 +166,8 @@ def inputs_of(job: Job, suite: Suite) -> dict[str, Any]:
     assert job.mode is not None
     experiment = experiment_of(suite, setting, job.mode, job.seed, Path())
     tested = {"prices": suite.prices, "price_range": list(setting.price_range)}
-    return found | {"training": training_of(experiment)} | tested
+    envelope = {"class": job.envelopes[0][0], "sha256": job.envelopes[0][1]}
+    return found | {"training": training_of(experiment), "envelope": envelope} | tested
 
 
 def finished(job: Job, suite: Suite, folders: Folders) -> bool:

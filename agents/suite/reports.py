@@ -96,6 +96,8 @@ class Front(Shape):
     """An agent's points in one mode."""
 
     seeds: int
+    prices: NonNegativeInt = 0
+    rates: list[FiniteFloat] = pydantic.Field(default_factory=list)
     points: list[Point] = pydantic.Field(min_length=1)
     envelope: list[Named]
     room: float = 0.0

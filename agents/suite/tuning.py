@@ -1,111 +1,246 @@
-"""Baselines at full strength: Optuna searches a rule's parameters for its whole trade-off."""
+"""Rules at full strength: Optuna searches their parameters, price by price, seed by seed."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import optuna
+from optuna.distributions import (
+    BaseDistribution,
+    CategoricalDistribution,
+    FloatDistribution,
+    IntDistribution,
+)
 
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.evaluation.beside import Brief, run_beside
+from fusion_gym.evaluation.envelope import EnvelopePoint, height, lower_hull
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.validation import ConfigurationError
 
 from .config import Choices, Family, Range, Tuning
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
+_RUNS = 1024  # beside each other; fixed, so that results do not depend on the machine
+_MOST = 3  # parameters of a rule that multiply its trials
+_WORST = 1e300  # the error of a policy whose error is no number
 
 
-def shared_values(family: Family, trials: int, sensors: int) -> list[dict[str, Any]]:
-    """Trials to begin with: all sensors alike, a parameter at a time over its whole range.
+@dataclass(frozen=True)
+class Trial:
+    """A tried policy: its text, its parameters for the sampler, mean rate and error."""
 
-    Without them a search with a parameter for every sensor can miss what a sweep of one shared
-    value finds. Choices take turns; other parameters are left to the sampler.
-    """
-    ranges = {
-        name: space
-        for name, space in family.parameters.items()
-        if isinstance(space, Range) and space.per_sensor
-    }
-    if not ranges:
-        return []
-    choices = {
-        name: space.values
-        for name, space in family.parameters.items()
-        if isinstance(space, Choices)
-    }
-    turns = list(itertools.product(*choices.values()))
-    count = -(-trials // len(turns))
-    found = []
-    for place in range(trials):
-        values: dict[str, Any] = dict(zip(choices, turns[place % len(turns)], strict=True))
-        share = (place // len(turns) + 0.5) / count
-        for name, space in ranges.items():
-            value = space.low * (space.high / space.low) ** share
-            for key in _keys(name, space, sensors):
-                values[key] = round(value) if space.whole else value
-        found.append(values)
+    policy: str
+    values: dict[str, Any]
+    rate: float
+    mse: float
+
+
+@dataclass(frozen=True)
+class Finalist:
+    """A policy on the episodes of all searches, and the numbers of those that found it."""
+
+    policy: str
+    brief: Brief
+    found_by: tuple[int, ...]
+
+
+def space_of(family: Family, sensors: int) -> dict[str, BaseDistribution]:
+    """The numbers that a family's search sets, by name."""
+    found: dict[str, BaseDistribution] = {}
+    for name, space in family.parameters.items():
+        if isinstance(space, Choices):
+            found[name] = CategoricalDistribution(space.values)
+            continue
+        for key in _keys(name, space, sensors):
+            if space.whole:
+                found[key] = IntDistribution(int(space.low), int(space.high), log=True)
+            else:
+                found[key] = FloatDistribution(space.low, space.high, log=True)
     return found
 
 
-def _keys(name: str, space: Range, sensors: int) -> list[str]:
+def _keys(name: str, space: Range | Choices, sensors: int) -> list[str]:
     """Names of a parameter's numbers in the study."""
-    if not space.per_sensor or sensors == 1:
+    if isinstance(space, Choices) or not space.per_sensor or sensors == 1:
         return [name]
     return [f"{name}_{place}" for place in range(sensors)]
 
 
-def suggest(trial: optuna.Trial, family: Family, sensors: int) -> str:
-    """The policy's text for a trial."""
-    parts = []
-    for name, space in family.parameters.items():
-        if isinstance(space, Choices):
-            value = trial.suggest_categorical(name, list(space.values))
-            parts.append(f"{name}={_text(value)}")
-            continue
-        values = [_number(trial, key, space) for key in _keys(name, space, sensors)]
-        parts.append(f"{name}={'/'.join(_text(value) for value in values)}")
-    return f"{family.policy}:{','.join(parts)}" if parts else family.policy
-
-
-def _number(trial: optuna.Trial, name: str, space: Range) -> float:
-    if space.whole:
-        return trial.suggest_int(name, int(space.low), int(space.high), log=True)
-    return trial.suggest_float(name, space.low, space.high, log=True)
+def policy_text(family: Family, values: dict[str, Any], sensors: int) -> str:
+    """The policy with these numbers, behind what the family fixes."""
+    parts = [
+        f"{name}={'/'.join(_text(values[key]) for key in _keys(name, space, sensors))}"
+        for name, space in family.parameters.items()
+    ]
+    if not parts:
+        return family.policy
+    return f"{family.policy}{',' if ':' in family.policy else ':'}{','.join(parts)}"
 
 
 def _text(value: Any) -> str:
     return f"{value:.5g}" if isinstance(value, float) else str(value).lower()
 
 
-def tune(task: Task, family: Family, tuning: Tuning, seed: int = 0) -> list[str]:
-    """The rule's Pareto-optimal policies in rate and error, by rising rate; at most ``kept``.
+def first_values(family: Family, trials: int, sensors: int, seed: int) -> list[dict[str, Any]]:
+    """Trials to begin with: half with all sensors alike, over the whole range, half at random.
 
-    Two objectives at once, so that the search looks for the curve and not for one point of it;
-    the budget of trials is the same for every rule. A third of it goes to values that all sensors
-    share (or to random ones, for rules without a parameter a sensor), the rest to the sampler.
+    Without the first a search with a number for every sensor can miss what a sweep of one shared
+    value finds. Choices take turns. With one number to set there is nothing else to draw: all
+    trials are the sweep. Searches of other seeds sweep between the values of this one.
+    """
+    generator = np.random.default_rng(seed)
+    ranges = {n: s for n, s in family.parameters.items() if isinstance(s, Range)}
+    choices = {n: s.values for n, s in family.parameters.items() if isinstance(s, Choices)}
+    turns = list(itertools.product(*choices.values()))
+    numbers = sum(len(_keys(name, space, sensors)) for name, space in ranges.items())
+    swept = trials if numbers == 1 else -(-trials // 2)
+    swept = swept if len(ranges) == 1 else 0
+    count = max(-(-swept // len(turns)), 1)
+    offset = generator.random()
+    found = []
+    for place in range(trials):
+        values: dict[str, Any] = dict(zip(choices, turns[place % len(turns)], strict=True))
+        for name, space in ranges.items():
+            keys = _keys(name, space, sensors)
+            shares = generator.random(len(keys))
+            if place < swept:
+                shares[:] = (place // len(turns) + offset) / count
+            values |= zip(keys, (_between(space, share) for share in shares), strict=True)
+        found.append(values)
+    return found
+
+
+def _between(space: Range, share: float) -> float | int:
+    """The value at a share of the range, in the logarithm."""
+    value = space.low * (space.high / space.low) ** share
+    return round(value) if space.whole else float(value)
+
+
+def search(
+    task: Task, family: Family, tuning: Tuning, price_range: tuple[float, float], seed: int
+) -> list[Trial]:
+    """All policies that the search of one tuning seed tried, each once.
+
+    First those of :func:`first_values`. Then, price by price in turns, one that Optuna's sampler
+    takes for good at that price once it has been told of all that was tried before, whatever it
+    was tried for: it sets out from the policies that are nearest to the envelope there.
 
     Raises:
-        ConfigurationError: none of the trials was a policy that fits the task.
+        ConfigurationError: a policy that does not fit the task.
     """
-    first = max(tuning.trials // 3, 4)
-    sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=first)
-    study = optuna.create_study(directions=["minimize", "minimize"], sampler=sampler)
-    for values in shared_values(family, min(first, tuning.trials), task.sensors):
-        study.enqueue_trial(values)
+    space = space_of(family, task.sensors)
+    tried: dict[str, Trial] = {}
 
-    def objective(trial: optuna.Trial) -> tuple[float, float]:
-        policy = suggest(trial, family, task.sensors)
-        trial.set_user_attr("policy", policy)
-        results = run_episodes(task, make_policy(policy, task), tuning.episodes, tuning.seed)
-        mse = float(results.mse.mean())
-        return float(results.rate.mean()), mse if np.isfinite(mse) else 1e300
+    def run(asked: Iterable[dict[str, Any]]) -> None:
+        texts = {policy_text(family, values, task.sensors): values for values in asked}
+        new = [text for text in texts if text not in tried]
+        briefs = briefs_of(task, new, tuning.episodes, episodes_seed(tuning, seed))
+        for text, brief in zip(new, briefs, strict=True):
+            tried[text] = Trial(text, texts[text], *_means(brief))
 
-    study.optimize(objective, n_trials=tuning.trials)
-    best = sorted(study.best_trials, key=lambda trial: trial.values[0])
-    if not best:
-        raise ConfigurationError(f"family = {family.label!r} is not allowed: no trial succeeded")
-    places = np.unique(np.linspace(0, len(best) - 1, min(tuning.kept, len(best))).round())
-    return list(dict.fromkeys(best[int(place)].user_attrs["policy"] for place in places))
+    effort = min(len(space), _MOST)
+    run(first_values(family, max(effort * tuning.trials, 1), task.sensors, seed))
+    if not space:
+        return list(tried.values())
+    slopes = [error_per_rate(task, price) for price in np.geomspace(*price_range, tuning.prices)]
+    for turn in range(effort * tuning.refined):
+        run(
+            ask(space, list(tried.values()), slope, [seed, turn, place])
+            for place, slope in enumerate(slopes)
+        )
+    return list(tried.values())
+
+
+def episodes_seed(tuning: Tuning, seed: int) -> int:
+    """Seed of the first episode of a search."""
+    return tuning.seed + seed * tuning.episodes
+
+
+def error_per_rate(task: Task, price: float) -> float:
+    """By how much a transmission of each sensor in each step must lower the mean squared error.
+
+    The price in the reward's units, of a step in which every sensor transmits, in those of the
+    error; with equal weights of the states and equal tokens of the sensors this is the reward.
+    """
+    weight = task.reward.error_weight * float(task.reward.state_weights.mean())
+    return price * float(task.bucket.cost.sum()) / weight
+
+
+def ask(
+    space: dict[str, BaseDistribution], tried: Sequence[Trial], slope: float, seed: Sequence[int]
+) -> dict[str, Any]:
+    """The next values for the least error plus ``slope`` times rate, after all that was tried."""
+    state = int(np.random.SeedSequence(seed).generate_state(1)[0])
+    sampler = optuna.samplers.TPESampler(seed=state, n_startup_trials=1, multivariate=True)
+    study = optuna.create_study(sampler=sampler)
+    study.add_trials(
+        optuna.trial.create_trial(
+            params=trial.values, distributions=space, value=trial.mse + slope * trial.rate
+        )
+        for trial in tried
+    )
+    return study.ask(fixed_distributions=space).params
+
+
+def briefs_of(task: Task, policies: Sequence[str], episodes: int, seed: int) -> list[Brief]:
+    """The policies on the same episodes, many at a time."""
+    size = max(_RUNS // episodes, 1)
+    found: list[Brief] = []
+    for first in range(0, len(policies), size):
+        made = [make_policy(text, task) for text in policies[first : first + size]]
+        found += run_beside(task, made, episodes, seed)
+    return found
+
+
+def _means(brief: Brief) -> tuple[float, float]:
+    mse = float(brief.mse.mean())
+    return float(brief.rate.mean()), mse if np.isfinite(mse) else _WORST
+
+
+def near_hull(trials: Sequence[Trial], near: float, finalists: int) -> list[str]:
+    """The policies on the lower envelope of a search and those hardly above it, best first.
+
+    All of the envelope, and more only up to ``finalists``, within a share ``near`` of its error.
+    """
+    points = [EnvelopePoint(trial.policy, trial.rate, trial.mse) for trial in trials]
+    hull = lower_hull(points)
+    on_it = [point.name for point in hull]
+
+    def excess(point: EnvelopePoint) -> float:
+        below = height(hull, point.rate)
+        return point.mse / below - 1.0 if below else np.inf
+
+    others = sorted((p for p in points if p.name not in set(on_it)), key=excess)
+    close = [point.name for point in others if excess(point) <= near]
+    return on_it + close[: max(finalists - len(on_it), 0)]
+
+
+def tune(
+    task: Task, family: Family, tuning: Tuning, price_range: tuple[float, float]
+) -> tuple[int, list[Finalist]]:
+    """The number of trials of all searches, and their finalists, each on all searches' episodes.
+
+    Raises:
+        ConfigurationError: a policy that does not fit the task.
+    """
+    found_by: dict[str, list[int]] = {}
+    tried = 0
+    for seed in range(tuning.seeds):
+        trials = search(task, family, tuning, price_range, seed)
+        tried += len(trials)
+        for text in near_hull(trials, tuning.near, tuning.finalists):
+            found_by.setdefault(text, []).append(seed)
+    briefs = on_all_episodes(task, list(found_by), tuning)
+    return tried, [
+        Finalist(text, brief, tuple(seeds))
+        for (text, seeds), brief in zip(found_by.items(), briefs, strict=True)
+    ]
+
+
+def on_all_episodes(task: Task, policies: Sequence[str], tuning: Tuning) -> list[Brief]:
+    """The policies on the episodes of all searches together."""
+    return briefs_of(task, policies, tuning.seeds * tuning.episodes, tuning.seed)

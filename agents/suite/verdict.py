@@ -1,66 +1,110 @@
-"""The benchmark's verdict: learned fronts against tuned baselines, at the agents' own rates."""
+"""The benchmark's verdict: learned fronts against committed envelopes, at the agents' own rates."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from fusion_gym.arrays import Array
-from fusion_gym.evaluation.envelope import envelope_mse
+from fusion_gym.evaluation.envelope import EnvelopePoint, chosen_mse, envelope_mse, height
 from fusion_gym.evaluation.episodes import EpisodeResults
 
 RESAMPLES = 2000
 MIDDLE = (0.05, 0.5)  # of the rate that transmitting always gets: the middle of the front
+RATES = 10  # of the grid over the middle, each for an equal part of it in the logarithm
+_PRICE = (1, 1, 1, 2)  # the axis of the prices in the arrays of a front
+Searches = Sequence[Sequence[tuple[float, float]]]
+
+
+@dataclass(frozen=True)
+class Front:
+    """An agent beside the envelope, at P prices.
+
+    ``learned`` and ``envelope`` (seeds, P, E) are the agents' MSE and the envelope's at their own
+    ``rates`` (seeds, P); ``tuned`` (K, seeds, P) is the height there of what each of K searches
+    alone would have made of the envelope, as a share of their mean.
+    """
+
+    learned: Array
+    envelope: Array
+    rates: Array
+    tuned: Array
+
+    def at(self, price: int) -> Front:
+        """The front at one price alone."""
+        one = slice(price, price + 1)
+        return Front(
+            self.learned[:, one], self.envelope[:, one], self.rates[:, one], self.tuned[..., one]
+        )
 
 
 def judge(
     agents: Sequence[Sequence[EpisodeResults]],
     prices: Sequence[float],
-    baselines: Mapping[str, EpisodeResults],
+    envelope: Mapping[str, EpisodeResults],
     references: Mapping[str, EpisodeResults],
     always: float,
     clairvoyant: Mapping[str, EpisodeResults] | None = None,
+    searches: Searches = (),
 ) -> dict[str, Any]:
     """Points and verdict of one front.
 
-    ``agents[seed][price]`` are test results of one training seed at one price. A point has the
-    mean rate and MSE over seeds, the envelopes of baselines and references there, and the relative
-    difference of the MSE to the baselines' envelope: interquartile mean over seeds with a 95 %
-    interval, bootstrapped over seeds and (paired) episodes at once. The verdict does the same over
-    all points in the middle of the front, stratified by price, where the rate is between 5 % and
-    50 % of ``always``, the rate that always transmitting gets. ``clairvoyant`` has results of
-    schedules made in hindsight, on the first of the episodes: points have their MSE at the same
-    rate, as a share of the baselines' envelope on the same episodes times that on all.
+    ``agents[seed][price]`` are test results of one training seed at one price. ``envelope`` has
+    the rules of a committed envelope, all of which count. A point has the mean rate and MSE over
+    seeds, the envelope and the references' there, and the relative difference of the MSE to the
+    envelope: the interquartile mean over seeds. The verdict, ``middle``, is the plain mean of that
+    over a fixed grid of rates: the middles of ten equal parts, in the logarithm, of 5 % to 50 % of
+    ``always``, the rate that always transmitting gets. Between prices it is interpolated in the
+    logarithm of the rate; parts that the front does not reach are left out. ``prices`` says how
+    many prices lie in the middle, ``rates`` which rates of the grid count.
+
+    The 95 % intervals are bootstrapped over (paired) episodes, training seeds (one agent for all
+    prices), the grid's rates and tuning seeds, all at once. ``searches`` has the envelope, as
+    (rate, MSE), that each tuning seed would have made alone: a resample draws as many of them as
+    there are and scales the envelope by their mean, as a share of the mean of all; so it has the
+    spread of tuning and no shift. ``clairvoyant`` has results of schedules made in hindsight, on
+    the first of the episodes: points have their MSE at the same rate, as a share of the envelope on
+    the same episodes times that on all.
     """
-    points, inside = [], []
+    points, columns, kept = [], [], []
     for place, price in enumerate(prices):
         column = [seed[place] for seed in agents]
         rates = [float(found.rate.mean()) for found in column]
-        learned = np.array([found.mse for found in column])
+        learned: Array = np.array([found.mse for found in column])
         rate = float(np.mean(rates))
         point: dict[str, Any] = {"price": price, "rate": rate, "mse": float(learned.mean())}
-        floors = [envelope_mse(baselines, own) for own in rates]
+        floors = [chosen_mse(envelope, own) for own in rates]
         if all(floor is not None for floor in floors):
-            envelope = np.array(floors)
-            point["envelope"] = float(envelope.mean())
-            point["difference"] = _interval([(learned, envelope)])
-            if MIDDLE[0] * always <= rate <= MIDDLE[1] * always:
-                inside.append((learned, envelope))
+            below = np.array(floors)
+            point["envelope"] = float(below.mean())
+            columns.append((learned, below, rates, _shares(searches, rates)))
+            kept.append(point)
             known = [envelope_mse(references, own) for own in rates] if references else []
             sound = [found.mean() for found in known if found is not None]
             if sound and len(sound) == len(rates):
                 point["reference"] = float(np.mean(sound))
             ahead = envelope_mse(clairvoyant, rate) if clairvoyant else None
             if ahead is not None:
-                share = ahead.mean() / envelope[:, : len(ahead)].mean()
-                point["hindsight"] = float(share * envelope.mean())
+                share = ahead.mean() / below[:, : len(ahead)].mean()
+                point["hindsight"] = float(share * below.mean())
         points.append(point)
     verdict: dict[str, Any] = {"points": points, "seeds": len(agents)}
-    if inside:
-        verdict["middle"] = _interval(inside)
+    if kept:
+        parts = [np.array(part) for part in zip(*columns, strict=True)]  # prices first
+        front = Front(
+            *(np.moveaxis(part, 0, axis) for part, axis in zip(parts, _PRICE, strict=True))
+        )
+        for place, point in enumerate(kept):
+            point["difference"] = interval(front.at(place), np.array([point["rate"]]))
+        grid = grid_of(front, always)
+        inside = sum(_in_middle(point, always) for point in kept)
+        verdict |= {"prices": inside, "rates": grid.tolist()}
+        if inside:
+            verdict["middle"] = interval(front, grid)
     gaps = [p for p in points if "reference" in p and _in_middle(p, always)]
     room = sum(p["envelope"] - p["reference"] for p in gaps)
     if room > 0.0:
@@ -77,29 +121,54 @@ def _in_middle(point: Mapping[str, float], always: float) -> bool:
     return MIDDLE[0] * always <= point["rate"] <= MIDDLE[1] * always
 
 
-def _interval(strata: Sequence[tuple[Array, Array]]) -> dict[str, float]:
-    """Relative difference of the means: interquartile mean over seeds and strata, its interval.
+def _shares(searches: Searches, rates: Sequence[float]) -> Array:
+    """Height (K, seeds) of each search's own envelope at these rates, as a share of their mean.
 
-    Each stratum is a pair of (seeds, episodes): the agents' MSE and the envelope's. A resample
-    draws the episodes once for all (they are paired) and the seeds anew in every stratum.
+    One search, or a rate at which some search has nothing, says nothing of the spread: shares of 1.
     """
+    found = np.ones((max(len(searches), 1), len(rates)))
+    hulls = [[EnvelopePoint(f"{rate}", rate, mse) for rate, mse in one] for one in searches]
+    for column, rate in enumerate(rates):
+        heights = [height(hull, rate) for hull in hulls]
+        if heights and None not in heights:
+            known = np.array(heights, dtype=np.float64)
+            found[:, column] = known / known.mean()
+    return found
 
-    def middle(shares: Array) -> float:
-        return float(stats.trim_mean(shares, 0.25))
 
-    def relative(learned: Array, envelope: Array) -> Array:
-        return np.asarray(learned.mean(-1) / envelope.mean(-1) - 1.0)
+def grid_of(front: Front, always: float) -> Array:
+    """The grid's rates, of those of its parts that the front reaches; moved to its nearest end."""
+    edges = np.geomspace(MIDDLE[0] * always, MIDDLE[1] * always, RATES + 1)
+    rates = front.rates.mean(0)
+    low, high = rates.min(), rates.max()
+    reached = (edges[:-1] <= high) & (edges[1:] >= low)
+    middles = np.sqrt(edges[:-1] * edges[1:])
+    return np.asarray(np.clip(middles[reached], low, high))
 
-    found = middle(np.concatenate([relative(*stratum) for stratum in strata]))
+
+def score(shares: Array, rates: Array, grid: Array) -> Array:
+    """Interquartile mean over seeds of the ``shares`` (seeds, P), at the rates of the ``grid``."""
+    middle = stats.trim_mean(shares, 0.25, axis=0)
+    places, which = np.unique(rates.mean(0), return_inverse=True)
+    values = np.bincount(which, weights=middle) / np.bincount(which)
+    tiny = np.finfo(np.float64).tiny  # of an agent that never transmits
+    return np.interp(np.log(np.maximum(grid, tiny)), np.log(np.maximum(places, tiny)), values)
+
+
+def interval(front: Front, grid: Array) -> dict[str, float]:
+    """Mean over the grid's rates of the relative difference to the envelope, and its interval."""
+    found = front.learned.mean(-1) / front.envelope.mean(-1) - 1.0
     generator = np.random.default_rng(0)
-    seeds, episodes = strata[0][0].shape
+    seeds, _, episodes = front.learned.shape
+    searches = len(front.tuned)
     drawn = np.empty(RESAMPLES)
     for place in range(RESAMPLES):
         counts = generator.multinomial(episodes, np.full(episodes, 1.0 / episodes))
-        shares = []
-        for learned, envelope in strata:
-            chosen = generator.integers(0, seeds, seeds)
-            shares.append((learned[chosen] @ counts) / (envelope[chosen] @ counts) - 1.0)
-        drawn[place] = middle(np.concatenate(shares))
+        chosen = generator.integers(0, seeds, seeds)
+        tuned = front.tuned[generator.integers(0, searches, searches)].mean(0)
+        shares = (front.learned @ counts) / (tuned * (front.envelope @ counts)) - 1.0
+        scores = score(shares[chosen], front.rates[chosen], grid)
+        drawn[place] = scores[generator.integers(0, len(grid), len(grid))].mean()
     low, high = np.quantile(drawn, (0.025, 0.975))
-    return {"mean": found, "low": float(low), "high": float(high)}
+    mean = float(score(found, front.rates, grid).mean())
+    return {"mean": mean, "low": float(low), "high": float(high)}

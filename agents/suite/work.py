@@ -1,8 +1,7 @@
-"""The benchmark's work: tuned baselines, references, hindsight, and one training each."""
+"""The benchmark's work: the envelopes' rules, references, hindsight, and one training each."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -16,23 +15,19 @@ from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.hindsight import run_hindsight
 from fusion_gym.evaluation.metrics import robust_summary, summarise
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError
 
 from ..output.files import save_results, write
 from ..output.folders import fingerprint
 from ..training.run import holds_training, train
+from .committed import present
 from .config import Suite
+from .envelopes import task_of
 from .jobs import Folders, Job, computed, experiment_of, inputs_of, setting_task, training_of
-from .tuning import tune
-from .workers import end_with
 
 
-def run(job: Job, suite: Suite, folders: Folders, parent: int) -> float:
-    """Do a job and write its results; returns its weight.
-
-    A worker ends with its ``parent``, the process that gave it the job.
-    """
-    if os.getpid() != parent:
-        end_with(parent)
+def run(job: Job, suite: Suite, folders: Folders) -> None:
+    """Do a job and write its results."""
     torch.set_num_threads(1)
     if job.kind == "baselines":
         _run_baselines(job, suite, folders)
@@ -42,7 +37,6 @@ def run(job: Job, suite: Suite, folders: Folders, parent: int) -> float:
         _run_hindsight(job, suite, folders)
     else:
         _run_agent(job, suite, folders)
-    return job.weight
 
 
 def _test(task: Task, policies: list[str], suite: Suite) -> dict[str, EpisodeResults]:
@@ -53,16 +47,33 @@ def _test(task: Task, policies: list[str], suite: Suite) -> dict[str, EpisodeRes
 
 
 def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
-    """Tune every family, then test its curve, the single policies and the genie."""
-    setting, task = job.setting, setting_task(job.setting)
+    """Test the rules of the committed envelopes, the single policies and the genie.
+
+    Raises:
+        ConfigurationError: a rule does other than its envelope says.
+    """
+    setting = job.setting
+    classes = present(suite, setting, folders.results)
+    vertices = [vertex for name, _ in job.envelopes for vertex in classes[name]["vertices"]]
     curves: dict[str, dict[str, Any]] = {}
     found: dict[str, EpisodeResults] = {}
-    for family in suite.families_of(setting):
-        policies = tune(task, family, suite.tuning)
-        found |= _test(task, policies, suite)
-        curves[family.label] = _curve(task, policies)
-    curves |= {name: _curve(task, [name]) for name in setting.points}
-    found |= _test(task, list(setting.points), suite)
+    for vertex in {vertex["name"]: vertex for vertex in vertices}.values():
+        task = task_of(setting, vertex["options"].items())
+        policy = make_policy(vertex["policy"], task)
+        results = run_episodes(task, policy, suite.episodes, suite.seed)
+        _check_vertex(vertex, results)
+        found[vertex["name"]] = results
+        curve = curves.setdefault(vertex["family"], {"knows": [], "policies": []})
+        curve["knows"].append(policy.knowledge)
+        curve["policies"].append(vertex["name"])
+    task = setting_task(setting)
+    for name in setting.points:
+        found |= _test(task, [name], suite)
+        knows = [make_policy(name, task).knowledge]
+        curves[name] = {"knows": knows, "policies": [name]}
+    for curve in curves.values():
+        curve["knows"] = least_covering(curve["knows"])
+        curve["policies"].sort(key=lambda name: float(found[name].rate.mean()))
     report: dict[str, Any] = {**_header(job, suite, task), "curves": curves}
     if setting.genie is not None:
         options = setting.environment.options | setting.genie.options
@@ -72,10 +83,14 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
     _keep(job, folders, found, report)
 
 
-def _curve(task: Task, policies: list[str]) -> dict[str, Any]:
-    """A baseline's policies, and who knows all that they look at."""
-    knows = least_covering(make_policy(name, task).knowledge for name in policies)
-    return {"knows": knows, "policies": policies}
+def _check_vertex(vertex: dict[str, Any], results: EpisodeResults) -> None:
+    """Whether a rule does on the test seeds what its envelope says."""
+    said, does = vertex["test"]["mse"]["mean"], float(results.mse.mean())
+    if not np.isclose(said, does, rtol=1e-6):
+        raise ConfigurationError(
+            f"envelopes: {vertex['name']!r} has an error of {does:.6g} on the test seeds, and not "
+            f"{said:.6g} as its envelope says: tune it again"
+        )
 
 
 def _run_references(job: Job, suite: Suite, folders: Folders) -> None:

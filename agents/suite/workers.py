@@ -1,4 +1,4 @@
-"""Worker processes that end with the process that they work for."""
+"""Work on several cores: processes that end with the process that they work for."""
 
 from __future__ import annotations
 
@@ -6,8 +6,55 @@ import functools
 import os
 import threading
 import time
+from collections.abc import Callable, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, NamedTuple
+
+import joblib
+from tqdm import tqdm
+
+from fusion_gym.validation import ConfigurationError
 
 _EVERY = 1.0  # seconds between two looks
+
+
+class Work(NamedTuple):
+    """A call and about how long it takes, in seconds on one core."""
+
+    weight: float
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+
+
+def side_by_side(work: Sequence[Work], workers: int, description: str) -> None:
+    """Do the work on several cores, with an estimate of the remaining time.
+
+    Raises:
+        ConfigurationError: some of it does not fit, or the system ended a worker.
+    """
+    total = sum(one.weight for one in work)
+    began = time.perf_counter()
+    with tqdm(total=round(total), desc=description, unit="s of work", smoothing=0.0) as bar:
+        weights = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")(
+            joblib.delayed(_do)(one, os.getpid()) for one in work
+        )
+        try:
+            for weight in weights:
+                bar.update(min(weight, bar.total - bar.n))
+        except BrokenProcessPool:
+            raise ConfigurationError(
+                f"workers = {workers}: the system ended one of them, perhaps for want of memory; "
+                "finished pieces of work are kept, go on with --resume"
+            ) from None
+    print(f"{description}: {len(work)} pieces of work in {time.perf_counter() - began:.0f} s")
+
+
+def _do(work: Work, parent: int) -> float:
+    """Do a piece of work; returns its weight. A worker ends with its ``parent``."""
+    if os.getpid() != parent:
+        end_with(parent)
+    work.function(*work.arguments)
+    return work.weight
 
 
 @functools.cache

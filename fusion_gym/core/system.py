@@ -193,6 +193,11 @@ class Signals(Mapping[str, SignalArray]):
     def __contains__(self, name: object) -> bool:
         return name in self._values and name not in self._withheld
 
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        """Names of the signals that are withheld."""
+        return tuple(sorted(self._hidden))
+
     def __iter__(self) -> Iterator[str]:
         return (name for name in self._values if name not in self._withheld)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,15 @@ class EnvelopePoint(NamedTuple):
     mse: float
 
 
+def points_of(results: Mapping[str, EpisodeResults]) -> list[EnvelopePoint]:
+    """Each policy's mean rate and error, by rising rate (of equal ones: by rising error)."""
+    points = [
+        EnvelopePoint(name, float(r.rate.mean()), float(r.mse.mean()))
+        for name, r in results.items()
+    ]
+    return sorted(points, key=lambda point: (point.rate, point.mse, point.name))
+
+
 def lower_envelope(results: Mapping[str, EpisodeResults]) -> list[EnvelopePoint]:
     """The lower convex hull of the policies' points, by rising rate and strictly falling error.
 
@@ -31,15 +40,20 @@ def lower_envelope(results: Mapping[str, EpisodeResults]) -> list[EnvelopePoint]
     Raises:
         ConfigurationError: there are no policies.
     """
-    if not results:
+    return lower_hull(points_of(results))
+
+
+def lower_hull(points: Iterable[EnvelopePoint]) -> list[EnvelopePoint]:
+    """The points of :func:`lower_envelope`, of points in any order.
+
+    Raises:
+        ConfigurationError: there are none.
+    """
+    ordered = sorted(points, key=lambda point: (point.rate, point.mse, point.name))
+    if not ordered:
         raise ConfigurationError("policies = {} is not allowed: an envelope needs at least one")
-    points = sorted(
-        EnvelopePoint(name, float(r.rate.mean()), float(r.mse.mean()))
-        for name, r in results.items()
-    )
-    points.sort(key=lambda point: (point.rate, point.mse))
     hull: list[EnvelopePoint] = []
-    for point in points:
+    for point in ordered:
         if hull and point.mse >= hull[-1].mse:
             continue
         while len(hull) >= 2 and _above(hull[-2], hull[-1], point):
@@ -55,7 +69,10 @@ def _above(left: EnvelopePoint, middle: EnvelopePoint, right: EnvelopePoint) -> 
 
 
 def mixture(hull: Sequence[EnvelopePoint], rate: float) -> dict[str, float] | None:
-    """The policies of a lower envelope and their shares at a rate, ``None`` left of it."""
+    """The policies of an envelope, by rising rate, and their shares at a rate.
+
+    ``None`` left of it; right of it the last policy alone.
+    """
     if rate < hull[0].rate:
         return None
     left = max((p for p in hull if p.rate <= rate), key=lambda p: p.rate)
@@ -66,9 +83,35 @@ def mixture(hull: Sequence[EnvelopePoint], rate: float) -> dict[str, float] | No
     return {left.name: 1.0 - share, right.name: share}
 
 
+def height(hull: Sequence[EnvelopePoint], rate: float) -> float | None:
+    """The envelope's error at a rate, ``None`` left of it."""
+    shares = mixture(hull, rate)
+    if shares is None:
+        return None
+    errors = {point.name: point.mse for point in hull}
+    return sum(share * errors[name] for name, share in shares.items())
+
+
 def envelope_mse(results: Mapping[str, EpisodeResults], rate: float) -> Array | None:
     """Each episode's MSE (E,) on the lower envelope at a rate, ``None`` left of it."""
-    shares = mixture(lower_envelope(results), rate)
+    return mixed_mse(results, lower_envelope(results), rate)
+
+
+def chosen_mse(results: Mapping[str, EpisodeResults], rate: float) -> Array | None:
+    """Each episode's MSE (E,) at a rate on the line through all these policies, by their rate.
+
+    For policies that were chosen as an envelope on other episodes: all of them count, also those
+    that lie above the line between their neighbours here, for leaving them out would be a choice
+    on the episodes that measure. ``None`` left of the first.
+    """
+    return mixed_mse(results, points_of(results), rate)
+
+
+def mixed_mse(
+    results: Mapping[str, EpisodeResults], points: Sequence[EnvelopePoint], rate: float
+) -> Array | None:
+    """Each episode's MSE (E,) at a rate on the line through these points, ``None`` left of it."""
+    shares = mixture(points, rate)
     return None if shares is None else _mixed(results, shares)
 
 

@@ -1,0 +1,93 @@
+"""Tune the rules of every setting and class, and commit their envelopes before agents are trained.
+
+    python -m agents.envelope [--envs NAME …] [--classes NAME …] [--quick] [--resume]
+
+For each class of knowledge the vertices of the lower envelope are chosen on tuning seeds and then
+measured on the test seeds. ``envelopes/SETTING.json`` in the results folder holds them, each class
+with a SHA-256 of its content, which ``agents.benchmark`` keeps with every agent that it trains;
+``envelopes/README.md`` has the table. What was tuned stays in the work folder, so that an
+interrupted run goes on where it was.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from fusion_gym.validation import ConfigurationError, choice
+
+from .command_line import Command, spelled, start
+from .input.options import OutputFolder, Whole, writable_folder
+from .output.files import write_text
+from .suite.classes import classes_of
+from .suite.committed import FOLDER, complete, path_of, present
+from .suite.config import load_suite
+from .suite.envelope_table import text_of
+from .suite.jobs import Folders
+
+
+@dataclass(frozen=True)
+class Envelope(Command):
+    """Tune the rules of every setting and class, and commit their envelopes."""
+
+    config: str = "benchmark"
+    """The suite: a YAML file, or the name of a shipped config."""
+    envs: tuple[str, ...] = ()
+    """Settings by name; none stands for all."""
+    classes: tuple[str, ...] = ()
+    """Classes by name, as sensors_memory or local_packets; none stands for all."""
+    quick: bool = False
+    """Less of everything, in minutes."""
+    resume: bool = False
+    """Keep the classes that are there, and add the others."""
+    results: Annotated[Path | None, OutputFolder()] = None
+    """Folder for JSON, instead of results or results/quick."""
+    work: Annotated[Path | None, OutputFolder()] = None
+    """Folder for tuned rules and episodes, instead of runs/benchmark/full or quick."""
+    workers: Annotated[int, Whole(1, 512)] = 2
+    """Processes side by side."""
+
+    def interrupted(self) -> str:
+        """Finished pieces of work are kept."""
+        words = [word for word in sys.argv[1:] if word != "--resume"]
+        return f"interrupted; go on with: {shlex.join([*spelled('envelope').split(), *words])}"
+
+    def run(self) -> None:
+        """Do all work that is not finished, and write the table."""
+        suite = load_suite(self.config, self.quick)
+        folders = Folders.chosen(self.results, self.work, self.quick)
+        writable_folder("results", folders.results)
+        writable_folder("work", folders.work)
+        by_name = {setting.name: setting for setting in suite.settings}
+        settings = [by_name[choice("envs", name, by_name)] for name in self.envs or by_name]
+        known = dict.fromkeys(c.name for setting in settings for c in classes_of(setting))
+        for name in self.classes:
+            choice("classes", name, known)
+        with folders.alone():
+            there = [
+                name
+                for setting in settings
+                for name in present(suite, setting, folders.results)
+                if not self.classes or name in self.classes
+            ]
+            if there and not self.resume:
+                raise ConfigurationError(
+                    f"results = {str(folders.results)!r} holds {len(there)} of these envelopes: go "
+                    "on with --resume, or give another --results"
+                )
+            complete(suite, settings, self.classes, folders.results, folders.work, self.workers)
+            readme = folders.results / FOLDER / "README.md"
+            write_text(readme, text_of(folders.results, spelled("envelope")))
+        print(f"envelopes in {path_of(folders.results, '').parent}, the table in {readme}")
+
+
+def main() -> None:
+    """Entry point; exit status 130 after an interrupt."""
+    start(Envelope)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,183 @@
+"""The file of a setting's envelopes: made piece by piece, read with its hashes checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pydantic
+from pydantic import FiniteFloat
+
+from fusion_gym.core.system import Knowledge
+from fusion_gym.validation import ConfigurationError
+
+from ..output.files import write
+from ..output.folders import check_inputs
+from .classes import Class, classes_of
+from .config import Setting, Suite
+from .envelopes import (
+    candidates_of,
+    chosen,
+    content_of,
+    curves_of,
+    digest,
+    inputs_of,
+    run_search,
+    run_test,
+    searches_of,
+    task_of,
+    tests_of,
+)
+from .reports import Interval, Shape, read
+from .workers import Work, side_by_side
+
+FOLDER = "envelopes"  # in that of the results
+
+
+class Place(Shape):
+    """A policy's mean rate and its error."""
+
+    rate: FiniteFloat
+    mse: Interval
+
+
+class Vertex(Shape):
+    """A policy of an envelope, on the tuning and on the test episodes."""
+
+    name: str
+    policy: str
+    options: dict[str, Any]
+    family: str
+    knows: Knowledge
+    tuning: Place
+    test: Place
+    convex: bool
+
+
+class Envelope(Shape):
+    """One class."""
+
+    mode: str
+    memory: bool
+    broadcast: str | None
+    knows: Knowledge
+    options: dict[str, Any]
+    contains: list[str]
+    families: list[str]
+    trials: int
+    vertices: list[Vertex] = pydantic.Field(min_length=1)
+    searches: list[list[list[FiniteFloat]]] = pydantic.Field(min_length=1)
+    sha256: str = pydantic.Field(pattern=r"^[0-9a-f]{64}$")
+
+
+class Envelopes(Shape):
+    """A setting's ``envelopes/SETTING.json``."""
+
+    setting: str
+    title: str
+    env: str
+    always: FiniteFloat
+    inputs: dict[str, Any]
+    classes: dict[str, Envelope]
+    curves: list[dict[str, Any]]
+
+
+def path_of(results: Path, setting: str) -> Path:
+    """Where a setting's envelopes are."""
+    return results / FOLDER / f"{setting}.json"
+
+
+def read_envelopes(path: Path) -> dict[str, Any]:
+    """A setting's envelopes.
+
+    Raises:
+        ConfigurationError: the file cannot be read, is of another shape, or a class is not what
+            its hash says.
+    """
+    found = read(Envelopes, path, "envelopes")
+    for name, content in found["classes"].items():
+        if digest(found["inputs"], name, content) != content["sha256"]:
+            raise ConfigurationError(
+                f"envelopes = {str(path)!r}: classes.{name}.sha256 = {content['sha256'][:12]!r}… "
+                "is not that of what it holds: it was changed after it was written"
+            )
+    return found
+
+
+def present(suite: Suite, setting: Setting, results: Path) -> dict[str, Any]:
+    """The classes of a setting that are there, by name, made from these inputs.
+
+    Raises:
+        ConfigurationError: as :func:`read_envelopes`, or they were made from other inputs.
+    """
+    path = path_of(results, setting.name)
+    if not path.exists():
+        return {}
+    found = read_envelopes(path)
+    check_inputs(inputs_of(suite, setting), found["inputs"], repr(str(path)))
+    classes: dict[str, Any] = found["classes"]
+    return classes
+
+
+def complete(
+    suite: Suite, settings: Sequence[Setting], names: Sequence[str], results: Path, work: Path,
+    workers: int,
+) -> None:  # fmt: skip
+    """Tune, choose and measure what is missing of these classes (none: all), setting by setting.
+
+    Everything is made once before anything runs, so that a family that does not fit is told.
+
+    Raises:
+        ConfigurationError: a family that does not fit, or envelopes made from other inputs.
+    """
+    missing = {}
+    for setting in settings:
+        there = present(suite, setting, results)
+        every = [c for c in classes_of(setting) if not names or c.name in names]
+        missing[setting.name] = [c for c in every if c.name not in there]
+        for search in searches_of(suite, setting, missing[setting.name]):
+            search.check()
+    for setting in settings:
+        if missing[setting.name]:
+            _complete(suite, setting, missing[setting.name], results, work, workers)
+
+
+def _complete(
+    suite: Suite, setting: Setting, wanted: Sequence[Class], results: Path, work: Path, workers: int
+) -> None:
+    searches = searches_of(suite, setting, wanted)
+    left = [search for search in searches if not search.path(work).exists()]
+    left.sort(key=lambda search: -len(search.family.parameters))  # the long ones first
+    side_by_side(
+        [Work(10.0, run_search, (one, work)) for one in left], workers, f"{setting.name}: tuning"
+    )
+    vertices = [
+        vertex for of in wanted for vertex in chosen(candidates_of(setting, of, searches, work)[0])
+    ]
+    tests = {one.path(work): one for one in tests_of(suite, setting, vertices)}
+    side_by_side(
+        [Work(2.0, run_test, (one, work)) for path, one in tests.items() if not path.exists()],
+        workers,
+        f"{setting.name}: testing",
+    )
+    classes = present(suite, setting, results)
+    inputs = inputs_of(suite, setting)
+    for of in wanted:
+        content = content_of(suite, setting, of, searches, work)
+        classes[of.name] = content | {"sha256": digest(inputs, of.name, content)}
+    task = task_of(setting)
+    always = next(one for one in curves_of(searches, work) if one["family"] == "always")
+    order = [c.name for c in classes_of(setting)]
+    report = {
+        "setting": setting.name,
+        "title": setting.title,
+        "env": setting.environment.id,
+        "options": setting.environment.options,
+        "horizon": task.horizon,
+        "always": always["points"][0]["rate"],
+        "inputs": inputs,
+        "classes": {name: classes[name] for name in order if name in classes},
+        "curves": list(curves_of(searches, work)),
+    }
+    write(path_of(results, setting.name), report)

@@ -1,0 +1,171 @@
+"""The table of the committed envelopes: what the strongest rules do, before agents exist."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from fusion_gym.core.system import Knowledge, covers
+from fusion_gym.evaluation.envelope import EnvelopePoint, height, lower_hull
+from fusion_gym.validation import ConfigurationError
+
+from .committed import FOLDER, read_envelopes
+from .reports import Baselines, Shape, read
+
+SHARES = (0.05, 0.1, 0.2, 0.4)  # of the rate that transmitting always gets
+# With which rules the agents of results/SETTING/baselines.json were compared.
+_BEFORE: dict[str, Knowledge] = {
+    "sensors": "coordinator_memory",
+    "centre": "centre",
+    "local": "own_memory",
+}
+
+
+class Measured(Shape):
+    """A point that was computed elsewhere."""
+
+    rate: float
+    mse: float
+
+
+class Measurements(Shape):
+    """``rollout/SETTING.json`` or ``bounds/SETTING.json``, by the points' rates."""
+
+    setting: str
+    points: list[Measured]
+
+
+def text_of(results: Path, command: str) -> str:
+    """The table in Markdown.
+
+    Raises:
+        ConfigurationError: a file that is damaged or of another shape.
+    """
+    files = sorted((results / FOLDER).glob("*.json"))
+    found = [read_envelopes(path) for path in files]
+    lines = [
+        "# Envelopes of the tuned rules",
+        "",
+        f"Made by `{command}`; the JSON beside this file has every class with its policies, their "
+        "rates and errors on tuning and test seeds, the number of trials and a SHA-256 of its "
+        "content. Vertices are chosen on tuning seeds and measured on the test seeds: the envelope "
+        "is the line through all of them there, mixtures of two policies between them. A vertex "
+        "that lies above the line between its neighbours on the test seeds is kept "
+        '(`"convex": false`). A class contains the rules of every class that knows less, so on the '
+        "tuning seeds its envelope is nowhere higher; on the test seeds it may be, by noise.",
+        "",
+        "Who decides: `centre` by what it knows before anything is sent, `sensors` is a "
+        "coordinator that sees all new measurements, `local` is every sensor by itself, which "
+        "hears nothing (`none`), the centre's `estimate`, or every delivered packet (`packets`). "
+        "Mean squared error at some rates, 5, 10, 20 and 40 % of that of always transmitting: of "
+        "the rules tuned before (with which the agents in this folder were compared), of those "
+        "that remember nothing, of those that do, of one improvement on the best rule (rollout), "
+        "and a lower bound; – where there is none.",
+        "",
+        "| setting | class | rate | envelope before | envelope now | with memory | rollout "
+        "| bound |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for envelopes in found:
+        lines += rows_of(envelopes, results)
+    lines += ["", "## The strongest rules", ""]
+    for envelopes in found:
+        lines += vertices_of(envelopes)
+    return "\n".join(lines) + "\n"
+
+
+def rows_of(envelopes: dict[str, Any], results: Path) -> Iterator[str]:
+    """A setting's rows."""
+    name, classes = envelopes["setting"], envelopes["classes"]
+    rates = [round(share * envelopes["always"], 4) for share in SHARES]
+    rollout = measured(results / "rollout" / f"{name}.json", name)
+    bound = measured(results / "bounds" / f"{name}.json", name)
+    baselines = results / name / "baselines.json"
+    before = read(Baselines, baselines, "results") if baselines.exists() else None
+    pairs = {(content["mode"], content["broadcast"]) for content in classes.values()}
+    for mode, broadcast in sorted(pairs, key=str):
+        plain, remembering = (
+            next(
+                (
+                    hull_of(content)
+                    for content in classes.values()
+                    if (content["mode"], content["broadcast"], content["memory"])
+                    == (mode, broadcast, memory)
+                ),
+                [],
+            )
+            for memory in (False, True)
+        )
+        default = mode != "local" or broadcast == envelopes["inputs"]["broadcasts"][0]
+        old = old_hull(before, mode) if before and default else []
+        own = [rollout if mode == "sensors" else [], bound]
+        label = mode if broadcast is None else f"{mode}, {broadcast}"
+        for rate in rates:
+            cells = [cell(hull, rate) for hull in (old, plain, remembering, *own)]
+            yield f"| {name} | {label} | {rate:.4g} | {' | '.join(cells)} |"
+
+
+def hull_of(content: dict[str, Any]) -> list[EnvelopePoint]:
+    """A class's envelope on the test seeds."""
+    points = [
+        EnvelopePoint(v["name"], v["test"]["rate"], v["test"]["mse"]["mean"])
+        for v in content["vertices"]
+    ]
+    return sorted(points, key=lambda point: (point.rate, point.mse))
+
+
+def old_hull(baselines: dict[str, Any], mode: str) -> list[EnvelopePoint]:
+    """The envelope with which agents were compared before there were committed ones."""
+    points = []
+    for curve in baselines["curves"].values():
+        if covers(_BEFORE[mode], curve["knows"]):
+            for name in curve["policies"]:
+                policy = baselines["policies"][name]
+                rate = sum(policy["rate"]) / len(policy["rate"])
+                points.append(EnvelopePoint(name, rate, policy["mse"]["mean"]))
+    return lower_hull(points) if points else []
+
+
+def measured(path: Path, setting: str) -> list[EnvelopePoint]:
+    """The points of a file ``{"setting": …, "points": [{"rate": …, "mse": …}, …]}``, if there.
+
+    Raises:
+        ConfigurationError: it is of another shape, or of another setting.
+    """
+    if not path.exists():
+        return []
+    found = read(Measurements, path, "results")
+    if found["setting"] != setting:
+        raise ConfigurationError(
+            f"results = {str(path)!r}: setting = {found['setting']!r} is not allowed: it must be "
+            f"{setting!r}"
+        )
+    points = [EnvelopePoint(f"{p['rate']}", p["rate"], p["mse"]) for p in found["points"]]
+    return sorted(points, key=lambda point: point.rate)
+
+
+def cell(points: list[EnvelopePoint], rate: float) -> str:
+    """The error at a rate between the points, or a dash."""
+    computed = bool(points) and points[0].rate > 0.0  # point by point: it ends with the last one
+    if not points or (computed and rate > points[-1].rate):
+        return "–"
+    found = height(points, rate)
+    return "–" if found is None else f"{found:.4g}"
+
+
+def vertices_of(envelopes: dict[str, Any]) -> Iterator[str]:
+    """A setting's coordinators and what their envelopes are made of."""
+    yield f"### {envelopes['title']}"
+    yield ""
+    yield "| class | rule | rate | MSE on test seeds | on tuning seeds |"
+    yield "|---|---|---|---|---|"
+    for name, content in envelopes["classes"].items():
+        for vertex in content["vertices"]:
+            test, tuning = vertex["test"], vertex["tuning"]
+            yield (
+                f"| {name} | `{vertex['name']}` | {test['rate']:.4f} | "
+                f"{test['mse']['mean']:.4g} [{test['mse']['low']:.4g}, {test['mse']['high']:.4g}] "
+                f"| {tuning['mse']['mean']:.4g} |"
+            )
+    yield ""

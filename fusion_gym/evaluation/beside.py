@@ -1,0 +1,140 @@
+"""Several policies on the same episodes in one batch: for searches over many parameters."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array, take_runs
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.beliefs import Beliefs, Estimate
+from fusion_gym.core.system import Signals
+from fusion_gym.core.task import Task
+from fusion_gym.policies.base import Policy, owner_of
+from fusion_gym.validation import ConfigurationError
+
+Runs = NDArray[np.int64]
+
+
+class Brief(NamedTuple):
+    """What a policy's E episodes brought, each averaged over its steps.
+
+    ``rate`` (E,) of transmissions, the mean over sensors · ``mse`` (E,), as in
+    :class:`~fusion_gym.evaluation.episodes.EpisodeResults`.
+    """
+
+    rate: Array
+    mse: Array
+
+
+def run_beside(task: Task, policies: Sequence[Policy], episodes: int, seed: int) -> list[Brief]:
+    """What ``run_episodes`` finds of each policy, up to rounding, in the time of one large batch.
+
+    Every policy meets the noise of the seeds ``seed``, ``seed + 1``, …; a step's cost hardly
+    depends on the number of runs as long as that is some hundred.
+
+    Raises:
+        ConfigurationError: no policies, policies that look at different owners' beliefs, fewer
+            than one episode, or a negative seed.
+        LookupError: a policy looks at a signal that the task withholds.
+    """
+    validation.integer("episodes", episodes, at_least=1)
+    validation.integer("seed", seed, at_least=0)
+    owners = {owner_of(policy) for policy in policies}
+    if len(owners) != 1:
+        raise ConfigurationError(
+            f"policies that look at the beliefs of {sorted(map(str, owners))} are not allowed "
+            "beside each other: there must be some, and all must look at the same owner's"
+        )
+    runs = len(policies) * episodes
+    batch = EpisodeBatch(task, runs, owners.pop())
+    batch.seed(np.arange(runs), [seed + run % episodes for run in range(runs)])
+    batch.reset()
+    for policy in policies:
+        policy.reset(episodes, seed)
+    parts = np.arange(runs).reshape(len(policies), episodes)
+    mse, rate = np.zeros(runs), np.zeros(runs)
+    for _ in range(task.horizon):
+        signals = _Whole(batch.signals())
+        asked = [policy(signals.part(part)) for policy, part in zip(policies, parts, strict=True)]
+        outcome = batch.step(np.concatenate(asked, axis=-1))
+        mse += outcome.squared_error.sum(0)
+        rate += outcome.granted.mean(0)
+    return [Brief(rate[part] / task.horizon, mse[part] / task.horizon) for part in parts]
+
+
+class _Whole:
+    """The signals of all runs, from which each policy takes those of its own."""
+
+    def __init__(self, signals: Signals) -> None:
+        self._signals = signals
+        self._beliefs: dict[str, _Once] = {}
+
+    def part(self, runs: Runs) -> Signals:
+        """The signals of some runs alone; nothing is computed before it is looked at."""
+        values: dict[str, Callable[[], Any]] = {
+            name: partial(self._take, name, runs) for name in self._signals
+        }
+        return Signals(values, self._signals.hidden)
+
+    def _take(self, name: str, runs: Runs) -> Any:
+        if name in self._beliefs:
+            return _Part(self._beliefs[name], runs)
+        value: Any = self._signals[name]
+        if isinstance(value, Beliefs):
+            self._beliefs[name] = _Once(value)
+            return _Part(self._beliefs[name], runs)
+        if name == "token_cost":  # the same for all runs
+            return value
+        if name == "observation":  # the one with the batch first
+            return value[runs]
+        return take_runs(value, runs)
+
+
+class _Once:
+    """Beliefs of all runs, whose sums over several steps are computed once for all policies."""
+
+    def __init__(self, beliefs: Beliefs) -> None:
+        self.beliefs = beliefs
+        self.loss = functools.cache(beliefs.loss)
+        self.value = functools.cache(beliefs.value)
+
+
+class _Part(Beliefs):
+    """The beliefs of some runs alone."""
+
+    def __init__(self, whole: _Once, runs: Runs) -> None:
+        self.task, self.shadows = whole.beliefs.task, whole.beliefs.shadows
+        self._whole, self._chosen = whole, runs
+        self.arrival = take_runs(whole.beliefs.arrival, runs)
+
+    @property
+    def silent(self) -> Estimate:
+        estimate: Estimate = take_runs(self._whole.beliefs.silent, self._chosen)
+        return estimate
+
+    @property
+    def sent(self) -> Estimate:
+        estimate: Estimate = take_runs(self._whole.beliefs.sent, self._chosen)
+        return estimate
+
+    @property
+    def best(self) -> Estimate:
+        estimate: Estimate = take_runs(self._whole.beliefs.best, self._chosen)
+        return estimate
+
+    @property
+    def remembered(self) -> Any:
+        return take_runs(self._whole.beliefs.remembered, self._chosen)
+
+    def loss(self, steps: int = 1) -> Array:
+        return np.asarray(take_runs(self._whole.loss(steps), self._chosen))
+
+    def value(self, steps: int = 1) -> Array:
+        return np.asarray(take_runs(self._whole.value(steps), self._chosen))

@@ -1,0 +1,227 @@
+"""Tuning and committed envelopes: what is searched, chosen, measured, hashed and compared."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small_suite import ENV, small_suite
+
+import fusion_gym
+from agents import envelope
+from agents.suite.classes import Class, classes_of
+from agents.suite.committed import read_envelopes
+from agents.suite.config import Choices, Family, Range, Tuning, load_suite
+from agents.suite.envelope_table import cell
+from agents.suite.tuning import Trial, first_values, near_hull, policy_text, search
+from fusion_gym.core.system import covers
+from fusion_gym.evaluation.beside import run_beside
+from fusion_gym.evaluation.envelope import EnvelopePoint, chosen_mse, lower_hull
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError
+
+FAMILY = Family(
+    label="x", policy="innovation_threshold",
+    parameters={
+        "threshold": Range(low=0.1, high=10, per_sensor=True),
+        "whitened": Choices(values=(True, False)),
+    },
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("options", "policies"),
+    [
+        ({}, ["innovation_threshold:threshold=0.5", "stochastic_event:weight=2", "always"]),
+        ({"memory": True}, ["value_of_information:threshold=0.01,steps=2", "value_of_information"]),
+        (
+            {"memory": True},
+            ["estimate_difference:own=true", "estimate_difference:own=true,whitened=true"],
+        ),
+    ],
+)
+def test_policies_beside_each_other_do_what_each_does_alone(
+    options: dict[str, Any], policies: list[str]
+) -> None:
+    task = fusion_gym.make_task(ENV, filter="tobit", horizon=15, **options)
+    made = [make_policy(name, task) for name in policies]
+    for name, brief in zip(policies, run_beside(task, made, 7, 3), strict=True):
+        alone = run_episodes(task, make_policy(name, task), 7, 3)
+        np.testing.assert_array_equal(brief.mse, alone.mse)
+        np.testing.assert_allclose(brief.rate, alone.rate.mean(-1), rtol=1e-12)
+
+
+def test_owners_of_beliefs_are_not_mixed() -> None:
+    task = fusion_gym.make_task(ENV, filter="tobit", memory=True, horizon=5)
+    made = [make_policy(f"value_of_information:own={own}", task) for own in ("true", "false")]
+    with pytest.raises(ConfigurationError, match="the same owner"):
+        run_beside(task, made, 2, 0)
+
+
+def test_a_search_begins_with_values_that_all_sensors_share() -> None:
+    found = first_values(FAMILY, 24, 3, seed=0)
+    texts = [policy_text(FAMILY, values, 3) for values in found]
+    assert len(set(texts)) == 24
+    alike = [values for values in found if len({values[f"threshold_{i}"] for i in range(3)}) == 1]
+    assert alike == found[:12]
+    for kind in (True, False):
+        swept = [values["threshold_0"] for values in alike if values["whitened"] is kind]
+        assert np.diff(np.log(swept)) == pytest.approx(np.log(100) / 6)
+    assert policy_text(FAMILY, found[0], 3).endswith("whitened=true")
+    fixed = Family(label="y", policy="paced:rate=0.1", parameters={"a": Choices(values=(1,))})
+    assert policy_text(fixed, {"a": 1}, 3) == "paced:rate=0.1,a=1"
+    assert found != first_values(FAMILY, 24, 3, seed=1)
+
+
+def test_the_search_at_a_price_gets_nearer_to_the_envelope_there() -> None:
+    """More than as many trials without it, and the same again."""
+    task = fusion_gym.make_task(ENV, filter="tobit", random_start=True, horizon=30)
+    few = Tuning(trials=6, prices=4, refined=1, episodes=40, seeds=1)
+    more = few.model_copy(update={"refined": 4})
+    found = search(task, FAMILY, more, (0.003, 0.3), 0)
+    assert search(task, FAMILY, few, (0.003, 0.3), 0) == found[: 18 + 12]
+    points = [EnvelopePoint(t.policy, t.rate, t.mse) for t in found]
+    first, last = points[:18], points
+    slope = 0.5
+    assert min(p.mse + slope * p.rate for p in last) < min(p.mse + slope * p.rate for p in first)
+
+
+def test_all_of_the_hull_is_kept_and_what_lies_near() -> None:
+    curve = [Trial(f"p{k}", {}, 0.05 * k, (1 - 0.05 * k) ** 2) for k in range(21)]
+    above = [Trial("near", {}, 0.5, 0.2525), Trial("far", {}, 0.5, 0.4)]
+    kept = near_hull(curve + above, near=0.02, finalists=22)
+    assert set(kept) == {trial.policy for trial in curve} | {"near"}
+    assert len(near_hull(curve + above, near=0.02, finalists=3)) == 21
+
+
+def test_classes_contain_what_knows_less() -> None:
+    suite = load_suite("benchmark")
+    for setting in suite.settings:
+        classes = list(classes_of(setting))
+        assert len({c.name for c in classes}) == len(classes)
+        for place, of in enumerate(classes):
+            assert of.contains(of)
+            for other in classes:
+                if of != other and of.contains(other):
+                    assert classes.index(other) < place
+                    assert covers(of.knows, other.knows)
+        packets = Class("local", False, "packets")
+        assert packets.contains(Class("local", False, "estimate"))
+        assert not packets.contains(Class("local", True, "estimate"))
+        assert not Class("local", True, "estimate").contains(packets)
+        assert classes[-1].name == "sensors_memory"
+        assert all(classes[-1].contains(c) for c in classes)
+
+
+def test_chosen_policies_all_count() -> None:
+    """A vertex that lies above its neighbours' line on other episodes stays in the envelope."""
+    task = fusion_gym.make_task(ENV, filter="tobit", horizon=10)
+    found = {
+        name: run_episodes(task, make_policy(name, task), 5, 0)
+        for name in ("never", "random:rate=0.3", "always")
+    }
+    rate = float(found["random:rate=0.3"].rate.mean())
+    mixed = chosen_mse(found, rate)
+    assert mixed is not None
+    np.testing.assert_array_equal(mixed, found["random:rate=0.3"].mse)
+    assert chosen_mse(found, -0.1) is None
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["envelope", *words])
+    envelope.main()
+
+
+def test_envelopes_are_committed_and_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = {
+        "label": "own", "policy": "value_of_information:own=true", "tuned_in": "local",
+        "parameters": {"threshold": {"low": 0.01, "high": 1}},
+    }  # fmt: skip
+    families = [json.loads(json.dumps(f)) for f in small_families()] + [own]
+    config = str(small_suite(tmp_path, families=families))
+    results = tmp_path / "results"
+    words = ["--config", config, "--results", str(results), "--work", str(tmp_path / "work")]
+    words += ["--workers", "1"]
+    run(monkeypatch, *words, "--classes", "centre", "local_packets")
+    path = results / "envelopes" / "small.json"
+    first = read_envelopes(path)
+    assert list(first["classes"]) == ["centre", "local_packets"]
+    with pytest.raises(SystemExit, match="--resume"):
+        run(monkeypatch, *words)
+    run(monkeypatch, *words, "--resume")
+    found = read_envelopes(path)
+    for name, content in first["classes"].items():
+        assert found["classes"][name] == content, "what is committed stays"
+    tuned: dict[str, list[EnvelopePoint]] = {}
+    for name, content in found["classes"].items():
+        listed = content["vertices"]
+        tuned[name] = [
+            EnvelopePoint(v["name"], v["tuning"]["rate"], v["tuning"]["mse"]["mean"])
+            for v in listed
+        ]
+        assert tuned[name] == lower_hull(tuned[name]), "chosen on the tuning seeds"
+        assert len(content["searches"]) == 2
+        assert all(covers(content["knows"], v["knows"]) for v in listed)
+        if not content["memory"]:
+            assert not any("memory" in v["options"] for v in listed)
+    # On the tuning seeds no class is worse than one that it contains.
+    for name, content in found["classes"].items():
+        for inside in content["contains"]:
+            both = [*tuned[name], *tuned[inside]]
+            assert {p[1:] for p in lower_hull(both)} <= {p[1:] for p in tuned[name]}
+    # The values are those of the test seeds.
+    vertex = found["classes"]["sensors_memory"]["vertices"][-1]
+    task = fusion_gym.make_task(ENV, filter="tobit", horizon=10, **vertex["options"])
+    again = run_episodes(task, make_policy(vertex["policy"], task), 12, 0)
+    assert vertex["test"]["mse"]["mean"] == pytest.approx(again.mse.mean())
+    text = (results / "envelopes" / "README.md").read_text()
+    assert "| small | sensors |" in text
+    assert "| small | local, packets |" in text
+    # What was changed by hand is noticed, and what was made from other inputs refused.
+    content = json.loads(path.read_text())
+    content["classes"]["centre"]["vertices"][0]["test"]["mse"]["mean"] *= 0.9
+    path.write_text(json.dumps(content))
+    with pytest.raises(SystemExit, match=r"classes.centre.sha256 = .* it was changed"):
+        run(monkeypatch, *words, "--resume")
+    path.write_text(json.dumps(found))
+    other = tmp_path / "other"
+    other.mkdir()
+    words[1] = str(small_suite(other, families=families, episodes=13))
+    with pytest.raises(SystemExit, match="episodes = 13 differs"):
+        run(monkeypatch, *words, "--resume")
+    capsys.readouterr()
+
+
+def small_families() -> list[dict[str, Any]]:
+    from small_suite import SMALL
+
+    found: list[dict[str, Any]] = SMALL["families"]
+    return found
+
+
+def test_a_family_that_does_not_fit_is_told_before_anything_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong = [{"label": "gap", "policy": "paced:rat=1", "parameters": {}}]
+    words = ["--config", str(small_suite(tmp_path, families=wrong)), "--results"]
+    words += [str(tmp_path / "results"), "--work", str(tmp_path / "work")]
+    with pytest.raises(SystemExit) as caught:
+        run(monkeypatch, *words)
+    assert "family = 'gap' is not allowed in small" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert not list((tmp_path / "work").rglob("*.json"))
+
+
+def test_cells_of_the_table() -> None:
+    envelope = [EnvelopePoint("a", 0.0, 2.0), EnvelopePoint("b", 0.2, 1.0)]
+    assert [cell(envelope, rate) for rate in (0.1, 0.3)] == ["1.5", "1"]
+    computed = [EnvelopePoint("a", 0.1, 2.0), EnvelopePoint("b", 0.2, 1.0)]
+    assert [cell(computed, rate) for rate in (0.05, 0.15, 0.3)] == ["–", "1.5", "–"]
+    assert cell([], 0.1) == "–"
