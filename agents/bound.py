@@ -26,7 +26,7 @@ from fusion_gym.solvers.silence import SilenceBound, silence_bound
 from fusion_gym.validation import choice
 
 from .command_line import Command, Words, start
-from .input.options import Between, Episodes, OutputFile, Seed
+from .input.options import Between, Episodes, OutputFile, Seed, Whole
 from .output import tables
 from .output.files import write
 
@@ -51,6 +51,8 @@ class Bound(Command):
     """What weighs the states: mse (each with 1) or reward (as the reward does)."""
     accuracy: Annotated[float, Between(0.0, 0.5)] = 0.01
     """What the bound may lose by its lattices, relatively."""
+    points: Annotated[int, Whole(1000)] = 3_000_000
+    """Points of a lattice at most; the accuracy suffers before."""
     episodes: Episodes = 1000
     """Episodes in which everything is delivered."""
     seed: Seed = 0
@@ -72,7 +74,9 @@ class Bound(Command):
         console = tables.console()
         if self.rates:
             weights = _reward_weights(task) if self.weights == "reward" else None
-            bound = silence_bound(task, self.rates, weights, self.accuracy, progress=console.print)
+            bound = silence_bound(
+                task, self.rates, weights, self.accuracy, self.points, progress=console.print
+            )
             report |= summary(bound, self.rates)
         delivered = everything_delivered(self.env, options, self.filters, self.episodes, self.seed)
         report["everything_delivered"] = {

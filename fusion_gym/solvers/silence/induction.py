@@ -63,7 +63,10 @@ class SilenceSolution:
 
 
 class _Expectation:
-    """E of the next time's value at A e + w, from below; ``middle`` is that at e = 0."""
+    """E of the next time's value at A e + w, from below; ``middle`` is that at e = 0.
+
+    The cost after a packet is at most by ``rise`` higher at the time before.
+    """
 
     def __init__(self, stage: Stage, price: float) -> None:
         deviations = np.sqrt(stage.coordinates.variance) / stage.step
@@ -73,6 +76,7 @@ class _Expectation:
         self.far = stage.ceiling - _TAIL * price
         self.half = (np.array(gain.shape) - 1) // 2
         self.middle = float(self.values[tuple(self.half)])
+        self.rise = max(self.middle - stage.floor, 0.0) + _TAIL * price
 
     def within(self, deviations: float) -> Array:
         """Semi-axes (B, n) of ellipsoids, each around all points that near the silent set.
@@ -85,13 +89,13 @@ class _Expectation:
         return np.sqrt((1.0 + 1.0 / _BALANCES) * silent + (1.0 + _BALANCES) * noise)
 
     def at(self, points: Array) -> Array:
-        """The expectation at ``points`` A e (n, ...)."""
-        places = np.tensordot(self.stage.coordinates.inverse / self.stage.step, points, 1)
-        near = np.ones(points.shape[1:], dtype=np.bool_)
+        """The expectation (M,) at ``points`` A e (n, M)."""
+        places = (self.stage.coordinates.inverse / self.stage.step) @ points
+        near = np.ones(points.shape[1], dtype=np.bool_)
         for place, half in zip(places, self.half, strict=True):
             near &= np.abs(place) <= half
         found, parts = interpolated(self.values, places[:, near])
-        result = np.full(points.shape[1:], self.far)
+        result = np.full(points.shape[1], self.far)
         result[near] = found - self.stage.step**2 * parts
         return result
 
@@ -136,7 +140,7 @@ def _half(
     if ahead is None:
         width = extents(weight / price)
     else:
-        rise = max(ahead.middle - ahead.stage.floor, 0.0) + _TAIL * price
+        rise = ahead.rise
         to_next = ahead.stage.coordinates.inverse @ problem.transition @ coordinates.basis
         width = np.full(problem.size, np.inf)
         for deviations in _DEVIATIONS.tolist():
@@ -163,7 +167,9 @@ def _stage(
     error = np.tensordot(coordinates.basis, place, 1)
     silent = np.tensordot(problem.weights, error**2, 1)
     if ahead is not None:
-        silent += ahead.at(np.tensordot(problem.transition, error, 1))
+        known = silent <= problem.price + ahead.rise  # elsewhere silence is not best
+        silent[known] += ahead.at(problem.transition @ error[:, known])
+        silent[~known] = np.inf
     between = 0.25 * problem.size * step**2  # by which the cost may be less between points
     # At the last step the cost of silence is known, and least at 0.
     floor = 0.0 if ahead is None else float(silent.min()) - between

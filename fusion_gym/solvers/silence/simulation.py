@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
 from fusion_gym.solvers.silence.induction import SilenceSolution, Stage
@@ -38,7 +39,7 @@ def simulate(
         factor = covariance_factor(noise)
         moved = factor @ draw.standard_normal((factor.shape[1], episodes))
         error = problem.transition @ error + moved
-        sends = ~_silent(stage, error)
+        sends = _sends(stage, error)
         error[:, sends] = 0.0
         cost += problem.weights @ error**2 + problem.price * sends
         packets += float(sends.mean())
@@ -47,12 +48,12 @@ def simulate(
     return UpperValue(float(cost.mean()), deviation, packets / problem.horizon)
 
 
-def _silent(stage: Stage, error: Array) -> Array:
-    """Whether silence is best at the point next to each of the errors (n, M)."""
+def _sends(stage: Stage, error: Array) -> NDArray[np.bool_]:
+    """Whether a packet is best at the point next to each of the errors (n, M)."""
     place = np.rint(stage.coordinates.inverse @ error / stage.step).astype(np.int64)
     place += stage.half[:, None]
     shape = np.array(stage.gain.shape)[:, None]
     inside = ((place >= 0) & (place < shape)).all(0)
-    result = np.zeros(error.shape[1], dtype=np.bool_)
-    result[inside] = stage.gain[tuple(place[:, inside])] < 0.0
+    result = np.ones(error.shape[1], dtype=np.bool_)
+    result[inside] = stage.gain[tuple(place[:, inside])] == 0.0
     return result
