@@ -1,0 +1,133 @@
+"""Print what no policy can undercut: floors, and a proven lower bound of the error at each rate.
+
+    python -m agents.bound --env fusion_gym/TobitOscillator-v0 \\
+        --set filter=tobit random_start=true token_rate=2 --filters tobit adf --rates 0.03 0.1
+
+Rates are transmissions a sensor and step; ``docs/bounds.md`` has the proof and says where it does
+not apply. There only what is left where everything is delivered is printed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich import box
+from rich.table import Table
+
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation.floor import everything_delivered
+from fusion_gym.policies.settings import parse_settings
+from fusion_gym.solvers.silence import SilenceBound, silence_bound
+from fusion_gym.validation import choice
+
+from .command_line import Command, Words, start
+from .input.options import Between, Episodes, OutputFile, Seed, Whole
+from .output import tables
+from .output.files import write
+
+_WEIGHTS = ("mse", "reward")
+
+
+@dataclass(frozen=True)
+class Bound(Command):
+    """Print what no policy can undercut: floors, and a proven lower bound at each rate."""
+
+    env: str
+    """Id of a registered environment."""
+    options: Annotated[
+        Words, tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE …")
+    ] = ()
+    """Options of gym.make for the environment."""
+    rates: Annotated[tuple[float, ...], Between(0.0, 1.0)] = ()
+    """Transmissions a sensor and step; without any, only what is left with everything delivered."""
+    filters: tuple[str, ...] = ()
+    """Filters to take everything in with; by default the environment's own."""
+    weights: str = "mse"
+    """What weighs the states: mse (each with 1) or reward (as the reward does)."""
+    accuracy: Annotated[float, Between(0.0, 0.5)] = 0.01
+    """What the bound may lose by its lattices, relatively."""
+    points: Annotated[int, Whole(1000)] = 3_000_000
+    """Points of a lattice at most; the accuracy suffers before."""
+    episodes: Episodes = 1000
+    """Episodes in which everything is delivered."""
+    seed: Seed = 0
+    """Seed of the first episode."""
+    json: Annotated[Path | None, OutputFile()] = None
+    """Write the results to this file."""
+
+    def run(self) -> None:
+        """Work out floors and bound, write and print them."""
+        options = parse_settings("option", list(chain(*self.options)))
+        choice("weights", self.weights, _WEIGHTS)
+        task = make_task(self.env, **options)
+        report: dict[str, Any] = {
+            "env": self.env,
+            "settings": task.settings,
+            "horizon": task.horizon,
+            "weights": self.weights,
+        }
+        console = tables.console()
+        if self.rates:
+            weights = _reward_weights(task) if self.weights == "reward" else None
+            bound = silence_bound(
+                task, self.rates, weights, self.accuracy, self.points, progress=console.print
+            )
+            report |= summary(bound, self.rates)
+        delivered = everything_delivered(self.env, options, self.filters, self.episodes, self.seed)
+        report["everything_delivered"] = {
+            name: found._asdict() for name, found in delivered.items()
+        }
+        write(self.json, report)
+        console.print(_floors(report))
+        if self.rates:
+            console.print(_table(report))
+
+
+def summary(bound: SilenceBound, rates: tuple[float, ...]) -> dict[str, Any]:
+    """The bound at each rate, and the costs that show it, as the JSON holds them."""
+    rows = []
+    for rate in rates:
+        value, shown = bound.at(rate)
+        rows.append({"rate": rate, "bound": value, "price": shown.price, "gap": shown.gap})
+    costs = [asdict(cost) | {"gap": cost.gap} for cost in bound.costs]
+    return {"floor": bound.floor, "bounds": rows, "costs": costs}
+
+
+def _reward_weights(task: Task) -> Any:
+    return task.reward.error_weight * task.reward.state_weights[:, 0]
+
+
+def _floors(report: dict[str, Any]) -> Table:
+    table = Table(title=f"{report['env']}: floors", box=box.SIMPLE_HEAD)
+    table.add_column("everything delivered")
+    table.add_column("MSE, every state with 1", justify="right")
+    for name, found in report["everything_delivered"].items():
+        table.add_row(f"filter {name}", tables.number(found))
+    if "floor" in report:
+        table.add_row("uncensored, Kalman filter: unavoidable", f"{report['floor']:.4g}")
+    return table
+
+
+def _table(report: dict[str, Any]) -> Table:
+    table = Table(title="no policy has less", box=box.SIMPLE_HEAD)
+    for column in ("rate", "error at least", "price of a packet", "gap at this price"):
+        table.add_column(column, justify="right")
+    for row in report["bounds"]:
+        table.add_row(
+            f"{row['rate']:.4g}", f"{row['bound']:.5g}", f"{row['price']:.3g}", f"{row['gap']:.2%}"
+        )
+    return table
+
+
+def main() -> None:
+    """Entry point; exit status 130 after an interrupt."""
+    start(Bound)
+
+
+if __name__ == "__main__":
+    main()

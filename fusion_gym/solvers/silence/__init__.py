@@ -1,0 +1,20 @@
+"""When silence is best, once all else is given away: a lower bound of every policy's error."""
+
+from fusion_gym.solvers.silence.bound import PricedCost, SilenceBound, silence_bound
+from fusion_gym.solvers.silence.induction import SilenceSolution, solve_silence
+from fusion_gym.solvers.silence.model import SilenceModel, silence_model
+from fusion_gym.solvers.silence.problem import SilenceProblem
+from fusion_gym.solvers.silence.simulation import UpperValue, simulate
+
+__all__ = [
+    "PricedCost",
+    "SilenceBound",
+    "SilenceModel",
+    "SilenceProblem",
+    "SilenceSolution",
+    "UpperValue",
+    "silence_bound",
+    "silence_model",
+    "simulate",
+    "solve_silence",
+]

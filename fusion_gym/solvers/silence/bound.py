@@ -1,0 +1,154 @@
+"""A lower bound of every policy's error at a rate, for linear plants measured at every step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import brentq
+
+from fusion_gym import validation
+from fusion_gym.core.task import Task
+from fusion_gym.solvers.silence.induction import SilenceSolution, solve_silence
+from fusion_gym.solvers.silence.model import SilenceModel, silence_model
+from fusion_gym.solvers.silence.simulation import simulate
+
+_ROUGH_STEP = 0.15  # of the root of the price: enough to find the price of a rate
+_ROUGH_EPISODES = 4000
+_SPAN = 1e7  # of the prices looked at, relative to each other
+_CLOSE = 0.02  # of the logarithm of the price: the bound is flat there
+
+
+@dataclass(frozen=True)
+class PricedCost:
+    """The least cost of an episode's step, error and packets, at a ``price`` of a packet.
+
+    It is proven to be at least ``lower``; ``upper``, with three standard errors in it, is what the
+    policy of the lattices costs, which transmits at ``rate`` (a sensor and step). ``step`` and
+    ``points`` are those of the lattices.
+    """
+
+    price: float
+    lower: float
+    upper: float
+    rate: float
+    step: float
+    points: int
+
+    @property
+    def gap(self) -> float:
+        """How far the least cost may lie above ``lower``, as a share of it."""
+        return (self.upper - self.lower) / self.lower
+
+
+@dataclass(frozen=True)
+class SilenceBound:
+    """What no policy can undercut.
+
+    ``floor`` is the error where everything is known to the centre at once, averaged over an
+    episode's steps; ``costs`` are in the order of their prices.
+    """
+
+    floor: float
+    sensors: int
+    costs: tuple[PricedCost, ...]
+
+    def at(self, rate: float) -> tuple[float, PricedCost]:
+        """The bound at a rate (transmissions a sensor and step), and the price that shows it."""
+        packets = rate * self.sensors
+        found = [(cost.lower - cost.price * packets, cost) for cost in self.costs]
+        best, shown = max(found, key=lambda row: row[0])
+        return max(best, self.floor), shown
+
+
+def silence_bound(
+    task: Task,
+    rates: Sequence[float],
+    weights: ArrayLike | None = None,
+    accuracy: float = 0.01,
+    most_points: int = 3_000_000,
+    progress: Callable[[str], object] | None = None,
+) -> SilenceBound:
+    """Bound the error of every policy of the task from below, best at these rates.
+
+    The error is Σᵢ Wᵢ (xᵢ - x̂ᵢ)², averaged over an episode's steps, W = ``weights`` (n,), by
+    default 1: the MSE that an evaluation prints. No policy that transmits at a rate at most, with
+    whatever tokens, knowledge of the past and filter for what arrives, has less.
+
+    The lattices are so fine that the bound loses about ``accuracy``, relatively, as far as
+    ``most_points`` allow; what was reached is each cost's ``gap``. ``progress`` is told what is
+    being done.
+
+    Raises:
+        ConfigurationError: a task to which the bound does not apply, or a value that is not
+            allowed.
+    """
+    model = silence_model(task, weights)
+    wanted = [validation.number("rates", rate, above=0.0, at_most=1.0) for rate in rates]
+    share = validation.number("accuracy", accuracy, above=0.0, at_most=0.5)
+    limit = validation.integer("most_points", most_points, at_least=1000)
+    told = progress or (lambda text: None)
+    costs = []
+    for rate in wanted:
+        told(f"rate {rate:g}: looking for the price")
+        price, rough = _price(model, rate * task.sensors)
+        told(f"rate {rate:g}: price {price:.3g}")
+        costs.append(_cost(model, price, rough, rate, share, limit))
+    costs.sort(key=lambda cost: cost.price)
+    return SilenceBound(model.floor, task.sensors, tuple(costs))
+
+
+def _price(model: SilenceModel, packets: float) -> tuple[float, SilenceSolution]:
+    """A price at which about so many packets a step are best, and its solution on a rough lattice.
+
+    Any price gives a bound; this one a good one.
+    """
+    typical = float(np.einsum("tii,i->", model.problem.noise, model.problem.weights))
+    typical /= model.problem.horizon
+    solved: dict[float, tuple[float, SilenceSolution]] = {}
+
+    def excess(logarithm: float) -> float:
+        problem = replace(model.problem, price=float(np.exp(logarithm)))
+        solution = solve_silence(problem, _ROUGH_STEP * np.sqrt(problem.price))
+        sent = simulate(problem, solution, _ROUGH_EPISODES).packets
+        solved[logarithm] = (sent - packets, solution)
+        return sent - packets
+
+    low = high = float(np.log(typical))
+    reach = 0.5 * np.log(_SPAN)
+    while excess(low) < 0.0 and low > np.log(typical) - reach:
+        high, low = low, low - 1.5
+    while excess(high) > 0.0 and high < np.log(typical) + reach:
+        low, high = high, high + 1.5
+    if solved[low][0] > 0.0 > solved[high][0]:
+        brentq(lambda logarithm: excess(float(logarithm)), low, high, xtol=_CLOSE)
+    best = min(solved, key=lambda logarithm: abs(solved[logarithm][0]))
+    return float(np.exp(best)), solved[best][1]
+
+
+def _cost(
+    model: SilenceModel,
+    price: float,
+    rough: SilenceSolution,
+    rate: float,
+    accuracy: float,
+    most_points: int,
+) -> PricedCost:
+    """Both sides of the least cost at a price, on lattices for this accuracy at this rate."""
+    problem = replace(model.problem, price=price)
+    size, coarse = problem.size, rough.stages[0].step
+    bound = max(model.floor + rough.lower - price * rate * model.sensors, model.floor)
+    step = float(np.sqrt(3.0 * accuracy * bound / size))
+    step = max(step, coarse * (rough.points / most_points) ** (1.0 / size))
+    solution = solve_silence(problem, step)
+    above = simulate(problem, solution)
+    return PricedCost(
+        price=price,
+        lower=model.floor + solution.lower,
+        upper=model.floor + above.high,
+        rate=above.packets / model.sensors,
+        step=step,
+        points=solution.points,
+    )

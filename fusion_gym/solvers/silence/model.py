@@ -1,0 +1,102 @@
+"""What a task leaves to decide once censoring and tokens are given away, and where it may be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.task import Task
+from fusion_gym.solvers.silence.problem import SilenceProblem
+from fusion_gym.systems.tobit.bound_filter import BoundTobitFilter
+from fusion_gym.systems.tobit.centre import Centre, FeedbackCentre, SequentialCentre
+from fusion_gym.systems.tobit.filters import KalmanFilter
+from fusion_gym.systems.tobit.system import CensoredSystem
+from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
+from fusion_gym.validation import ConfigurationError
+
+
+@dataclass(frozen=True)
+class SilenceModel:
+    """The task's problem at a price of 1, and the ``floor`` under its error, a mean over steps."""
+
+    problem: SilenceProblem
+    floor: float
+    sensors: int
+
+
+def silence_model(task: Task, weights: ArrayLike | None = None) -> SilenceModel:
+    """The Kalman filter of all uncensored measurements, the first one included.
+
+    Its covariances P(t) are the floor, and its corrections, of covariance P⁻(t) - P(t), are the
+    noise of what the centre does not know. ``weights`` (n,) are by default 1.
+
+    Raises:
+        ConfigurationError: a task whose centre does other things in silence than to predict with
+            the plant's own matrix, or weights that are not all above 0.
+    """
+    system = _system(task)
+    plant, sensors = system.plant, system.centre.sensors
+    transition, process = plant.transition[..., 0], plant.process_covariance[..., 0]
+    size = plant.size
+    weight = validation.positive("weights", np.ones(size) if weights is None else weights, (size,))
+    matrix = sensors.measurement_matrix[..., 0].reshape(-1, size)
+    variance = sensors.variance[..., 0].ravel()
+    covariance, correction = _update(plant.initial_covariance[..., 0], matrix, variance)
+    # The centre starts without the first measurement, but a policy may know it.
+    before = transition @ correction @ transition.T
+    noise, floor = np.empty((task.horizon, size, size)), 0.0
+    for time in range(task.horizon):
+        prior = transition @ covariance @ transition.T + process
+        covariance, noise[time] = _update(prior, matrix, variance)
+        floor += float(weight @ np.diagonal(covariance)) / task.horizon
+    noise[0] += before
+    return SilenceModel(SilenceProblem.create(transition, weight, noise, 1.0), floor, task.sensors)
+
+
+def _update(prior: Array, matrix: Array, variance: Array) -> tuple[Array, Array]:
+    """The posterior covariance, and that of the correction K (y - C x̂), both (n, n)."""
+    innovation = matrix @ prior @ matrix.T + np.diag(variance)
+    gain = np.linalg.solve(innovation, matrix @ prior).T
+    keep = np.eye(len(prior)) - gain @ matrix
+    posterior = keep @ prior @ keep.T + gain * variance @ gain.T
+    correction = gain @ innovation @ gain.T
+    return 0.5 * (posterior + posterior.T), 0.5 * (correction + correction.T)
+
+
+def _system(task: Task) -> CensoredSystem:
+    """The task's system, if the bound applies to it."""
+    system: Any = task.system
+    if not isinstance(system, CensoredSystem):
+        raise ConfigurationError(
+            f"system = {type(system).__name__} is not allowed for the bound: its estimate from all "
+            "measurements must be that of a linear plant, as in TobitOscillator and the biased "
+            "systems"
+        )
+    if system.model is not system.plant:
+        raise ConfigurationError(
+            "bias_aware = False is not allowed for the bound: the filters must predict with the "
+            "plant's own matrix"
+        )
+    if not _predicts(system.centre):
+        raise ConfigurationError(
+            "filter is not allowed for the bound: in silence the centre must predict, so neither "
+            "hold the last value (filter='paper' with silent='hold') nor read what silence says "
+            "(filter='stochastic')"
+        )
+    return system
+
+
+def _predicts(centre: Centre) -> bool:
+    """Whether A x̂ is all that the centre makes of a step without deliveries."""
+    if isinstance(centre, SequentialCentre):
+        return True
+    if not isinstance(centre, FeedbackCentre):
+        return False
+    if isinstance(centre.filter, BoundTobitFilter):
+        return not centre.filter.hold
+    return isinstance(centre.filter, (KalmanFilter, TobitKalmanFilter))
