@@ -136,7 +136,10 @@ def test_one_table_as_rliable_has_it() -> None:
     library = pytest.importorskip("rliable.library")
     metrics = pytest.importorskip("rliable.metrics")
     means = np.array([-0.1, -0.09, -0.12, -0.07])
-    shares = np.random.default_rng(3).normal(means, 0.05, (8, 4))
+    noise = np.random.default_rng(3).normal(size=(20, 4))
+    # Columns without correlation: the library draws the seeds of each price by themselves, and one
+    # agent has all prices here.
+    shares = means + 0.2 * np.linalg.qr(noise - noise.mean(0))[0]
     rates = np.array([0.1, 0.2, 0.3, 0.4])
     found = interval(front_of(shares, rates), rates)
 
@@ -145,9 +148,13 @@ def test_one_table_as_rliable_has_it() -> None:
         return np.array([np.mean(columns)])
 
     point, ends = library.get_interval_estimates(
-        {"agent": shares}, mean_of_prices, reps=2000, task_bootstrap=True, random_state=0
+        {"agent": shares},
+        mean_of_prices,
+        reps=2000,
+        task_bootstrap=True,
+        random_state=np.random.RandomState(0),
     )
     assert found["mean"] == pytest.approx(point["agent"][0])
     width = ends["agent"][1, 0] - ends["agent"][0, 0]
-    assert found["high"] - found["low"] == pytest.approx(width, rel=0.15)
-    assert (found["low"], found["high"]) == pytest.approx(ends["agent"][:, 0], abs=0.15 * width)
+    assert found["high"] - found["low"] == pytest.approx(width, rel=0.2)
+    assert (found["low"], found["high"]) == pytest.approx(ends["agent"][:, 0], abs=0.2 * width)
