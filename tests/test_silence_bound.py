@@ -1,0 +1,322 @@
+"""The lower bound of every policy's error: against exact optima, policies and itself."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_runs import call
+from scipy import stats
+from scipy.optimize import brentq
+
+from fusion_gym.arrays import Array
+from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.evaluation.floor import everything_delivered
+from fusion_gym.evaluation.intervals import mean_interval
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.solvers.silence import (
+    SilenceProblem,
+    silence_bound,
+    silence_model,
+    simulate,
+    solve_silence,
+)
+from fusion_gym.solvers.silence.lattice import Coordinates, hat_weights, spread
+from fusion_gym.solvers.silence.survival import Survival
+from fusion_gym.solvers.single import solve_finite
+from fusion_gym.solvers.source import SourceProblem
+from fusion_gym.validation import ConfigurationError
+
+OSCILLATOR: dict[str, Any] = {"filter": "tobit", "random_start": True, "horizon": 20}
+TURN = [[0.8, -0.6], [0.6, 0.8]]
+
+
+# --- against what is known exactly ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("coefficient", "price", "horizon"),
+    [(1.0, 5.0, 40), (1.0, 0.3, 40), (0.9, 0.5, 30), (0.5, 3.0, 20), (1.05, 8.0, 20)],
+)
+def test_never_above_the_exact_optimum_of_remote_estimation(
+    coefficient: float, price: float, horizon: int
+) -> None:
+    """And within a thousandth of it: the bound is not low for safety."""
+    source = SourceProblem.create(coefficient=coefficient, price=price)
+    exact = solve_finite(source, horizon, grid=source.grid(horizon, step=0.02)).cost / horizon
+    noise = np.ones((horizon, 1, 1))
+    problem = SilenceProblem.create([[coefficient]], [1.0], noise, price)
+    coarse, fine = (solve_silence(problem, step).lower for step in (0.2, 0.03))
+    assert coarse < fine < exact
+    assert fine > 0.998 * exact
+
+
+def test_two_steps_in_the_plane_by_quadrature() -> None:
+    """Turned by A, with round noise: the squared length is a noncentral chi-square."""
+    price = 3.0
+
+    place, weight = np.polynomial.legendre.leggauss(60)
+    inner = 0.5 * price * (place + 1.0)
+
+    def silent(square: Array) -> Array:
+        """|e|² now, then the lesser of the next |e|² and a packet."""
+        left = stats.ncx2.sf(inner[:, None], 2, np.maximum(square, 1e-12))
+        return square + 0.5 * price * weight @ left
+
+    packet = price + float(silent(np.zeros(1))[0])
+    edge = float(brentq(lambda square: float(silent(np.array([square]))[0]) - packet, 0.0, 10.0))
+    outer = 0.5 * edge * (place + 1.0)
+    exact = 0.5 * edge * weight @ (silent(outer) * 0.5 * np.exp(-0.5 * outer))
+    exact += packet * np.exp(-0.5 * edge)
+    problem = SilenceProblem.create(TURN, [1.0, 1.0], np.tile(np.eye(2), (2, 1, 1)), price)
+    found = solve_silence(problem, 0.02).lower
+    assert found < 0.5 * exact
+    assert found == pytest.approx(0.5 * exact, rel=2e-3)
+
+
+def test_unequal_weights_are_a_change_of_units() -> None:
+    noise = np.tile(np.diag([1.0, 0.3]), (20, 1, 1))
+    plain = SilenceProblem.create(TURN, [1.0, 1.0], noise, 2.0)
+    unit = np.diag([2.0, 0.5])
+    other = SilenceProblem.create(
+        unit @ np.array(TURN) @ np.linalg.inv(unit), [0.25, 4.0], unit @ noise @ unit, 2.0
+    )
+    assert solve_silence(other, 0.1).lower == pytest.approx(
+        solve_silence(plain, 0.1).lower, rel=1e-3
+    )
+
+
+# --- against itself and against policies ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_policy_of_the_lattices_costs_no_less(seed: int) -> None:
+    """Any matrix, noise of any rank that changes with time; both sides are close."""
+    draw = np.random.default_rng(seed)
+    size = 2 if seed % 2 else 3
+    transition = draw.standard_normal((size, size))
+    transition /= max(np.abs(np.linalg.eigvals(transition)))
+    factor = draw.standard_normal((12, size, 1 + seed // 2))
+    noise = factor @ np.swapaxes(factor, -1, -2)
+    problem = SilenceProblem.create(transition, draw.uniform(0.5, 2.0, size), noise, 4.0)
+    solution = solve_silence(problem, 0.2)
+    above = simulate(problem, solution, 4000)
+    assert solution.lower < above.high
+    assert above.cost < 1.15 * solution.lower
+    # Neither always silent nor always sending is as good as the bound.
+    assert solution.lower < problem.price
+    covariance, silent = np.zeros((size, size)), 0.0
+    for step in noise:
+        covariance = transition @ covariance @ transition.T + step
+        silent += problem.weights @ np.diagonal(covariance) / len(noise)
+    assert solution.lower < silent
+
+
+@cache
+def oscillator_bound() -> Any:
+    return silence_bound(make_task("fusion_gym/TobitOscillator-v0", **OSCILLATOR), (0.03, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("policy", "tokens"),
+    [
+        ("always", "unlimited"),
+        ("always", "limited"),
+        ("never", "limited"),
+        ("innovation_threshold:threshold=1", "limited"),
+        ("innovation_threshold:threshold=2,at_most=1", "unlimited"),
+        ("innovation_threshold:threshold=3", "unlimited"),
+        ("periodic:period=12", "unlimited"),
+        ("lookahead:steps=1,price=0.02", "limited"),
+    ],
+)
+def test_never_above_the_interval_of_a_policy(policy: str, tokens: str) -> None:
+    options = OSCILLATOR | {"token_rate": 2.0, "tokens": tokens}
+    task = make_task("fusion_gym/TobitOscillator-v0", **options)
+    found = run_episodes(task, make_policy(policy, task), 300, 0)
+    bound, _ = oscillator_bound().at(float(found.rate.mean()))
+    assert bound < mean_interval(found.mse).low
+    assert bound >= oscillator_bound().floor
+
+
+def test_the_bound_is_tight_where_every_measurement_arrives_uncensored() -> None:
+    """The Kalman filter of all measurements is the floor, but for the first measurement."""
+    options = {"filter": "kalman", "censoring_threshold": -np.inf, "horizon": 100}
+    found = everything_delivered("fusion_gym/TobitOscillator-v0", options, (), 200)
+    model = silence_model(make_task("fusion_gym/TobitOscillator-v0", **options))
+    assert 0.9 * found["own"].mean < model.floor < found["own"].mean
+
+
+def test_a_better_filter_leaves_less_where_everything_is_delivered() -> None:
+    found = everything_delivered(
+        "fusion_gym/TobitOscillator-v0", {"random_start": True}, ("paper", "adf"), 100
+    )
+    assert found["adf"].high < found["paper"].low
+
+
+def test_halving_the_lattice_moves_the_bound_by_less_than_one_per_cent() -> None:
+    task = make_task("fusion_gym/TobitOscillator-v0", **OSCILLATOR)
+    model, bound = silence_model(task), oscillator_bound()
+    for rate in (0.03, 0.1):
+        value, cost = bound.at(rate)
+        problem = replace(model.problem, price=cost.price)
+        finer = solve_silence(problem, 0.5 * cost.step)
+        assert 0.0 < model.floor + finer.lower - cost.lower < 0.01 * value
+        assert model.floor + finer.lower < cost.upper
+        assert 0.0 < cost.gap < 0.015
+
+
+def test_the_bound_falls_with_the_rate_and_every_price_gives_one() -> None:
+    bound = oscillator_bound()
+    values = [bound.at(rate)[0] for rate in (0.01, 0.03, 0.06, 0.1, 0.5)]
+    assert (np.diff(values) < 0.0).all()
+    assert values[-1] == bound.floor
+    dear, cheap = bound.at(0.03)[1], bound.at(0.1)[1]
+    assert dear.price > cheap.price
+    assert dear.rate == pytest.approx(0.03, rel=0.1)
+    # The cost is concave in the price, its slope the packets a step.
+    slope = (dear.lower - cheap.lower) / (dear.price - cheap.price)
+    assert 3 * dear.rate < slope < 3 * cheap.rate
+
+
+# --- the parts ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("deviation", [0.05, 0.7, 3.0, 20.0])
+def test_hats_keep_the_mean_and_widen_the_noise(deviation: float) -> None:
+    weights = hat_weights(deviation, int(9 * deviation) + 3)
+    assert (weights >= -1e-16).all()
+    assert weights[0] + 2.0 * weights[1:].sum() == pytest.approx(1.0, abs=1e-13)
+    variance = 2.0 * weights @ np.arange(len(weights)) ** 2
+    assert deviation**2 <= variance < deviation**2 + 0.25
+    values, added = spread(np.array([0.0, -1.0, 0.0]), np.array([deviation]))
+    assert variance == pytest.approx(deviation**2 + added)
+    assert -values.sum() == pytest.approx(1.0, abs=1e-12)
+    # A concave function has its mean bounded from below: here that of -|X|.
+    mean = -2.0 * weights @ np.arange(len(weights))
+    assert mean <= -deviation * np.sqrt(2.0 / np.pi) + 1e-12
+
+
+def test_silence_lasts_no_longer_than_its_bounds_say() -> None:
+    draw, transition = np.random.default_rng(0), np.array(TURN)
+    noise, form = np.diag([0.3, 0.1]), np.diag([1.0, 0.8])
+    survival = Survival(transition, np.ones(2), 21)
+    for _ in range(20):
+        survival.add(form, noise)
+    assert np.trace(survival.curvature) < 2 * 20
+    for start in ([0.0, 0.0], [0.5, 0.0], [0.0, -0.9]):
+        error = np.tile(np.array(start)[:, None], 20_000)
+        silent = np.ones(20_000)
+        total = np.ones(20_000)
+        for _ in range(19):
+            error = transition @ error + np.sqrt(noise) @ draw.standard_normal(error.shape)
+            silent *= np.linalg.norm(form @ error, axis=0) <= 1.0
+            total += silent
+        assert total.mean() < 0.5 * np.trace(survival.curvature)
+
+
+def test_coordinates_make_noise_and_curvature_diagonal() -> None:
+    draw = np.random.default_rng(1)
+    root, factor = draw.standard_normal((3, 3)), draw.standard_normal((3, 2))
+    curvature, noise = root @ root.T, factor @ factor.T
+    found = Coordinates.create(curvature, noise)
+    assert found.basis.T @ curvature @ found.basis == pytest.approx(np.eye(3), abs=1e-9)
+    assert found.basis @ np.diag(found.variance) @ found.basis.T == pytest.approx(noise, abs=1e-9)
+    assert (found.variance == 0.0).sum() == 1
+
+
+# --- where it does not apply ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("env", "options", "named"),
+    [
+        ("TobitOscillator", {"filter": "paper"}, "filter"),
+        ("TobitOscillator", {"filter": "stochastic", "stochastic_weight": 1.0}, "filter"),
+        ("BiasedOscillator", {"bias_aware": False}, "bias_aware"),
+        ("UnknownInput", {}, "system"),
+        ("RemoteEstimation", {}, "system"),
+        ("CorrelatedTracking", {}, "system"),
+        ("MarkovJumpTracking", {}, "system"),
+    ],
+)
+def test_tasks_without_the_bound_are_refused(env: str, options: dict[str, Any], named: str) -> None:
+    task = make_task(f"fusion_gym/{env}-v0", **options)
+    with pytest.raises(ConfigurationError, match=f"^{named} .*not allowed for the bound") as caught:
+        silence_bound(task, (0.1,))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("env", "options"),
+    [
+        ("TobitOscillator", {"filter": "paper", "silent": "predict", "event_error": False}),
+        ("TobitOscillator", {"filter": "adf"}),
+        ("TobitOscillator", {"filter": "kalman", "fusion": "ci"}),
+        ("TobitOscillator", {"filter": "tobit", "fusion": "sci"}),
+        ("BiasedOscillator", {}),
+        ("BiasedTracking", {"filter": "adf"}),
+    ],
+)
+def test_where_it_applies_silence_is_prediction(env: str, options: dict[str, Any]) -> None:
+    task = make_task(f"fusion_gym/{env}-v0", horizon=5, **options)
+    assert silence_model(task).floor > 0.0
+    system = task.system
+    draw = np.random.default_rng(0)
+    state = system.start(draw.standard_normal((system.start_channels, 3)))
+    for granted in (True, False, False):
+        before = system.fused(state)[0]
+        state = system.sense(state, draw.standard_normal((system.noise_channels, 3)))
+        state = system.deliver(state, np.full((task.sensors, 3), granted))
+    matrix = system.plant.transition[..., 0]  # type: ignore[attr-defined]
+    assert system.fused(state)[0] == pytest.approx(matrix @ before, rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"rates": (0.0,)}, "rates"),
+        ({"rates": (1.5,)}, "rates"),
+        ({"weights": (1.0, 0.0)}, "weights"),
+        ({"weights": (1.0, 2.0, 3.0)}, "weights"),
+        ({"accuracy": 0.0}, "accuracy"),
+        ({"most_points": 10}, "most_points"),
+    ],
+)
+def test_values_that_are_refused(change: dict[str, Any], named: str) -> None:
+    task = make_task("fusion_gym/TobitOscillator-v0", **OSCILLATOR)
+    with pytest.raises(ConfigurationError, match=named):
+        silence_bound(task, **{"rates": (0.1,)} | change)
+
+
+def test_a_lattice_that_fits_nowhere_is_refused() -> None:
+    problem = SilenceProblem.create(np.eye(3), np.ones(3), np.tile(np.eye(3), (3, 1, 1)), 100.0)
+    with pytest.raises(ConfigurationError, match="step"):
+        solve_silence(problem, 1e-3)
+    with pytest.raises(ConfigurationError, match="noise"):
+        SilenceProblem.create(np.eye(3), np.ones(3), np.eye(3), 1.0)
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+def test_the_command_writes_what_it_prints(tmp_path: Path) -> None:
+    file = tmp_path / "bound.json"
+    words = ["--env", "fusion_gym/TobitOscillator-v0", "--set", "filter=tobit", "horizon=5"]
+    words += ["--episodes", "8", "--filters", "tobit", "adf", "--json", str(file)]
+    ended = call("bound", [*words, "--rates", "0.1", "--accuracy", "0.1"])
+    assert (ended.status, ended.trace) == (0, "")
+    report = json.loads(file.read_text())
+    assert report["everything_delivered"].keys() == {"tobit", "adf"}
+    row = report["bounds"][0]
+    assert report["floor"] < row["bound"]
+    assert f"{row['bound']:.5g}" in ended.out
+    refused = call("bound", ["--env", "fusion_gym/UnknownInput-v0", "--rates", "0.1"])
+    assert refused.status == 2
+    assert refused.err.count("\n") == 1
