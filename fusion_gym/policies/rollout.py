@@ -29,12 +29,17 @@ class Rollout:
     for; after each the base goes on for ``steps`` more, in ``samples`` simulations. They begin with
     what is believed (:class:`~fusion_gym.core.system.ImaginableSystem`), have noise of their own,
     the same for every decision, and know neither the truth nor coming noise and losses. The
-    decision of the least mean cost is taken: what the reward counts for errors, and ``price`` for
-    each token (None: the task's own). A simulation does not end with the episode.
+    decision of the least mean cost is taken, of those that beat the base's own by ``doubt``
+    standard errors of their difference; with 0 it is the least cost itself, whose chance finds
+    make it send too often. A simulation does not end with the episode.
+
+    The cost is error_weight · ‖x* - x̂‖² + ``price`` for each token (None: the task's own), with x*
+    the best estimate that could be made at that step and the reward's weights. Where x* is the
+    conditional mean, that is the expected squared error but for a part that no decision changes.
 
     With ``samples`` and ``steps`` without limit, on a model that is true, it would cost no more
-    than its base: where one improvement brings little, the base is nearly the best there is. It
-    does samples · (steps + 1) · (sensors + 1) steps of the base for one of its own.
+    than its base: where one improvement brings little, the base is nearly the best of those near
+    it. It does samples · (steps + 1) · (sensors + 1) steps of the base for one of its own.
 
     Source: D. P. Bertsekas, J. N. Tsitsiklis and C. Wu, "Rollout algorithms for combinatorial
     optimization", Journal of Heuristics 3, 1997.
@@ -53,8 +58,9 @@ class Rollout:
         task: Task,
         base: str,
         samples: int = 16,
-        steps: int = 12,
+        steps: int = 8,
         price: float | None = None,
+        doubt: float = 1.0,
         trust: bool = False,
     ) -> None:
         self.samples = validation.integer("samples", samples, at_least=1)
@@ -62,6 +68,7 @@ class Rollout:
         if price is not None:
             validation.number("price", price, at_least=0.0)
         self.price = price
+        self.doubt = validation.number("doubt", doubt, at_least=0.0)
         check_owner(task, own=False)
         if not isinstance(base, str):
             raise validation.refusal("base", base, "the text that names a policy")
@@ -80,6 +87,7 @@ class Rollout:
         self.knowledge: Knowledge = knows(task, own=False)
         memory = Memory(task, "coordinator")
         self._task = task
+        self._weights = task.reward.error_weight * task.reward.state_weights
         self._imagination = Imagination(task, memory, ObservationLayout(task))
         self.reset(0)
 
@@ -95,28 +103,39 @@ class Rollout:
         runs = len(signals["tokens"])
         if len(self._generators) != runs:
             self.reset(runs)
-        choices = self._choices(np.asarray(self.base(signals)))
+        choices, own = self._choices(np.asarray(self.base(signals)))
         size = max(1, _LANES // (len(choices) * self.samples))
         best = np.empty(runs, dtype=np.int64)
         for first in range(0, runs, size):
             block = np.arange(first, min(first + size, runs))
             cost = self._cost(signals, block, choices[..., block])
-            best[block] = cost.argmin(0)  # of equal costs the first: nobody
+            best[block] = self._least(cost, own[block])
         return np.ascontiguousarray(choices[best, :, np.arange(runs)].T)
 
-    def _choices(self, own: Requests) -> NDArray[np.bool_]:
-        """First decisions (choices, sensors, N): nobody, each sensor alone, the base's ``own``."""
+    def _choices(self, own: Requests) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+        """First decisions (choices, sensors, N), nobody and each sensor alone before the base's
+        ``own``, and which of them is the base's (N,)."""
         sensors, runs = own.shape
         single = np.concatenate(
             (np.zeros((1, sensors), dtype=np.bool_), np.eye(sensors, dtype=np.bool_))
         )
         choices = np.repeat(single[..., None], runs, axis=-1)
-        if (own.sum(0) <= 1).all():  # it is among them already
-            return choices
-        return np.concatenate((choices, own[None]))
+        several = own.sum(0) > 1
+        if several.any():
+            choices = np.concatenate((choices, own[None]))
+        return choices, np.where(several, sensors + 1, own.any(0) * (1 + own.argmax(0)))
+
+    def _least(self, cost: Array, own: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Which decision to take (R,), from costs (choices, R, samples) and the base's (R,)."""
+        gain = cost[own, np.arange(len(own))] - cost
+        error = gain.std(-1) / np.sqrt(self.samples)
+        mean = gain.mean(-1)
+        worth: Array = np.where(mean > self.doubt * error, mean, 0.0)
+        found = worth.argmax(0)
+        return np.where(worth.max(0) > 0.0, found, own)
 
     def _cost(self, signals: Signals, runs: NDArray[np.int64], choices: NDArray[np.bool_]) -> Array:
-        """Mean cost (choices, R) of first decisions (choices, sensors, R) in these runs."""
+        """Costs (choices, R, samples) of first decisions (choices, sensors, R) in these runs."""
         count, samples = len(choices), self.samples
         drawn = self._imagination.channels(self.steps)
         normals = np.stack(
@@ -129,10 +148,11 @@ class Rollout:
         price = branch.price if self.price is None else self.price
         cost = np.zeros(len(lanes))
         for step in range(self.steps + 1):
-            outcome = branch.deliver(requests)
-            cost += price * outcome.cost - outcome.reward_error
+            best = branch.beliefs().best.mean[0]
+            spent = branch.deliver(requests).cost
+            missed = best - self._task.system.fused(branch.delivered)[0]
+            cost += (self._weights * missed * missed).sum(0) + price * spent
             if step < self.steps:
                 branch.sense(noise[step].take(lanes, axis=-1))
                 requests = np.asarray(self.base(branch.signals()))
-        mean: Array = cost.reshape(count, len(runs), samples).mean(-1)
-        return mean
+        return cost.reshape(count, len(runs), samples)
