@@ -95,6 +95,7 @@ POLICIES: dict[str, list[str]] = {
     "periodic": ["", "period=3,staggered=false"],
     "periodic_optimum": ["packets=2,period=2"],
     "random": ["rate=0.4"],
+    "rollout": ["samples=2,steps=1,base=innovation_threshold:threshold=0.5"],
     "round_robin": ["", "period=2"],
     "send_on_delta": ["", "threshold=0.4"],
     "stochastic_event": ["", "weight=0.4,whitened=true"],

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, take_runs
-from fusion_gym.core.memory import Memory, Shadows
+from fusion_gym.core.beliefs import Shadows
+from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Branch, Position
 from fusion_gym.core.system import ImaginableSystem, Signals, System
