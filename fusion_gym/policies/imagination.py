@@ -55,9 +55,9 @@ class Imagination:
             seen = system.visible(take_runs(state, runs))
             return _imaginable(system).imagine(seen, mean, covariance, first)
 
-        shadows = None
-        if task.shadow is not None:
-            shadows = Shadows(every=imagined(task.shadow, beliefs.shadows.every))
+        shadows, every = None, beliefs.shadows.every
+        if every is not None:
+            shadows = Shadows(every=imagined(task.shadow or task.system, every))
         steps = signals["step"][runs]
         position = Position(
             imagined(task.system, signals["model"]),
