@@ -246,6 +246,11 @@ def factor(a: FloatArray) -> FloatArray:
     return result
 
 
+def draw(mean: FloatArray, covariance: FloatArray, normals: FloatArray) -> FloatArray:
+    """From N(mean, covariance): ``(..., n, N)`` of ``(..., n, n, N)`` and standard normals."""
+    return mean + matvec(factor(covariance), normals)
+
+
 @np.errstate(all="ignore")
 def solve(a: FloatArray, b: FloatArray) -> FloatArray:
     """Solve ``a x = b`` for symmetric positive definite `a`.

@@ -164,11 +164,80 @@ def test_what_cannot_be_is_refused() -> None:
     ):
         with pytest.raises(ConfigurationError, match=message):
             make_policy(text, task)
-    with pytest.raises(ConfigurationError, match=r"sensors = 13 .* at most 12, for all 2\^13"):
-        make_policy("lookahead", fusion_gym.make_task(REMOTE, sensors=13))
-    make_policy("lookahead", fusion_gym.make_task(REMOTE, sensors=13, access="single"))
     centre = fusion_gym.make_task(TOBIT, information="centre")
     with pytest.raises(ConfigurationError, match="information = 'centre'"):
         make_policy("lookahead", centre)
     with pytest.raises(LookupError, match="'model'"):
         played(centre).signals()["model"]
+
+
+def test_with_memory_it_aims_at_what_was_never_sent() -> None:
+    """Paired episodes at one price: no more error, for less than half the packets."""
+    options: dict[str, Any] = {"filter": "tobit", "random_start": True, "token_rate": 2.0}
+    results = []
+    for memory, price in ((False, 0.015), (True, 0.03)):
+        task = fusion_gym.make_task(TOBIT, **options, memory=memory, horizon=60, cost_weight=0.03)
+        policy = make_policy(f"lookahead:steps=2,price={price}", task)
+        assert policy.knowledge == ("coordinator_memory" if memory else "coordinator")
+        results.append(run_episodes(task, policy, 40, seed=0))
+    forgets, remembers = results
+    better = remembers.returns - forgets.returns
+    assert better.mean() > 4.0 * better.std() / np.sqrt(40)
+    assert remembers.mse.mean() < forgets.mse.mean()
+    assert remembers.rate.mean() < 0.5 * forgets.rate.mean()
+
+
+def test_a_packet_with_an_estimate_leaves_nothing_to_a_second_one() -> None:
+    """Any packet brings x*, so one is enough; it goes where the distance outweighs the price."""
+    options: dict[str, Any] = {"filter": "kalman", "access": "any", "tokens": "unlimited"}
+    task = fusion_gym.make_task(TRACKING, **options, memory=True, packet="estimate")
+    batch, price, steps = played(task), 0.01, 3
+    asked = Lookahead(task, price, steps)(batch.signals())
+    assert set(asked.sum(0)) == {0, 1}
+    transition = task.system.plant.transition[..., 0]  # type: ignore[attr-defined]
+    distance, total = batch.beliefs().difference[0], np.zeros(30)
+    for _ in range(steps):
+        total += (task.reward.state_weights * distance**2).sum(0)
+        distance = transition @ distance
+    np.testing.assert_array_equal(asked.any(0), total > price * task.bucket.cost[0, 0])
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options", "price"),
+    [
+        (REMOTE, {"sensors": 5, "channel": "independent", "drop_probability": 0.3}, 0.3),
+        (
+            TOBIT,
+            {"filter": "kalman", "measurement_matrices": [np.eye(2).tolist()] * 5, "memory": True},
+            0.002,
+        ),
+    ],
+)
+def test_adding_one_after_another_is_nearly_as_good(
+    env_id: str, options: dict[str, Any], price: float
+) -> None:
+    """Where sensors do not overlap, and losses are theirs alone, it is the same."""
+    task = fusion_gym.make_task(env_id, **options, token_capacity=30.0, horizon=30)
+    whole, greedy = Lookahead(task, price, 2), Lookahead(task, price, 2)
+    assert not whole.greedy
+    greedy.greedy = True
+    signals = played(task, runs=200).signals()
+    same = (whole(signals) == greedy(signals)).all(0)
+    several = whole(signals).sum(0) > 1
+    assert several.any()
+    assert same.mean() > (0.999 if env_id == REMOTE else 0.8)
+    best, found = (run_episodes(task, policy, 40, seed=0) for policy in (whole, greedy))
+    cost = [price * r.tokens * task.horizon + task.error_scale * r.mse * 30 for r in (best, found)]
+    assert abs(cost[1].mean() / cost[0].mean() - 1.0) < 0.02
+
+
+def test_above_eight_sensors_it_says_that_it_is_greedy() -> None:
+    message = "'lookahead' adds one transmission after another for 9 sensors: .* at most 8"
+    task = fusion_gym.make_task(REMOTE, sensors=9, cost_weight=0.3, token_capacity=30.0, horizon=5)
+    with pytest.warns(UserWarning, match=message) as caught:
+        policy: Any = make_policy("lookahead:price=0.3", task)
+    assert len(caught) == 1
+    assert policy.greedy
+    assert run_episodes(task, policy, 4, seed=0).rate.mean() > 0.05
+    make_policy("lookahead", fusion_gym.make_task(REMOTE, sensors=13, access="single", horizon=2))
+    make_policy("lookahead", fusion_gym.make_task(REMOTE, sensors=8, horizon=2))

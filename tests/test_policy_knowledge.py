@@ -69,7 +69,9 @@ REMEMBERING: dict[str, tuple[str, Values]] = {
     ),
 }
 # Policies that look at what is believed are tried where that differs.
-BELIEVING = ("estimate_difference", "kullback_leibler", "value_of_information")
+BELIEVING = (
+    "estimate_difference", "kullback_leibler", "lookahead", "rollout", "value_of_information",
+)  # fmt: skip
 BELIEVED = (*REMEMBERING, "tobit", "tobit, centre", "correlated", "remote, one link")
 POLICIES: dict[str, list[str]] = {
     "adaptive_innovation": ["", "threshold=3,sensitivity=0.9", "sensitivity=0"],
@@ -95,6 +97,7 @@ POLICIES: dict[str, list[str]] = {
     "periodic": ["", "period=3,staggered=false"],
     "periodic_optimum": ["packets=2,period=2"],
     "random": ["rate=0.4"],
+    "rollout": ["samples=2,steps=1,base=innovation_threshold:threshold=0.5"],
     "round_robin": ["", "period=2"],
     "send_on_delta": ["", "threshold=0.4"],
     "stochastic_event": ["", "weight=0.4,whitened=true"],
@@ -121,18 +124,21 @@ def task_of(name: str) -> Task:
 
 
 class Believed:
-    """Beliefs as plain arrays (…, N), so that some of them can be changed."""
+    """Beliefs as plain arrays (…, N), so that some of them can be changed, beside the states that
+    they were made of."""
 
     parts = ("difference", "best", "silent", "sent")
+    states = ("remembered", "shadows")
 
-    def __init__(self, values: Values) -> None:
-        self.values = values
+    def __init__(self, values: Values, made_of: Values) -> None:
+        self.values, self.made_of = values, made_of
 
     @classmethod
     def of(cls, beliefs: Any, steps: int) -> Believed:
         """All that a policy may ask of beliefs, over so many steps."""
         values = {name: getattr(beliefs, name) for name in cls.parts}
-        return cls(values | {"value": beliefs.value(steps), "loss": beliefs.loss(steps)})
+        made_of = {name: getattr(beliefs, name) for name in cls.states if beliefs.task.shadow}
+        return cls(values | {"value": beliefs.value(steps), "loss": beliefs.loss(steps)}, made_of)
 
     def with_each(self, change: Callable[..., Any], *others: Believed) -> Believed:
         """``change`` of every array, and of the others' of the same name."""
@@ -143,11 +149,13 @@ class Believed:
                 result[name] = type(value)(*(change(*same) for same in zip(*parts, strict=True)))
             else:
                 result[name] = change(*parts)
-        return Believed(result)
+        return Believed(result, self.made_of)
 
     def __getattr__(self, name: str) -> Any:
         if name in self.parts:
             return self.values[name]
+        if name in self.states:
+            return self.made_of.get(name, Shadows())
         raise AttributeError(name)
 
     def value(self, steps: int = 1) -> Any:
@@ -283,6 +291,11 @@ def in_runs(runs: np.ndarray[Any, Any], true: Values, other: Values) -> Values:
             result[name] = value.with_each(
                 lambda array, another: merge_runs(array, another[..., runs], runs), other[name]
             )
+            if name == "beliefs":
+                result[name].made_of = {
+                    what: merge_runs(kept, take_runs(other[name].made_of[what], runs), runs)
+                    for what, kept in value.made_of.items()
+                }
         elif name == "model":
             result[name] = merge_runs(value, take_runs(other[name], runs), runs)
         elif name not in CLOCK:
@@ -525,7 +538,7 @@ def test_a_maker_is_given_the_task_and_says_what_is_missing() -> None:
     register_policy("gains", make, "reference")
     assert policy_names("reference") == [
         "estimate_difference", "gains", "kullback_leibler", "lookahead", "optimal",
-        "periodic_optimum", "value_of_information", "whittle",
+        "periodic_optimum", "rollout", "value_of_information", "whittle",
     ]  # fmt: skip
     policy: Any = make_policy("gains:gain=2", task_of("tobit"))
     assert policy.number(None) == 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -11,38 +11,16 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, merge_runs
-from fusion_gym.core.access import access_mask, first_request
-from fusion_gym.core.beliefs import Beliefs, Shadows
+from fusion_gym.core.beliefs import Shadows
 from fusion_gym.core.memory import Memory, Owner
-from fusion_gym.core.observation import Network, ObservationLayout
-from fusion_gym.core.signals import memory_signals, missing_signals
-from fusion_gym.core.system import Signals
+from fusion_gym.core.observation import ObservationLayout
+from fusion_gym.core.runs import Outcome, Runs
 from fusion_gym.core.task import Task
 
 _LONGEST_BLOCK = 256  # steps of noise that are drawn and kept at a time
 
 
-class Outcome(NamedTuple):
-    """What one step brought, batch axis last.
-
-    ``reward`` (N,) is ``reward_error`` + ``reward_communication``; ``cost`` (N,) the tokens spent;
-    ``requested``, ``granted`` (sensors, N) bool; ``squared_error`` (n, N) of the fused estimate;
-    ``diverged`` (N,) bool, whether some state's squared error is not finite or above the task's
-    ``divergence_level``; ``truncated`` (N,) bool.
-    """
-
-    reward: Array
-    reward_error: Array
-    reward_communication: Array
-    cost: Array
-    requested: NDArray[np.bool_]
-    granted: NDArray[np.bool_]
-    squared_error: Array
-    diverged: NDArray[np.bool_]
-    truncated: NDArray[np.bool_]
-
-
-class EpisodeBatch:
+class EpisodeBatch(Runs):
     """N runs of a :class:`~fusion_gym.core.task.Task`, advanced together.
 
     Each run draws all its noise from its own generator, in blocks and whatever the actions: a
@@ -51,22 +29,16 @@ class EpisodeBatch:
 
     ``remember`` says whose memory is kept, the coordinator's or every sensor's own; ``None`` is
     the coordinator's in a task with memory, and nothing in one without.
-
-    ``state`` is the system's after sensing, ``delivered`` its state after the last delivery,
-    for metrics and figures; ``shadows`` is what is remembered, or ``None``.
     """
 
     def __init__(self, task: Task, num_envs: int, remember: Owner | None = None) -> None:
-        self.task = task
+        memory = Memory(task, "coordinator" if remember is None else remember)
+        super().__init__(task, memory, ObservationLayout(task, memory.owner))
         self.num_envs = num_envs
-        self.memory = Memory(task, "coordinator" if remember is None else remember)
-        self.layout = ObservationLayout(task, self.memory.owner)
-        self.shadows: Shadows | None = Shadows() if self.memory.keeps else None
-        self._beliefs: Beliefs | None = None
+        self.shadows = Shadows() if memory.keeps else None
         self.generators: list[np.random.Generator | None] = [None] * num_envs
         self._episode_starts: list[Any] = [None] * num_envs
-        self.state: Any = None
-        self.delivered: Any = None
+        self.state = None
         self.tokens = task.bucket.start(num_envs)
         self.price = task.reward.price.draw(np.zeros(num_envs))
         self.steps = np.zeros(num_envs, dtype=np.int64)
@@ -75,8 +47,7 @@ class EpisodeBatch:
         # Row (cursor mod block) of the ring holds the noise of the next sensing; a run's block
         # starts wherever the cursor stood at its reset, so that a row is one contiguous read.
         self._block = min(task.horizon + 1, _LONGEST_BLOCK)
-        self._channels = task.system.noise_channels + (task.access == "random")
-        self._ring = np.zeros((self._block, self._channels, num_envs))
+        self._ring = np.zeros((self._block, self.channels, num_envs))
         self._cursor = 0
         self._block_start = np.zeros(num_envs, dtype=np.int64)
 
@@ -147,104 +118,22 @@ class EpisodeBatch:
         """
         if self.state is None:
             raise ResetNeeded("call reset before the first step")
-        task, system = self.task, self.task.system
-        if task.access == "any":
-            admitted = requests
-        elif task.access == "single":
-            admitted = first_request(requests, self.steps)
-        else:
-            admitted = requests & self.admitted()
-        granted, spent, tokens = task.bucket.grant(self.tokens, admitted, self.steps)
-        state = system.deliver(self.state, granted)
-        if task.packet == "estimate":
-            state = self._adopted(state, np.asarray(granted.any(0)))
-        mean, covariance = system.fused(state)
-        error = system.truth(state) - mean
-        squared_error = error * error
-        reward_error, reward_communication = task.reward.terms(
-            squared_error, covariance, spent, self.price
-        )
-        self.tokens = tokens
-        self.steps = self.steps + 1
-        truncated = self.steps >= self._limit
+        outcome = self.deliver(requests)
         self._cursor += 1
         used_up = ~self.finished & (self._cursor - self._block_start >= self._block)
         if used_up.any():
             self._draw(np.flatnonzero(used_up))
-        self.delivered, noise = state, self.noise()
-        if self.shadows is not None:
-            self.shadows = self.memory.sense(self.memory.deliver(self.beliefs(), granted), noise)
-        self.state = system.sense(state, noise)
-        self._beliefs = None
-        self.finished = truncated.copy()
-        return Outcome(
-            reward=reward_error + reward_communication,
-            reward_error=reward_error,
-            reward_communication=reward_communication,
-            cost=spent,
-            requested=requests,
-            granted=granted,
-            squared_error=squared_error,
-            diverged=np.asarray(~(squared_error <= task.divergence_level).all(0)),
-            truncated=truncated,
-        )
+        self.sense(self.normals())
+        self.finished = outcome.truncated.copy()
+        return outcome
 
-    def observe(self) -> NDArray[np.float32]:
-        """Observations (N, entries) of all runs, a fresh array."""
-        network = Network(self.tokens, self.admitted, self.price)
-        return self.layout.encode(self.state, network, self.beliefs)
-
-    def beliefs(self) -> Beliefs:
-        """What the owner of the memory believes before anything is sent."""
-        if self._beliefs is None:
-            self._beliefs = self.memory.beliefs(self.state, self.shadows or Shadows())
-        return self._beliefs
-
-    def admitted(self) -> NDArray[np.bool_]:
-        """The sensors (sensors, N) that the network's access rule admits in the coming step."""
-        noise = self._ring[self._cursor % self._block, -1] if self.task.access == "random" else None
-        return access_mask(self.task.access, self.task.sensors, self.steps, noise)
-
-    def grantable(self) -> NDArray[np.bool_]:
-        """The sensors (sensors, N) whose request alone the network would grant now."""
-        admitted = self.admitted()
-        result = np.zeros_like(admitted)
-        for sensor in range(self.task.sensors):
-            alone = np.zeros_like(admitted)
-            alone[sensor] = admitted[sensor]
-            result[sensor] = self.task.bucket.grant(self.tokens, alone, self.steps).granted[sensor]
-        return result
+    def normals(self) -> Array:
+        """The normals (channels, N) of the last sensing, a view that later steps overwrite."""
+        return self._ring[self._cursor % self._block]
 
     def noise(self) -> Array:
-        """The normals (channels, N) of the last sensing, a view that later steps overwrite."""
-        return self._ring[self._cursor % self._block, : self.task.system.noise_channels]
-
-    def signals(self) -> Signals:
-        """The signals of all runs, without what the information mode withholds.
-
-        To the system's own it adds ``tokens`` (N,), ``token_cost`` (sensors, 1), ``price`` (N,) of
-        a token, ``step`` (N,),
-        the steps taken in the episode, ``start`` (N,) bool, ``admitted`` and
-        ``grantable`` (sensors, N) bool, ``observation`` (N, entries), and ``model``, the system's
-        state without what no policy may know, for policies that plan with the system's own moves;
-        and what is believed (:mod:`fusion_gym.core.signals`).
-        """
-        system, state = self.task.system, self.state
-        values = dict(system.read(state))
-        values |= {
-            "tokens": self.tokens,
-            "token_cost": self.task.bucket.cost,
-            "price": self.price,
-            "step": self.steps,
-            "start": self.steps == 0,
-            "admitted": self.admitted,
-            "grantable": self.grantable,
-            "observation": self.observe,
-            "model": lambda: system.visible(state),
-        }
-        owner = self.memory.owner
-        values |= memory_signals(owner, self.beliefs)
-        return Signals(values, self.task.hidden_signals, missing_signals(owner))
+        """Those of them that the system takes."""
+        return self.normals()[: self.task.system.noise_channels]
 
     def snapshot(self) -> dict[str, Any]:
         """Where all runs are, without the task, for :meth:`restore`; valid until the next step."""
@@ -256,11 +145,8 @@ class EpisodeBatch:
         vars(self).update(snapshot)
         self._beliefs = None
 
-    def _adopted(self, state: Any, arrived: NDArray[np.bool_]) -> Any:
-        """The delivered state whose centre goes on from x* where a packet arrived, (N,) bool."""
-        best = self.beliefs().best
-        system: Any = self.task.system
-        return system.adopt(state, best.mean[0], best.covariance[0], arrived)
+    def _lottery(self) -> Array | None:
+        return self.normals()[-1] if self.task.access == "random" else None
 
     def _next_episode(self, run: int) -> np.random.Generator:
         """The run's generator at the start of its next episode.
@@ -295,7 +181,7 @@ class EpisodeBatch:
 
     def _draw(self, runs: NDArray[np.int64]) -> None:
         """Draw the next block of noise for these runs, to begin at the cursor."""
-        noise = np.empty((len(runs), self._block, self._channels))
+        noise = np.empty((len(runs), self._block, self.channels))
         for place, run in enumerate(runs.tolist()):
             self._generator(run).standard_normal(out=noise[place])
         rows = (self._cursor + np.arange(self._block)) % self._block

@@ -178,17 +178,10 @@ class CoordinatorBeliefs(Beliefs):
         return found
 
     def _best_path(self, steps: int) -> Array:
-        return self._path(self.remembered, steps, self.task.shadow)
+        return silent_path(self.task.shadow or self.task.system, self.remembered, steps)
 
-    def _path(self, delivered: Any, steps: int, system: System[Any] | None = None) -> Array:
-        """Fused means (steps, n, N) from a delivered state on."""
-        system = system or self.task.system
-        still = np.zeros((system.noise_channels, self._runs))
-        means = [system.fused(delivered)[0]]
-        for _ in range(steps - 1):
-            delivered = system.deliver(system.sense(delivered, still), self._nobody(self._runs))
-            means.append(system.fused(delivered)[0])
-        return np.stack(means)
+    def _path(self, delivered: Any, steps: int) -> Array:
+        return silent_path(self.task.system, delivered, steps)
 
 
 class OwnBeliefs(Beliefs):
@@ -250,6 +243,21 @@ class OwnBeliefs(Beliefs):
 def arriving(system: System[Any], state: Any, packets: Packets) -> Any:
     """The state of a system in which these packets (sensors, N), if they are sent, arrive."""
     return system.arriving(state, packets) if isinstance(system, LossySystem) else state
+
+
+def silent_path(system: System[Any], delivered: Any, steps: int) -> Array:
+    """Fused means (steps, n, N) from a delivered state on, without noise and transmissions.
+
+    The expectation of a linear system.
+    """
+    runs = system.truth(delivered).shape[-1]
+    still = np.zeros((system.noise_channels, runs))
+    silence = np.zeros((system.sensor_count, runs), dtype=np.bool_)
+    means = [system.fused(delivered)[0]]
+    for _ in range(steps - 1):
+        delivered = system.deliver(system.sense(delivered, still), silence)
+        means.append(system.fused(delivered)[0])
+    return np.stack(means)
 
 
 def _delivered(system: System[Any], state: Any, packets: Packets) -> Any:

@@ -101,14 +101,27 @@ class Memory:
             result.alone = self.task.system.deliver(shadows.alone, sent)
         return result
 
+    def take(self, shadows: Shadows, runs: NDArray[np.int64], num_envs: int) -> Shadows:
+        """Those of the given runs, in this order and possibly again and again."""
+        many = self._places(runs, num_envs)
+        return Shadows(
+            every=take_runs(shadows.every, runs),
+            own=take_runs(shadows.own, many),
+            alone=take_runs(shadows.alone, many),
+        )
+
     def merge(self, old: Shadows, new: Shadows, runs: NDArray[np.int64], num_envs: int) -> Shadows:
         """The shadows of ``num_envs`` runs with those of the given runs replaced."""
-        many = (np.arange(self.task.sensors)[:, None] * num_envs + runs).ravel()
+        many = self._places(runs, num_envs)
         return Shadows(
             every=merge_runs(old.every, new.every, runs),
             own=merge_runs(old.own, new.own, many),
             alone=merge_runs(old.alone, new.alone, many),
         )
+
+    def _places(self, runs: NDArray[np.int64], num_envs: int) -> NDArray[np.int64]:
+        """Where the runs (R,) of every sensor stand, (sensors · R,)."""
+        return (np.arange(self.task.sensors)[:, None] * num_envs + runs).ravel()
 
     def _own(self, granted: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Each sensor's own packet in its own runs (sensors, sensors · N)."""

@@ -310,6 +310,28 @@ class AdoptingSystem(System[StateT], Protocol[StateT]):
 
 
 @runtime_checkable
+class ImaginableSystem(System[StateT], Protocol[StateT]):
+    """A system that can put what could be in the place of all that is hidden. Optional.
+
+    For policies that simulate what may come, from what is believed and not from the truth.
+    """
+
+    @property
+    def imagination_channels(self) -> int | None:
+        """Standard normals that :meth:`imagine` consumes; None where there is nothing to draw."""
+        ...
+
+    def imagine(self, state: StateT, mean: Array, covariance: Array, noise: Array) -> StateT:
+        """The state after :meth:`sense` with all that :meth:`visible` hides drawn anew.
+
+        The truth by what is believed of it, N(mean, covariance) of shapes (n, N) and (n, n, N);
+        the rest by its law, as each system says; what has been measured stays. Two systems of one
+        plant draw the same from the same ``noise`` (imagination_channels, N).
+        """
+        ...
+
+
+@runtime_checkable
 class PredictableSystem(System[StateT], Protocol[StateT]):
     """A system that says whether its covariances follow from what is delivered alone.
 

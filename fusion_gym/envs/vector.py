@@ -12,7 +12,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from fusion_gym import validation
-from fusion_gym.core.batch import EpisodeBatch, Outcome
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.envs.views import CoordinatorView
 

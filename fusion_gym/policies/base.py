@@ -27,7 +27,9 @@ class Policy(Protocol):
     episode wherever ``signals["start"]`` is true.
 
     A policy that looks at what is believed (:mod:`fusion_gym.core.signals`) has an attribute
-    ``remember`` as well, ``"coordinator"`` or ``"own"``: whose beliefs.
+    ``remember`` as well, ``"coordinator"`` or ``"own"``: whose beliefs. One that answers to the
+    signals of the present step alone may say so by an attribute ``stateless``, true: it can then be
+    asked in the middle of a simulated episode.
     """
 
     @property
@@ -58,6 +60,11 @@ def owner_of(policy: Policy) -> Owner | None:
     return owner
 
 
+def is_stateless(policy: Policy) -> bool:
+    """Whether a policy says that it keeps nothing from step to step and draws nothing."""
+    return bool(getattr(policy, "stateless", False))
+
+
 class Rule:
     """Base of the analytic policies: a dataclass of parameters, checked before anything runs."""
 
@@ -71,6 +78,11 @@ class Rule:
             if check := field.metadata.get("check"):
                 check(field.name, getattr(self, field.name))
         self.reset(0)
+
+    @property
+    def stateless(self) -> bool:
+        """Whether it has nothing to forget: no :meth:`reset` of its own."""
+        return type(self).reset is Rule.reset
 
     def column(self, name: str, sensors: int) -> Array:
         """The parameter of this name as (sensors, 1): one number for all sensors, or one for each.

@@ -2,40 +2,51 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import ClassVar
 
 import numpy as np
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.memory import Owner
 from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests
+from fusion_gym.policies.believing import knows
 from fusion_gym.policies.planning import Model, transmission_sets
 from fusion_gym.validation import ConfigurationError
+
+_MOST_TOGETHER = 8  # sensors whose sets are all weighed
 
 
 class Lookahead:
     """Takes the transmissions with the least expected error over the next steps and price.
 
-    A coordinator that knows all new measurements has the best estimate x̂* by delivering them all.
-    Whatever it lets through, x̂, the fused error's second moment is the unavoidable part plus
-    |x̂* - x̂|², so a set of transmissions is worth what it takes off the sum of that distance,
-    weighted as in the reward, over ``steps`` times, with no noise and no further transmission in
-    between. It asks for the set with the least of that sum plus ``price`` for each token spent.
-    Where packets may be lost it takes the mean over what may arrive of the set: it knows the
-    channel's probabilities and not what the channel is about to do.
+    A coordinator that knows all new measurements has the best estimate x̂* by delivering them all;
+    with memory, by all that was ever measured. Whatever it lets through, x̂, the fused error's
+    second moment is the unavoidable part plus |x̂* - x̂|², so a set of transmissions is worth what
+    it takes off the sum of that distance, weighted as in the reward, over ``steps`` times, with no
+    noise and no further transmission in between. It asks for the set with the least of that sum
+    plus ``price`` for each token spent. Where packets may be lost it takes the mean over what may
+    arrive of the set: it knows the channel's probabilities and not what the channel is about to
+    do.
+
+    Of up to 8 sensors every set is weighed. Above that it is ``greedy``, and warns of it: it adds
+    the transmission that lowers the cost most until none does, each by its own probability of
+    arrival as if those before it had arrived.
 
     It uses the task's model through the system itself (:class:`Model`), so it works for every
-    system; exact for linear systems, plausible for others. Every set of sensors is weighed, at
-    most 2^12. This is neither an optimum nor a bound, but a policy that knows the model.
+    system; exact for linear systems, plausible for others. This is neither an optimum nor a bound,
+    but a policy that knows the model.
 
     Raises:
-        ConfigurationError: fewer than one step, a negative price, information other than
-            "sensors", or more than 12 sensors that may transmit at once.
+        ConfigurationError: fewer than one step, a negative price, or information other than
+            "sensors".
     """
 
-    knowledge: ClassVar[Knowledge] = "coordinator"
+    stateless: ClassVar[bool] = True
+    remember: ClassVar[Owner] = "coordinator"
 
     def __init__(self, task: Task, price: float = 0.01, steps: int = 4) -> None:
         self.steps = validation.integer("steps", steps, at_least=1)
@@ -46,6 +57,15 @@ class Lookahead:
                 "must be 'sensors', for it weighs the new measurements"
             )
         self._task = task
+        self.knowledge: Knowledge = knows(task, own=False)
+        self.greedy = task.sensors > _MOST_TOGETHER and task.access != "single"
+        if self.greedy:
+            warnings.warn(
+                f"policy 'lookahead' adds one transmission after another for {task.sensors} "
+                f"sensors: all sets are weighed of at most {_MOST_TOGETHER}",
+                stacklevel=2,
+            )
+            return
         self._sets = transmission_sets(task, "policy 'lookahead'")
         # The sets with each sensor, and the same sets without it.
         number = self._sets @ (1 << np.arange(task.sensors))
@@ -62,28 +82,64 @@ class Lookahead:
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
         model = Model(self._task, signals)
+        best = model.best_means(self.steps)
+        return self._one_by_one(model, best) if self.greedy else self._of_all_sets(model, best)
+
+    def _of_all_sets(self, model: Model, best: Array) -> Requests:
         everyone = np.ones((self._task.sensors, model.runs), dtype=np.bool_)
         grants = [model.grant(chosen & everyone) for chosen in self._sets[:, :, None]]
-        cost = self._expected_error(model) + self.price * np.stack([g.spent for g in grants])
+        cost = self._expected_error(model, best)
+        cost = cost + self.price * np.stack([g.spent for g in grants])
         for place, chosen in enumerate(self._sets[:, :, None]):
             # What the network would deny is no choice of its own.
             cost[place, (grants[place].granted != chosen).any(0)] = np.inf
         return np.ascontiguousarray(self._sets[cost.argmin(0)].T)
 
-    def _expected_error(self, model: Model) -> Array:
+    def _one_by_one(self, model: Model, best: Array) -> Requests:
+        sensors, lanes = self._task.sensors, np.arange(model.runs)
+        arrival = np.ones((sensors, model.runs)) if model.arrival is None else model.arrival
+        chosen = np.zeros((sensors, model.runs), dtype=np.bool_)
+        spent, error = np.zeros(model.runs), self._error(model, chosen, best)
+        for _ in range(sensors):
+            saved = np.full(chosen.shape, -np.inf)
+            after, paid = np.empty(chosen.shape), np.empty(chosen.shape)
+            for sensor in range(sensors):
+                added = chosen.copy()
+                added[sensor] = True
+                granted, paid[sensor], _ = model.grant(added)
+                after[sensor] = self._error(model, added, best)
+                gain = arrival[sensor] * (error - after[sensor])
+                gain -= self.price * (paid[sensor] - spent)
+                possible = ~chosen[sensor] & (granted == added).all(0)
+                saved[sensor] = np.where(possible, gain, -np.inf)
+            place = saved.argmax(0)
+            worth = saved[place, lanes] > 0.0
+            if not worth.any():
+                break
+            chosen[place[worth], lanes[worth]] = True
+            error = np.where(worth, after[place, lanes], error)
+            spent = np.where(worth, paid[place, lanes], spent)
+        return chosen
+
+    def _expected_error(self, model: Model, best: Array) -> Array:
         """Weighted squared distance (sets, N) to the best estimate, summed over the steps.
 
         The mean over what the channel lets arrive of each set: packets are lost independently.
         """
-        reward, everyone = self._task.reward, np.ones((self._task.sensors, model.runs), np.bool_)
-        best = model.fused_means(everyone, self.steps)
-        weights = reward.error_weight * reward.state_weights
+        everyone = np.ones((self._task.sensors, model.runs), np.bool_)
         error = np.empty((len(self._sets), model.runs))
         for place, chosen in enumerate(self._sets[:, :, None]):
-            distance = model.fused_means(chosen & everyone, self.steps) - best
-            error[place] = (weights * (distance * distance).sum(0)).sum(0)
+            error[place] = self._error(model, chosen & everyone, best)
         if model.arrival is not None:
             for sensor, arrives in enumerate(model.arrival):
                 sent, lost = self._sent[sensor], self._without[sensor]
                 error[sent] = arrives * error[sent] + (1.0 - arrives) * error[lost]
         return error
+
+    def _error(self, model: Model, arriving: Requests, best: Array) -> Array:
+        """The same (N,) if these packets (sensors, N) arrive."""
+        reward = self._task.reward
+        distance = model.fused_means(arriving, self.steps) - best
+        weights = reward.error_weight * reward.state_weights
+        total: Array = (weights * (distance * distance).sum(0)).sum(0)
+        return total

@@ -65,6 +65,7 @@ class ModelPolicy:
         self._task = priced(task, price_range)
         self._view = make_view(self._task, local)
         self._memory: Any = None  # of a recurrent policy
+        self.stateless = deterministic and not isinstance(model, RecurrentPPO)
         self.knowledge: Knowledge = self._view.knowledge
         self.remember = self._view.owner
         if isinstance(model, RecurrentPPO) and self.knowledge != "centre":

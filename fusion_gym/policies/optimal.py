@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import ClassVar
 
 import numpy as np
 
@@ -23,6 +24,8 @@ class OptimalPolicy:
     Raises:
         ConfigurationError: a task that is not solved here, or a negative price.
     """
+
+    stateless: ClassVar[bool] = True
 
     def __init__(self, task: Task, criterion: str = "finite", price: float | None = None) -> None:
         if price is not None:

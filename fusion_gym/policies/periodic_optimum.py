@@ -63,6 +63,7 @@ class PeriodicOptimum:
     """
 
     knowledge: ClassVar[Knowledge] = "clock"
+    stateless: ClassVar[bool] = True
 
     def __init__(
         self,

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
+from fusion_gym.core.beliefs import silent_path
 from fusion_gym.core.system import LossySystem, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import Grants
+from fusion_gym.policies.believing import beliefs_of
 from fusion_gym.validation import ConfigurationError
 
 _MOST_SENSORS = 12
@@ -38,7 +41,8 @@ class Model:
     """The task's own moves from the signals of one step on, for N runs.
 
     It knows what a coordinator knows: all new measurements, what the nodes and the centre hold,
-    the tokens. It has neither the true state nor what the channel is about to lose.
+    the tokens, and with memory all that was measured and not sent. It has neither the true state
+    nor what the channel is about to lose.
 
     ``arrival`` (sensors, N) is the probability that a packet sent now arrives; None: surely.
     """
@@ -46,6 +50,7 @@ class Model:
     def __init__(self, task: Task, signals: Signals) -> None:
         self._task, self._state, self._step = task, signals["model"], signals["step"]
         self._tokens, self._admitted = signals["tokens"], signals["admitted"]
+        self._beliefs = beliefs_of(signals, own=False) if task.memory else None
         system = task.system
         self.arrival: Array | None = None
         if isinstance(system, LossySystem):
@@ -67,13 +72,18 @@ class Model:
         """Fused means (steps, n, N) if these packets (sensors, N) arrive now.
 
         After that nothing is transmitted and no noise acts: the expectation of a linear system.
+        With ``packet="estimate"`` they bring the best estimate there is.
         """
-        system = self._task.system
-        silence = np.zeros_like(arriving)
-        still = np.zeros((system.noise_channels, self.runs))
+        system: Any = self._task.system
         delivered = system.deliver(self._state, arriving)
-        means = [system.fused(delivered)[0]]
-        for _ in range(steps - 1):
-            delivered = system.deliver(system.sense(delivered, still), silence)
-            means.append(system.fused(delivered)[0])
-        return np.stack(means)
+        if self._task.packet == "estimate" and self._beliefs is not None:
+            mean, covariance = self._beliefs.best
+            delivered = system.adopt(delivered, mean[0], covariance[0], arriving.any(0))
+        return silent_path(system, delivered, steps)
+
+    def best_means(self, steps: int) -> Array:
+        """The same of the estimate that holds all that was measured, with memory ever."""
+        shadow = self._task.shadow
+        if shadow is None or self._beliefs is None:
+            return self.fused_means(np.ones((self._task.sensors, self.runs), np.bool_), steps)
+        return silent_path(shadow, shadow.visible(self._beliefs.remembered), steps)

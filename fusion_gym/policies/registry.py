@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, TypedDict, get_args
 
@@ -37,11 +38,13 @@ class Row(NamedTuple):
     The maker takes the policy's parameters by name, the task if it has a parameter ``task``, and
     whether files may run code if it has a parameter ``trust``.
     A rule looks at signals alone, a reference takes the task and its model, an agent was trained;
-    an agent's first parameter is the text behind its name.
+    an agent's first parameter is the text behind its name. The parameter ``rest`` takes all the
+    text behind it, for it may hold colons and commas.
     """
 
     kind: Kind
     maker: Maker | str
+    rest: str | None = None
 
 
 _HERE = "fusion_gym.policies"
@@ -65,6 +68,7 @@ _ROWS: dict[str, Row] = {
     "periodic": Row("rule", f"{_RULES}.periodic:Periodic"),
     "periodic_optimum": Row("reference", f"{_HERE}.periodic_optimum:PeriodicOptimum"),
     "random": Row("rule", f"{_RULES}.random:Random"),
+    "rollout": Row("reference", f"{_HERE}.rollout:Rollout", rest="base"),
     "round_robin": Row("rule", f"{_RULES}.periodic:RoundRobin"),
     "send_on_delta": Row("rule", f"{_RULES}.send_on_delta:SendOnDelta"),
     "stochastic_event": Row("rule", f"{_RULES}.stochastic_event:StochasticEvent"),
@@ -149,6 +153,7 @@ def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> P
         key, (value, *entries) = next(iter(known)), text.split(",")
         given[key] = value.removeprefix(f"{key}=")
     else:
+        text, given = _split_rest(text, _ROWS[name].rest)
         entries = text.split(",") if text else []
     settings = parse_settings(f"parameter of policy {name!r}", entries)
     keys(f"parameter of policy {name!r}", settings, known.keys() - given.keys())
@@ -170,6 +175,13 @@ def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> P
             f"looks at, one of {', '.join(map(repr, KNOWLEDGE))}"
         )
     return policy
+
+
+def _split_rest(text: str, rest: str | None) -> tuple[str, dict[str, Any]]:
+    """The settings before the parameter that takes the rest of the text, and that one."""
+    if rest is not None and (found := re.search(rf"(^|,)\s*{rest}=", text)):
+        return text[: found.start()], {rest: text[found.end() :]}
+    return text, {}
 
 
 def _maker(name: str) -> Maker:

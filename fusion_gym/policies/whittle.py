@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,6 +36,8 @@ class WhittleIndex:
     Source: P. Whittle, "Restless bandits: activity allocation in a changing world", Journal of
     Applied Probability 25A, 1988.
     """
+
+    stateless: ClassVar[bool] = True
 
     def __init__(self, task: Task, price: float | None = None, at_most: int | None = None) -> None:
         check_at_most("at_most", at_most)

@@ -164,11 +164,7 @@ class CorrelatedTrackingSystem:
     def start(self, noise: Array) -> CorrelatedTrackingState:
         """Time 0: the state is drawn about the initial mean; nothing has been measured."""
         runs, nodes, n = noise.shape[-1], self.sensor_count, self.plant.size
-        if self.noise_scale is None:
-            low, high = RANDOM_SCALE
-            scale = low + (high - low) * ndtr(noise[-1])
-        else:
-            scale = np.full(runs, self.noise_scale)
+        scale = self._scale(noise[-1])
         plant = self.plant
         mean = np.broadcast_to(plant.initial_mean, (nodes + 1, n, runs)).copy()
         covariance = np.broadcast_to(plant.initial_covariance, (nodes + 1, n, n, runs)).copy()
@@ -264,6 +260,19 @@ class CorrelatedTrackingSystem:
         hidden = np.full_like(state.truth, np.nan)
         return replace(state, truth=hidden, scale=hidden[0], joint=None)
 
+    @property
+    def imagination_channels(self) -> int:
+        """One for each state, one for the noise scale."""
+        return self.plant.size + 1
+
+    def imagine(
+        self, state: CorrelatedTrackingState, mean: Array, covariance: Array, noise: Array
+    ) -> CorrelatedTrackingState:
+        """The noise scale is drawn by its law, whatever was measured, the truth from that share of
+        the covariance: it is a bound, and actual covariances are proportional to the scale."""
+        scale = self._scale(noise[-1])
+        return replace(state, truth=linalg.draw(mean, scale * covariance, noise[:-1]), scale=scale)
+
     def adopt(
         self,
         state: CorrelatedTrackingState,
@@ -320,6 +329,13 @@ class CorrelatedTrackingSystem:
     def open_loop(self, horizon: int) -> Array:
         """Mean error variance (n,) over t = 1..horizon of a centre that only predicts (bound)."""
         return self.plant.open_loop(horizon)
+
+    def _scale(self, noise: Array) -> Array:
+        """Noise scales (N,) from standard normals (N,)."""
+        if self.noise_scale is not None:
+            return np.full(noise.shape, self.noise_scale)
+        low, high = RANDOM_SCALE
+        return low + (high - low) * ndtr(noise)
 
     def _whitened(self, state: CorrelatedTrackingState) -> Array:
         deviation = _deviation(_sensed(state).innovation_covariance)

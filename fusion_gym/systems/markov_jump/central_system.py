@@ -27,7 +27,13 @@ from fusion_gym.systems.markov_jump.interacting_models import InteractingModels
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, Times
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
-from fusion_gym.systems.markov_jump.state import move, sampling_blocks, without_truth
+from fusion_gym.systems.markov_jump.state import (
+    imagination_channels,
+    imagined,
+    move,
+    sampling_blocks,
+    without_truth,
+)
 
 _RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
 
@@ -302,6 +308,17 @@ class MarkovJumpCentralSystem:
     def visible(self, state: MarkovJumpCentralState) -> MarkovJumpCentralState:
         """The state without the truth, the mode and the noise that moves the plant next."""
         return without_truth(state)
+
+    @property
+    def imagination_channels(self) -> int:
+        """Normals of :meth:`imagine`."""
+        return imagination_channels(self.plant)
+
+    def imagine(
+        self, state: MarkovJumpCentralState, mean: Array, covariance: Array, noise: Array
+    ) -> MarkovJumpCentralState:
+        """See :func:`~fusion_gym.systems.markov_jump.state.imagined`."""
+        return imagined(self.plant, state, mean, covariance, noise)
 
     def truth(self, state: MarkovJumpCentralState) -> Array:
         """The plant's state (n, N)."""

@@ -13,11 +13,12 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import Block, Signal, numbered
 from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagCovariances
 from fusion_gym.systems.markov_jump.linear_minimum_variance import Times
-from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes
+from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes, draw
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
 
 
@@ -143,4 +144,30 @@ def without_truth(state: AnyState) -> AnyState:
         truth=np.full_like(state.truth, np.nan),
         mode=np.zeros_like(state.mode),
         process_noise=np.full_like(state.process_noise, np.nan),
+    )
+
+
+def imagination_channels(plant: MarkovJumpPlant) -> int:
+    """Normals of :func:`imagined`: the truth's, the mode's, the process noise's."""
+    return plant.size + 1 + plant.noise_channels
+
+
+def imagined(
+    plant: MarkovJumpPlant, state: AnyState, mean: Array, covariance: Array, noise: Array
+) -> AnyState:
+    """A state of this family with all that is hidden drawn anew.
+
+    The truth by what is believed; the mode by the chain's own law at that time and the process
+    noise by its own, whatever the measurements tell of them.
+    """
+    n = plant.size
+    law = np.empty((plant.modes, len(state.time)))
+    for time in np.unique(state.time):
+        moved = np.linalg.matrix_power(plant.mode_transition, int(time))
+        law[:, state.time == time] = (plant.initial_probabilities @ moved)[:, None]
+    return replace(
+        state,
+        truth=linalg.draw(mean, covariance, noise[:n]),
+        mode=draw(np.cumsum(law, 0)[:-1], noise[n]),
+        process_noise=plant.process_noise(noise[n + 1 :]),
     )

@@ -25,6 +25,8 @@ from fusion_gym.systems.markov_jump.sensors import FadingSensors
 from fusion_gym.systems.markov_jump.state import (
     SIGNALS,
     MarkovJumpState,
+    imagination_channels,
+    imagined,
     move,
     sampling_blocks,
     without_truth,
@@ -245,6 +247,17 @@ class MarkovJumpSystem:
     def visible(self, state: MarkovJumpState) -> MarkovJumpState:
         """The state without the truth, the mode and the noise that moves the plant next."""
         return without_truth(state)
+
+    @property
+    def imagination_channels(self) -> int:
+        """Normals of :meth:`imagine`."""
+        return imagination_channels(self.plant)
+
+    def imagine(
+        self, state: MarkovJumpState, mean: Array, covariance: Array, noise: Array
+    ) -> MarkovJumpState:
+        """See :func:`~fusion_gym.systems.markov_jump.state.imagined`."""
+        return imagined(self.plant, state, mean, covariance, noise)
 
     def truth(self, state: MarkovJumpState) -> Array:
         """The plant's state (n, N)."""

@@ -158,19 +158,14 @@ class RemoteEstimationSystem:
         """The sources and the channels move, the centre predicts."""
         sensors = self.sensor_count
         a, sigma = self.coefficient[:, None], self.deviation[:, None]
-        channel = state.next_channel
-        following, lost = channel, np.zeros(channel.shape, dtype=np.bool_)
-        if self.channel.states > 1:
-            following = self.channel.advance(channel, noise[sensors : 2 * sensors])
-        if self.channel.loses:
-            lost = self.channel.lost(following, noise[-sensors:])
+        following, lost = self._coming(state.next_channel, noise[sensors:])
         return replace(
             state,
             truth=a * state.truth + sigma * noise[:sensors],
             prior=a * state.estimate,
             prior_variance=a * a * state.variance + sigma * sigma,
             age=state.age + 1.0,
-            channel=channel,
+            channel=state.next_channel,
             next_channel=following,
             lost=lost,
         )
@@ -216,6 +211,21 @@ class RemoteEstimationSystem:
         """
         return replace(state, next_channel=state.channel, lost=np.zeros_like(state.lost))
 
+    @property
+    def imagination_channels(self) -> int:
+        """Those of a step but the sources'."""
+        return self.noise_channels - self.sensor_count
+
+    def imagine(
+        self, state: RemoteEstimationState, mean: Array, covariance: Array, noise: Array
+    ) -> RemoteEstimationState:
+        """What the channel does is drawn by its law, from the state that was fed back.
+
+        The sources are what the sensors measure, so they stay, whatever ``mean`` is.
+        """
+        following, lost = self._coming(state.channel, noise)
+        return replace(state, next_channel=following, lost=lost)
+
     def arrival_probability(self, state: RemoteEstimationState) -> Array | None:
         """Probability (sensors, N) that a packet sent now arrives, given the channel before."""
         return self._arrival_probability(state.channel) if self.channel.loses else None
@@ -249,6 +259,18 @@ class RemoteEstimationSystem:
             variance = self.coefficient**2 * variance + self.deviation**2
             total = total + variance
         return total / horizon
+
+    def _coming(
+        self, channel: NDArray[np.int64], noise: Array
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """The channel's next state and whether it loses a packet, from what it was (sensors, N)."""
+        sensors = self.sensor_count
+        following, lost = channel, np.zeros(channel.shape, dtype=np.bool_)
+        if self.channel.states > 1:
+            following = self.channel.advance(channel, noise[:sensors])
+        if self.channel.loses:
+            lost = self.channel.lost(following, noise[-sensors:])
+        return following, lost
 
     def _weighted(self, variance: Array) -> Array:
         return self.state_weights[:, None] * variance

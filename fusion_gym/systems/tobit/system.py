@@ -253,6 +253,17 @@ class CensoredSystem:
         """The state without the truth; nothing else is hidden."""
         return replace(state, truth=np.full_like(state.truth, np.nan))
 
+    @property
+    def imagination_channels(self) -> int:
+        """One for each state."""
+        return self.plant.size
+
+    def imagine(
+        self, state: CensoredState, mean: Array, covariance: Array, noise: Array
+    ) -> CensoredState:
+        """The state with a truth drawn by what is believed."""
+        return replace(state, truth=linalg.draw(mean, covariance, noise))
+
     def adopt(
         self, state: CensoredState, mean: Array, covariance: Array, runs: NDArray[np.bool_]
     ) -> CensoredState:

@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
@@ -22,6 +23,7 @@ from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
 from fusion_gym.systems.unknown_input.signals import InputSignal
 
 _RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
+_IMAGINED = 32  # signals of which one is taken, where one is imagined
 
 
 @dataclass(slots=True)
@@ -231,6 +233,46 @@ class UnknownInputSystem:
             state,
             truth=np.full_like(state.truth, np.nan),
             signal=np.full_like(state.signal, np.nan),
+        )
+
+    @property
+    def imagination_channels(self) -> int | None:
+        """For the states and for ``_IMAGINED`` signals; None if the input is not drawn at all."""
+        if self.signal.start_channels == 0:
+            return None
+        signal = self.signal.noise_channels + _IMAGINED * (self.signal.start_channels + 1)
+        return self.plant.size + signal
+
+    def imagine(
+        self, state: UnknownInputState, mean: Array, covariance: Array, noise: Array
+    ) -> UnknownInputState:
+        """The signal is drawn by its law and by what is believed of the input that has just acted.
+
+        Of ``_IMAGINED`` signals drawn as at a start, one is taken with the probability that its
+        last value has under N(mean, covariance); the rest of the truth follows that distribution,
+        given this value. What older estimates tell of the signal's course is not used.
+        """
+        n, steps, runs = self.plant.size, self.signal.noise_channels, len(state.time)
+        first, moving, drawn = np.split(noise, (n, n + steps))
+        choice, starts = drawn[:_IMAGINED], drawn[_IMAGINED:].reshape(-1, _IMAGINED * runs)
+        last = np.tile(state.time - 1.0, _IMAGINED)
+        memories = self.signal.start(starts)
+        values = self.signal.value(memories, last).reshape(-1, _IMAGINED, runs)
+        apart = np.moveaxis(values - mean[n:, None], 1, 0)
+        spread = covariance[n:, n:]
+        # The largest of Gumbel numbers moved by log weights is a draw with these weights.
+        weight = -0.5 * linalg.dot(apart, linalg.solve_vector(spread, apart))
+        chosen = (weight - np.log(-np.log(ndtr(choice)))).argmax(0)
+        memory = memories.reshape(-1, _IMAGINED, runs)[:, chosen, np.arange(runs)]
+        off = apart[chosen, :, np.arange(runs)].T
+        cross = covariance[:n, n:]
+        gained = linalg.solve(spread, linalg.transpose(cross))
+        left = linalg.symmetrise(covariance[:n, :n] - linalg.matmul(cross, gained))
+        moved = mean[:n] + linalg.matvec(linalg.transpose(gained), off)
+        return replace(
+            state,
+            truth=np.concatenate((linalg.draw(moved, left, first), mean[n:] + off)),
+            signal=self.signal.advance(memory, moving),
         )
 
     def truth(self, state: UnknownInputState) -> Array:

@@ -1,0 +1,96 @@
+"""What one improvement by simulation brings over the value rule, in the benchmark's settings.
+
+    python -m benchmarks.rollout tobit_oscillator --output results/rollout
+
+For each price of a token it plays `rollout` on `value_of_information`, and that base by itself, on
+the same episodes of the setting with memory, and writes both points and the paired difference of
+the returns at that price to `OUTPUT/SETTING.json`. The base's own price is the token's over
+`--ratio`: a packet keeps its worth over several steps, and the rule counts one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+import fusion_gym
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.metrics import mean_interval
+from fusion_gym.policies.registry import make_policy
+
+CONFIG = Path(__file__).parent.parent / "configs" / "benchmark.yaml"
+
+
+def point(policy: str, found: EpisodeResults) -> dict[str, Any]:
+    """Rate and mean squared error of a policy's episodes."""
+    return {
+        "policy": policy,
+        "rate": float(found.rate.mean()),
+        "mse": float(found.mse.mean()),
+        "mse_interval": mean_interval(found.mse)[1:],
+    }
+
+
+def improve(env_id: str, options: dict[str, Any], price: float, given: Any) -> dict[str, Any]:
+    """The point of one improvement at a price, with its base's beside it."""
+    task: Task = fusion_gym.make_task(env_id, **options, memory=True, cost_weight=price)
+    base = f"value_of_information:price={price / given.ratio:.3g},at_most=1"
+    policy = f"rollout:samples={given.samples},steps={given.steps},price={price:.3g},base={base}"
+    found, plain = (
+        run_episodes(task, make_policy(name, task), given.episodes, given.seed)
+        for name in (policy, base)
+    )
+    gain = mean_interval(found.returns - plain.returns)
+    return point(policy, found) | {
+        "price": price,
+        "base": point(base, plain),
+        "return_gain": gain.mean,
+        "return_gain_interval": gain[1:],
+        "return": float(found.returns.mean()),
+    }
+
+
+def main() -> None:
+    """Entry point."""
+    settings = {one["name"]: one for one in yaml.safe_load(CONFIG.read_text())["settings"]}
+    parser = argparse.ArgumentParser(description="One improvement by simulation on the value rule.")
+    parser.add_argument("setting", choices=settings)
+    parser.add_argument("--prices", type=float, nargs="+", help="default: four of the range")
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--samples", type=int, default=8)
+    parser.add_argument("--steps", type=int, default=8)
+    parser.add_argument("--ratio", type=float, default=5.0)
+    parser.add_argument("--output", type=Path, required=True, help="a folder")
+    given = parser.parse_args()
+    chosen = settings[given.setting]
+    low, high = chosen["price_range"]
+    prices = given.prices or [(low * high) ** 0.5 * factor for factor in (0.3, 1.0, 3.0, 10.0)]
+    environment = chosen["environment"]
+    points = []
+    for price in [float(f"{price:.3g}") for price in prices]:
+        points.append(improve(environment["id"], environment["options"], price, given))
+        last = points[-1]
+        print(f"price {price}: rate {last['rate']:.4f}, MSE {last['mse']:.4g}", flush=True)
+    report = {
+        "setting": given.setting,
+        "env": environment["id"],
+        "options": environment["options"] | {"memory": True},
+        "episodes": given.episodes,
+        "seed": given.seed,
+        "command": " ".join(["python -m benchmarks.rollout", *sys.argv[1:]]),
+        "points": points,
+    }
+    given.output.mkdir(parents=True, exist_ok=True)
+    path = given.output / f"{given.setting}.json"
+    path.write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

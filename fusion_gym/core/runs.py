@@ -1,0 +1,235 @@
+"""N runs of a task at one time: what is known of them, and the two halves of a step.
+
+Both halves are pure: they make new arrays and change none, so runs can be taken apart from those
+that they began as and moved on other noise.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym.arrays import Array, take_runs
+from fusion_gym.core.access import access_mask, first_request
+from fusion_gym.core.beliefs import Beliefs, Shadows
+from fusion_gym.core.memory import Memory
+from fusion_gym.core.observation import Network, ObservationLayout
+from fusion_gym.core.signals import memory_signals, missing_signals
+from fusion_gym.core.system import Signals
+from fusion_gym.core.task import Task
+
+
+class Outcome(NamedTuple):
+    """What one step brought, batch axis last.
+
+    ``reward`` (N,) is ``reward_error`` + ``reward_communication``; ``cost`` (N,) the tokens spent;
+    ``requested``, ``granted`` (sensors, N) bool; ``squared_error`` (n, N) of the fused estimate;
+    ``diverged`` (N,) bool, whether some state's squared error is not finite or above the task's
+    ``divergence_level``; ``truncated`` (N,) bool.
+    """
+
+    reward: Array
+    reward_error: Array
+    reward_communication: Array
+    cost: Array
+    requested: NDArray[np.bool_]
+    granted: NDArray[np.bool_]
+    squared_error: Array
+    diverged: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+
+
+class Position(NamedTuple):
+    """Where N runs are, after sensing: all that moves with them.
+
+    The system's ``state`` and the ``shadows`` beside it, ``tokens`` and ``price`` (N,), ``steps``
+    taken and the ``limit`` at which the episode ends (N,), and who is ``admitted`` in the coming
+    step (sensors, N) bool.
+    """
+
+    state: Any
+    shadows: Shadows | None
+    tokens: Array
+    price: Array
+    steps: NDArray[np.int64]
+    limit: NDArray[np.int64]
+    admitted: NDArray[np.bool_]
+
+
+class Runs:
+    """N runs of a :class:`~fusion_gym.core.task.Task` at one time, after sensing.
+
+    ``state`` is the system's after sensing, ``delivered`` its state after the last delivery,
+    for metrics and figures; ``shadows`` is what is remembered, or ``None``; ``tokens``, ``price``
+    of a token and ``steps`` taken are (N,).
+    """
+
+    state: Any
+    shadows: Shadows | None
+    tokens: Array
+    price: Array
+    steps: NDArray[np.int64]
+    _limit: NDArray[np.int64]
+
+    def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
+        self.task, self.memory, self.layout = task, memory, layout
+        self.delivered: Any = None
+        self._beliefs: Beliefs | None = None
+
+    @property
+    def channels(self) -> int:
+        """Standard normals of one step: the system's, and one for ``access="random"``."""
+        return self.task.system.noise_channels + (self.task.access == "random")
+
+    def deliver(self, requests: NDArray[np.bool_]) -> Outcome:
+        """The first half of a step: answer the requests (sensors, N), update, fuse, reward."""
+        task, system = self.task, self.task.system
+        if task.access == "any":
+            admitted = requests
+        elif task.access == "single":
+            admitted = first_request(requests, self.steps)
+        else:
+            admitted = requests & self.admitted()
+        granted, spent, tokens = task.bucket.grant(self.tokens, admitted, self.steps)
+        state = system.deliver(self.state, granted)
+        if task.packet == "estimate":
+            state = self._adopted(state, np.asarray(granted.any(0)))
+        mean, covariance = system.fused(state)
+        error = system.truth(state) - mean
+        squared_error = error * error
+        reward_error, reward_communication = task.reward.terms(
+            squared_error, covariance, spent, self.price
+        )
+        if self.shadows is not None:
+            self.shadows = self.memory.deliver(self.beliefs(), granted)
+        self.delivered, self.tokens, self.steps = state, tokens, self.steps + 1
+        return Outcome(
+            reward=reward_error + reward_communication,
+            reward_error=reward_error,
+            reward_communication=reward_communication,
+            cost=spent,
+            requested=requests,
+            granted=granted,
+            squared_error=squared_error,
+            diverged=np.asarray(~(squared_error <= task.divergence_level).all(0)),
+            truncated=self.steps >= self._limit,
+        )
+
+    def sense(self, noise: Array) -> None:
+        """The second half: the plant moves, the sensors measure, with noise (channels, N)."""
+        noise = noise[: self.task.system.noise_channels]
+        if self.shadows is not None:
+            self.shadows = self.memory.sense(self.shadows, noise)
+        self.state = self.task.system.sense(self.delivered, noise)
+        self._beliefs = None
+
+    def branch(self, runs: NDArray[np.int64] | None = None) -> Branch:
+        """The given runs (all by default), in this order and possibly again and again, apart.
+
+        Runs that are finished go on from their continued state.
+        """
+        runs = np.arange(len(self.tokens)) if runs is None else runs
+        position = Position(
+            take_runs(self.state, runs),
+            None if self.shadows is None else self.memory.take(self.shadows, runs, len(self.steps)),
+            self.tokens[runs],
+            self.price[runs],
+            self.steps[runs],
+            self._limit[runs],
+            self.admitted()[:, runs],
+        )
+        return Branch(self.task, self.memory, self.layout, position)
+
+    def observe(self) -> NDArray[np.float32]:
+        """Observations (N, entries) of all runs, a fresh array."""
+        network = Network(self.tokens, self.admitted, self.price)
+        return self.layout.encode(self.state, network, self.beliefs)
+
+    def beliefs(self) -> Beliefs:
+        """What the owner of the memory believes before anything is sent."""
+        if self._beliefs is None:
+            self._beliefs = self.memory.beliefs(self.state, self.shadows or Shadows())
+        return self._beliefs
+
+    def admitted(self) -> NDArray[np.bool_]:
+        """The sensors (sensors, N) that the network's access rule admits in the coming step."""
+        return access_mask(self.task.access, self.task.sensors, self.steps, self._lottery())
+
+    def grantable(self) -> NDArray[np.bool_]:
+        """The sensors (sensors, N) whose request alone the network would grant now."""
+        admitted = self.admitted()
+        result = np.zeros_like(admitted)
+        for sensor in range(self.task.sensors):
+            alone = np.zeros_like(admitted)
+            alone[sensor] = admitted[sensor]
+            result[sensor] = self.task.bucket.grant(self.tokens, alone, self.steps).granted[sensor]
+        return result
+
+    def signals(self) -> Signals:
+        """The signals of all runs, without what the information mode withholds.
+
+        To the system's own it adds ``tokens`` (N,), ``token_cost`` (sensors, 1), ``price`` (N,) of
+        a token, ``step`` (N,),
+        the steps taken in the episode, ``start`` (N,) bool, ``admitted`` and
+        ``grantable`` (sensors, N) bool, ``observation`` (N, entries), and ``model``, the system's
+        state without what no policy may know, for policies that plan with the system's own moves;
+        and what is believed (:mod:`fusion_gym.core.signals`).
+        """
+        system, state = self.task.system, self.state
+        values = dict(system.read(state))
+        values |= {
+            "tokens": self.tokens,
+            "token_cost": self.task.bucket.cost,
+            "price": self.price,
+            "step": self.steps,
+            "start": self.steps == 0,
+            "admitted": self.admitted,
+            "grantable": self.grantable,
+            "observation": self.observe,
+            "model": lambda: system.visible(state),
+        }
+        owner = self.memory.owner
+        values |= memory_signals(owner, self.beliefs)
+        return Signals(values, self.task.hidden_signals, missing_signals(owner))
+
+    def _lottery(self) -> Array | None:
+        """The standard normals (N,) that decide random access; None with another rule."""
+        return None
+
+    def _adopted(self, state: Any, arrived: NDArray[np.bool_]) -> Any:
+        """The delivered state whose centre goes on from x* where a packet arrived, (N,) bool."""
+        best = self.beliefs().best
+        system: Any = self.task.system
+        return system.adopt(state, best.mean[0], best.covariance[0], arrived)
+
+
+class Branch(Runs):
+    """Runs of their own from a :class:`Position` on, with whatever noise they are given.
+
+    It shares arrays with what it was taken from and never changes one.
+    """
+
+    def __init__(
+        self, task: Task, memory: Memory, layout: ObservationLayout, position: Position
+    ) -> None:
+        super().__init__(task, memory, layout)
+        self.state, self.shadows, self.tokens, self.price = position[:4]
+        self.steps, self._limit, self._admitted = position[4:]
+
+    def step(self, requests: NDArray[np.bool_], noise: Array) -> Outcome:
+        """Both halves of a step, with standard normals (channels, N)."""
+        outcome = self.deliver(requests)
+        self.sense(noise)
+        return outcome
+
+    def sense(self, noise: Array) -> None:
+        """See :class:`Runs`."""
+        super().sense(noise)
+        lottery = noise[-1] if self.task.access == "random" else None
+        self._admitted = access_mask(self.task.access, self.task.sensors, self.steps, lottery)
+
+    def admitted(self) -> NDArray[np.bool_]:
+        """See :class:`Runs`."""
+        return self._admitted

@@ -1,0 +1,77 @@
+"""Runs as they could be, from what a coordinator believes: for policies that simulate."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym.arrays import Array, take_runs
+from fusion_gym.core.beliefs import Shadows
+from fusion_gym.core.memory import Memory
+from fusion_gym.core.observation import ObservationLayout
+from fusion_gym.core.runs import Branch, Position
+from fusion_gym.core.system import ImaginableSystem, Signals, System
+from fusion_gym.core.task import Task
+from fusion_gym.policies.believing import beliefs_of
+from fusion_gym.validation import ConfigurationError
+
+
+class Imagination:
+    """Makes runs of a task whose hidden parts are drawn anew, to be moved on imagined noise.
+
+    Raises:
+        ConfigurationError: a system that has no way to draw them.
+    """
+
+    def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
+        self._task, self._memory, self._layout = task, memory, layout
+        for system in (task.system, task.shadow or task.system):
+            if not isinstance(system, ImaginableSystem) or system.imagination_channels is None:
+                raise ConfigurationError(
+                    f"{type(system).__name__} cannot be imagined here: what is hidden in it, the "
+                    "truth and what comes, has no law by which it is drawn in each episode"
+                )
+        self._first: int = _imaginable(task.system).imagination_channels or 0
+        self._each = task.system.noise_channels + (task.access == "random")
+
+    def channels(self, steps: int) -> int:
+        """Standard normals that :meth:`begin` takes for ``steps`` steps."""
+        return self._first + steps * self._each
+
+    def begin(
+        self, signals: Signals, runs: NDArray[np.int64], normals: Array
+    ) -> tuple[Branch, Array]:
+        """Of the signals' runs those with the numbers ``runs`` (R,), and noise for their steps.
+
+        From normals (channels, R); the noise is (steps, channels of a step, R).
+        """
+        task, beliefs = self._task, beliefs_of(signals, own=False)
+        first, rest = normals[: self._first], normals[self._first :]
+        mean, covariance = (take_runs(part[0], runs) for part in beliefs.best)
+
+        def imagined(system: System[Any], state: Any) -> Any:
+            seen = system.visible(take_runs(state, runs))
+            return _imaginable(system).imagine(seen, mean, covariance, first)
+
+        shadows, every = None, beliefs.shadows.every
+        if every is not None:
+            shadows = Shadows(every=imagined(task.shadow or task.system, every))
+        steps = signals["step"][runs]
+        position = Position(
+            imagined(task.system, signals["model"]),
+            shadows,
+            signals["tokens"][runs],
+            signals["price"][runs],
+            steps,
+            np.full_like(steps, task.horizon),
+            signals["admitted"][:, runs],
+        )
+        branch = Branch(task, self._memory, self._layout, position)
+        return branch, rest.reshape(-1, self._each, len(runs))
+
+
+def _imaginable(system: Any) -> ImaginableSystem[Any]:
+    assert isinstance(system, ImaginableSystem), "checked when it was made"
+    return system

@@ -1,0 +1,158 @@
+"""One improvement on a policy: try first decisions, and let it go on, in simulations."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.memory import Memory, Owner
+from fusion_gym.core.observation import ObservationLayout
+from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.task import Task
+from fusion_gym.policies.base import Policy, Requests, is_stateless, owner_of
+from fusion_gym.policies.believing import check_owner, knows
+from fusion_gym.policies.imagination import Imagination
+from fusion_gym.policies.registry import make_policy
+
+_STREAM = 0x726F6C6C6F7574  # keeps what is imagined apart from the noise of the same seed
+_LANES = 16384  # simulations side by side, unless those of one run are more
+
+
+class Rollout:
+    """One policy improvement on the policy ``base``, whose text ends that of this one.
+
+    At every step it tries, as first decisions, nobody, each sensor alone and what the base asks
+    for; after each the base goes on for ``steps`` more, in ``samples`` simulations. They begin with
+    what is believed (:class:`~fusion_gym.core.system.ImaginableSystem`), have noise of their own,
+    the same for every decision, and know neither the truth nor coming noise and losses. The
+    decision of the least mean cost is taken, of those that beat the base's own by ``doubt``
+    standard errors of their difference; with 0 it is the least cost itself, whose chance finds
+    make it send too often. A simulation does not end with the episode.
+
+    The cost is error_weight · ‖x* - x̂‖² + ``price`` for each token (None: the task's own), with x*
+    the best estimate that could be made at that step and the reward's weights. Where x* is the
+    conditional mean, that is the expected squared error but for a part that no decision changes.
+
+    With ``samples`` and ``steps`` without limit, on a model that is true, it would cost no more
+    than its base: where one improvement brings little, the base is nearly the best of those near
+    it. It does samples · (steps + 1) · (sensors + 1) steps of the base for one of its own.
+
+    Source: D. P. Bertsekas, J. N. Tsitsiklis and C. Wu, "Rollout algorithms for combinatorial
+    optimization", Journal of Heuristics 3, 1997.
+
+    Raises:
+        ConfigurationError: a number that is not allowed; a base that cannot be made, that keeps
+            variables of its own from step to step, or that looks at each sensor's own beliefs; a
+            task whose policies do not see the sensors, or whose system cannot be imagined.
+    """
+
+    stateless: ClassVar[bool] = False  # it draws
+    remember: ClassVar[Owner] = "coordinator"
+
+    def __init__(
+        self,
+        task: Task,
+        base: str,
+        samples: int = 16,
+        steps: int = 8,
+        price: float | None = None,
+        doubt: float = 1.0,
+        trust: bool = False,
+    ) -> None:
+        self.samples = validation.integer("samples", samples, at_least=1)
+        self.steps = validation.integer("steps", steps, at_least=1)
+        if price is not None:
+            validation.number("price", price, at_least=0.0)
+        self.price = price
+        self.doubt = validation.number("doubt", doubt, at_least=0.0)
+        check_owner(task, own=False)
+        if not isinstance(base, str):
+            raise validation.refusal("base", base, "the text that names a policy")
+        self.base: Policy = make_policy(base, task, trust=trust)
+        if not is_stateless(self.base):
+            raise validation.refusal(
+                "base",
+                base,
+                "a policy that looks at the signals of the present step alone, for it is asked in "
+                "the middle of simulated episodes",
+            )
+        if owner_of(self.base) == "own":
+            raise validation.refusal(
+                "base", base, "a coordinator's policy, for simulations begin with what it believes"
+            )
+        self.knowledge: Knowledge = knows(task, own=False)
+        memory = Memory(task, "coordinator")
+        self._task = task
+        self._weights = task.reward.error_weight * task.reward.state_weights
+        self._imagination = Imagination(task, memory, ObservationLayout(task))
+        self.reset(0)
+
+    def reset(self, runs: int, seed: int = 0) -> None:
+        """Begin again: run i imagines with a stream of its own, that of ``seed + i``."""
+        self.base.reset(runs, seed)
+        self._generators = [
+            np.random.default_rng([one, _STREAM]) for one in range(seed, seed + runs)
+        ]
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Requests (sensors, N)."""
+        runs = len(signals["tokens"])
+        if len(self._generators) != runs:
+            self.reset(runs)
+        choices, own = self._choices(np.asarray(self.base(signals)))
+        size = max(1, _LANES // (len(choices) * self.samples))
+        best = np.empty(runs, dtype=np.int64)
+        for first in range(0, runs, size):
+            block = np.arange(first, min(first + size, runs))
+            cost = self._cost(signals, block, choices[..., block])
+            best[block] = self._least(cost, own[block])
+        return np.ascontiguousarray(choices[best, :, np.arange(runs)].T)
+
+    def _choices(self, own: Requests) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+        """First decisions (choices, sensors, N), nobody and each sensor alone before the base's
+        ``own``, and which of them is the base's (N,)."""
+        sensors, runs = own.shape
+        single = np.concatenate(
+            (np.zeros((1, sensors), dtype=np.bool_), np.eye(sensors, dtype=np.bool_))
+        )
+        choices = np.repeat(single[..., None], runs, axis=-1)
+        several = own.sum(0) > 1
+        if several.any():
+            choices = np.concatenate((choices, own[None]))
+        return choices, np.where(several, sensors + 1, own.any(0) * (1 + own.argmax(0)))
+
+    def _least(self, cost: Array, own: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Which decision to take (R,), from costs (choices, R, samples) and the base's (R,)."""
+        gain = cost[own, np.arange(len(own))] - cost
+        error = gain.std(-1) / np.sqrt(self.samples)
+        mean = gain.mean(-1)
+        worth: Array = np.where(mean > self.doubt * error, mean, 0.0)
+        found = worth.argmax(0)
+        return np.where(worth.max(0) > 0.0, found, own)
+
+    def _cost(self, signals: Signals, runs: NDArray[np.int64], choices: NDArray[np.bool_]) -> Array:
+        """Costs (choices, R, samples) of first decisions (choices, sensors, R) in these runs."""
+        count, samples = len(choices), self.samples
+        drawn = self._imagination.channels(self.steps)
+        normals = np.stack(
+            [self._generators[run].standard_normal((drawn, samples)) for run in runs.tolist()], 1
+        ).reshape(drawn, -1)
+        lanes = np.tile(np.arange(len(runs) * samples), count)
+        imagined, noise = self._imagination.begin(signals, runs.repeat(samples), normals)
+        branch = imagined.branch(lanes)
+        requests = np.moveaxis(choices, 0, 1).repeat(samples, axis=-1).reshape(len(choices[0]), -1)
+        price = branch.price if self.price is None else self.price
+        cost = np.zeros(len(lanes))
+        for step in range(self.steps + 1):
+            best = branch.beliefs().best.mean[0]
+            spent = branch.deliver(requests).cost
+            missed = best - self._task.system.fused(branch.delivered)[0]
+            cost += (self._weights * missed * missed).sum(0) + price * spent
+            if step < self.steps:
+                branch.sense(noise[step].take(lanes, axis=-1))
+                requests = np.asarray(self.base(branch.signals()))
+        return cost.reshape(count, len(runs), samples)

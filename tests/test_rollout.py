@@ -1,0 +1,239 @@
+"""One improvement by simulation: it beats its base, and is blind to what is hidden."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies import rollout
+from fusion_gym.policies.base import Policy
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError
+
+REMOTE, TRACKING = "fusion_gym/RemoteEstimation-v0", "fusion_gym/BiasedTracking-v0"
+TOBIT, MARKOV = "fusion_gym/TobitOscillator-v0", "fusion_gym/MarkovJumpTracking-v0"
+CORRELATED, INPUT = "fusion_gym/CorrelatedTracking-v0", "fusion_gym/UnknownInput-v0"
+VALUE = "value_of_information:threshold=0.05,at_most=1"
+CASES: dict[str, tuple[str, dict[str, Any], str]] = {
+    "tobit": (TOBIT, {"filter": "tobit", "memory": True, "packet": "estimate"}, VALUE),
+    "tobit, no memory": (TOBIT, {"access": "random"}, VALUE),
+    "correlated": (CORRELATED, {"memory": True, "noise_scale": "random"}, VALUE),
+    "markov": (MARKOV, {"memory": True, "memory_filter": "imm"}, VALUE),
+    "unknown input": (INPUT, {"memory": True}, VALUE),
+    "unknown steps": (INPUT, {"input_signal": "steps"}, "innovation_threshold:threshold=2"),
+    "remote": (
+        REMOTE,
+        {"sensors": 2, "channel": "gilbert_elliott", "cost_weight": 1.0},
+        "innovation_threshold:threshold=1.5",
+    ),
+}
+
+
+def case(name: str, samples: int = 3, steps: int = 2) -> tuple[Task, Policy]:
+    env_id, options, base = CASES[name]
+    task = fusion_gym.make_task(env_id, **options)
+    return task, make_policy(f"rollout:samples={samples},steps={steps},base={base}", task)
+
+
+def otherwise(system: Any, state: Any, rng: np.random.Generator) -> Any:
+    """The state with everything changed that its visible part hides."""
+    seen, changed = system.visible(state), {}
+    for field in dataclasses.fields(state):
+        value = getattr(state, field.name)
+        if value is None or value is getattr(seen, field.name):
+            continue
+        if value.dtype == np.bool_:
+            changed[field.name] = ~value
+        elif value.dtype == np.float64:
+            changed[field.name] = value + rng.standard_normal(value.shape)
+        else:
+            changed[field.name] = np.roll(value, 1, axis=-1)
+    assert changed
+    return dataclasses.replace(state, **changed)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_hidden_does_not_matter(name: str) -> None:
+    """Neither the truth, nor coming noise and losses, nor what the shadow hides of them."""
+    task, policy = case(name)
+    batch, rng = EpisodeBatch.seeded(task, 6, 0), np.random.default_rng(1)
+    policy.reset(6, 0)
+    asked = 0
+    for _ in range(8):
+        other, blind = copy.copy(batch), copy.deepcopy(policy)
+        other._beliefs = None
+        other.state = otherwise(task.system, batch.state, rng)
+        if batch.shadows is not None and task.shadow is not None:
+            hidden = otherwise(task.shadow, batch.shadows.every, rng)
+            other.shadows = dataclasses.replace(batch.shadows, every=hidden)
+        other._ring = np.roll(batch._ring, 1, axis=0) + (batch.task.access != "random")
+        other._ring[batch._cursor % batch._block] = batch.normals()
+        answer = policy(batch.signals())
+        np.testing.assert_array_equal(blind(other.signals()), answer)
+        asked += int(answer.sum())
+        batch.step(answer)
+    assert asked > 0
+
+
+def test_runs_and_seeds_are_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reset begins again; a run does not depend on those beside it, nor on how they are cut."""
+    env_id, options, base = CASES["tobit"]
+    task = fusion_gym.make_task(env_id, **options, horizon=12)
+    policy = make_policy(f"rollout:samples=3,steps=2,base={base}", task)
+    found = run_episodes(task, policy, 4, seed=5)
+    again = run_episodes(task, policy, 4, seed=5)
+    np.testing.assert_array_equal(found.returns, again.returns)
+    alone = run_episodes(task, policy, 1, seed=7)
+    np.testing.assert_array_equal(found.returns[2], alone.returns[0])
+    monkeypatch.setattr(rollout, "_LANES", 24)
+    cut = run_episodes(task, policy, 4, seed=5)
+    np.testing.assert_array_equal(found.returns, cut.returns)
+    batch = EpisodeBatch.seeded(task, 40, 0)
+    batch.step(np.zeros((3, 40), dtype=np.bool_))
+    answers = []
+    for seed in (0, 1):
+        policy.reset(40, seed)
+        answers.append(policy(batch.signals()))
+    assert not np.array_equal(*answers)
+
+
+def test_it_asks_for_what_is_worth_its_price() -> None:
+    """Sources that nobody else serves: a packet takes w e² (1 + a² + …) off, in expectation."""
+    task = fusion_gym.make_task(REMOTE, sensors=2, coefficient=0.8, tokens="unlimited")
+    batch, price, steps = EpisodeBatch.seeded(task, 80, 0), 1.0, 3
+    for _ in range(3):
+        batch.step(np.zeros((2, 80), dtype=np.bool_))
+    text = f"rollout:samples=400,steps={steps},price={price},doubt=0,base=never"
+    policy = make_policy(text, task)
+    policy.reset(80)
+    asked = policy(batch.signals())
+    error = (batch.state.truth - batch.state.prior) ** 2 * task.reward.state_weights
+    worth = error * sum(0.8 ** (2 * step) for step in range(steps + 1)) - price
+    best = np.where(worth.max(0) > 0.0, worth.argmax(0), -1)
+    clear = (np.abs(worth) > 0.3).all(0) & (np.abs(worth[0] - worth[1]) > 0.3)
+    expected = np.arange(2)[:, None] == best
+    assert clear.sum() > 20
+    assert 0 < expected[:, clear].sum() < clear.sum()
+    np.testing.assert_array_equal(asked[:, clear], expected[:, clear])
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options", "base", "gain"),
+    [
+        (TOBIT, {"filter": "tobit", "token_rate": 2.0, "memory": True}, VALUE, 0.0),
+        (TRACKING, {"access": "any", "cost_weight": 0.1}, "paced:rate=0.2", 1.0),
+        (
+            REMOTE,
+            {"sensors": 2, "cost_weight": 1.0, "channel": "independent", "drop_probability": 0.3},
+            "innovation_threshold:threshold=1",
+            0.0,
+        ),
+    ],
+)
+def test_it_costs_no_more_than_its_base(
+    env_id: str, options: dict[str, Any], base: str, gain: float
+) -> None:
+    task = fusion_gym.make_task(env_id, **({"cost_weight": 0.03} | options), horizon=40)
+    policy = make_policy(f"rollout:samples=16,steps=5,base={base}", task)
+    found = run_episodes(task, policy, 24, seed=0).returns
+    plain = run_episodes(task, make_policy(base, task), 24, seed=0).returns
+    better = found - plain
+    assert better.mean() > gain - 2.0 * better.std() / np.sqrt(24)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_imagined_follows_what_is_believed(name: str) -> None:
+    """Moments of the truth over many draws; system and shadow agree on everything hidden."""
+    task, policy = case(name)
+    batch: Any = EpisodeBatch.seeded(task, 2, 0)
+    for _ in range(4):
+        batch.step(np.zeros((task.sensors, 2), dtype=np.bool_))
+    signals, count = batch.signals(), 4000
+    imagination = policy._imagination  # type: ignore[attr-defined]
+    runs = np.repeat([0, 1], count)
+    normals = np.random.default_rng(0).standard_normal((imagination.channels(1), 2 * count))
+    imagined, noise = imagination.begin(signals, runs, normals)
+    state, best = imagined.state, signals["beliefs"].best  # type: ignore[attr-defined]
+    truth = task.system.truth(state).reshape(-1, 2, count)
+    deviation = np.sqrt(np.einsum("iin->in", best.covariance[0]))
+    if not name.startswith("unknown"):  # their input has a law of its own
+        assert (np.abs(truth.mean(-1) - best.mean[0]) < 0.1 * deviation + 1e-12).all()
+        least = 0.6 if name == "correlated" else 0.9  # the covariance is a bound
+        if name != "remote":
+            ratio = truth.std(-1) / deviation
+            assert (ratio > least).all()
+            assert (ratio < 1.1).all()
+    else:
+        last = task.system.signal.value(state.signal, state.time - 1.0)  # type: ignore[attr-defined]
+        kept = np.isclose(last, task.system.truth(state)[-1:])
+        assert kept.mean() > (0.99 if name == "unknown input" else 0.9)  # steps may have jumped
+        apart = np.abs(truth.mean(-1) - best.mean[0]) / deviation
+        assert (apart < 1.0).all()
+    if name == "remote":
+        arrives = task.system.arrival_probability(state)  # type: ignore[attr-defined]
+        lost = state.lost.reshape(-1, 2, count).mean(-1)
+        np.testing.assert_allclose(1.0 - lost, arrives[:, [0, count]], atol=0.03)
+    if task.shadow is not None:
+        shadow = imagined.shadows.every
+        np.testing.assert_array_equal(task.shadow.truth(shadow), task.system.truth(state))
+        for hidden in ("mode", "process_noise", "scale", "signal"):
+            if hasattr(state, hidden) and hasattr(shadow, hidden):
+                np.testing.assert_array_equal(getattr(shadow, hidden), getattr(state, hidden))
+    assert noise.shape == (1, batch.channels, 2 * count)
+
+
+def test_the_base_is_the_rest_of_the_text() -> None:
+    task = fusion_gym.make_task(TOBIT, filter="tobit", memory=True, cost_weight=0.2)
+    policy: Any = make_policy(
+        "rollout:samples=2, steps=3,base=value_of_information:threshold=0.03,at_most=1", task
+    )
+    assert (policy.samples, policy.steps, policy.price) == (2, 3, None)
+    assert (policy.base.threshold, policy.base.at_most) == (0.03, 1)
+    assert policy.knowledge == "coordinator_memory"
+    nested: Any = make_policy("rollout:samples=1,steps=1,base=lookahead:price=0.1,steps=2", task)
+    assert (nested.base.price, nested.base.steps) == (0.1, 2)
+    free = make_policy("rollout:samples=2,steps=1,price=0,base=never", task)
+    dear = make_policy("rollout:samples=2,steps=1,price=1e9,base=never", task)
+    assert run_episodes(task, dear, 3, 0).rate.max() == 0.0
+    assert run_episodes(task, free, 3, 0).rate.mean() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "message"),
+    [
+        ("rollout", {}, "policy 'rollout' needs a parameter 'base': write base="),
+        ("rollout:base=", {}, "unknown policy ''"),
+        ("rollout:base=nobody", {}, "unknown policy 'nobody'"),
+        ("rollout:base=never,samples=3", {}, "unknown policy 'never,samples=3'"),
+        ("rollout:base=always:samples=3", {}, "unknown parameter of policy 'always' 'samples'"),
+        ("rollout:doubt=-1,base=never", {}, "doubt = -1"),
+        ("rollout:samples=0,base=never", {}, "samples = 0"),
+        ("rollout:steps=0,base=never", {}, "steps = 0"),
+        ("rollout:price=-1,base=never", {}, "price = -1"),
+        ("rollout:basis=never", {}, "unknown parameter of policy 'rollout' 'basis'"),
+        ("rollout:base=dynamic_event", {}, "base = 'dynamic_event' .* the present step alone"),
+        ("rollout:base=random:rate=0.1", {}, "base = 'random:rate=0.1' .* the present step alone"),
+        ("rollout:base=rollout:base=never", {}, "base = 'rollout:base=never' .* present step"),
+        ("rollout:base=value_of_information:own=true", {}, "base = .* a coordinator's policy"),
+        ("rollout:base=never", {"information": "centre"}, "information = 'centre'"),
+    ],
+)
+def test_what_cannot_be_is_refused(text: str, options: dict[str, Any], message: str) -> None:
+    task = fusion_gym.make_task(TOBIT, **options)
+    with pytest.raises(ConfigurationError, match=message) as caught:
+        make_policy(text, task)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_input_that_is_the_same_in_every_episode_cannot_be_imagined() -> None:
+    task = fusion_gym.make_task(INPUT, input_phase=(0.0, 1.0), horizon=5)
+    with pytest.raises(ConfigurationError, match="UnknownInputSystem cannot be imagined here"):
+        make_policy("rollout:base=never", task)
