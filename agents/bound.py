@@ -69,6 +69,7 @@ class Bound(Command):
             "env": self.env,
             "settings": task.settings,
             "horizon": task.horizon,
+            "sensors": task.sensors,
             "weights": self.weights,
         }
         console = tables.console()

@@ -30,10 +30,25 @@ class Measured(Shape):
 
 
 class Measurements(Shape):
-    """``rollout/SETTING.json`` or ``bounds/SETTING.json``, by the points' rates."""
+    """``rollout/SETTING.json``, by the points' rates."""
 
     setting: str
     points: list[Measured]
+
+
+class Price(Shape):
+    """No policy costs less than ``lower`` at this price of a packet, error and packets a step."""
+
+    price: float
+    lower: float
+
+
+class Bound(Shape):
+    """``bounds/SETTING.json``, as ``agents.bound`` writes it."""
+
+    sensors: int
+    floor: float
+    costs: list[Price]
 
 
 def text_of(results: Path, command: str) -> str:
@@ -80,7 +95,7 @@ def rows_of(envelopes: dict[str, Any], results: Path) -> Iterator[str]:
     name, classes = envelopes["setting"], envelopes["classes"]
     rates = [round(share * envelopes["always"], 4) for share in SHARES]
     rollout = measured(results / "rollout" / f"{name}.json", name)
-    bound = measured(results / "bounds" / f"{name}.json", name)
+    bound = bound_of(results / "bounds" / f"{name}.json")
     baselines = results / name / "baselines.json"
     before = read(Baselines, baselines, "results") if baselines.exists() else None
     pairs = {(content["mode"], content["broadcast"]) for content in classes.values()}
@@ -99,10 +114,11 @@ def rows_of(envelopes: dict[str, Any], results: Path) -> Iterator[str]:
         )
         default = mode != "local" or broadcast == envelopes["inputs"]["broadcasts"][0]
         old = old_hull(before, mode) if before and default else []
-        own = [rollout if mode == "sensors" else [], bound]
+        own = rollout if mode == "sensors" else []
         label = mode if broadcast is None else f"{mode}, {broadcast}"
         for rate in rates:
-            cells = [cell(hull, rate) for hull in (old, plain, remembering, *own)]
+            cells = [cell(hull, rate) for hull in (old, plain, remembering, own)]
+            cells.append("–" if bound is None else f"{at_least(bound, rate):.4g}")
             yield f"| {name} | {label} | {rate:.4g} | {' | '.join(cells)} |"
 
 
@@ -143,6 +159,22 @@ def measured(path: Path, setting: str) -> list[EnvelopePoint]:
         )
     points = [EnvelopePoint(f"{p['rate']}", p["rate"], p["mse"]) for p in found["points"]]
     return sorted(points, key=lambda point: point.rate)
+
+
+def bound_of(path: Path) -> dict[str, Any] | None:
+    """A setting's lower bound, if it was computed.
+
+    Raises:
+        ConfigurationError: it is of another shape.
+    """
+    return read(Bound, path, "results") if path.exists() else None
+
+
+def at_least(bound: dict[str, Any], rate: float) -> float:
+    """The least error at a rate that the prices' lines leave: between two rates a bound as well."""
+    packets = bound["sensors"] * rate
+    lines = [cost["lower"] - cost["price"] * packets for cost in bound["costs"]]
+    return float(max([bound["floor"], *lines]))
 
 
 def cell(points: list[EnvelopePoint], rate: float) -> str:
