@@ -196,7 +196,7 @@ class Signals(Mapping[str, SignalArray]):
     @property
     def hidden(self) -> tuple[str, ...]:
         """Names of the signals that are withheld."""
-        return tuple(sorted(self._hidden))
+        return tuple(sorted(self._withheld))
 
     def __iter__(self) -> Iterator[str]:
         return (name for name in self._values if name not in self._withheld)
