@@ -4,8 +4,8 @@
 
 One thread (``make bench`` sets it), float64. All rows are measured in one run, in turns, and each
 figure is the median of its turns; the ratios are to a plain loop with FilterPy and to SB3's
-DummyVecEnv, and in a second table what memory costs. The absolute figures belong to the machine, the
-ratios to the code.
+DummyVecEnv, and in a second table what memory costs. The absolute figures belong to the machine,
+the ratios to the code.
 """
 
 from __future__ import annotations
