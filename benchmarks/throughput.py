@@ -4,7 +4,8 @@
 
 One thread (``make bench`` sets it), float64. All rows are measured in one run, in turns, and each
 figure is the median of its turns; the ratios are to a plain loop with FilterPy and to SB3's
-DummyVecEnv. The absolute figures belong to the machine, the ratios to the code.
+DummyVecEnv, and in a second table what memory costs. The absolute figures belong to the machine,
+the ratios to the code.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from rich.table import Table
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.memory import Owner
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
 
 ENV = "fusion_gym/TobitOscillator-v0"
@@ -90,6 +93,39 @@ def dummy_sb3(options: dict[str, Any], num_envs: int) -> Workload:
     return _timed(lambda: env.step(actions[next(count) % 16]), num_envs)
 
 
+# An environment's options in the comparison of what memory costs.
+REMEMBERED: dict[str, dict[str, Any]] = {
+    "TobitOscillator": {"filter": "tobit"},
+    "BiasedOscillator": {"access": "any"},
+    "BiasedTracking": {"access": "any"},
+    "CorrelatedTracking": {},
+    "UnknownInput": {},
+    "MarkovJumpTracking": {},
+    "MarkovJumpTracking, imm": {"filter": "imm"},
+    "RemoteEstimation": {"sensors": 3},
+}
+RATE = 0.3  # of requests there, a sensor and step
+
+
+def remembering(name: str, how: str, num_envs: int = 1024) -> Workload:
+    """The core's loop: nothing remembered, the ``shadow`` alone, ``values``, or ``own`` values."""
+    env_id, options = f"fusion_gym/{name.partition(',')[0]}-v0", REMEMBERED[name]
+    task = fusion_gym.make_task(env_id, memory=how != "without", horizon=250, **options)
+    owner: Owner = "own" if how == "own" else "coordinator"
+    batch = EpisodeBatch.seeded(task, num_envs, 0, owner)
+    draw = np.random.default_rng(0)
+    wanted = draw.random((16, task.sensors, num_envs)) < RATE
+    count = iter(range(10**12))
+
+    def step() -> None:
+        if how in ("values", "own"):
+            batch.beliefs().value()
+        if batch.step(wanted[next(count) % 16]).truncated.any():
+            batch.reset()
+
+    return _timed(step, num_envs)
+
+
 def filterpy_loop() -> Workload:
     """Plant, three sensors and three FilterPy updates in a loop: no network, no observation.
 
@@ -151,12 +187,7 @@ def main() -> None:
         "BiasedOscillator, 1,024, adf": vector(adf, 1024, "fusion_gym/BiasedOscillator-v0"),
         "BiasedTracking, 1,024": vector({}, 1024, "fusion_gym/BiasedTracking-v0"),
     }
-    figures: dict[str, list[float]] = {name: [] for name in rows}
-    for workload in rows.values():
-        workload(seconds / 4)
-    for _ in range(TURNS):
-        for name, workload in rows.items():
-            figures[name].append(workload(seconds))
+    figures = measured(rows, seconds)
     medians = {name: statistics.median(found) for name, found in figures.items()}
     names = list(rows)
     table = Table(
@@ -177,6 +208,44 @@ def main() -> None:
             f"{median / medians[names[3]]:.2f}",
         )
     Console(width=130).print(table)
+    Console(width=130).print(memory_table(seconds))
+
+
+def measured(rows: dict[str, Workload], seconds: float) -> dict[str, list[float]]:
+    """Steps per second of every row in every turn, after a short first try."""
+    figures: dict[str, list[float]] = {name: [] for name in rows}
+    for workload in rows.values():
+        workload(seconds / 4)
+    for _ in range(TURNS):
+        for name, workload in rows.items():
+            figures[name].append(workload(seconds))
+    return figures
+
+
+def memory_table(seconds: float) -> Table:
+    """What memory costs: the core's loop with it over without, the median of a turn's ratios."""
+    ways = {
+        "shadow": "shadow alone",
+        "values": "and values",
+        "own": "every sensor's own values",
+    }
+    table = Table(
+        title=f"core's loop, 1,024 runs, requests at rate {RATE}: with memory over without",
+        box=box.SIMPLE_HEAD,
+    )
+    table.add_column("environment")
+    for column in ("steps/s without", *ways.values()):
+        table.add_column(column, justify="right")
+    for name in REMEMBERED:
+        rows = {how: remembering(name, how) for how in ("without", *ways)}
+        found = measured(rows, seconds)
+        ratios = [
+            statistics.median(a / b for a, b in zip(found[how], found["without"], strict=True))
+            for how in ways
+        ]
+        without = statistics.median(found["without"])
+        table.add_row(name, f"{without:,.0f}", *(f"{ratio:.2f}" for ratio in ratios))
+    return table
 
 
 if __name__ == "__main__":

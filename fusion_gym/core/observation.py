@@ -148,7 +148,7 @@ class ObservationLayout:
         for name in names:
             if names.count(name) > 1:
                 raise ConfigurationError(f"observation block {name!r} is declared twice")
-        self.entries = tuple(entry for block in self.blocks for entry in _entries(block))
+        self.entries = tuple(entry for block in self.blocks for entry in block_entries(block))
         self.names = tuple(entry.name for entry in self.entries)
         bounds = [block.bounds for block in self.blocks for _ in block.places]
         self.low, self.high = np.array(bounds, dtype=np.float32).T.copy()
@@ -177,7 +177,8 @@ class ObservationLayout:
         return np.minimum(result, self.high, out=result)
 
 
-def _entries(block: Block) -> list[Entry]:
+def block_entries(block: Block) -> list[Entry]:
+    """The entries of a block, one a number."""
     found = []
     for place in block.places:
         own, rest = block.node == "own", place[1:] if block.node == "own" else place

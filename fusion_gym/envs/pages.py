@@ -19,18 +19,26 @@ from typing import Any
 
 import numpy as np
 
-from fusion_gym.core.observation import ObservationLayout, network_blocks
+from fusion_gym.core.communication import FEATURES
+from fusion_gym.core.memory import Owner
+from fusion_gym.core.observation import (
+    ObservationLayout,
+    block_entries,
+    memory_blocks,
+    network_blocks,
+)
 from fusion_gym.core.options import CommonOptions, plain
 from fusion_gym.core.reward import Price
 from fusion_gym.core.system import Block, covers, numbered
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task, options_of
 from fusion_gym.envs.vector import reset_infos
-from fusion_gym.envs.views import make_view
+from fusion_gym.envs.views import heard, make_view
 
 LEGEND = """\
 A star marks what only the sensors know: `information="centre"` leaves it out. The third column
-tells what a sensor that decides by itself sees of these entries."""
+tells what a sensor that decides by itself sees of these entries; with `broadcast="estimate"` it
+sees all without a star that belong to no sensor, with `broadcast="packets"` all without a star."""
 
 _PAGE = """\
 {description}
@@ -79,6 +87,11 @@ _NETWORK = {
     "admitted": 'only with `access="round_robin"` or `"random"`',
     "price": "only with a `price_range`",
 }
+# What memory adds to the observation of the coordinator, and to a sensor's own.
+_MEMORY: dict[Owner, str] = {
+    "coordinator": "only with `memory=True`",
+    "own": "only with `memory=True`, for a sensor that decides by itself",
+}
 _SEES = {"own": "its own", "told": "all", "hidden": "none"}
 _MARKED = re.compile(r"(<!-- observation: (.*?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -126,6 +139,11 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
     for name, other in others:
         for block in other.system.observation:
             rows.setdefault(block.name, _row(other, block, f"only with {name}"))
+    remembering = replace(task, memory=True, memory_features=task.memory_features or FEATURES)
+    for owner, condition in _MEMORY.items():
+        for block in memory_blocks(remembering, owner):
+            shown = task.memory and owner == "coordinator"
+            rows[block.name] = _row(task, block, "" if shown else condition)
     always = [block.name for block in network_blocks(task)]
     price = replace(task.reward, price=Price(None, (0.01, 1.0)))
     for block in network_blocks(replace(task, access="round_robin", reward=price)):
@@ -174,7 +192,13 @@ def _row(task: Task, block: Block, condition: str = "") -> tuple[str, ...]:
     star = "" if covers("centre", block.knowledge) else " *"
     low, high = block.bounds
     meaning = _plain(block.meaning) + (f"; {condition}" if condition else "")
-    return name + star, f"{low:g}..{high:g}", _SEES[block.node], meaning
+    return name + star, f"{low:g}..{high:g}", _seen(task, block), meaning
+
+
+def _seen(task: Task, block: Block) -> str:
+    """What a sensor that decides by itself sees of a block."""
+    entries = block_entries(block)
+    return "all" if all(heard(entry, task.broadcast) for entry in entries) else _SEES[block.node]
 
 
 def _axis(task: Task, block: Block, place: int) -> str:

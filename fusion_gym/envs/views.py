@@ -172,7 +172,7 @@ class SensorView:
                 "'sensors', for a sensor sees its own measurement"
             )
         layout, count = ObservationLayout(task, "own"), task.sensors
-        told = [p for p, entry in enumerate(layout.entries) if _heard(entry, task.broadcast)]
+        told = [p for p, entry in enumerate(layout.entries) if heard(entry, task.broadcast)]
         columns, names = [], []
         for sensor in range(count):
             own = [place for place, entry in enumerate(layout.entries) if entry.sensor == sensor]
@@ -209,7 +209,7 @@ class SensorView:
         return np.stack((np.ones(allowed.size, dtype=np.bool_), allowed.T.ravel()), axis=1)
 
 
-def _heard(entry: Entry, broadcast: str) -> bool:
+def heard(entry: Entry, broadcast: str) -> bool:
     """Whether every sensor sees an entry."""
     told = {"none": False, "estimate": entry.centre and entry.sensor is None}
     return entry.told or told.get(broadcast, entry.centre)
