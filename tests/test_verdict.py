@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rliable import library, metrics
 
 from agents.suite.verdict import Front, interval, judge
 from fusion_gym.evaluation.episodes import EpisodeResults
@@ -133,8 +134,6 @@ def test_searches_are_compared_at_the_agents_rates() -> None:
 
 def test_one_table_as_rliable_has_it() -> None:
     """Interquartile means over seeds at each of four prices, and their mean; bootstrapped too."""
-    library = pytest.importorskip("rliable.library")
-    metrics = pytest.importorskip("rliable.metrics")
     means = np.array([-0.1, -0.09, -0.12, -0.07])
     noise = np.random.default_rng(3).normal(size=(20, 4))
     # Columns without correlation: the library draws the seeds of each price by themselves, and one
@@ -150,7 +149,7 @@ def test_one_table_as_rliable_has_it() -> None:
     point, ends = library.get_interval_estimates(
         {"agent": shares},
         mean_of_prices,
-        reps=2000,
+        reps=500,
         task_bootstrap=True,
         random_state=np.random.RandomState(0),
     )
