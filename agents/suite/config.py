@@ -91,7 +91,8 @@ class Setting(Strict):
     ``informed`` are policies that know the model and all new signals, ``references`` computed
     ones that know no more than the centre. ``longer`` multiplies the length of its trainings,
     ``price_exponent``, ``algorithm`` and ``tuning`` replace the suite's. ``broadcasts`` are what a
-    sensor by itself may hear, by rising knowledge, the environment's default first.
+    sensor by itself may hear, by rising knowledge, the environment's default first. ``known`` are
+    policies that earlier searches found: they compete with what the search finds.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
@@ -100,6 +101,7 @@ class Setting(Strict):
     price_range: tuple[Rate, Rate]
     families: tuple[str, ...] | None = None
     points: tuple[str, ...] = ("always", "never")
+    known: tuple[str, ...] = ()
     informed: tuple[str, ...] = ()
     references: tuple[str, ...] = ()
     longer: float = pydantic.Field(default=1.0, gt=0)

@@ -28,30 +28,35 @@ from ..output.files import load_results, read_json, save_results, write
 from ..output.folders import fingerprint
 from .classes import Class, classes_of
 from .config import Family, Setting, Suite, Tuning
-from .tuning import first_values, policy_text, tune
+from .tuning import as_they_are, first_values, policy_text, tune
 
 Options = tuple[tuple[str, Any], ...]
 
 
 @dataclass(frozen=True)
 class Search:
-    """A family to tune in a setting with some options of its classes."""
+    """A family to tune in a setting with some options of its classes.
+
+    With ``policies`` there is nothing to tune: these compete as they are.
+    """
 
     setting: Setting
     options: Options
     family: Family
     tuning: Tuning
+    policies: tuple[str, ...] = ()
 
     @property
     def inputs(self) -> dict[str, Any]:
         """All that its result depends on."""
-        return {
+        found = {
             "environment": self.setting.environment.model_dump(mode="json"),
             "options": dict(self.options),
             "family": self.family.model_dump(mode="json"),
             "price_range": list(self.setting.price_range),
             "tuning": self.tuning.model_dump(mode="json"),
         }
+        return found | ({"policies": list(self.policies)} if self.policies else {})
 
     def path(self, work: Path) -> Path:
         """Its JSON."""
@@ -65,8 +70,12 @@ class Search:
         """
         try:
             task = task_of(self.setting, self.options)
-            values = first_values(self.family, 1, task.sensors, 0)[0]
-            make_policy(policy_text(self.family, values, task.sensors), task)
+            texts = self.policies
+            if not texts:
+                values = first_values(self.family, 1, task.sensors, 0)[0]
+                texts = (policy_text(self.family, values, task.sensors),)
+            for text in texts:
+                make_policy(text, task)
         except ConfigurationError as error:
             raise ConfigurationError(
                 f"family = {self.family.label!r} is not allowed in {self.setting.name} with "
@@ -127,7 +136,10 @@ def task_of(setting: Setting, options: Iterable[tuple[str, Any]] = ()) -> Task:
 def run_search(search: Search, work: Path) -> None:
     """Tune a family and keep its finalists, on the episodes of all searches."""
     task = task_of(search.setting, search.options)
-    tried, finalists = tune(task, search.family, search.tuning, search.setting.price_range)
+    if search.policies:
+        tried, finalists = 0, as_they_are(task, search.policies, search.tuning)
+    else:
+        tried, finalists = tune(task, search.family, search.tuning, search.setting.price_range)
     found = [
         {
             "policy": finalist.policy,
@@ -167,6 +179,9 @@ def searches_of(suite: Suite, setting: Setting, wanted: Sequence[Class]) -> list
                 for c in within
                 if c.mode == family.tuned_in
             ]
+    if setting.known:
+        earlier = Family(label="found before", policy="", parameters={})
+        found.append(Search(setting, (), earlier, tuning, setting.known))
     return found
 
 
@@ -289,6 +304,7 @@ def inputs_of(suite: Suite, setting: Setting) -> dict[str, Any]:
         "tuning": suite.tuning_of(setting).model_dump(mode="json"),
         "families": {f.label: f.model_dump(mode="json") for f in suite.families_of(setting)},
         "points": list(setting.points),
+        "known": list(setting.known),
         "episodes": suite.episodes,
         "seed": suite.seed,
     }
