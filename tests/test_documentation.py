@@ -19,6 +19,7 @@ import pytest
 
 import fusion_gym
 from agents import report
+from agents.suite import envelope_table
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.options import Scenario
 from fusion_gym.envs import pages
@@ -31,7 +32,7 @@ from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions, build
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 DOCS = sorted((ROOT / "docs").glob("*.md"))
-PAGES = [path for path in DOCS if path.stem != "memory"]  # each of an environment
+PAGES = [path for path in DOCS if path.stem not in ("memory", "bounds")]  # of environments
 TEXTS = README + "".join(path.read_text() for path in (*DOCS, ROOT / "CONTRIBUTING.md"))
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", TEXTS, re.DOTALL | re.MULTILINE)
 EXAMPLES = [text for language, text in BLOCKS if language == "python"]
@@ -95,6 +96,14 @@ def test_the_committed_report_says_what_the_results_say() -> None:
     assert report.headline_count(found) in " ".join(README.split())
     missing = [line for line in report.headline_table(found) if line not in README]
     assert missing == []
+
+
+def test_the_committed_envelopes_are_what_the_pages_say() -> None:
+    results = ROOT / "results"
+    written = (results / "envelopes" / "README.md").read_text()
+    assert written == envelope_table.text_of(results, "python -m agents.envelope")
+    missing = [line for line in envelope_table.headline_table(results) if line not in README]
+    assert not missing
 
 
 def doc_of(env_id: str) -> str:

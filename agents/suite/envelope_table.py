@@ -14,6 +14,7 @@ from .committed import FOLDER, read_envelopes
 from .reports import Baselines, Shape, read
 
 SHARES = (0.05, 0.1, 0.2, 0.4)  # of the rate that transmitting always gets
+HEADLINE = 0.2
 # With which rules the agents of results/SETTING/baselines.json were compared.
 _BEFORE: dict[str, Knowledge] = {
     "sensors": "coordinator_memory",
@@ -88,6 +89,32 @@ def text_of(results: Path, command: str) -> str:
     for envelopes in found:
         lines += vertices_of(envelopes)
     return "\n".join(lines) + "\n"
+
+
+def headline_table(results: Path) -> list[str]:
+    """One row a setting, at a fifth of the rate of always transmitting: the front page's table."""
+    lines = [
+        "| setting | rate | before | now | with memory | bound | alone | alone, with memory |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for path in sorted((results / FOLDER).glob("*.json")):
+        envelopes = read_envelopes(path)
+        name, rate = envelopes["setting"], round(HEADLINE * envelopes["always"], 4)
+        baselines, classes = results / name / "baselines.json", envelopes["classes"]
+        before = read(Baselines, baselines, "results") if baselines.exists() else None
+        bound = bound_of(results / "bounds" / f"{name}.json")
+        heard = envelopes["inputs"]["broadcasts"][0]
+        hulls = [
+            hull_of(classes[key]) if key in classes else []
+            for key in ("sensors", "sensors_memory", f"local_{heard}", f"local_{heard}_memory")
+        ]
+        cells = [cell(old_hull(before, "sensors") if before else [], rate)]
+        cells += [cell(hull, rate) for hull in hulls[:2]]
+        cells.append("–" if bound is None else f"{at_least(bound, rate):.4g}")
+        cells += [cell(hull, rate) for hull in hulls[2:]]
+        title = envelopes["title"].split(",")[0]
+        lines.append(f"| {title} | {rate:.4g} | {' | '.join(cells)} |")
+    return lines
 
 
 def rows_of(envelopes: dict[str, Any], results: Path) -> Iterator[str]:
