@@ -51,7 +51,7 @@ class Bound(Command):
     """What weighs the states: mse (each with 1) or reward (as the reward does)."""
     accuracy: Annotated[float, Between(0.0, 0.5)] = 0.01
     """What the bound may lose by its lattices, relatively."""
-    points: Annotated[int, Whole(1000)] = 3_000_000
+    points: Annotated[int, Whole(1000, 100_000_000)] = 3_000_000
     """Points of a lattice at most; the accuracy suffers before."""
     episodes: Episodes = 1000
     """Episodes in which everything is delivered."""

@@ -45,6 +45,9 @@ BASES: dict[str, dict[str, list[str]]] = {
     "benchmark": {
         "config": ["suite.yaml"], "results": ["made"], "work": ["made_too"], "workers": ["1"],
     },
+    "envelope": {
+        "config": ["suite.yaml"], "results": ["made"], "work": ["made_too"], "workers": ["1"],
+    },
 }  # fmt: skip
 
 WORDS = ["nothing_of_that_name", "fusion_gym/Nothing-v0"]

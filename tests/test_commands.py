@@ -36,7 +36,7 @@ def test_help_shows_every_option_with_a_sentence_and_its_default(
     assert shown.startswith(f"usage: python -m agents.{name} ")
     kind = getattr(module, name.capitalize())
     options = {field.name: field for field in dataclasses.fields(kind)}
-    if name == "evaluate":
+    if "options" in options:
         options["set"] = options.pop("options")
     listed = shown.partition("--help")[2]  # the usage above it may name options as well
     for option, field in options.items():

@@ -16,7 +16,7 @@ from .reports import Baselines, Shape, read
 SHARES = (0.05, 0.1, 0.2, 0.4)  # of the rate that transmitting always gets
 HEADLINE = 0.2
 # With which rules the agents of results/SETTING/baselines.json were compared.
-_BEFORE: dict[str, Knowledge] = {
+BEFORE: dict[str, Knowledge] = {
     "sensors": "coordinator_memory",
     "centre": "centre",
     "local": "own_memory",
@@ -162,7 +162,7 @@ def old_hull(baselines: dict[str, Any], mode: str) -> list[EnvelopePoint]:
     """The envelope with which agents were compared before there were committed ones."""
     points = []
     for curve in baselines["curves"].values():
-        if covers(_BEFORE[mode], curve["knows"]):
+        if covers(BEFORE[mode], curve["knows"]):
             for name in curve["policies"]:
                 policy = baselines["policies"][name]
                 rate = sum(policy["rate"]) / len(policy["rate"])
