@@ -2,13 +2,43 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 from fusion_gym.core.beliefs import Beliefs
+from fusion_gym.core.memory import Owner
 from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.envs.views import SensorView
-from fusion_gym.validation import ConfigurationError, refusal
+from fusion_gym.policies.base import Rule, parameter
+from fusion_gym.validation import ConfigurationError, boolean, refusal
+
+
+@dataclass
+class BelievingRule(Rule):
+    """A rule on what is believed: the coordinator's, or with ``own`` every sensor's by itself.
+
+    ``together`` names the parameters that take more than one sensor to decide.
+    """
+
+    task: Task = field(repr=False)
+    own: bool = parameter(False, boolean)
+    together: ClassVar[tuple[str, ...]] = ("at_most",)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        only = {name: getattr(self, name) for name in self.together}
+        check_owner(self.task, self.own, **only)
+        self.remember: Owner = "own" if self.own else "coordinator"
+
+    @property
+    def knowledge(self) -> Knowledge:
+        """By the task's memory and by who decides."""
+        return knows(self.task, self.own)
+
+    def beliefs(self, signals: Signals) -> Beliefs:
+        """The coordinator's beliefs, or every sensor's own."""
+        return beliefs_of(signals, self.own)
 
 
 def knows(task: Task, own: bool) -> Knowledge:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.beliefs import Beliefs
-from fusion_gym.core.memory import Owner
-from fusion_gym.core.system import Knowledge, Signals
-from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Requests, Rule, check_at_most, parameter, strongest
-from fusion_gym.policies.believing import beliefs_of, check_owner, knows
+from fusion_gym.core.system import Signals
+from fusion_gym.policies.base import Requests, check_at_most, parameter, strongest
+from fusion_gym.policies.believing import BelievingRule
 
 
 @dataclass
-class EstimateDifference(Rule):
+class EstimateDifference(BelievingRule):
     """Request when |x* - x̂| >= ``threshold``; of the sensors, those of the highest value.
 
     x* is the estimate that could be made and x̂ the centre's if nobody transmits
@@ -36,25 +34,13 @@ class EstimateDifference(Rule):
             policies do not see the sensors.
     """
 
-    task: Task = field(repr=False)
     threshold: float = parameter(0.2, validation.number, at_least=0.0)
     whitened: bool = parameter(False, validation.boolean)
     at_most: int | None = parameter(1, check_at_most)
-    own: bool = parameter(False, validation.boolean)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_owner(self.task, self.own, at_most=self.at_most)
-        self.remember: Owner = "own" if self.own else "coordinator"
-
-    @property
-    def knowledge(self) -> Knowledge:
-        """By the task's memory and by who decides."""
-        return knows(self.task, self.own)
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
-        beliefs, age = beliefs_of(signals, self.own), signals["age"]
+        beliefs, age = self.beliefs(signals), signals["age"]
         squared = _whitened(beliefs) if self.whitened else beliefs.loss()
         wanted = np.broadcast_to(squared >= self.threshold * self.threshold, age.shape)
         if self.own or self.at_most is None:

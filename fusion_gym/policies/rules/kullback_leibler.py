@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.beliefs import Estimate
-from fusion_gym.core.memory import Owner
-from fusion_gym.core.system import Knowledge, Signals
-from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Requests, Rule, check_at_most, parameter, strongest
-from fusion_gym.policies.believing import beliefs_of, check_owner, knows
+from fusion_gym.core.system import Signals
+from fusion_gym.policies.base import Requests, check_at_most, parameter, strongest
+from fusion_gym.policies.believing import BelievingRule
 
 
 @dataclass
-class KullbackLeibler(Rule):
+class KullbackLeibler(BelievingRule):
     """Request where the divergence of the centre's two densities is at least ``threshold`` nats.
 
     D(s) = ½ (tr P⁻¹ P_s - n + δᵀ P⁻¹ δ + ln det P - ln det P_s): from the Gaussian N(x̂(s), P_s)
@@ -35,24 +33,12 @@ class KullbackLeibler(Rule):
             policies do not see the sensors.
     """
 
-    task: Task = field(repr=False)
     threshold: float = parameter(0.5, validation.number, at_least=0.0)
     at_most: int | None = parameter(None, check_at_most)
-    own: bool = parameter(False, validation.boolean)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_owner(self.task, self.own, at_most=self.at_most)
-        self.remember: Owner = "own" if self.own else "coordinator"
-
-    @property
-    def knowledge(self) -> Knowledge:
-        """By the task's memory and by who decides."""
-        return knows(self.task, self.own)
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
-        beliefs = beliefs_of(signals, self.own)
+        beliefs = self.beliefs(signals)
         divergence = _divergence(beliefs.best if self.own else beliefs.sent, beliefs.silent)
         return strongest(divergence, divergence >= self.threshold, self.at_most, signals["age"])
 

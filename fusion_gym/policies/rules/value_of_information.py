@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from fusion_gym import validation
-from fusion_gym.core.memory import Owner
-from fusion_gym.core.system import Knowledge, Signals
-from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Requests, Rule, check_at_most, parameter, strongest
-from fusion_gym.policies.believing import beliefs_of, check_owner, knows
+from fusion_gym.core.system import Signals
+from fusion_gym.policies.base import Requests, check_at_most, parameter, strongest
+from fusion_gym.policies.believing import BelievingRule
 from fusion_gym.validation import ConfigurationError
 
 
@@ -21,7 +20,7 @@ def _optional(name: str, value: float | None) -> None:
 
 
 @dataclass
-class ValueOfInformation(Rule):
+class ValueOfInformation(BelievingRule):
     """Request the sensors whose transmission is worth at least ``threshold``, or its ``price``.
 
     v(s) = ‖x* - x̂‖² - E‖x* - x̂(s)‖² with x* the estimate that could be made, x̂ the centre's if
@@ -42,12 +41,11 @@ class ValueOfInformation(Rule):
             with ``own``, or a task whose policies do not see the sensors.
     """
 
-    task: Task = field(repr=False)
     threshold: float | None = parameter(None, _optional)
     price: float | None = parameter(None, _optional)
     at_most: int | None = parameter(None, check_at_most)
     steps: int = parameter(1, validation.integer, at_least=1)
-    own: bool = parameter(False, validation.boolean)
+    together: ClassVar[tuple[str, ...]] = ("at_most", "steps")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -56,17 +54,10 @@ class ValueOfInformation(Rule):
                 f"price = {self.price} is not allowed beside threshold = {self.threshold}: one of "
                 "them must be left out"
             )
-        check_owner(self.task, self.own, at_most=self.at_most, steps=self.steps)
-        self.remember: Owner = "own" if self.own else "coordinator"
-
-    @property
-    def knowledge(self) -> Knowledge:
-        """By the task's memory and by who decides."""
-        return knows(self.task, self.own)
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
-        value = beliefs_of(signals, self.own).value(self.steps)
+        value = self.beliefs(signals).value(self.steps)
         if self.price is None:
             least = np.asarray(0.03 if self.threshold is None else self.threshold)
         else:
