@@ -31,9 +31,10 @@ class Measured(Shape):
 
 
 class Measurements(Shape):
-    """``rollout/SETTING.json``, by the points' rates."""
+    """``rollout/SETTING.json``, by the points' rates; ``episodes`` are the first of the test's."""
 
     setting: str
+    episodes: int
     points: list[Measured]
 
 
@@ -76,8 +77,9 @@ def text_of(results: Path, command: str) -> str:
         "hears nothing (`none`), the centre's `estimate`, or every delivered packet (`packets`). "
         "Mean squared error at some rates, 5, 10, 20 and 40 % of that of always transmitting: of "
         "the rules tuned before (with which the agents in this folder were compared), of those "
-        "that remember nothing, of those that do, of one improvement on the best rule (rollout), "
-        "and a lower bound; – where there is none.",
+        "that remember nothing, of those that do, of one improvement on the value of "
+        "information by simulation (rollout; in brackets the number of episodes, so few that "
+        "chance moves it by 5 to 15 %), and a lower bound; – where there is none.",
         "",
         "| setting | class | rate | envelope before | envelope now | with memory | rollout "
         "| bound |",
@@ -121,7 +123,7 @@ def rows_of(envelopes: dict[str, Any], results: Path) -> Iterator[str]:
     """A setting's rows."""
     name, classes = envelopes["setting"], envelopes["classes"]
     rates = [round(share * envelopes["always"], 4) for share in SHARES]
-    rollout = measured(results / "rollout" / f"{name}.json", name)
+    rollout, episodes = measured(results / "rollout" / f"{name}.json", name)
     bound = bound_of(results / "bounds" / f"{name}.json")
     baselines = results / name / "baselines.json"
     before = read(Baselines, baselines, "results") if baselines.exists() else None
@@ -145,6 +147,7 @@ def rows_of(envelopes: dict[str, Any], results: Path) -> Iterator[str]:
         label = mode if broadcast is None else f"{mode}, {broadcast}"
         for rate in rates:
             cells = [cell(hull, rate) for hull in (old, plain, remembering, own)]
+            cells[-1] += f" ({episodes})" if cells[-1] != "–" else ""
             cells.append("–" if bound is None else f"{at_least(bound, rate):.4g}")
             yield f"| {name} | {label} | {rate:.4g} | {' | '.join(cells)} |"
 
@@ -170,14 +173,16 @@ def old_hull(baselines: dict[str, Any], mode: str) -> list[EnvelopePoint]:
     return lower_hull(points) if points else []
 
 
-def measured(path: Path, setting: str) -> list[EnvelopePoint]:
-    """The points of a file ``{"setting": …, "points": [{"rate": …, "mse": …}, …]}``, if there.
+def measured(path: Path, setting: str) -> tuple[list[EnvelopePoint], int]:
+    """The points of a file, if it is there, and their number of episodes.
+
+    ``{"setting": …, "episodes": …, "points": [{"rate": …, "mse": …}, …]}``.
 
     Raises:
         ConfigurationError: it is of another shape, or of another setting.
     """
     if not path.exists():
-        return []
+        return [], 0
     found = read(Measurements, path, "results")
     if found["setting"] != setting:
         raise ConfigurationError(
@@ -185,7 +190,7 @@ def measured(path: Path, setting: str) -> list[EnvelopePoint]:
             f"{setting!r}"
         )
     points = [EnvelopePoint(f"{p['rate']}", p["rate"], p["mse"]) for p in found["points"]]
-    return sorted(points, key=lambda point: point.rate)
+    return sorted(points, key=lambda point: point.rate), found["episodes"]
 
 
 def bound_of(path: Path) -> dict[str, Any] | None:
