@@ -190,3 +190,19 @@ def test_nodes_hear_by_default_what_the_papers_let_them_hear(env_id: str, broadc
     assert task.broadcast == broadcast
     assert (task.memory, task.packet, task.shadow) == (False, "measurement", None)
     assert EpisodeBatch(task, 1).shadows is None
+
+
+def test_a_sensor_by_itself_looks_one_step_ahead() -> None:
+    task = fusion_gym.make_task("fusion_gym/TobitOscillator-v0", filter="tobit", memory=True)
+    beliefs = EpisodeBatch.seeded(task, 2, 0, "own").beliefs()
+    for ask in (beliefs.loss, beliefs.value):
+        with pytest.raises(ValueError, match="steps = 2 is not allowed here: it must be 1"):
+            ask(2)
+
+
+def test_sensors_by_themselves_do_not_send_everyones_estimate() -> None:
+    task = fusion_gym.make_task(
+        "fusion_gym/TobitOscillator-v0", filter="tobit", memory=True, packet="estimate"
+    )
+    with pytest.raises(ConfigurationError, match="packet = 'estimate' is not allowed"):
+        EpisodeBatch(task, 2, "own")

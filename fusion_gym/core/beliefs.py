@@ -87,17 +87,27 @@ class Beliefs(ABC):
     def remembered(self) -> Any:
         """The shadow with its owner's new measurements."""
 
-    @property
+    @cached_property
     def difference(self) -> Array:
         """x* - x̂ (k, n, N)."""
         return self.best.mean - self.silent.mean
 
     def loss(self, steps: int = 1) -> Array:
-        """‖x* - x̂‖² (k, N), weighted by ``task.relative_weights``."""
+        """‖x* - x̂‖² (k, N), weighted by ``task.relative_weights``.
+
+        Raises:
+            ValueError: more steps than one, where its owner has no model of the centre.
+        """
+        _one(steps)
         return self._weighted(self.difference)
 
     def value(self, steps: int = 1) -> Array:
-        """v(s) (sensors, N), weighted by ``task.relative_weights``."""
+        """v(s) (sensors, N), weighted by ``task.relative_weights``.
+
+        Raises:
+            ValueError: as :meth:`loss`.
+        """
+        _one(steps)
         return self._expected(self.loss(), self._weighted(self.best.mean - self.sent.mean))
 
     def _expected(self, silent: Array, sent: Array) -> Array:
@@ -237,6 +247,14 @@ class OwnBeliefs(Beliefs):
         return Estimate(
             np.moveaxis(mean.reshape(*mean.shape[:-1], *shape), -2, 0),
             np.moveaxis(covariance.reshape(*covariance.shape[:-1], *shape), -2, 0),
+        )
+
+
+def _one(steps: int) -> None:
+    if steps != 1:
+        raise ValueError(
+            f"steps = {steps} is not allowed here: it must be 1, for a sensor by itself cannot "
+            "carry the centre's estimate on"
         )
 
 

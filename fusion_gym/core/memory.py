@@ -29,6 +29,7 @@ from fusion_gym.core.beliefs import (
     arriving,
 )
 from fusion_gym.core.task import Task
+from fusion_gym.errors import refusal
 
 Owner = Literal["coordinator", "own"]
 
@@ -37,11 +38,21 @@ class Memory:
     """Moves the shadows of a task's runs and says what is believed by them; it holds no runs.
 
     ``owner`` says whose: the coordinator's, or every sensor's by itself.
+
+    Raises:
+        ConfigurationError: sensors by themselves, where packets hold the coordinator's estimate.
     """
 
     def __init__(self, task: Task, owner: Owner) -> None:
         self.task, self.owner, sensors = task, owner, task.sensors
         own = owner == "own"
+        if own and task.packet == "estimate":
+            raise refusal(
+                "packet",
+                task.packet,
+                "'measurement' where sensors decide by themselves, for the estimate is the "
+                "coordinator's, of all sensors",
+            )
         distant = task.broadcast == "none" or (task.broadcast == "estimate" and not task.feedback)
         self._needs_alone = own and distant
         self._needs_own = own and task.shadow is not None

@@ -194,9 +194,9 @@ class Signals(Mapping[str, SignalArray]):
         return name in self._values and name not in self._withheld
 
     @property
-    def hidden(self) -> tuple[str, ...]:
-        """Names of the signals that are withheld."""
-        return tuple(sorted(self._withheld))
+    def withheld(self) -> Mapping[str, str]:
+        """The names of the signals that are withheld or not kept, and why."""
+        return self._withheld
 
     def __iter__(self) -> Iterator[str]:
         return (name for name in self._values if name not in self._withheld)

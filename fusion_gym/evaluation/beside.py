@@ -81,7 +81,7 @@ class _Whole:
         values: dict[str, Callable[[], Any]] = {
             name: partial(self._take, name, runs) for name in self._signals
         }
-        return Signals(values, self._signals.hidden)
+        return Signals(values, missing=self._signals.withheld)
 
     def _take(self, name: str, runs: Runs) -> Any:
         if name in self._beliefs:

@@ -18,6 +18,7 @@ from fusion_gym.systems.tobit.system import CensoredSystem
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
 from fusion_gym.validation import choice
 
+_OF_FUSION = ("fusion", "information_shares", "order")
 _STRUCTURE = Structure(
     common="all nodes start from the same prediction", holds=("information shares",)
 )
@@ -42,11 +43,13 @@ class FeedbackOptions(CommonOptions):
 class Filter:
     """A row of a table of filters: the centre that it makes of options and sensors.
 
-    ``own`` are options that belong to this filter alone; elsewhere they are ``None``.
+    ``own`` are options that belong to this filter alone; elsewhere they are ``None``. ``nodes``
+    says whether there are nodes to be joined; without, the options of their fusion are ``None``.
     """
 
     make: Callable[[Any, CensoredSensors], Centre]
     own: tuple[str, ...] = ()
+    nodes: bool = True
 
 
 def at_the_nodes(node: Callable[[CensoredSensors], NodeFilter]) -> Filter:
@@ -86,10 +89,10 @@ def remembering_system(
     if kind is None:
         return None
     row = filters[choice("memory_filter", kind, filters)]
-    others: dict[str, Any] = {"filter": kind}
-    if kind == "adf":
-        others |= {"fusion": None, "information_shares": None, "order": None}
-    return replace(system, centre=row.make(replace(chosen, **others), sensors))
+    changed: dict[str, Any] = {"filter": kind}
+    if not row.nodes:
+        changed |= dict.fromkeys(_OF_FUSION)
+    return replace(system, centre=row.make(replace(chosen, **changed), sensors))
 
 
 def feedback_centre(chosen: FeedbackOptions, node: NodeFilter) -> FeedbackCentre:
@@ -131,7 +134,7 @@ def assumed_density_centre(chosen: FeedbackOptions, sensors: CensoredSensors) ->
     """
     _refuse(
         chosen,
-        ("fusion", "information_shares", "order"),
+        _OF_FUSION,
         "filter='adf'",
         "a filter with nodes (here the centre takes the measurements itself)",
     )
@@ -141,7 +144,7 @@ def assumed_density_centre(chosen: FeedbackOptions, sensors: CensoredSensors) ->
 # What every environment of the family offers; each adds its paper's own.
 FILTERS = {
     "kalman": at_the_nodes(KalmanFilter),
-    "adf": Filter(assumed_density_centre),
+    "adf": Filter(assumed_density_centre, nodes=False),
     "stochastic": Filter(stochastic_centre, own=("stochastic_weight",)),
 }
 
