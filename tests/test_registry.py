@@ -1,0 +1,124 @@
+"""The registry: policies of one's own, and what is wrong with a name, a maker or a parameter."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fusion_gym
+from fusion_gym.core.system import Signals
+from fusion_gym.core.task import Task
+from fusion_gym.policies.base import Policy, Rule
+from fusion_gym.policies.registry import make_policy, policy_names, register_policy
+from fusion_gym.validation import ConfigurationError
+
+
+@pytest.fixture(scope="module")
+def task() -> Task:
+    return fusion_gym.make_task("fusion_gym/TobitOscillator-v0", filter="tobit", random_start=True)
+
+
+class Steady(Rule):
+    """Requests always or never, and declares whatever it likes."""
+
+    def __init__(self, declared: Any, number: float = 1.0) -> None:
+        self.declared, self.number = declared, number
+
+    @property
+    def knowledge(self) -> Any:
+        return self.declared
+
+    def __call__(self, signals: Signals) -> Any:
+        shape = (len(signals["token_cost"]), len(signals["tokens"]))
+        return np.broadcast_to(self.number, shape) > 0.0
+
+
+@dataclasses.dataclass
+class Mine(Rule):
+    threshold: float = 0.5
+    knowledge = "own"
+
+    def __call__(self, signals: Signals) -> Any:
+        return signals["measurement"][:, 0] > self.threshold
+
+
+@pytest.mark.usefixtures("own_table")
+def test_a_policy_of_ones_own_is_in_every_list(task: Task) -> None:
+    fusion_gym.register_policy("mine", Mine)
+    assert "mine" in fusion_gym.policy_names()
+    assert fusion_gym.policy_names("rule") == sorted([*policy_names("rule")])
+    policy: Any = fusion_gym.evaluation.make_policy("mine:threshold=0.2", task)
+    assert policy.threshold == 0.2
+    results = fusion_gym.evaluation.run_episodes(task, policy, 4, 0)
+    assert 0.0 < results.requests.mean() < 1.0
+    for text, message in (
+        ("mien", r"unknown policy 'mien': did you mean 'mine'\? .*lookahead, mine, model"),
+        ("mine:treshold=1", r"unknown parameter of policy 'mine' 'treshold': .* 'threshold'"),
+    ):
+        with pytest.raises(ConfigurationError, match=message):
+            make_policy(text, task)
+    centre = fusion_gym.make_task(
+        "fusion_gym/TobitOscillator-v0", filter="tobit", information="centre"
+    )
+    with pytest.raises(ConfigurationError, match="policy 'mine': signal 'measurement'"):
+        make_policy("mine", centre)
+
+
+@pytest.mark.usefixtures("own_table")
+def test_a_maker_is_given_the_task_and_says_what_is_missing(task: Task) -> None:
+    given = task
+
+    def make(task: Task, gain: float) -> Policy:
+        assert task is given
+        return Steady("clock", gain)
+
+    register_policy("gains", make, "reference")
+    assert policy_names("reference") == [
+        "estimate_difference", "gains", "kullback_leibler", "lookahead", "optimal",
+        "periodic_optimum", "rollout", "value_of_information", "whittle",
+    ]  # fmt: skip
+    policy: Any = make_policy("gains:gain=2", task)
+    assert policy.number == 2
+    with pytest.raises(ConfigurationError, match="policy 'gains' needs a parameter 'gain'"):
+        make_policy("gains", task)
+    register_policy("shapeless", lambda: Steady("clock"))
+    register_policy("undeclared", lambda: Steady(None))
+    with pytest.raises(ConfigurationError, match=r"knowledge = None: it must declare .* 'clock'"):
+        make_policy("undeclared", task)
+
+    class Flat(Mine):
+        def __call__(self, signals: Signals) -> Any:
+            return signals["measurement"][:, 0, 0] > 0.0
+
+    register_policy("flat", Flat)
+    with pytest.raises(ConfigurationError, match=r"an array of bool \(3,\): .* \(3, 1\)"):
+        make_policy("flat", task)
+
+
+@pytest.mark.usefixtures("own_table")
+@pytest.mark.parametrize(
+    ("name", "maker", "message"),
+    [
+        ("always", Mine, "there is a policy of that name"),
+        ("zoo", Mine, "there is a policy of that name"),
+        ("my-rule", Mine, "name = 'my-rule'"),
+        ("", Mine, "name = ''"),
+        (3, Mine, "name = 3"),
+        ("mine", "module:Mine", "'module:Mine' .* must be a callable"),
+        ("mine", 7, "maker = 7 .* must be a callable"),
+        ("mine", lambda *values: Mine(), "named parameters"),
+    ],
+)
+def test_what_cannot_be_registered(name: Any, maker: Any, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        register_policy(name, maker)
+    assert "mine" not in policy_names()
+
+
+def test_near_misses_of_references_are_told(task: Task) -> None:
+    for wrong, right in (("lookahed", "lookahead"), ("perodic_optimum", "periodic_optimum")):
+        with pytest.raises(ConfigurationError, match=f"did you mean '{right}'"):
+            make_policy(wrong, task)

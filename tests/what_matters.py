@@ -1,0 +1,282 @@
+"""Other values of what must not matter to a policy, and what does matter to it.
+
+A policy's copies watch the same episodes, and each is shown other values of what it must not know;
+the network answers to the policy itself. Other values come from the system: the same delivered
+state, moved and measured with other noise.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from fusion_gym.arrays import merge_runs, take_runs
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.beliefs import Beliefs
+from fusion_gym.core.memory import Memory, Shadows
+from fusion_gym.core.signals import MEMORY_SIGNALS
+from fusion_gym.core.system import Knowledge, Signals, covers
+from fusion_gym.core.task import Task
+from fusion_gym.policies.base import Policy, owner_of
+
+Values = dict[str, Any]
+RUNS, STEPS = 6, 10
+CLOCK = ("step", "start", "token_cost")  # all runs know the costs, which never change
+TOLD = (*CLOCK, "tokens", "price")
+
+
+class Believed:
+    """Beliefs as plain arrays (…, N), so that some of them can be changed, beside the states that
+    they were made of."""
+
+    parts = ("difference", "best", "silent", "sent")
+    states = ("remembered", "shadows")
+
+    def __init__(self, values: Values, made_of: Values) -> None:
+        self.values, self.made_of = values, made_of
+
+    @classmethod
+    def of(cls, beliefs: Any, steps: int) -> Believed:
+        """All that a policy may ask of beliefs, over so many steps."""
+        values = {name: getattr(beliefs, name) for name in cls.parts}
+        made_of = {name: getattr(beliefs, name) for name in cls.states if beliefs.task.shadow}
+        return cls(values | {"value": beliefs.value(steps), "loss": beliefs.loss(steps)}, made_of)
+
+    def with_each(self, change: Callable[..., Any], *others: Believed) -> Believed:
+        """``change`` of every array, and of the others' of the same name."""
+        result: Values = {}
+        for name, value in self.values.items():
+            parts = (value, *(other.values[name] for other in others))
+            if isinstance(value, tuple):
+                result[name] = type(value)(*(change(*same) for same in zip(*parts, strict=True)))
+            else:
+                result[name] = change(*parts)
+        return Believed(result, self.made_of)
+
+    def __getattr__(self, name: str) -> Any:
+        if name in self.parts:
+            return self.values[name]
+        if name in self.states:
+            return self.made_of.get(name, Shadows())
+        raise AttributeError(name)
+
+    def value(self, steps: int = 1) -> Any:
+        """As of the beliefs."""
+        return self.values["value"]
+
+    def loss(self, steps: int = 1) -> Any:
+        """As of the beliefs."""
+        return self.values["loss"]
+
+
+def read(signals: Signals, policy: Any) -> Values:
+    """All signals; what is believed only for a policy that looks at it, for it takes long."""
+    beliefs = ("beliefs", "own_beliefs", *(signal.name for signal in MEMORY_SIGNALS))
+    believes, steps = owner_of(policy) is not None, getattr(policy, "steps", 1)
+    found: Values = {name: signals[name] for name in signals if believes or name not in beliefs}
+    return {n: Believed.of(v, steps) if isinstance(v, Beliefs) else v for n, v in found.items()}
+
+
+def with_shadows(batch: EpisodeBatch, state: Any, shadows: Shadows | None) -> EpisodeBatch:
+    """The batch with another state and memory."""
+    result = copy.copy(batch)
+    result.state, result.shadows, result._beliefs = state, shadows, None
+    return result
+
+
+def moved_otherwise(
+    batch: EpisodeBatch, remembered: Shadows | None, rng: np.random.Generator
+) -> EpisodeBatch:
+    """The same history, but the last move and all new measurements are made of other noise.
+
+    ``remembered`` is what there was before the last move.
+    """
+    if batch.delivered is None:
+        return batch
+    noise = rng.standard_normal((batch.task.system.noise_channels, batch.num_envs))
+    shadows = None if remembered is None else batch.memory.sense(remembered, noise)
+    return with_shadows(batch, batch.task.system.sense(batch.delivered, noise), shadows)
+
+
+def forgotten(batch: EpisodeBatch) -> EpisodeBatch:
+    """Without what was measured and not sent."""
+    task = dataclasses.replace(batch.task, shadow=None)
+    shadows = None if batch.shadows is None else Shadows(alone=batch.shadows.alone)
+    result = with_shadows(batch, batch.state, shadows)
+    result.memory = Memory(task, batch.memory.owner)
+    return result
+
+
+def with_other_truth(batch: EpisodeBatch, rng: np.random.Generator) -> EpisodeBatch:
+    """All that the system's visible state hides is changed: the truth, coming losses."""
+    system, kept = batch.task.system, batch.shadows
+    state, shadows = tampered(system, batch.state, rng), kept
+    if kept is not None:
+        shadow = batch.task.shadow
+        shadows = Shadows(
+            tampered(shadow, kept.every, rng),
+            tampered(shadow, kept.own, rng),
+            tampered(system, kept.alone, rng),
+        )
+    return with_shadows(batch, state, shadows)
+
+
+def tampered(system: Any, state: Any, rng: np.random.Generator) -> Any:
+    """A state with other values of what the visible one hides."""
+    if state is None:
+        return None
+    visible = system.visible(state)
+    changed = {}
+    for field in dataclasses.fields(state):
+        value = getattr(state, field.name)
+        if value is None or value is getattr(visible, field.name):
+            continue
+        if value.dtype == np.bool_:
+            changed[field.name] = ~value
+        elif value.dtype == np.float64:
+            other = rng.standard_normal(value.shape)
+            changed[field.name] = value * np.exp(other) if (value > 0.0).all() else value + other
+        else:
+            changed[field.name] = np.roll(value, 1, axis=-1)
+    assert changed
+    return dataclasses.replace(state, **changed)
+
+
+def other_runs(values: Values, rng: np.random.Generator) -> Values:
+    """Every value is another run's, numbers moved besides."""
+    result = {}
+    for name, value in values.items():
+        if name == "model":
+            result[name] = value
+            continue
+        if isinstance(value, Believed):
+            result[name] = value.with_each(lambda array: np.roll(1.5 * array, 1, axis=-1))
+            continue
+        rolled = np.roll(value, 1, axis=0 if name == "observation" else -1)
+        if rolled.dtype == np.bool_:
+            rolled = ~rolled
+        elif rolled.dtype.kind == "f":
+            rolled = rolled + rng.standard_normal(rolled.shape).astype(rolled.dtype)
+        result[name] = rolled
+    return result
+
+
+def of_sensor(sensor: int, true: Values, other: Values, batch: EpisodeBatch) -> Values:
+    """``true`` where the sensor knows it by itself or everyone is told, ``other`` elsewhere."""
+    own = [signal for signal in MEMORY_SIGNALS if signal.knowledge == "own_memory"]
+    signals = (*batch.task.system.signals, *own)
+    declared = {signal.name: signal.axes for signal in signals if signal.name in true}
+
+    def with_own(all_other: Any, all_true: Any) -> Any:
+        result = all_other.copy()
+        result[sensor] = all_true[sensor]
+        return result
+
+    result = {name: true[name] if name in TOLD else other[name] for name in true}
+    for name, value in true.items():
+        if name in ("admitted", "grantable") or declared.get(name, "").startswith("(sensors"):
+            result[name] = with_own(result[name], value)
+        elif name == "own_beliefs":
+            result[name] = other[name].with_each(with_own, value)
+    known = [entry.told or entry.sensor == sensor for entry in batch.layout.entries]
+    result["observation"] = np.where(known, true["observation"], other["observation"])
+    return result
+
+
+def in_runs(runs: np.ndarray[Any, Any], true: Values, other: Values) -> Values:
+    """``other`` in these runs, ``true`` in all others."""
+    result = dict(true)
+    for name, value in true.items():
+        if name == "observation":
+            result[name] = merge_runs(value.T, other[name][runs].T, runs).T
+        elif isinstance(value, Believed):
+            result[name] = value.with_each(
+                lambda array, another: merge_runs(array, another[..., runs], runs), other[name]
+            )
+            if name == "beliefs":
+                result[name].made_of = {
+                    what: merge_runs(kept, take_runs(other[name].made_of[what], runs), runs)
+                    for what, kept in value.made_of.items()
+                }
+        elif name == "model":
+            result[name] = merge_runs(value, take_runs(other[name], runs), runs)
+        elif name not in CLOCK:
+            result[name] = merge_runs(value, other[name][..., runs], runs)
+    return result
+
+
+# --- what matters to a policy -------------------------------------------------------------------
+
+ANYTHING = "anything but the clock"
+MEASUREMENTS = "new measurements"
+OTHERS = "what other sensors and the centre know"
+PAST = "what was measured and not delivered"
+HIDDEN = "the truth or coming losses"
+
+
+CHARACTERISTIC: dict[Knowledge, set[str]] = {
+    "clock": set(),
+    "centre": {ANYTHING},
+    "own": {MEASUREMENTS},
+    "coordinator": {MEASUREMENTS, OTHERS},
+    "own_memory": {MEASUREMENTS, PAST},
+    "coordinator_memory": {MEASUREMENTS, OTHERS, PAST},
+}
+
+
+def may_matter(knowledge: Knowledge) -> set[str]:
+    result = set()
+    if knowledge != "clock":
+        result.add(ANYTHING)
+    if covers(knowledge, "own"):
+        result.add(MEASUREMENTS)
+    if covers(knowledge, "centre"):
+        result.add(OTHERS)
+    if covers(knowledge, "own_memory"):
+        result.add(PAST)
+    return result
+
+
+def what_matters(policy: Policy, task: Task) -> set[str]:
+    """Play episodes with the policy and see which changes move its copies' requests."""
+    rng, seed = np.random.default_rng(1), 3
+    batch = EpisodeBatch.seeded(task, RUNS, seed, owner_of(policy))
+    remembered = None
+    timed, blind, forgetful, honest, *alone = (
+        copy.deepcopy(policy) for _ in range(4 + task.sensors)
+    )
+    for each in (policy, timed, blind, forgetful, honest, *alone):
+        each.reset(RUNS, seed)
+    found: set[str] = set()
+
+    def compare(what: str, answer: Any, expected: Any) -> None:
+        if not np.array_equal(answer, expected):
+            found.add(what)
+
+    for step in range(STEPS):
+        signals = batch.signals()
+        asked = policy(signals)
+        elsewhere = moved_otherwise(batch, remembered, rng)
+        true, other = (read(one.signals(), policy) for one in (batch, elsewhere))
+        foreign = other_runs(other, rng)
+        clock = {name: true[name] if name in CLOCK else foreign[name] for name in true}
+        compare(ANYTHING, timed(Signals(clock)), asked)
+        compare(MEASUREMENTS, blind(elsewhere.signals()), asked)
+        compare(HIDDEN, honest(with_other_truth(batch, rng).signals()), asked)
+        for sensor, each in enumerate(alone):
+            answer = each(Signals(of_sensor(sensor, true, foreign, batch)))
+            compare(OTHERS, answer[sensor], asked[sensor])
+        if task.shadow is not None:
+            compare(PAST, copy.deepcopy(forgetful)(forgotten(batch).signals()), asked)
+        believed, granted = batch.beliefs(), batch.step(asked).granted
+        remembered = batch.memory.deliver(believed, granted)
+        if step % 2 == 0:
+            compare(PAST, forgetful(signals), asked)
+        else:
+            silent = np.flatnonzero(~granted.any(0))
+            forgetful(Signals(in_runs(silent, true, other)))
+    return found
