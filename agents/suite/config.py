@@ -92,7 +92,8 @@ class Setting(Strict):
     ones that know no more than the centre. ``longer`` multiplies the length of its trainings,
     ``price_exponent``, ``algorithm`` and ``tuning`` replace the suite's. ``broadcasts`` are what a
     sensor by itself may hear, by rising knowledge, the environment's default first. ``known`` are
-    policies that earlier searches found: they compete with what the search finds.
+    policies that earlier searches found: they compete with what the search finds, as if every
+    tuning seed had found them.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")

@@ -11,7 +11,7 @@ from fusion_gym.evaluation.envelope import EnvelopePoint, height, lower_hull
 from fusion_gym.validation import ConfigurationError
 
 from .committed import FOLDER, read_envelopes
-from .reports import Baselines, Shape, read
+from .reports import Baselines, Shape, Verdict, read
 
 SHARES = (0.05, 0.1, 0.2, 0.4)  # of the rate that transmitting always gets
 HEADLINE = 0.2
@@ -87,7 +87,7 @@ def text_of(results: Path, command: str) -> str:
     ]
     for envelopes in found:
         lines += rows_of(envelopes, results)
-    lines += ["", "## The strongest rules", ""]
+    lines += ["", *agents_table(found, results), "", "## The strongest rules", ""]
     for envelopes in found:
         lines += vertices_of(envelopes)
     return "\n".join(lines) + "\n"
@@ -117,6 +117,40 @@ def headline_table(results: Path) -> list[str]:
         title = envelopes["title"].split(",")[0]
         lines.append(f"| {title} | {rate:.4g} | {' | '.join(cells)} |")
     return lines
+
+
+def agents_table(found: list[dict[str, Any]], results: Path) -> list[str]:
+    """The agents of ``verdict.json`` beside the classes of now, price by price."""
+    lines = [
+        "## The agents in this folder",
+        "",
+        "Mean squared error of the agents, which remember nothing, relative to the envelope at "
+        "their own rate: of the rules of now that remember nothing, and of those that do. From "
+        "their lowest price to their highest; – left of an envelope.",
+        "",
+        "| setting | agent | against rules without memory | with memory |",
+        "|---|---|---|---|",
+    ]
+    for envelopes in found:
+        name, classes = envelopes["setting"], envelopes["classes"]
+        path = results / name / "verdict.json"
+        fronts = read(Verdict, path, "results")["modes"] if path.exists() else {}
+        for mode, front in fronts.items():
+            heard = envelopes["inputs"]["broadcasts"][0]
+            key = f"local_{heard}" if mode == "local" else mode
+            cells = [
+                " ".join(_relative(hull_of(classes[one]), point) for point in front["points"])
+                if one in classes
+                else "–"
+                for one in (key, f"{key}_memory")
+            ]
+            lines.append(f"| {name} | {mode} | {' | '.join(cells)} |")
+    return lines
+
+
+def _relative(hull: list[EnvelopePoint], point: dict[str, Any]) -> str:
+    below = height(hull, point["rate"])
+    return f"{point['mse'] / below - 1.0:+.1%}" if below else "–"
 
 
 def rows_of(envelopes: dict[str, Any], results: Path) -> Iterator[str]:
