@@ -14,6 +14,7 @@ from fusion_gym.core.memory import Owner
 TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "paper": ("TobitOscillator-v0", {"horizon": 6}),
     "memory": ("TobitOscillator-v0", {"filter": "tobit", "memory": True, "packet": "estimate"}),
+    "heard": ("TobitOscillator-v0", {"filter": "tobit", "memory": True, "broadcast": "packets"}),
     "random": ("BiasedTracking-v0", {"access": "random", "memory": True}),
     "correlated": ("CorrelatedTracking-v0", {"memory": True, "noise_scale": "random"}),
     "markov": ("MarkovJumpTracking-v0", {"memory": True, "memory_filter": "imm"}),
@@ -36,7 +37,7 @@ def contents(batch: Any) -> list[bytes]:
 
 @pytest.mark.parametrize(
     ("name", "owner"),
-    [*((name, "coordinator") for name in TASKS), ("memory", "own"), ("unknown", "own")],
+    [*((name, "coordinator") for name in TASKS), ("heard", "own"), ("unknown", "own")],
 )
 def test_a_branch_takes_the_step_that_would_have_been(name: str, owner: Owner) -> None:
     """Also of finished runs, on their continued state; nothing of the real runs moves."""
