@@ -19,6 +19,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from fusion_gym.validation import choice
 
 from .checked import Positive, Rate, Several, Share, Strict, Weight
+from .counterfactual import Counterfactual, CounterfactualMaskablePPO, CounterfactualPPO, Kind
 
 # Share of the steps in which the untrained policy lets every sensor request; by default one half.
 # Where that is far more than the tokens pay for, asking for less changes nothing (another sensor's
@@ -78,6 +79,22 @@ class PPOConfig(A2CConfig):
     clip_range: Rate = 0.2
 
 
+class CounterfactualConfig(PPOConfig):
+    """PPO with counterfactual credit (:mod:`.counterfactual`).
+
+    ``alternatives`` of a decision are ``all`` actions, or the requests with one sensor's flipped at
+    a time; by default all where a coordinator has at most 16.
+    """
+
+    learning_rate: Rate = 2e-3
+    learning_rate_end: Rate | None = 1e-5
+    ent_coef: Weight = 0.003
+    initial_rate: InitialRate = 0.1
+    n_steps: Positive = 32
+    batch_size: Several = 2048
+    alternatives: Kind | None = None
+
+
 class RecurrentPPOConfig(PPOConfig):
     """PPO with a memory, for modes that hide the sensors' signals."""
 
@@ -116,9 +133,16 @@ class Algorithm:
     policy: str = "MlpPolicy"
     discrete_only: bool = False
 
+    @property
+    def privileged(self) -> bool:
+        """Whether it learns from what no policy may know."""
+        return issubclass(self.model, Counterfactual)
+
 
 TABLE = {
     "a2c": Algorithm(A2C, A2CConfig),
+    "counterfactual_maskable_ppo": Algorithm(CounterfactualMaskablePPO, CounterfactualConfig),
+    "counterfactual_ppo": Algorithm(CounterfactualPPO, CounterfactualConfig),
     "dqn": Algorithm(DQN, DQNConfig, discrete_only=True),
     "maskable_ppo": Algorithm(MaskablePPO, PPOConfig),
     "ppo": Algorithm(PPO, PPOConfig),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pydantic
 
@@ -29,6 +29,11 @@ class TrainingConfig(Strict):
     token starts at the environment's ``cost_weight`` and is adapted. ``price_exponent`` is for a
     price that is drawn: episodes count by (middle of the range / price)^exponent, in training and
     in validation, so that an agent does not neglect the low prices.
+
+    ``error`` is what is trained on (validations are of the true error): ``excess`` and ``mismatch``
+    take off what no policy can change, by an estimate that takes in every measurement with the
+    filter ``error_filter``, by default that of a memory. The mismatch has the least noise, and is
+    right where that estimate is the conditional mean.
     """
 
     timesteps: Positive
@@ -37,6 +42,8 @@ class TrainingConfig(Strict):
     threads: Positive = 1
     target_rate: float | None = pydantic.Field(default=None, gt=0, le=1)
     price_exponent: Share = 0.0
+    error: Literal["squared", "excess", "mismatch"] = "squared"
+    error_filter: str | None = None
 
 
 class ValidationConfig(Strict):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from gymnasium.spaces import Discrete, MultiBinary
@@ -9,9 +11,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
+from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_system
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.policies.model import tag_model
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, refusal
 
 from .algorithms import TABLE
 from .config import Experiment
@@ -30,13 +33,21 @@ def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
             f"action = {task.action!r} is not allowed with algorithm {name!r}: set the "
             "environment's option action: discrete"
         )
-    return FusionSB3VecEnv(
-        task,
-        experiment.training.num_envs,
-        stagger=True,
-        local=local,
-        price_exponent=experiment.training.price_exponent,
-    )
+    training, where = experiment.training, experiment.environment
+    runs: dict[str, Any] = {
+        "num_envs": training.num_envs,
+        "stagger": True,
+        "local": local,
+        "price_exponent": training.price_exponent,
+    }
+    reference = None
+    if training.error != "squared":
+        reference = reference_system(where.id, where.options, training.error_filter)
+    elif training.error_filter is not None:
+        raise refusal("error_filter", training.error_filter, "none with error: squared")
+    if reference is None and not TABLE[name].privileged:
+        return FusionSB3VecEnv(task, **runs)
+    return PrivilegedVecEnv(task, error=training.error, reference=reference, **runs)
 
 
 def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:

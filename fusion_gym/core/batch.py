@@ -11,10 +11,11 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, merge_runs
-from fusion_gym.core.beliefs import Shadows
+from fusion_gym.core.beliefs import Shadows, arrived
 from fusion_gym.core.memory import Memory, Owner
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Outcome, Runs
+from fusion_gym.core.system import System
 from fusion_gym.core.task import Task
 
 _LONGEST_BLOCK = 256  # steps of noise that are drawn and kept at a time
@@ -29,9 +30,21 @@ class EpisodeBatch(Runs):
 
     ``remember`` says whose memory is kept, the coordinator's or every sensor's own; ``None`` is
     the coordinator's in a task with memory, and nothing in one without.
+
+    ``reference`` is a system on the same noise whose filter takes in every measurement beside the
+    run, whoever decides: after each step ``reference_error`` (n, N) is the truth minus its fused
+    estimate x*. It is for rewards in training, and no policy sees it.
     """
 
-    def __init__(self, task: Task, num_envs: int, remember: Owner | None = None) -> None:
+    reference_error: Array
+
+    def __init__(
+        self,
+        task: Task,
+        num_envs: int,
+        remember: Owner | None = None,
+        reference: System[Any] | None = None,
+    ) -> None:
         memory = Memory(task, "coordinator" if remember is None else remember)
         super().__init__(task, memory, ObservationLayout(task, memory.owner))
         self.num_envs = num_envs
@@ -39,6 +52,10 @@ class EpisodeBatch(Runs):
         self.generators: list[np.random.Generator | None] = [None] * num_envs
         self._episode_starts: list[Any] = [None] * num_envs
         self.state = None
+        self.reference = reference
+        # Where the coordinator's own memory is that of the reference, it is not kept twice.
+        self._shared = reference is not None and memory.keeps_every and reference is task.shadow
+        self._beside: Any = None  # the reference's state, after sensing
         self.tokens = task.bucket.start(num_envs)
         self.price = task.reward.price.draw(np.zeros(num_envs))
         self.steps = np.zeros(num_envs, dtype=np.int64)
@@ -97,6 +114,9 @@ class EpisodeBatch(Runs):
             if not everyone:
                 shadows = self.memory.merge(self.shadows, shadows, runs, self.num_envs)
             self.shadows = shadows
+        if self.reference is not None and not self._shared:
+            beside = self.reference.sense(self.reference.start(first), row)
+            self._beside = beside if everyone else merge_runs(self._beside, beside, runs)
         fresh = system.sense(fresh, row)
         self.state = fresh if everyone else merge_runs(self.state, fresh, runs)
         self._beliefs = None
@@ -119,11 +139,15 @@ class EpisodeBatch(Runs):
         if self.state is None:
             raise ResetNeeded("call reset before the first step")
         outcome = self.deliver(requests)
+        if self.reference is not None:
+            self._refer(self.reference)
         self._cursor += 1
         used_up = ~self.finished & (self._cursor - self._block_start >= self._block)
         if used_up.any():
             self._draw(np.flatnonzero(used_up))
         self.sense(self.normals())
+        if self.reference is not None and not self._shared:
+            self._beside = self.reference.sense(self._beside, self.noise())
         self.finished = outcome.truncated.copy()
         return outcome
 
@@ -137,13 +161,23 @@ class EpisodeBatch(Runs):
 
     def snapshot(self) -> dict[str, Any]:
         """Where all runs are, without the task, for :meth:`restore`; valid until the next step."""
-        made = ("task", "layout", "memory", "_beliefs")
+        made = ("task", "layout", "memory", "reference", "_beliefs")
         return {key: value for key, value in vars(self).items() if key not in made}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Put the runs where they were at a :meth:`snapshot` of a batch like this one."""
         vars(self).update(snapshot)
         self._beliefs = None
+
+    def _refer(self, system: System[Any]) -> None:
+        """Let the reference take in every measurement of this step."""
+        if self._shared:
+            assert self.shadows is not None
+            beside = self.shadows.every
+        else:
+            everyone = np.ones((self.task.sensors, self.num_envs), dtype=np.bool_)
+            self._beside = beside = arrived(system, self._beside, everyone)
+        self.reference_error = system.truth(beside) - system.fused(beside)[0]
 
     def _lottery(self) -> Array | None:
         return self.normals()[-1] if self.task.access == "random" else None

@@ -19,7 +19,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,11 +59,15 @@ class Beliefs(ABC):
     ``arrival`` (sensors, N) is the probability that a packet sent now arrives; None: surely.
     """
 
-    def __init__(self, task: Task, state: Any, shadows: Shadows) -> None:
+    def __init__(
+        self, task: Task, state: Any, shadows: Shadows, best: Estimate | None = None
+    ) -> None:
+        if best is not None:
+            vars(self)["best"] = best
         self.task, self.shadows, self._state = task, shadows, state
         system = task.system
         self.arrival: Array | None = None
-        if isinstance(system, LossySystem):
+        if loses(system):
             self.arrival = system.arrival_probability(state)
         self._runs = system.truth(state).shape[-1]
 
@@ -150,9 +154,9 @@ class CoordinatorBeliefs(Beliefs):
         """See :class:`Beliefs`; without memory the centre's, had all packets arrived."""
         everyone = ~self._nobody(self._runs)
         if self.shadows.every is None:
-            return _delivered(self.task.system, self._state, everyone)
+            return arrived(self.task.system, self._state, everyone)
         assert self.task.shadow is not None
-        return _delivered(self.task.shadow, self.shadows.every, everyone)
+        return arrived(self.task.shadow, self.shadows.every, everyone)
 
     def loss(self, steps: int = 1) -> Array:
         """See :class:`Beliefs`; summed over ``steps`` times without noise and transmissions."""
@@ -184,7 +188,7 @@ class CoordinatorBeliefs(Beliefs):
         for sensor in range(self.task.sensors):
             alone = self._nobody(self._runs)
             alone[sensor] = True
-            found.append(_delivered(self.task.system, self._state, alone))
+            found.append(arrived(self.task.system, self._state, alone))
         return found
 
     def _best_path(self, steps: int) -> Array:
@@ -215,8 +219,8 @@ class OwnBeliefs(Beliefs):
         system, itself = self.task.system, self._itself
         if self.shadows.alone is None:
             every = np.tile(np.arange(self._runs), self.task.sensors)
-            return self._each(system, _delivered(system, take_runs(self._state, every), itself))
-        own = self._each(system, _delivered(system, self.shadows.alone, itself))
+            return self._each(system, arrived(system, take_runs(self._state, every), itself))
+        own = self._each(system, arrived(system, self.shadows.alone, itself))
         return own if self.task.broadcast == "none" else _joined(self.silent, own)
 
     @cached_property
@@ -233,7 +237,7 @@ class OwnBeliefs(Beliefs):
     def remembered(self) -> Any:
         """See :class:`Beliefs`."""
         assert self.task.shadow is not None
-        return _delivered(self.task.shadow, self.shadows.own, self._itself)
+        return arrived(self.task.shadow, self.shadows.own, self._itself)
 
     @property
     def _itself(self) -> Packets:
@@ -260,7 +264,15 @@ def _one(steps: int) -> None:
 
 def arriving(system: System[Any], state: Any, packets: Packets) -> Any:
     """The state of a system in which these packets (sensors, N), if they are sent, arrive."""
-    return system.arriving(state, packets) if isinstance(system, LossySystem) else state
+    return system.arriving(state, packets) if loses(system) else state
+
+
+def loses(system: System[Any]) -> TypeGuard[LossySystem[Any]]:
+    """Whether the channel of a system may lose packets.
+
+    Asked in every step, where the protocol's own check would cost as much as a delivery.
+    """
+    return hasattr(system, "arriving")
 
 
 def silent_path(system: System[Any], delivered: Any, steps: int) -> Array:
@@ -278,7 +290,7 @@ def silent_path(system: System[Any], delivered: Any, steps: int) -> Array:
     return np.stack(means)
 
 
-def _delivered(system: System[Any], state: Any, packets: Packets) -> Any:
+def arrived(system: System[Any], state: Any, packets: Packets) -> Any:
     """The state after the arrival of these packets and no others."""
     return system.deliver(arriving(system, state, packets), packets)
 

@@ -24,6 +24,7 @@ from fusion_gym.arrays import Array, merge_runs, take_runs
 from fusion_gym.core.beliefs import (
     Beliefs,
     CoordinatorBeliefs,
+    Estimate,
     OwnBeliefs,
     Shadows,
     arriving,
@@ -56,13 +57,13 @@ class Memory:
         distant = task.broadcast == "none" or (task.broadcast == "estimate" and not task.feedback)
         self._needs_alone = own and distant
         self._needs_own = own and task.shadow is not None
-        self._needs_every = not own and task.shadow is not None
+        self.keeps_every = not own and task.shadow is not None
         self._itself = np.eye(sensors, dtype=np.bool_)
 
     @property
     def keeps(self) -> bool:
         """Whether there is anything to keep from step to step."""
-        return self._needs_every or self._needs_own or self._needs_alone
+        return self.keeps_every or self._needs_own or self._needs_alone
 
     def start(self, noise: Array, fresh: Any) -> Shadows:
         """Of runs that begin with this noise (start_channels, N) in the states ``fresh``."""
@@ -71,7 +72,7 @@ class Memory:
             first = system.start(noise)
         every = np.tile(np.arange(noise.shape[-1]), self.task.sensors)
         return Shadows(
-            every=first if self._needs_every else None,
+            every=first if self.keeps_every else None,
             own=take_runs(first, every) if self._needs_own else None,
             alone=take_runs(fresh, every) if self._needs_alone else None,
         )
@@ -90,10 +91,13 @@ class Memory:
             result.alone = system.sense(shadows.alone, noise)
         return result
 
-    def beliefs(self, state: Any, shadows: Shadows) -> Beliefs:
-        """What is believed before anything is sent; computed when it is first looked at."""
+    def beliefs(self, state: Any, shadows: Shadows, best: Estimate | None = None) -> Beliefs:
+        """What is believed before anything is sent; computed when it is first looked at.
+
+        ``best`` is x*, where it is known already.
+        """
         kind = OwnBeliefs if self.owner == "own" else CoordinatorBeliefs
-        return kind(self.task, state, shadows)
+        return kind(self.task, state, shadows, best)
 
     def deliver(self, beliefs: Beliefs, granted: NDArray[np.bool_]) -> Shadows:
         """After the network's answer (sensors, N): its own is remembered, others' packets heard."""

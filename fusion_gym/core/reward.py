@@ -14,6 +14,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.validation import ConfigurationError
 
 ERROR_KINDS = ("squared", "trace")
+TRAINING_ERRORS = ("squared", "excess", "mismatch")
 _LARGEST = 1e32  # of squares on average: rewards are also handed on as float32
 
 
@@ -113,6 +114,24 @@ class Reward:
         """
         error = squared_error if self.error == "squared" else linalg.diagonal(covariance)
         return -self.error_weight * (self.state_weights * error).sum(0), -price * spent
+
+    def training_error(self, kind: str, error: Array, reference_error: Array) -> Array:
+        """The error's term of the reward (…,) to train with, of errors (n, …): truth - estimate.
+
+        With x̂ the fused estimate, and x* the one that takes in every measurement, whose error is
+        ``reference_error`` (n, …): ``"squared"`` is ‖x - x̂‖², ``"excess"`` ‖x - x̂‖² - ‖x - x*‖²,
+        which differs by what no policy can change, ``"mismatch"`` ‖x* - x̂‖², all weighted. If x*
+        is the conditional mean given all that x̂ and the policy use, the last two have the same
+        mean, and the mismatch the least noise.
+        """
+        if kind == "mismatch":
+            squared = (error - reference_error) ** 2
+        elif kind == "excess":
+            squared = error * error - reference_error * reference_error
+        else:
+            squared = error * error
+        found = -self.error_weight * np.tensordot(self.state_weights[:, 0], squared, axes=1)
+        return np.asarray(found)
 
 
 @dataclass(frozen=True)

@@ -13,19 +13,21 @@ from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, take_runs
 from fusion_gym.core.access import access_mask, first_request
-from fusion_gym.core.beliefs import Beliefs, Shadows
+from fusion_gym.core.beliefs import Beliefs, Estimate, Shadows
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import Network, ObservationLayout
 from fusion_gym.core.signals import memory_signals, missing_signals
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
+from fusion_gym.core.token_bucket import Grants
 
 
 class Outcome(NamedTuple):
     """What one step brought, batch axis last.
 
     ``reward`` (N,) is ``reward_error`` + ``reward_communication``; ``cost`` (N,) the tokens spent;
-    ``requested``, ``granted`` (sensors, N) bool; ``squared_error`` (n, N) of the fused estimate;
+    ``requested``, ``granted`` (sensors, N) bool; ``error`` (n, N) of the fused estimate, the truth
+    minus it, and ``squared_error``;
     ``diverged`` (N,) bool, whether some state's squared error is not finite or above the task's
     ``divergence_level``; ``truncated`` (N,) bool.
     """
@@ -36,6 +38,7 @@ class Outcome(NamedTuple):
     cost: Array
     requested: NDArray[np.bool_]
     granted: NDArray[np.bool_]
+    error: Array
     squared_error: Array
     diverged: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
@@ -86,13 +89,7 @@ class Runs:
     def deliver(self, requests: NDArray[np.bool_]) -> Outcome:
         """The first half of a step: answer the requests (sensors, N), update, fuse, reward."""
         task, system = self.task, self.task.system
-        if task.access == "any":
-            admitted = requests
-        elif task.access == "single":
-            admitted = first_request(requests, self.steps)
-        else:
-            admitted = requests & self.admitted()
-        granted, spent, tokens = task.bucket.grant(self.tokens, admitted, self.steps)
+        granted, spent, tokens = self.answer(requests)
         state = system.deliver(self.state, granted)
         if task.packet == "estimate":
             state = self._adopted(state, np.asarray(granted.any(0)))
@@ -112,10 +109,22 @@ class Runs:
             cost=spent,
             requested=requests,
             granted=granted,
+            error=error,
             squared_error=squared_error,
             diverged=np.asarray(~(squared_error <= task.divergence_level).all(0)),
             truncated=self.steps >= self._limit,
         )
+
+    def answer(self, requests: NDArray[np.bool_]) -> Grants:
+        """The network's answer to requests (sensors, k·N): k of each run, one after another."""
+        task, runs = self.task, len(self.tokens)
+        many = np.arange(requests.shape[1]) % runs if requests.shape[1] != runs else slice(None)
+        steps = self.steps[many]
+        if task.access == "single":
+            requests = first_request(requests, steps)
+        elif task.access != "any":
+            requests = requests & self.admitted()[:, many]
+        return task.bucket.grant(self.tokens[many], requests, steps)
 
     def sense(self, noise: Array) -> None:
         """The second half: the plant moves, the sensors measure, with noise (channels, N)."""
@@ -130,17 +139,43 @@ class Runs:
 
         Runs that are finished go on from their continued state.
         """
-        runs = np.arange(len(self.tokens)) if runs is None else runs
-        position = Position(
+        if runs is None:
+            position = Position(
+                self.state,
+                self.shadows,
+                self.tokens.copy(),
+                self.price.copy(),
+                self.steps.copy(),
+                self._limit.copy(),
+                self.admitted(),
+            )
+            return Branch(self.task, self.memory, self.layout, position, self._beliefs)
+        shadows = self.shadows
+        if shadows is not None:
+            shadows = self.memory.take(shadows, runs, len(self.steps))
+        return Branch(self.task, self.memory, self.layout, self._position(runs, shadows))
+
+    def remembering(self, runs: NDArray[np.int64]) -> Branch:
+        """As :meth:`branch`, of a coordinator's runs whose x* is known and no longer computed.
+
+        What a coordinator remembers does not depend on what is sent: x* after a step is that of
+        the runs that these were taken from, and has to be given to :meth:`Branch.step`.
+        """
+        best = take_runs(self.beliefs().best, runs)
+        position = self._position(runs, None)
+        beliefs = self.memory.beliefs(position.state, Shadows(), best)
+        return Branch(self.task, self.memory, self.layout, position, beliefs)
+
+    def _position(self, runs: NDArray[np.int64], shadows: Shadows | None) -> Position:
+        return Position(
             take_runs(self.state, runs),
-            None if self.shadows is None else self.memory.take(self.shadows, runs, len(self.steps)),
+            shadows,
             self.tokens[runs],
             self.price[runs],
             self.steps[runs],
             self._limit[runs],
             self.admitted()[:, runs],
         )
-        return Branch(self.task, self.memory, self.layout, position)
 
     def observe(self) -> NDArray[np.float32]:
         """Observations (N, entries) of all runs, a fresh array."""
@@ -212,16 +247,29 @@ class Branch(Runs):
     """
 
     def __init__(
-        self, task: Task, memory: Memory, layout: ObservationLayout, position: Position
+        self,
+        task: Task,
+        memory: Memory,
+        layout: ObservationLayout,
+        position: Position,
+        beliefs: Beliefs | None = None,
     ) -> None:
         super().__init__(task, memory, layout)
+        self._beliefs = beliefs
         self.state, self.shadows, self.tokens, self.price = position[:4]
         self.steps, self._limit, self._admitted = position[4:]
 
-    def step(self, requests: NDArray[np.bool_], noise: Array) -> Outcome:
-        """Both halves of a step, with standard normals (channels, N)."""
+    def step(
+        self, requests: NDArray[np.bool_], noise: Array, best: Estimate | None = None
+    ) -> Outcome:
+        """Both halves of a step, with standard normals (channels, N).
+
+        ``best`` is x* after the step, for runs that were taken by :meth:`Runs.remembering`.
+        """
         outcome = self.deliver(requests)
         self.sense(noise)
+        if best is not None:
+            self._beliefs = self.memory.beliefs(self.state, Shadows(), best)
         return outcome
 
     def sense(self, noise: Array) -> None:

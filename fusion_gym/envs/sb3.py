@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.views import make_view
@@ -115,7 +116,7 @@ class FusionSB3VecEnv(VecEnv):
         began = time.perf_counter()
         requests = self.view.requests(self._actions, self.runs)
         lengths, scale = self.batch.steps, self._scale()
-        outcome = self.batch.step(requests)
+        outcome = self._advance(requests)
         self._returns += outcome.reward
         self._spent += outcome.cost
         self.totals = (self.totals[0] + float(outcome.cost.sum()), self.totals[1] + self.runs)
@@ -123,7 +124,7 @@ class FusionSB3VecEnv(VecEnv):
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done.any():
             self._finish(np.flatnonzero(done), lengths, infos)
-        reward = (outcome.reward * scale).astype(np.float32)
+        reward = (self._reward(outcome) * scale).astype(np.float32)
         result = (
             self._observe(),
             reward.repeat(self._rows),
@@ -171,6 +172,14 @@ class FusionSB3VecEnv(VecEnv):
         self._returns[runs] = 0.0
         self._spent[runs] = 0.0
         self.batch.reset(runs)
+
+    def _advance(self, requests: NDArray[np.bool_]) -> Outcome:
+        """A step of the batch, before finished runs begin anew."""
+        return self.batch.step(requests)
+
+    def _reward(self, outcome: Outcome) -> Array:
+        """The rewards (N,) that are learned from."""
+        return outcome.reward
 
     def _scale(self) -> Array | float:
         """What the rewards of the coming step are multiplied by, (N,)."""

@@ -33,9 +33,11 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
 def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
     """Write the model's card into it (:mod:`fusion_gym.policies.card`), to be saved with it.
 
-    ``local`` marks a policy that every sensor runs on its own view.
+    ``local`` marks a policy that every sensor runs on its own view. A subclass of one of the
+    ``ALGORITHMS`` saves models of that algorithm.
     """
-    algorithm = next(name for name, kind in ALGORITHMS.items() if type(model) is kind)
+    names = {kind: name for name, kind in ALGORITHMS.items()}
+    algorithm = next(names[kind] for kind in type(model).__mro__ if kind in names)
     setattr(model, ENTRY, card(algorithm, model, task, local))
 
 

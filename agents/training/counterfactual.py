@@ -1,0 +1,369 @@
+"""PPO with counterfactual credit: the simulator steps what might have been done instead.
+
+The advantage of a request is read off from the alternatives of the decision, stepped on the same
+noise, instead of from the return that followed, in which it drowns. Only the training knows them:
+the policy sees what it will see in use, and what is saved is an ordinary model of PPO.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from gymnasium.spaces import MultiBinary
+from numpy.typing import NDArray
+from sb3_contrib import MaskablePPO
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.utils import explained_variance
+from stable_baselines3.common.vec_env import VecEnv
+
+from fusion_gym.arrays import Array
+from fusion_gym.envs.privileged import Branched, PrivilegedVecEnv
+from fusion_gym.validation import ConfigurationError
+
+Kind = Literal["all", "flips"]
+MOST_ALTERNATIVES = 16  # sets of requests that are all stepped unless told otherwise
+Chosen = NDArray[np.int64]  # choices (rows, D)
+_CLOSED = -1e8  # the logit of a choice that is masked
+
+
+class Decisions:
+    """The alternatives of every row's decision, as D factors of C choices each.
+
+    - ``"all"``: one factor, whose choices are all actions of a coordinator.
+    - ``"flips"``: a factor a sensor, silence or a request, the other sensors as they were; the
+      decision of a sensor by itself is one such factor.
+
+    Raises:
+        ConfigurationError: flips of an action that is one number.
+    """
+
+    def __init__(self, env: PrivilegedVecEnv, kind: Kind | None) -> None:
+        self.local = env.view.knowledge in ("own", "own_memory")
+        self.sensors, self.runs, self.rows = env.task.sensors, env.runs, env.num_envs
+        space = env.action_space
+        self.binary = isinstance(space, MultiBinary)
+        if self.local:
+            self.kind: Kind = "flips"
+        elif not self.binary:
+            self.kind = "all"
+        else:
+            few = self.sensors < 60 and 2**self.sensors <= MOST_ALTERNATIVES
+            self.kind = kind or ("all" if few else "flips")
+        if kind is not None and kind != self.kind:
+            raise ConfigurationError(
+                f"alternatives = {kind!r} is not allowed here: it must be {self.kind!r}, for "
+                + ("sensors decide by themselves" if self.local else "an action is one number")
+            )
+        self.choices = 2
+        if self.kind == "all":
+            self.choices = 2**self.sensors if self.binary else int(space.n)  # type: ignore[attr-defined]
+            numbers = np.arange(self.choices)
+            bits = (numbers[:, None] >> np.arange(self.sensors) & 1).astype(np.bool_)
+            actions = bits if self.binary else numbers
+            self.bits = torch.as_tensor(bits, dtype=torch.float32)
+            self.requests = env.view.requests(actions, self.choices).T[:, :, None]
+
+    def log_probabilities(self, logits: torch.Tensor) -> torch.Tensor:
+        """Of all choices, (rows, D, C), from logits of ``Discrete`` (rows, choices) or, for
+        ``MultiBinary``, of requests (rows, sensors)."""
+        if not self.binary:
+            return torch.log_softmax(logits, -1)[:, None]
+        silent = -torch.nn.functional.softplus(logits)
+        if self.kind == "flips":
+            return torch.stack((silent, logits + silent), -1)
+        return (silent.sum(-1, keepdim=True) + logits @ self.bits.T)[:, None]
+
+    def actions(self, chosen: Chosen) -> NDArray[Any]:
+        """Actions of the space from the choices (rows, D)."""
+        if not self.binary:
+            return chosen[:, 0]
+        if self.kind == "flips":
+            return chosen
+        return chosen >> np.arange(self.sensors) & 1
+
+    def alternatives(self, chosen: Chosen) -> NDArray[Any]:
+        """The requests (A, sensors, N) that are stepped beside those chosen (rows, D)."""
+        if self.kind == "all":
+            return np.broadcast_to(self.requests, (self.choices, self.sensors, self.runs))
+        taken = chosen.reshape(self.runs, self.sensors).T == 1
+        return taken ^ np.eye(self.sensors, dtype=np.bool_)[:, :, None]
+
+    def relevant(self, branched: Branched) -> tuple[Array, NDArray[np.float32]]:
+        """Rewards (K, rows) and observations (K, rows, entries) that a row's choices lead to.
+
+        All alternatives of a run; for a sensor by itself its own flip.
+        """
+        if not self.local:
+            return branched.reward, branched.observation
+        row = np.arange(self.rows)
+        sensor, run = row % self.sensors, row // self.sensors
+        return branched.reward[sensor, run][None], branched.observation[sensor, row][None]
+
+    def arranged(self, chosen: Chosen, taken: Array, stepped: Array) -> Array:
+        """Values (rows, D, C) of all choices, from those taken (rows,) and stepped (K, rows)."""
+        if self.kind == "all":
+            return stepped.T[:, None]
+        flipped = stepped.T
+        kept = np.broadcast_to(taken[:, None], flipped.shape)
+        request = chosen == 1
+        return np.stack((np.where(request, flipped, kept), np.where(request, kept, flipped)), -1)
+
+
+class Rollout(NamedTuple):
+    """What one stretch of T steps taught, B = T · rows.
+
+    ``observations`` (B, entries), ``masks`` (B, choices) or ``None``, ``chosen`` (B, D), ``old``
+    log-probabilities and ``advantages`` (B, D, C), ``surplus`` δ, ``returns`` G and ``values``
+    (B,).
+    """
+
+    observations: torch.Tensor
+    masks: torch.Tensor | None
+    chosen: torch.Tensor
+    old: torch.Tensor
+    advantages: torch.Tensor
+    surplus: torch.Tensor
+    returns: torch.Tensor
+    values: torch.Tensor
+
+
+class Counterfactual(OnPolicyAlgorithm):
+    """What PPO and MaskablePPO have in common here; it stands before the one that it changes.
+
+    Source of the surrogate, its clipping and the λ-returns: Schulman et al. 2015, 2017. For the
+    action b taken and each alternative a of a decision, on the same noise, Q_a = r_a + γ V(o'_a),
+    V̄ = Σ π_a Q_a, A_a = Q_a - V̄; one factor at a time, V̄ is their mean. Along the path
+    G = V̄ + δ, δ = γ λ (G' - V(o'_b)), zero at the end of an episode and of the rollout: G is the
+    critic's target, δ what the view of one step has missed. Both are divided by the spread
+    √(mean Σ π_a A_a²).
+    """
+
+    n_epochs: int
+    batch_size: Any
+    clip_range: Any
+
+    def __init__(self, *args: Any, alternatives: Kind | None = None, **kwargs: Any) -> None:
+        self.alternatives = alternatives
+        super().__init__(*args, **kwargs)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._decisions = Decisions(_privileged(self.env), self.alternatives)
+        self._rollout: Rollout | None = None
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_decisions", "_rollout"]
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+        use_masking: bool = True,
+    ) -> bool:
+        """Step all rows and the alternatives of their decisions; false if a callback ends it."""
+        privileged, decisions = _privileged(env), self._decisions
+        self.policy.set_training_mode(False)
+        callback.on_rollout_start()
+        steps: list[_Step] = []
+        while len(steps) < n_rollout_steps:
+            assert self._last_obs is not None
+            observation = torch.as_tensor(self._last_obs)
+            masks = self._masks(privileged)
+            with torch.no_grad():
+                old = decisions.log_probabilities(self._logits(observation, masks))
+                noise = -torch.log(-torch.log(torch.rand(old.shape)))
+            chosen = (old + noise).argmax(-1).numpy()
+            (after, rewards, dones, infos), branched = privileged.step_alternatives(
+                decisions.actions(chosen), decisions.alternatives(chosen)
+            )
+            self.num_timesteps += env.num_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+            self._update_info_buffer(infos, dones)
+            follows = np.array(after)
+            for row in np.flatnonzero(dones):
+                follows[row] = infos[row]["terminal_observation"]
+            reward, observed = decisions.relevant(branched)
+            stepped = reward + self.gamma * self._value(observed)
+            value = self._value(follows)
+            found = decisions.arranged(chosen, rewards + self.gamma * value, stepped)
+            steps.append(_Step(observation, masks, chosen, old, found, value, dones))
+            self._last_obs = after  # type: ignore[assignment]
+            self._last_episode_starts = dones
+        self._rollout = self._credited(steps)
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def _credited(self, steps: list[_Step]) -> Rollout:
+        """Advantages and returns of a rollout, undivided."""
+        values = [self._value(step.observation.numpy()) for step in steps]
+        advantages, surplus, returns = [], [], []
+        ahead = np.zeros(len(steps[0].dones))
+        for place in range(len(steps) - 1, -1, -1):
+            step = steps[place]
+            mean = (np.exp(step.old.numpy()) * step.found).sum(-1)
+            left = np.zeros_like(ahead)
+            if place + 1 < len(steps):
+                left = self.gamma * self.gae_lambda * (ahead - step.follows)
+                left[step.dones] = 0.0
+            ahead = mean.mean(-1) + left
+            advantages.append(step.found - mean[..., None])
+            surplus.append(left)
+            returns.append(ahead)
+
+        def joined(parts: list[Any]) -> torch.Tensor:
+            return torch.as_tensor(np.concatenate(parts[::-1]), dtype=torch.float32)
+
+        masks = [step.masks for step in steps if step.masks is not None]
+        return Rollout(
+            torch.cat([step.observation for step in steps]),
+            torch.cat(masks) if masks else None,
+            torch.as_tensor(np.concatenate([step.chosen for step in steps])),
+            torch.cat([step.old for step in steps]),
+            joined(advantages),
+            joined(surplus),
+            joined(returns),
+            torch.as_tensor(np.concatenate(values), dtype=torch.float32),
+        )
+
+    def train(self) -> None:
+        """Improve policy and critic on the last rollout."""
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        rollout = self._rollout
+        assert rollout is not None
+        clip = float(self.clip_range(self._current_progress_remaining))
+        weight = rollout.old.exp()
+        spread = float((weight * rollout.advantages**2).sum(-1).mean().sqrt()) + 1e-8
+        told: dict[str, list[float]] = {}
+        for _ in range(self.n_epochs):
+            order = np.random.permutation(len(rollout.returns))  # noqa: NPY002
+            for first in range(0, len(order), self.batch_size):
+                batch = torch.as_tensor(order[first : first + self.batch_size])
+                loss, parts = self._loss(rollout, batch, spread, clip)
+                self.policy.optimizer.zero_grad()
+                loss.backward()
+                torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+                self.policy.optimizer.step()
+                for name, part in parts.items():
+                    told.setdefault(name, []).append(part.item())
+            self._n_updates += 1
+        surplus = float(rollout.surplus.square().mean())
+        told |= {
+            "advantage_spread": [spread],
+            "surplus_share": [surplus / (surplus + spread**2)],
+            "explained_variance": [
+                float(explained_variance(rollout.values.numpy(), rollout.returns.numpy()))
+            ],
+        }
+        for name, found in told.items():
+            self.logger.record(f"train/{name}", float(np.mean(found)))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _loss(
+        self, rollout: Rollout, batch: torch.Tensor, spread: float, clip: float
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        observation = rollout.observations[batch]
+        masks = None if rollout.masks is None else rollout.masks[batch]
+        new = self._decisions.log_probabilities(self._logits(observation, masks))
+        old = rollout.old[batch]
+        weight, change = old.exp(), new - old
+        ratio = change.exp()
+        credit = rollout.advantages[batch] / spread
+        gain = torch.minimum(ratio * credit, ratio.clamp(1.0 - clip, 1.0 + clip) * credit)
+        chosen = rollout.chosen[batch][..., None]
+        whole = change.gather(-1, chosen).sum((-1, -2)).exp()
+        surplus = rollout.surplus[batch] / spread
+        late = torch.minimum(whole * surplus, whole.clamp(1.0 - clip, 1.0 + clip) * surplus)
+        policy = -(weight * gain).sum((-1, -2)).mean() - late.mean()
+        entropy = -(new.exp() * new).sum((-1, -2)).mean()
+        value = (self._critic(observation) - rollout.returns[batch]).square().mean()
+        loss = policy - self.ent_coef * entropy + self.vf_coef * value
+        with torch.no_grad():
+            parts = {
+                "policy_gradient_loss": policy,
+                "value_loss": value,
+                "entropy_loss": -entropy,
+                "approx_kl": ((whole - 1.0) - whole.log()).mean(),
+                "clip_fraction": ((whole - 1.0).abs() > clip).float().mean(),
+            }
+        return loss, parts
+
+    def _logits(self, observation: torch.Tensor, masks: torch.Tensor | None) -> torch.Tensor:
+        """Of the choices of ``Discrete``, of the requests of ``MultiBinary``."""
+        policy: Any = self.policy
+        logits: torch.Tensor = policy.action_net(
+            policy.mlp_extractor.forward_actor(policy.pi_features_extractor(observation))
+        )
+        if masks is not None and self._decisions.binary:  # two a sensor, silence and a request
+            pairs = logits.reshape(len(logits), -1, 2)
+            logits, masks = pairs[..., 1] - pairs[..., 0], masks.reshape(pairs.shape)[..., 1]
+        return logits if masks is None else logits.masked_fill(~masks, _CLOSED)
+
+    def _critic(self, observation: torch.Tensor) -> torch.Tensor:
+        policy: Any = self.policy
+        latent = policy.mlp_extractor.forward_critic(policy.vf_features_extractor(observation))
+        found: torch.Tensor = policy.value_net(latent).squeeze(-1)
+        return found
+
+    def _value(self, observation: NDArray[np.float32]) -> Array:
+        """V of observations (…, entries), (…,)."""
+        with torch.no_grad():
+            rows = torch.as_tensor(observation).reshape(-1, observation.shape[-1])
+            found = self._critic(rows).numpy().reshape(observation.shape[:-1])
+        return np.asarray(found, dtype=np.float64)
+
+    def _masks(self, env: PrivilegedVecEnv) -> torch.Tensor | None:
+        """Open choices (rows, choices), for an algorithm that knows them."""
+        return None
+
+
+class CounterfactualPPO(Counterfactual, PPO):
+    """PPO with counterfactual credit; what it saves are models of PPO."""
+
+
+class CounterfactualMaskablePPO(Counterfactual, MaskablePPO):
+    """MaskablePPO with counterfactual credit; what it saves are models of MaskablePPO."""
+
+    def _masks(self, env: PrivilegedVecEnv) -> torch.Tensor | None:
+        return torch.as_tensor(env.action_masks())
+
+
+class _Step(NamedTuple):
+    """One step of all rows, on the way to a :class:`Rollout`.
+
+    ``found`` (rows, D, C) are the values Q of all choices, ``follows`` (rows,) that of the state
+    reached; ``dones`` (rows,) bool.
+    """
+
+    observation: torch.Tensor
+    masks: torch.Tensor | None
+    chosen: Chosen
+    old: torch.Tensor
+    found: Array
+    follows: Array
+    dones: NDArray[np.bool_]
+
+
+def _privileged(env: Any) -> PrivilegedVecEnv:
+    """The training's own environment.
+
+    Raises:
+        ConfigurationError: another one, which cannot step alternatives.
+    """
+    found = None if env is None else env.unwrapped
+    if not isinstance(found, PrivilegedVecEnv):
+        raise ConfigurationError(
+            f"env = {type(found).__name__} is not allowed with counterfactual credit: it must be "
+            "a PrivilegedVecEnv, which steps alternatives"
+        )
+    return found

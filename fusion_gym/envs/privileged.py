@@ -1,0 +1,131 @@
+"""The vector environment of a training that knows what no policy may know.
+
+Only credit and rewards are made of it, in training: what a policy sees is what it sees in use.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.alternatives import alternatives
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.reward import TRAINING_ERRORS
+from fusion_gym.core.runs import Outcome
+from fusion_gym.core.system import System
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import make_task
+from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.validation import refusal
+
+
+class Branched(NamedTuple):
+    """What A other decisions would have brought, on the same noise.
+
+    ``reward`` (A, N), scaled as the rewards of the step are, and ``observation``
+    (A, N·rows_per_run, entries) float32. Of an episode that has ended it is the state with which
+    it would have gone on.
+    """
+
+    reward: Array
+    observation: NDArray[np.float32]
+
+
+class PrivilegedVecEnv(FusionSB3VecEnv):
+    """Stable-Baselines3's ``VecEnv`` with the simulator's own knowledge for credit and reward.
+
+    ``error`` is the error's term of the rewards: ``"squared"``, the task's own, or ``"excess"`` or
+    ``"mismatch"`` (:meth:`~fusion_gym.core.reward.Reward.training_error`), for which ``reference``
+    is the system, on the same noise, whose filter takes in every measurement
+    (:func:`reference_system`). Returns in infos are those of the task.
+
+    Raises:
+        ConfigurationError: an unknown kind, or one that needs a reference without one or with a
+            task whose own error is not squared.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        num_envs: int,
+        *,
+        error: str = "squared",
+        reference: System[Any] | None = None,
+        **options: Any,
+    ) -> None:
+        self.error = validation.choice("error", error, TRAINING_ERRORS)
+        if error != "squared" and reference is None:
+            raise refusal("error", error, "'squared' without a reference")
+        if error != "squared" and task.reward.error != "squared":
+            raise refusal("error", error, f"'squared' with the task's error={task.reward.error!r}")
+        super().__init__(task, num_envs, **options)
+        if error != "squared":
+            self.batch = EpisodeBatch(task, num_envs, self.view.owner, reference)
+        self._wanted: NDArray[np.bool_] | None = None
+        self._branched: Branched | None = None
+
+    def step_alternatives(
+        self, actions: NDArray[Any], requests: NDArray[np.bool_]
+    ) -> tuple[VecEnvStepReturn, Branched]:
+        """One step of every run, and what other requests (A, sensors, N) would have brought.
+
+        Raises:
+            ValueError: an action that is not in the action space.
+        """
+        self._wanted = requests
+        try:
+            result = self.step(actions)
+        finally:
+            self._wanted = None
+        branched = self._branched
+        assert branched is not None
+        return result, branched
+
+    def _advance(self, requests: NDArray[np.bool_]) -> Outcome:
+        if self._wanted is None:
+            return super()._advance(requests)
+        before, scale = self.batch.branch(), self._scale()
+        outcome = self.batch.step(requests)
+        found = alternatives(before, self._wanted, self.batch.normals(), outcome, self.batch)
+        reference = self._reference_error()
+        if reference is not None:
+            reference = reference[:, None]
+        reward = self._error_term(found.error, reference) + found.communication
+        rows = self.view.rows(found.observation.reshape(-1, found.observation.shape[-1]))
+        self._branched = Branched(reward * scale, rows.reshape(len(reward), -1, rows.shape[-1]))
+        return outcome
+
+    def _reward(self, outcome: Outcome) -> Array:
+        if self.error == "squared":
+            return outcome.reward
+        term = self._error_term(outcome.error, self._reference_error())
+        return term + outcome.reward_communication
+
+    def _reference_error(self) -> Array | None:
+        return None if self.error == "squared" else self.batch.reference_error
+
+    def _error_term(self, error: Array, reference_error: Array | None) -> Array:
+        shift = np.zeros(1) if reference_error is None else reference_error
+        return self.task.reward.training_error(self.error, error, shift)
+
+
+def reference_system(
+    env_id: str, options: dict[str, Any], memory_filter: str | None = None
+) -> System[Any]:
+    """The system whose filter takes in every measurement, of an environment with these options.
+
+    Its filter is ``memory_filter``, by default the one that a memory has there.
+
+    Raises:
+        ConfigurationError: an unknown id, option or filter.
+    """
+    chosen = {**options, "information": "sensors", "memory": True}
+    if memory_filter is not None:
+        chosen["memory_filter"] = memory_filter
+    task = make_task(env_id, **chosen)
+    return task.shadow or task.system
