@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, take_runs
-from fusion_gym.core.runs import Branch, Outcome, Runs
+from fusion_gym.core.beliefs import Beliefs
+from fusion_gym.core.runs import Branch, Outcome
 
 _MOST_BITS = 62  # sensors whose grants are one whole number
 
@@ -31,11 +32,13 @@ def alternatives(
     requests: NDArray[np.bool_],
     noise: Array,
     taken: Outcome,
-    after: Runs,
+    observation: NDArray[np.float32],
+    beliefs: Beliefs,
 ) -> Alternatives:
     """What each of the requests (A, sensors, N) would have brought to the runs of ``before``.
 
-    On the standard normals (channels, N) on which the step was ``taken`` that led to ``after``.
+    On the standard normals (channels, N) on which the step was ``taken`` that led to what is
+    observed, (N, entries), and to these ``beliefs``.
     Requests that the network would have answered alike are stepped once, those that it would have
     answered as in the step taken not at all. Nothing that is given moves.
     """
@@ -44,7 +47,6 @@ def alternatives(
     found = np.tile(np.arange(runs), many)  # where each one's results are; first the taken ones
     other = np.flatnonzero((granted != np.tile(taken.granted, many)).any(0))
     error, communication = taken.error, taken.reward_communication
-    observation = after.observe()
     if other.size:
         first = np.arange(other.size)
         if sensors <= _MOST_BITS:
@@ -57,7 +59,7 @@ def alternatives(
         run, sent = places % runs, granted[:, places]
         if before.memory.keeps_every:
             branch = before.remembering(run)
-            outcome = branch.step(sent, noise[:, run], take_runs(after.beliefs().best, run))
+            outcome = branch.step(sent, noise[:, run], take_runs(beliefs.best, run))
         else:
             branch = before.branch(run)
             outcome = branch.step(sent, noise[:, run])

@@ -90,11 +90,18 @@ class EpisodeBatch(Runs):
             self.generators[run] = generator
             self._episode_starts[run] = None
 
-    def reset(self, runs: NDArray[np.int64] | None = None, *, stagger: bool = False) -> None:
+    def reset(
+        self,
+        runs: NDArray[np.int64] | None = None,
+        *,
+        stagger: bool = False,
+        groups: int | None = None,
+    ) -> None:
         """Begin new episodes in the given runs (all by default) and sense for the first time.
 
-        ``stagger`` spreads the lengths of these first episodes evenly from 1 to the horizon, so
-        that later ones do not all end in the same step.
+        ``stagger`` spreads the lengths of these first episodes evenly up to the horizon, so that
+        later ones do not all end in the same step: each run has its own, or each of ``groups``, for
+        a step in which some episode begins costs almost as much as if all did.
         """
         everyone = runs is None
         runs = np.arange(self.num_envs) if runs is None else runs
@@ -126,7 +133,9 @@ class EpisodeBatch(Runs):
         horizon = self.task.horizon
         self._limit[runs] = horizon
         if stagger:
-            self._limit[runs] = horizon - (np.arange(len(runs)) * horizon) // len(runs)
+            parts = len(runs) if groups is None else min(groups, len(runs))
+            part = (np.arange(len(runs)) * parts) // len(runs)
+            self._limit[runs] = horizon - (part * horizon) // parts
 
     def step(self, requests: NDArray[np.bool_]) -> Outcome:
         """Answer the requests (sensors, N), update, fuse, reward; then move and sense.

@@ -23,6 +23,9 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import refusal
 
+# In how many parts of the runs episodes begin at different times.
+_GROUPS = 8
+
 
 class Branched(NamedTuple):
     """What A other decisions would have brought, on the same noise.
@@ -67,6 +70,7 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         if error != "squared":
             self.batch = EpisodeBatch(task, num_envs, self.view.owner, reference)
         self._wanted: NDArray[np.bool_] | None = None
+        self._seen: NDArray[np.float32] | None = None  # the rows, until an episode begins
         self._branched: Branched | None = None
 
     def step_alternatives(
@@ -86,12 +90,30 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         assert branched is not None
         return result, branched
 
+    def _begin(self) -> None:
+        self._seen = None
+        self.batch.reset(stagger=self.stagger, groups=_GROUPS)
+
+    def _finish(
+        self, runs: NDArray[np.int64], lengths: NDArray[np.int64], infos: list[dict[str, Any]]
+    ) -> None:
+        super()._finish(runs, lengths, infos)
+        self._seen = None
+
+    def _observe(self) -> NDArray[np.float32]:
+        return super()._observe() if self._seen is None else self._seen
+
     def _advance(self, requests: NDArray[np.bool_]) -> Outcome:
+        self._seen = None
         if self._wanted is None:
             return super()._advance(requests)
         before, scale = self.batch.branch(), self._scale()
         outcome = self.batch.step(requests)
-        found = alternatives(before, self._wanted, self.batch.normals(), outcome, self.batch)
+        observation = self.batch.observe()
+        self._seen = self.view.rows(observation)
+        found = alternatives(
+            before, self._wanted, self.batch.normals(), outcome, observation, self.batch.beliefs()
+        )
         reference = self._reference_error()
         if reference is not None:
             reference = reference[:, None]

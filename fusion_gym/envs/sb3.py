@@ -84,7 +84,7 @@ class FusionSB3VecEnv(VecEnv):
         for option in self._options:
             validation.keys("reset option", option, [])
         self.batch.seed(np.arange(self.runs), self._seeds[:: self._rows])
-        self.batch.reset(stagger=self.stagger)
+        self._begin()
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
@@ -172,6 +172,10 @@ class FusionSB3VecEnv(VecEnv):
         self._returns[runs] = 0.0
         self._spent[runs] = 0.0
         self.batch.reset(runs)
+
+    def _begin(self) -> None:
+        """New episodes in all runs."""
+        self.batch.reset(stagger=self.stagger)
 
     def _advance(self, requests: NDArray[np.bool_]) -> Outcome:
         """A step of the batch, before finished runs begin anew."""
