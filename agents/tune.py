@@ -4,7 +4,8 @@
         --timesteps 1000000 --output runs/tune/tobit_oscillator
 
 The study is a SQLite file in the output folder: running the command again goes on with it until it
-has the trials asked for, as if it had not been interrupted. Trials that fall behind at a validation
+has the trials asked for, as if it had not been interrupted. The first trial is the config itself,
+where its values lie in the search. Trials that fall behind at a validation
 are pruned, and so are those that diverge. ``best.yaml`` is the config with what was found, and the
 command that found it.
 """
@@ -172,9 +173,22 @@ def search(study: optuna.Study, experiment: Experiment, trials: int, folder: Pat
     done = min(ended(study), trials)
     with tqdm(total=trials, desc="tuning", unit="trial", initial=done) as bar:
         while ended(study) < trials:
+            if not ended(study):
+                begin_with(study, experiment)
             study.sampler = sampler(experiment, ended(study))
             study.optimize(lambda trial: run_trial(trial, experiment, folder), n_trials=1)
             bar.update()
+
+
+def begin_with(study: optuna.Study, experiment: Experiment) -> None:
+    """Let the config's own hyper-parameters be the first trial, where the search has them."""
+    algorithm = experiment.algorithm.model_dump()
+    own: dict[str, Any] = {name: algorithm[name] for name in NUMBERS if name in algorithm}
+    own |= {name: algorithm[name] for name in CHOICES if name in algorithm}
+    own["hidden"] = ",".join(str(size) for size in experiment.algorithm.network.hidden)
+    inside = all(low <= own[name] <= high for name, (low, high) in NUMBERS.items() if name in own)
+    if inside and all(own[name] in values for name, values in CHOICES.items() if name in own):
+        study.enqueue_trial(own)
 
 
 def ended(study: optuna.Study) -> int:

@@ -92,6 +92,8 @@ CASES = [
     ("dqn", "fixed", {}),
     ("maskable_ppo", "drawn", {}),
     ("recurrent_ppo", "fixed", {}),
+    ("counterfactual_ppo", "fixed", {"error": "mismatch"}),
+    ("counterfactual_maskable_ppo", "drawn", {"error": "excess"}),
 ]
 
 

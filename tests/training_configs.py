@@ -21,6 +21,19 @@ SMALL: dict[str, dict[str, Any]] = {
         "n_epochs": 1,
         "memory": 8,
     },
+    "counterfactual_ppo": {
+        "name": "counterfactual_ppo",
+        "n_steps": 16,
+        "batch_size": 128,
+        "n_epochs": 1,
+    },
+    "counterfactual_maskable_ppo": {
+        "name": "counterfactual_maskable_ppo",
+        "n_steps": 16,
+        "batch_size": 128,
+        "n_epochs": 1,
+        "alternatives": "flips",
+    },
     "a2c": {"name": "a2c", "n_steps": 8},
     "dqn": {
         "name": "dqn",

@@ -91,7 +91,8 @@ class CounterfactualConfig(PPOConfig):
     ent_coef: Weight = 0.003
     initial_rate: InitialRate = 0.1
     n_steps: Positive = 32
-    batch_size: Several = 2048
+    batch_size: Several = 1024
+    n_epochs: Positive = 8
     alternatives: Kind | None = None
 
 

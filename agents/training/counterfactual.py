@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from fusion_gym.arrays import Array
 from fusion_gym.envs.privileged import Branched, PrivilegedVecEnv
+from fusion_gym.envs.views import SensorView
 from fusion_gym.validation import ConfigurationError
 
 Kind = Literal["all", "flips"]
@@ -43,7 +44,7 @@ class Decisions:
     """
 
     def __init__(self, env: PrivilegedVecEnv, kind: Kind | None) -> None:
-        self.local = env.view.knowledge in ("own", "own_memory")
+        self.local = isinstance(env.view, SensorView)
         self.sensors, self.runs, self.rows = env.task.sensors, env.runs, env.num_envs
         space = env.action_space
         self.binary = isinstance(space, MultiBinary)
@@ -146,6 +147,7 @@ class Counterfactual(OnPolicyAlgorithm):
     n_epochs: int
     batch_size: Any
     clip_range: Any
+    _decisions: Decisions
 
     def __init__(self, *args: Any, alternatives: Kind | None = None, **kwargs: Any) -> None:
         self.alternatives = alternatives
@@ -153,7 +155,8 @@ class Counterfactual(OnPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self._decisions = Decisions(_privileged(self.env), self.alternatives)
+        if self.env is not None:
+            self._decisions = Decisions(_privileged(self.env), self.alternatives)
         self._rollout: Rollout | None = None
 
     def _excluded_save_params(self) -> list[str]:
@@ -360,7 +363,7 @@ def _privileged(env: Any) -> PrivilegedVecEnv:
     Raises:
         ConfigurationError: another one, which cannot step alternatives.
     """
-    found = None if env is None else env.unwrapped
+    found = env.unwrapped
     if not isinstance(found, PrivilegedVecEnv):
         raise ConfigurationError(
             f"env = {type(found).__name__} is not allowed with counterfactual credit: it must be "

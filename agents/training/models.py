@@ -13,6 +13,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_system
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.envs.views import SensorView
 from fusion_gym.policies.model import tag_model
 from fusion_gym.validation import ConfigurationError, refusal
 
@@ -87,7 +88,7 @@ def initial_logits(env: FusionSB3VecEnv, rate: float) -> Array:
     if isinstance(space, MultiBinary):
         return np.full(sensors, odds)
     assert isinstance(space, Discrete)
-    if env.view.knowledge == "own":
+    if isinstance(env.view, SensorView):
         return np.array([0.0, odds])
     if env.task.access == "single":
         if sensors * rate >= 1.0:

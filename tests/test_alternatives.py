@@ -1,0 +1,229 @@
+"""What other requests would have brought: the steps that would have been, and nothing moves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fusion_gym
+from fusion_gym.core.alternatives import Alternatives, alternatives
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.memory import Owner
+from fusion_gym.core.runs import Branch
+from fusion_gym.core.task import Task
+from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_system
+from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.validation import ConfigurationError
+
+OSCILLATOR = "fusion_gym/TobitOscillator-v0"
+TASKS: dict[str, tuple[str, dict[str, Any]]] = {
+    "paper": (OSCILLATOR, {"horizon": 6}),
+    "starved": (OSCILLATOR, {"token_rate": 2.0, "initial_tokens": 3.0, "sharing": "rotating"}),
+    "memory": (OSCILLATOR, {"filter": "tobit", "memory": True, "horizon": 5}),
+    "estimates": (OSCILLATOR, {"filter": "tobit", "memory": True, "packet": "estimate"}),
+    "heard": (OSCILLATOR, {"filter": "tobit", "memory": True, "broadcast": "packets"}),
+    "single": (OSCILLATOR, {"access": "single", "sharing": "equal"}),
+    "random": ("fusion_gym/BiasedTracking-v0", {"access": "random", "memory": True}),
+    "turns": ("fusion_gym/BiasedOscillator-v0", {"access": "round_robin"}),
+    "correlated": ("fusion_gym/CorrelatedTracking-v0", {"memory": True, "noise_scale": "random"}),
+    "markov": ("fusion_gym/MarkovJumpTracking-v0", {"information": "centre"}),
+    "unknown": ("fusion_gym/UnknownInput-v0", {"memory": True, "horizon": 5}),
+    "remote": (
+        "fusion_gym/RemoteEstimation-v0",
+        {"sensors": 2, "channel": "gilbert_elliott", "memory": True, "cost_weight": "random",
+         "price_range": (0.1, 1.0)},
+    ),
+    "many": ("fusion_gym/RemoteEstimation-v0", {"sensors": 70, "token_rate": 3.0}),
+}  # fmt: skip
+RUNS = 4
+
+
+def made(name: str) -> Task:
+    env_id, options = TASKS[name]
+    return fusion_gym.make_task(env_id, **options)
+
+
+def contents(runs: Any) -> list[bytes]:
+    """Everything that runs show of themselves."""
+    parts = [runs.observe(), runs.tokens, runs.price, runs.steps, runs.admitted()]
+    return [np.ascontiguousarray(part).tobytes() for part in parts]
+
+
+def stepped(
+    before: Branch, batch: EpisodeBatch, requests: np.ndarray, wanted: np.ndarray
+) -> Alternatives:
+    """The batch's step on ``requests`` and the alternatives ``wanted``."""
+    outcome = batch.step(requests)
+    return alternatives(before, wanted, batch.normals(), outcome, batch.observe(), batch.beliefs())
+
+
+@pytest.mark.parametrize(
+    ("name", "owner"),
+    [*((name, "coordinator") for name in TASKS), ("heard", "own"), ("unknown", "own")],
+)
+def test_alternatives_are_the_steps_that_would_have_been(name: str, owner: Owner) -> None:
+    """Also of runs that have finished; and neither the batch nor the branch moves."""
+    task = made(name)
+    batch = EpisodeBatch.seeded(task, RUNS, 3, owner)
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        many = rng.random((6, task.sensors, RUNS)) < 0.5
+        many[1] = False
+        requests = many[0]
+        before, branches = batch.branch(), [batch.branch() for _ in many]
+        stood = contents(before)
+        found = stepped(before, batch, requests, many)
+        assert contents(before) == stood
+        went = contents(batch)
+        for place, branch in enumerate(branches):
+            outcome = branch.step(many[place], batch.normals())
+            np.testing.assert_array_equal(found.error[:, place], outcome.error)
+            np.testing.assert_array_equal(found.communication[place], outcome.reward_communication)
+            np.testing.assert_array_equal(found.observation[place], branch.observe())
+        assert contents(batch) == went
+
+
+def test_requests_that_are_answered_alike_are_stepped_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nobody is granted anything without tokens, and what was taken is known already."""
+    task = fusion_gym.make_task(OSCILLATOR, token_rate=0.5, initial_tokens=3.0, sharing="rotating")
+    batch = EpisodeBatch.seeded(task, 2, 0)
+    counted: list[int] = []
+    take = Branch.step
+
+    def step(self: Branch, requests: Any, *rest: Any) -> Any:
+        counted.append(requests.shape[1])
+        return take(self, requests, *rest)
+
+    monkeypatch.setattr(Branch, "step", step)
+    everything = (np.arange(8)[:, None] >> np.arange(3) & 1).astype(np.bool_)[:, :, None]
+    wanted = np.broadcast_to(everything, (8, 3, 2))
+    requests = np.zeros((3, 2), dtype=np.bool_)
+    requests[0, 0] = True
+    stepped(batch.branch(), batch, requests, wanted)
+    assert counted == [6]  # one packet can be paid: four answers in each run, one of them taken
+    stepped(batch.branch(), batch, requests, wanted)
+    # The first run has nothing left; the second has had no use for its tokens.
+    assert counted == [6, 3]
+
+
+@pytest.mark.parametrize(
+    ("name", "local"),
+    [
+        ("memory", False),
+        ("memory", True),
+        ("correlated", False),
+        ("markov", True),
+        ("remote", False),
+    ],
+)
+def test_the_reference_takes_in_every_measurement(name: str, local: bool) -> None:
+    """Whoever decides, whatever is sent: the error of a centre that receives everything."""
+    env_id, options = TASKS[name]
+    options = {**options, "horizon": 4} | ({"information": "sensors"} if local else {})
+    task = fusion_gym.make_task(env_id, **options)
+    owner: Owner | None = ("own" if local else "coordinator") if task.memory else None
+    batch = EpisodeBatch(task, RUNS, owner, reference_system(env_id, options))
+    plain = EpisodeBatch(task, RUNS, owner)
+    free = fusion_gym.make_task(env_id, **options | {"tokens": "unlimited"})
+    receiving = EpisodeBatch(free, RUNS, owner)
+    every = (batch, plain, receiving)
+    for one in every:
+        one.seed(np.arange(RUNS), [5 + run for run in range(RUNS)])
+        one.reset(stagger=True)
+    rng = np.random.default_rng(0)
+    for _ in range(9):
+        requests = rng.random((task.sensors, RUNS)) < 0.3
+        batch.step(requests)
+        plain.step(requests)
+        received = receiving.step(np.ones((task.sensors, RUNS), dtype=np.bool_)).error
+        assert contents(batch) == contents(plain)
+        # All packets arrive at it, and remote estimation has a perfect measurement in each.
+        wanted = np.zeros_like(received) if name == "remote" else received
+        np.testing.assert_allclose(batch.reference_error, wanted, rtol=1e-12, atol=1e-12)
+        done = np.flatnonzero(batch.finished)
+        for one in every if done.size else ():
+            one.reset(done)
+
+
+@pytest.mark.parametrize("error", ["squared", "excess", "mismatch"])
+def test_rewards_of_a_training_are_made_of_the_two_errors(error: str) -> None:
+    """And those of the alternatives too; what infos tell of an episode is the task's own."""
+    options = {"filter": "tobit", "horizon": 3, "state_weights": [1.0, 2.0], "error_weight": 0.5}
+    task = fusion_gym.make_task(OSCILLATOR, **options)
+    reference = reference_system(OSCILLATOR, options)
+    env = PrivilegedVecEnv(task, RUNS, error=error, reference=reference)
+    true = EpisodeBatch(task, RUNS, None, reference)
+    env.seed(7)
+    env.reset()
+    true.seed(np.arange(RUNS), [7 + run for run in range(RUNS)])
+    true.reset()
+    rng = np.random.default_rng(0)
+    wanted = np.broadcast_to(
+        np.array([[True, False, False], [False] * 3])[:, :, None], (2, 3, RUNS)
+    )
+    returns = np.zeros(RUNS)
+    for _ in range(3):
+        actions = rng.integers(0, 2, (RUNS, 3))
+        before = true.branch()
+        outcome = true.step(actions.T == 1)
+        (_, reward, _, infos), branched = env.step_alternatives(actions, wanted)
+
+        def term(found: np.ndarray) -> np.ndarray:
+            own, best = found, true.reference_error
+            squared = {
+                "squared": own**2, "excess": own**2 - best**2, "mismatch": (own - best) ** 2
+            }[error]  # fmt: skip
+            return np.asarray(-0.5 * (squared[0] + 2.0 * squared[1]))
+
+        own = term(outcome.error) + outcome.reward_communication
+        np.testing.assert_allclose(reward, own, rtol=1e-6)
+        for place, requests in enumerate(wanted):
+            other = before.branch().step(requests, true.normals())
+            np.testing.assert_allclose(
+                branched.reward[place], term(other.error) + other.reward_communication, rtol=1e-9
+            )
+        returns += outcome.reward
+    np.testing.assert_allclose([info["episode"]["r"] for info in infos], returns, rtol=1e-9)
+
+
+def test_a_training_error_that_does_not_fit_is_refused() -> None:
+    task = fusion_gym.make_task(OSCILLATOR)
+    with pytest.raises(ConfigurationError, match="error = 'mismatch' is not allowed"):
+        PrivilegedVecEnv(task, 2, error="mismatch")
+    with pytest.raises(ConfigurationError, match="error = 'least' is not allowed"):
+        PrivilegedVecEnv(task, 2, error="least")
+    claimed = fusion_gym.make_task(OSCILLATOR, error="trace")
+    with pytest.raises(ConfigurationError, match="error = 'excess' is not allowed"):
+        PrivilegedVecEnv(claimed, 2, error="excess", reference=task.system)
+    with pytest.raises(ConfigurationError, match="memory_filter"):
+        reference_system("fusion_gym/RemoteEstimation-v0", {}, "adf")
+
+
+@pytest.mark.parametrize("local", [False, True])
+def test_looking_at_alternatives_changes_nothing(local: bool) -> None:
+    """Rows, rewards, ends and infos are those of the plain environment, but for its groups."""
+    options: dict[str, Any] = {"filter": "tobit", "memory": True, "horizon": 5}
+    task = fusion_gym.make_task(OSCILLATOR, **options)
+    plain = FusionSB3VecEnv(task, RUNS, local=local)
+    env = PrivilegedVecEnv(task, RUNS, local=local)
+    for one in (plain, env):
+        one.seed(3)
+    assert plain.reset().tobytes() == env.reset().tobytes()
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        actions = rng.integers(0, 2, RUNS * 3 if local else (RUNS, 3))
+        wanted = rng.random((2, 3, RUNS)) < 0.5
+        one, (two, _) = plain.step(actions), env.step_alternatives(actions, wanted)
+        for left, right in zip(one[:3], two[:3], strict=True):
+            assert np.asarray(left).tobytes() == np.asarray(right).tobytes()
+        assert [info.keys() for info in one[3]] == [info.keys() for info in two[3]]
+        for left, right in zip(one[3], two[3], strict=True):
+            if left:
+                assert (
+                    left["terminal_observation"].tolist() == right["terminal_observation"].tolist()
+                )
+                assert left["episode"]["r"] == right["episode"]["r"]

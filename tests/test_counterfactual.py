@@ -1,0 +1,261 @@
+"""The counterfactual learner: its arithmetic by definition, and models that are plain PPO's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from training_configs import ENV, small_config
+
+import fusion_gym
+from agents.training import run
+from agents.training.algorithms import TABLE
+from agents.training.checked import load
+from agents.training.config import Experiment
+from agents.training.counterfactual import CounterfactualPPO, Decisions, Rollout, _Step
+from fusion_gym.envs.privileged import Branched, PrivilegedVecEnv
+from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError
+
+RUNS = 5
+BERNOULLI, CATEGORICAL = torch.distributions.Bernoulli, torch.distributions.Categorical
+CASES: dict[str, tuple[dict[str, Any], bool, str | None]] = {
+    "all": ({}, False, None),
+    "flips": ({}, False, "flips"),
+    "discrete": ({"action": "discrete"}, False, None),
+    "single": ({"access": "single"}, False, None),
+    "local": ({}, True, None),
+}
+
+
+def env_of(name: str, **more: Any) -> tuple[PrivilegedVecEnv, Any]:
+    options, local, kind = CASES[name]
+    task = fusion_gym.make_task(ENV, **{"filter": "tobit", "horizon": 7, **options, **more})
+    return PrivilegedVecEnv(task, RUNS, local=local), kind
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_choices_are_the_actions_of_the_space(name: str) -> None:
+    """Their probabilities are torch's; their values those of the requests that they stand for."""
+    env, kind = env_of(name)
+    decisions = Decisions(env, kind)
+    rows, width = env.num_envs, 3 if decisions.binary else int(env.action_space.n)  # type: ignore[attr-defined]
+    generator = torch.Generator().manual_seed(0)
+    logits = torch.randn((rows, width), generator=generator)
+    found = decisions.log_probabilities(logits)
+    torch.testing.assert_close(found.exp().sum(-1), torch.ones(found.shape[:-1]))
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        chosen = rng.integers(0, decisions.choices, found.shape[:2])
+        actions = decisions.actions(chosen)
+        assert all(
+            env.action_space.contains(action)
+            for action in actions.astype(np.int8 if decisions.binary else np.int64)
+        )
+        wanted = (
+            BERNOULLI(logits=logits).log_prob(torch.as_tensor(actions).float()).sum(-1)
+            if decisions.binary
+            else CATEGORICAL(logits=logits).log_prob(torch.as_tensor(actions))
+        )
+        own = found.gather(-1, torch.as_tensor(chosen)[..., None]).sum((-1, -2))
+        torch.testing.assert_close(own, wanted)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_values_stand_at_the_choices_that_they_are_of(name: str) -> None:
+    """A made-up value of the requests, in place of a step: Q is it at every single choice."""
+    env, kind = env_of(name)
+    decisions, sensors = Decisions(env, kind), 3
+    worth = np.array([1.0, 10.0, 100.0])[:, None]
+    rng = np.random.default_rng(1)
+    factors = decisions.log_probabilities(
+        torch.zeros((env.num_envs, 3 if decisions.binary else int(env.action_space.n)))  # type: ignore[attr-defined]
+    ).shape[1]
+    chosen = rng.integers(0, decisions.choices, (env.num_envs, factors))
+    requests = env.view.requests(decisions.actions(chosen), RUNS)
+    wanted = decisions.alternatives(chosen)
+    value = (worth * wanted.transpose(1, 0, 2).reshape(sensors, -1)).sum(0).reshape(-1, RUNS)
+    rows = value.repeat(env.view.rows_per_run, axis=1)
+    reward, _ = decisions.relevant(Branched(value, np.zeros((*rows.shape, 1), dtype=np.float32)))
+    taken = (worth * requests).sum(0).repeat(env.view.rows_per_run)
+    found = decisions.arranged(chosen, taken, reward)
+    for factor in range(factors):
+        for choice in range(decisions.choices):
+            other = chosen.copy()
+            if decisions.local:
+                for row in range(env.num_envs):
+                    alone = chosen.copy()
+                    alone[row] = choice
+                    value_of = (worth * env.view.requests(decisions.actions(alone), RUNS)).sum(0)
+                    assert found[row, 0, choice] == value_of[row // sensors]
+                continue
+            other[:, factor] = choice
+            value_of = (worth * env.view.requests(decisions.actions(other), RUNS)).sum(0)
+            np.testing.assert_array_equal(found[:, factor, choice], value_of)
+
+
+def test_returns_and_advantages_are_those_of_the_definition() -> None:
+    """G = V̄ + δ, δ = γ λ (G' - V(o')), nothing across the ends; A = Q - V̄ (Schulman et al.)."""
+    env, _ = env_of("flips")
+    model = CounterfactualPPO(
+        "MlpPolicy", env, alternatives="flips", n_steps=3, gamma=0.9, gae_lambda=0.8
+    )
+    rng = np.random.default_rng(0)
+    steps = []
+    for _ in range(3):
+        probability = rng.uniform(0.1, 0.9, (RUNS, 3))
+        old = torch.as_tensor(np.log(np.stack((1 - probability, probability), -1)))
+        steps.append(
+            _Step(
+                torch.zeros((RUNS, env.observation_space.shape[0])), None,  # type: ignore[index]
+                rng.integers(0, 2, (RUNS, 3)), old, rng.normal(size=(RUNS, 3, 2)),
+                rng.normal(size=RUNS), rng.random(RUNS) < 0.3,
+            )
+        )  # fmt: skip
+    rollout = model._credited(steps)
+    for run_ in range(RUNS):
+        ahead = None
+        for place in (2, 1, 0):
+            step = steps[place]
+            mean = [
+                (np.exp(step.old[run_, i].numpy()) * step.found[run_, i]).sum() for i in range(3)
+            ]
+            own = 0.0
+            if ahead is not None and not step.dones[run_]:
+                own = 0.9 * 0.8 * (ahead - step.follows[run_])
+            ahead = np.mean(mean) + own
+            row = place * RUNS + run_
+            np.testing.assert_allclose(rollout.surplus[row], own, rtol=1e-5, atol=1e-7)
+            np.testing.assert_allclose(rollout.returns[row], ahead, rtol=1e-5)
+            for i in range(3):
+                wanted = step.found[run_, i] - mean[i]
+                np.testing.assert_allclose(rollout.advantages[row, i], wanted, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["all", "flips"])
+def test_the_first_step_climbs_the_expected_value(name: str) -> None:
+    """Where nothing has changed yet, the surrogate's gradient is that of Σ π_a Q_a, in each factor,
+    and of the log-probability of what was done times δ."""
+    env, kind = env_of(name)
+    model = CounterfactualPPO("MlpPolicy", env, alternatives=kind, ent_coef=0.0, vf_coef=0.0)
+    decisions = model._decisions
+    generator = torch.Generator().manual_seed(3)
+    observations = torch.randn((6, env.observation_space.shape[0]), generator=generator)  # type: ignore[index]
+    old = decisions.log_probabilities(model._logits(observations, None)).detach()
+    values = torch.randn(old.shape, generator=generator)
+    surplus = torch.randn(6, generator=generator)
+    chosen = torch.randint(0, decisions.choices, old.shape[:2], generator=generator)
+    mean = (old.exp() * values).sum(-1, keepdim=True)
+    rollout = Rollout(
+        observations, None, chosen, old, values - mean, surplus, torch.zeros(6), torch.zeros(6)
+    )
+    loss, parts = model._loss(rollout, torch.arange(6), 0.5, 0.2)
+    assert float(parts["clip_fraction"]) == 0.0
+    new = decisions.log_probabilities(model._logits(observations, None))
+    expected = (new.exp() * values).sum((-1, -2)).mean() / 0.5
+    path = (new.gather(-1, chosen[..., None]).sum((-1, -2)) * surplus).mean() / 0.5
+    weights = list(model.policy.action_net.parameters())
+    one = torch.autograd.grad(-loss, weights)
+    two = torch.autograd.grad(expected + path, weights)
+    for left, right in zip(one, two, strict=True):
+        torch.testing.assert_close(left, right, rtol=1e-4, atol=1e-6)
+
+
+SETTINGS: list[Any] = [
+    ("counterfactual_ppo", {"memory": True}, {"error": "mismatch"}, {}),
+    ("counterfactual_ppo", {"action": "discrete"}, {"error": "excess"}, {}),
+    ("counterfactual_ppo", {"access": "single"}, {"target_rate": 0.1}, {}),
+    (
+        "counterfactual_ppo",
+        {"memory": True, "broadcast": "packets"}, {"error": "mismatch"}, {"local": True},
+    ),
+    (
+        "counterfactual_maskable_ppo",
+        {"cost_weight": "random", "price_range": [0.003, 0.3]}, {"price_exponent": 0.5}, {},
+    ),
+    ("counterfactual_maskable_ppo", {}, {}, {"local": True}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "options", "training", "where"), SETTINGS)
+def test_its_models_are_ordinary_ones(
+    tmp_path: Path, kind: str, options: Any, training: Any, where: Any
+) -> None:
+    """Loaded without trust, and with Stable-Baselines3's own class; both decide alike."""
+    options = {"filter": "tobit", "horizon": 20, **options}
+    config = small_config(
+        tmp_path, kind, environment={"id": ENV, "options": options, **where},
+        training={"timesteps": 1024, "num_envs": 8, **training},
+    )  # fmt: skip
+    experiment = load(Experiment, config)
+    assert run.train(experiment, quiet=True)["finished"]
+    model = Path(experiment.output) / "final_model.zip"
+    priced = options | ({"cost_weight": 0.03} if "price_range" in options else {})
+    task = fusion_gym.make_task(ENV, **priced)
+    policy: Any = make_policy(f"model:{model}", task)
+    plain = next(
+        base for base in TABLE[kind].model.__mro__ if base.__module__.split(".")[0] != "agents"
+    )
+    assert type(policy.model) is plain
+    loaded = plain.load(model, device="cpu")  # type: ignore[attr-defined]
+    for name, weight in loaded.policy.state_dict().items():
+        assert torch.equal(policy.model.policy.state_dict()[name], weight)
+    found = run_episodes(task, policy, 4, 0)
+    assert np.isfinite(found.mse).all()
+
+
+def test_flips_of_one_number_are_refused(tmp_path: Path) -> None:
+    for options, where, reason in (
+        ({"action": "discrete"}, {}, "an action is one number"),
+        ({}, {"local": True}, "sensors decide by themselves"),
+    ):
+        wrong = "flips" if not where else "all"
+        config = small_config(
+            tmp_path, "counterfactual_ppo",
+            environment={"id": ENV, "options": {"horizon": 20, **options}, **where},
+            algorithm={"name": "counterfactual_ppo", "alternatives": wrong},
+        )  # fmt: skip
+        with pytest.raises(ConfigurationError, match=f"alternatives = '{wrong}' .*{reason}"):
+            run.train(load(Experiment, config), quiet=True)
+
+
+def test_it_needs_an_environment_that_can_branch() -> None:
+    plain = FusionSB3VecEnv(fusion_gym.make_task(ENV), 2)
+    with pytest.raises(ConfigurationError, match="env = FusionSB3VecEnv is not allowed"):
+        CounterfactualPPO("MlpPolicy", plain)
+
+
+@pytest.mark.parametrize("filter_", [None, "adf"])
+def test_an_error_filter_needs_an_error_that_uses_it(tmp_path: Path, filter_: str | None) -> None:
+    training = {"timesteps": 64, "num_envs": 4, "error_filter": filter_ or "none such"}
+    error = {"error": "mismatch"} if filter_ is None else {}
+    config = small_config(tmp_path, "ppo", training=training | error)
+    with pytest.raises(ConfigurationError, match="filter"):
+        run.train(load(Experiment, config), quiet=True)
+
+
+def test_it_learns_what_ppo_does_not_see_yet(tmp_path: Path) -> None:
+    """In 10,000 steps better than PPO after as many, and better than requests at random."""
+    options = {"filter": "tobit", "random_start": True, "token_rate": 2.0, "cost_weight": 0.03}
+    task = fusion_gym.make_task(ENV, **options, memory=True)
+    returns = {}
+    for kind in ("ppo", "counterfactual_ppo"):
+        config = small_config(
+            tmp_path, kind,
+            environment={"id": ENV, "options": {**options, "memory": True}},
+            algorithm={
+                "name": kind, "n_steps": 32, "batch_size": 256, "n_epochs": 8, "initial_rate": 0.1
+            },
+            training={"timesteps": 10_000, "num_envs": 64, "error": "mismatch"},
+            validation={"every": 10_000, "episodes": 4}, output=str(tmp_path / kind),
+        )  # fmt: skip
+        run.train(load(Experiment, config), quiet=True)
+        policy = make_policy(f"model:{tmp_path / kind / 'final_model.zip'}", task)
+        returns[kind] = run_episodes(task, policy, 100, 0).returns.mean()
+    chance = run_episodes(task, make_policy("random:rate=0.06", task), 100, 0).returns.mean()
+    assert returns["counterfactual_ppo"] > max(chance, returns["ppo"]) + 1.0, (returns, chance)
