@@ -173,7 +173,7 @@ def search(study: optuna.Study, experiment: Experiment, trials: int, folder: Pat
     done = min(ended(study), trials)
     with tqdm(total=trials, desc="tuning", unit="trial", initial=done) as bar:
         while ended(study) < trials:
-            if not ended(study):
+            if not ended(study) and not study.get_trials(states=(TrialState.WAITING,)):
                 begin_with(study, experiment)
             study.sampler = sampler(experiment, ended(study))
             study.optimize(lambda trial: run_trial(trial, experiment, folder), n_trials=1)
