@@ -44,10 +44,10 @@ NUMBERS = {"learning_rate": (3e-4, 5e-3), "ent_coef": (1e-5, 3e-2)}
 CHOICES: dict[str, tuple[Any, ...]] = {
     "gamma": (0.9, 0.95, 0.97, 0.99, 0.995),
     "gae_lambda": (0.8, 0.9, 0.95, 1.0),
-    "n_steps": (16, 32, 64, 128),
     "n_epochs": (2, 4, 8),
     "hidden": ("64,64", "128,128"),
 }
+FACTORS = (0.25, 0.5, 1, 2)  # of the config's steps between two updates
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,13 @@ class Tune(Command):
         return "interrupted; the same command goes on"
 
 
+def choices(experiment: Experiment) -> dict[str, tuple[Any, ...]]:
+    """The values among which a study of this experiment chooses, by name."""
+    own = getattr(experiment.algorithm, "n_steps", 1)
+    steps = tuple(sorted({max(round(own * factor), 1) for factor in FACTORS}))
+    return CHOICES | {"n_steps": steps}
+
+
 def suggest(trial: optuna.Trial, experiment: Experiment, output: Path) -> Experiment:
     """The experiment with a trial's hyper-parameters."""
     plain = experiment.model_dump()
@@ -92,7 +99,7 @@ def suggest(trial: optuna.Trial, experiment: Experiment, output: Path) -> Experi
     for name, (low, high) in NUMBERS.items():
         if name in algorithm:
             algorithm[name] = trial.suggest_float(name, low, high, log=True)
-    for name, values in CHOICES.items():
+    for name, values in choices(experiment).items():
         if name in algorithm or name == "hidden":
             value = trial.suggest_categorical(name, list(values))
             if name == "hidden":
@@ -184,10 +191,11 @@ def begin_with(study: optuna.Study, experiment: Experiment) -> None:
     """Let the config's own hyper-parameters be the first trial, where the search has them."""
     algorithm = experiment.algorithm.model_dump()
     own: dict[str, Any] = {name: algorithm[name] for name in NUMBERS if name in algorithm}
-    own |= {name: algorithm[name] for name in CHOICES if name in algorithm}
+    values = choices(experiment)
+    own |= {name: algorithm[name] for name in values if name in algorithm}
     own["hidden"] = ",".join(str(size) for size in experiment.algorithm.network.hidden)
     inside = all(low <= own[name] <= high for name, (low, high) in NUMBERS.items() if name in own)
-    if inside and all(own[name] in values for name, values in CHOICES.items() if name in own):
+    if inside and all(own[name] in some for name, some in values.items() if name in own):
         study.enqueue_trial(own)
 
 
