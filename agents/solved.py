@@ -16,8 +16,7 @@ from rich import box
 from rich.table import Table
 
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.evaluation.intervals import mean_interval
+from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
@@ -26,6 +25,7 @@ from .input.options import Episodes, OutputFolder, Seed, TrainingSeeds
 from .output import tables
 from .output.files import read_json, write
 from .output.folders import fingerprint
+from .suite.verdict import excess
 from .training.checked import load
 from .training.config import Experiment
 from .training.run import holds_training, train
@@ -100,15 +100,6 @@ def is_finished(experiment: Experiment) -> bool:
         return False
     same = summary.get("inputs") == fingerprint(experiment.inputs())
     return same and summary.get("finished") is True and (folder / "final_model.zip").is_file()
-
-
-def excess(agent: EpisodeResults, best: EpisodeResults) -> dict[str, float]:
-    """The agent's cost above the optimum's, as a share of it, with its paired 95 % interval."""
-    optimum = -float(best.returns.mean())
-    return {
-        name: value / optimum
-        for name, value in mean_interval(best.returns - agent.returns)._asdict().items()
-    }
 
 
 def main() -> None:

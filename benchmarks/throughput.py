@@ -35,14 +35,16 @@ TURNS = 5
 Workload = Callable[[float], float]
 
 
-def _timed(step: Callable[[], object], steps_per_call: int) -> Workload:
+def _timed(
+    step: Callable[[], object], steps_per_call: int, clock: Callable[[], float] = time.perf_counter
+) -> Workload:
     def run(seconds: float) -> float:
-        calls, began = 0, time.perf_counter()
+        calls, began = 0, clock()
         while True:
             for _ in range(8):
                 step()
             calls += 8
-            elapsed = time.perf_counter() - began
+            elapsed = clock() - began
             if elapsed >= seconds:
                 return calls * steps_per_call / elapsed
 
@@ -64,14 +66,19 @@ def single(options: dict[str, Any]) -> Workload:
     return _timed(step, 1)
 
 
-def vector(options: dict[str, Any], num_envs: int, env_id: str = ENV) -> Workload:
+def vector(
+    options: dict[str, Any],
+    num_envs: int,
+    env_id: str = ENV,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Workload:
     """``gym.make_vec`` with autoreset."""
     env = gymnasium.make_vec(env_id, num_envs, vectorization_mode="vector_entry_point", **options)
     env.reset(seed=0)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(16)]
     count = iter(range(10**12))
-    return _timed(lambda: env.step(actions[next(count) % 16]), num_envs)
+    return _timed(lambda: env.step(actions[next(count) % 16]), num_envs, clock)
 
 
 def native_sb3(options: dict[str, Any], num_envs: int) -> Workload:
@@ -107,10 +114,16 @@ REMEMBERED: dict[str, dict[str, Any]] = {
 RATE = 0.3  # of requests there, a sensor and step
 
 
-def remembering(name: str, how: str, num_envs: int = 1024) -> Workload:
+def remembering(
+    env_id: str,
+    options: dict[str, Any],
+    how: str,
+    num_envs: int = 1024,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Workload:
     """The core's loop: nothing remembered, the ``shadow`` alone, ``values``, or ``own`` values."""
-    env_id, options = f"fusion_gym/{name.partition(',')[0]}-v0", REMEMBERED[name]
-    task = fusion_gym.make_task(env_id, memory=how != "without", horizon=250, **options)
+    changed = {"memory": how != "without", "horizon": 250}
+    task = fusion_gym.make_task(env_id, **(options | changed))
     owner: Owner = "own" if how == "own" else "coordinator"
     batch = EpisodeBatch.seeded(task, num_envs, 0, owner)
     draw = np.random.default_rng(0)
@@ -123,7 +136,7 @@ def remembering(name: str, how: str, num_envs: int = 1024) -> Workload:
         if batch.step(wanted[next(count) % 16]).truncated.any():
             batch.reset()
 
-    return _timed(step, num_envs)
+    return _timed(step, num_envs, clock)
 
 
 def filterpy_loop() -> Workload:
@@ -236,8 +249,9 @@ def memory_table(seconds: float) -> Table:
     table.add_column("environment")
     for column in ("steps/s without", *ways.values()):
         table.add_column(column, justify="right")
-    for name in REMEMBERED:
-        rows = {how: remembering(name, how) for how in ("without", *ways)}
+    for name, options in REMEMBERED.items():
+        env_id = f"fusion_gym/{name.partition(',')[0]}-v0"
+        rows = {how: remembering(env_id, options, how) for how in ("without", *ways)}
         found = measured(rows, seconds)
         ratios = [
             statistics.median(a / b for a, b in zip(found[how], found["without"], strict=True))

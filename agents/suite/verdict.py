@@ -12,6 +12,7 @@ from scipy import stats
 from fusion_gym.arrays import Array
 from fusion_gym.evaluation.envelope import EnvelopePoint, chosen_mse, envelope_mse, height
 from fusion_gym.evaluation.episodes import EpisodeResults
+from fusion_gym.evaluation.intervals import mean_interval
 
 RESAMPLES = 2000
 MIDDLE = (0.05, 0.5)  # of the rate that transmitting always gets: the middle of the front
@@ -172,3 +173,12 @@ def interval(front: Front, grid: Array) -> dict[str, float]:
     low, high = np.quantile(drawn, (0.025, 0.975))
     mean = float(score(found, front.rates, grid).mean())
     return {"mean": mean, "low": float(low), "high": float(high)}
+
+
+def excess(agent: EpisodeResults, best: EpisodeResults) -> dict[str, float]:
+    """The agent's cost above the optimum's, as a share of it, with its paired 95 % interval."""
+    optimum = -float(best.returns.mean())
+    return {
+        name: value / optimum
+        for name, value in mean_interval(best.returns - agent.returns)._asdict().items()
+    }

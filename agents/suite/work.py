@@ -23,6 +23,7 @@ from ..training.run import holds_training, train
 from .committed import present
 from .config import Suite
 from .envelopes import task_of
+from .fronts import prices_of
 from .jobs import Folders, Job, computed, experiment_of, inputs_of, setting_task, training_of
 
 
@@ -61,7 +62,7 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
         task = task_of(setting, vertex["options"].items())
         policy = make_policy(vertex["policy"], task)
         results = run_episodes(task, policy, suite.episodes, suite.seed)
-        _check_vertex(vertex, results)
+        check_vertex(vertex, results)
         found[vertex["name"]] = results
         curve = curves.setdefault(vertex["family"], {"knows": [], "policies": []})
         curve["knows"].append(policy.knowledge)
@@ -83,7 +84,7 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
     _keep(job, folders, found, report)
 
 
-def _check_vertex(vertex: dict[str, Any], results: EpisodeResults) -> None:
+def check_vertex(vertex: dict[str, Any], results: EpisodeResults) -> None:
     """Whether a rule does on the test seeds what its envelope says."""
     said, does = vertex["test"]["mse"]["mean"], float(results.mse.mean())
     if not np.isclose(said, does, rtol=1e-6):
@@ -125,9 +126,8 @@ def _run_agent(job: Job, suite: Suite, folders: Folders) -> None:
     if not summary["finished"]:
         raise KeyboardInterrupt
     task, model = setting_task(setting, mode), folder / "best_model.zip"
-    prices = [float(price) for price in np.geomspace(*setting.price_range, suite.prices)]
-    low, high = setting.price_range
-    names = [f"model:{model},price={min(max(price, low), high)!r}" for price in prices]
+    prices = prices_of(setting.price_range, suite.prices)
+    names = [f"model:{model},price={price!r}" for price in prices]
     found = _test(task, names, suite)
     report = {
         **_header(job, suite, task),

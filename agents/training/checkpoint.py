@@ -38,7 +38,8 @@ class Journal:
     """What a training has done so far.
 
     ``inputs`` is what it was made from, ``records`` are its validations, ``seconds`` the wall time
-    by activity, over all stretches; ``best`` is the best model's file.
+    by activity and ``cpu_seconds`` the processor's, validation apart, over all stretches; ``best``
+    is the best model's file.
     """
 
     inputs: dict[str, Any]
@@ -48,6 +49,7 @@ class Journal:
             ("environment", "policy", "update", "validation"), 0.0
         )
     )
+    cpu_seconds: float = 0.0
     best: bytes | None = None
 
 

@@ -12,6 +12,7 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
 
@@ -27,6 +28,9 @@ from . import checkpoint
 from .checkpoint import Journal
 from .config import Experiment
 from .constraint import score
+
+# Handed the model and the processor's seconds of its training; more for a validation's record.
+Measure = Callable[[BaseAlgorithm, float], dict[str, Any]]
 
 
 class Interrupt:
@@ -66,15 +70,16 @@ class Progress(BaseCallback):
         bar: tqdm[Any],
         journal: Journal,
         watch: Callable[[dict[str, Any]], bool] | None = None,
+        measure: Measure | None = None,
     ) -> None:
         super().__init__()
-        self.watch, self.stopped = watch, False
+        self.watch, self.stopped, self.measure = watch, False, measure
         self.experiment, self.folder, self.task = experiment, folder, task
         self.interrupt, self.bar, self.journal = interrupt, bar, journal
         self.target = experiment.training.target_rate
         scores = (score(record, self.target) for record in journal.records)
         self.best = max(scores, default=(-np.inf, -np.inf))
-        self._mark = 0.0
+        self._mark = _now()
         self._env_mark = 0.0
         self._next = 0
         self._due = False  # a checkpoint, as soon as the model has learned from the rollout
@@ -86,7 +91,7 @@ class Progress(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._plan()
-        self._mark = time.perf_counter()
+        self._mark = _now()
 
     def _on_rollout_start(self) -> None:
         self._measure("update")
@@ -119,8 +124,10 @@ class Progress(BaseCallback):
 
     def _measure(self, activity: str) -> None:
         """Add the time since the last call to an activity's."""
-        now = time.perf_counter()
-        self.journal.seconds[activity] += now - self._mark
+        now = _now()
+        self.journal.seconds[activity] += now[0] - self._mark[0]
+        if activity != "validation":
+            self.journal.cpu_seconds += now[1] - self._mark[1]
         self._mark = now
 
     def _plan(self) -> None:
@@ -132,7 +139,7 @@ class Progress(BaseCallback):
         """Validate the finished model, if that was not done before."""
         records = self.journal.records
         if not records or records[-1]["timesteps"] < self.num_timesteps:
-            self._mark = time.perf_counter()
+            self._mark = _now()
             self.validate()
             self._measure("validation")
 
@@ -147,6 +154,8 @@ class Progress(BaseCallback):
             "mse": float(found.mse.mean()),
             "rate": float(found.rate.mean()),
         }
+        if self.measure is not None:
+            record |= self.measure(self.model, self.journal.cpu_seconds)
         if score(record, self.target) > self.best:
             self.best = score(record, self.target)
             file = io.BytesIO()
@@ -193,3 +202,8 @@ class Progress(BaseCallback):
         env = self.training_env.unwrapped
         assert isinstance(env, FusionSB3VecEnv)
         return env
+
+
+def _now() -> tuple[float, float]:
+    """Seconds of the wall, and of this process on all its processors."""
+    return time.perf_counter(), time.process_time()

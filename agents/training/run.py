@@ -28,7 +28,7 @@ from .checkpoint import Journal, read_journal, restore
 from .config import Experiment
 from .constraint import TargetRate, score
 from .models import make_env, make_model
-from .monitor import Interrupt, Progress, Stop
+from .monitor import Interrupt, Measure, Progress, Stop
 
 # Training seeds lie far from the validation's and from the small numbers that tests use.
 TRAINING_SEEDS = 1_000_000_000
@@ -109,11 +109,14 @@ def train(
     resume: bool = False,
     quiet: bool = False,
     watch: Callable[[dict[str, Any]], bool] | None = None,
+    measure: Measure | None = None,
 ) -> dict[str, Any]:
     """Run the training and return its summary; ``quiet`` shows neither bar nor summary.
 
     ``watch`` is handed each validation's record, those of earlier stretches first, and may end the
-    training by returning true.
+    training by returning true. ``measure`` is handed the model at each validation, and the
+    processor's seconds that it has been trained for (validations are none of it), and returns what
+    is added to the record.
 
     The summary has ``timesteps``, ``finished``, ``steps_per_second``, ``seconds`` by activity (of
     all stretches together), the best validation, and a hash of the inputs.
@@ -136,12 +139,13 @@ def train(
             model = restore(folder / "latest.zip", type(model), env)
         plain = experiment.model_dump(mode="json")
         write_text(folder / "config.yaml", yaml.safe_dump(plain, sort_keys=False))
-        return _learn(experiment, folder, model, env, scored, journal, quiet, watch)
+        return _learn(experiment, folder, model, env, scored, journal, quiet, watch, measure)
 
 
 def _learn(
     experiment: Experiment, folder: Path, model: BaseAlgorithm, env: FusionSB3VecEnv, scored: Task,
     journal: Journal, quiet: bool, watch: Callable[[dict[str, Any]], bool] | None,
+    measure: Measure | None,
 ) -> dict[str, Any]:  # fmt: skip
     """Train what remains, write the results and return the summary."""
     model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
@@ -150,7 +154,7 @@ def _learn(
         Interrupt() as interrupt,
         progress_bar(total, f"training {experiment.algorithm.name}", begun, quiet) as bar,
     ):
-        progress = Progress(experiment, folder, scored, interrupt, bar, journal, watch)
+        progress = Progress(experiment, folder, scored, interrupt, bar, journal, watch, measure)
         progress.init_callback(model)
         callbacks: list[BaseCallback] = [progress]
         if experiment.training.target_rate is not None:

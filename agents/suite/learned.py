@@ -1,0 +1,113 @@
+"""What a study has found so far: its JSON, made of the finished lessons."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from filelock import FileLock
+
+from ..output.files import read_json, write
+from .fronts import range_of
+from .study import Kind, Lesson, Study
+
+
+def finished(study: Study, kind: Kind, seeds: int) -> list[dict[str, Any]]:
+    """What the first so many seeds taught, as far as they are finished.
+
+    Raises:
+        ConfigurationError: a file is damaged, or was made from other inputs.
+    """
+    found = [Lesson(study, kind, seed).result() for seed in range(seeds)]
+    return [result for result in found if result is not None]
+
+
+def report(study: Study, seeds: int) -> dict[str, Any]:
+    """Write the study's JSON anew and return what it holds; lessons may end side by side."""
+    study.output.mkdir(parents=True, exist_ok=True)
+    with FileLock(study.work / f".{study.setting.name}.lock"):
+        fronts = finished(study, "front", seeds)
+        plain = finished(study, "plain", min(seeds, study.learning.plain.seeds))
+        speed = study.throughput
+        found: dict[str, Any] = {
+            "setting": study.setting.name,
+            "title": study.setting.title,
+            "env": study.setting.environment.id,
+            "course": study.course.model_dump(mode="json"),
+            "prices": study.prices,
+            "inner": study.inner,
+            "seeds": seeds,
+            "throughput": read_json(speed, "work") if speed.exists() else None,
+            "reached": {
+                "front": [reached(one) for one in fronts],
+                "plain": [reached(one) for one in plain],
+            },
+            "finished": judged(study, fronts),
+            "fronts": fronts,
+            "plain": plain,
+        }
+        write(study.report, found)
+    return found
+
+
+def reached(lesson: Mapping[str, Any]) -> dict[str, Any]:
+    """When a training's front first was below the memoryless envelope over its whole range.
+
+    Without ``first`` it never was, or there is no such envelope; ``above_later`` counts the
+    measurements after it that were not below.
+    """
+    curve = lesson["curve"]
+    found: dict[str, Any] = {
+        "seed": lesson["seed"],
+        "timesteps": curve[-1]["timesteps"],
+        "cpu_seconds": curve[-1]["cpu_seconds"],
+    }
+    below = [place for place, point in enumerate(curve) if point.get("below")]
+    if below:
+        first, later = curve[below[0]], curve[below[0] :]
+        found["first"] = {
+            "timesteps": first["timesteps"],
+            "cpu_seconds": first["cpu_seconds"],
+            "excess": first["excess"],
+            "rates": range_of(first["front"]),
+            "above_later": sum(not point["below"] for point in later),
+        }
+    return found
+
+
+def judged(study: Study, fronts: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """All seeds' finished fronts at the prices that count, beside what they are compared with.
+
+    With the optimum all prices count, otherwise the inner ones. ``above`` are seeds and prices
+    whose whole interval lies more than the allowed share above, ``worst`` has the largest
+    difference, ``closed`` the share of the gaps to rollout and bound.
+    """
+    every = study.course.against == "optimum"
+    counted = [every or inside for inside in study.inner]
+    points = [
+        point | {"seed": front["seed"]}
+        for front in fronts
+        for point, counts in zip(front["points"], counted, strict=True)
+        if counts and "difference" in point
+    ]
+    if not points:
+        return None
+    above = [p for p in points if p["difference"]["low"] > study.course.allowed]
+    worst = max(points, key=lambda point: float(point["difference"]["mean"]))
+    return {
+        "compared": len(points),
+        "above": [{key: p[key] for key in ("seed", "price", "difference")} for p in above],
+        "worst": {key: worst[key] for key in ("seed", "price", "difference")},
+        "mean": sum(p["difference"]["mean"] for p in points) / len(points),
+        "closed": {name: closed(points, name) for name in ("rollout", "bound")},
+    }
+
+
+def closed(points: Sequence[Mapping[str, Any]], name: str) -> float | None:
+    """The share of the gap between the envelope and what is known beyond it that is closed.
+
+    Over all points whose rate has both; ``None`` where nothing lies between.
+    """
+    known = [point for point in points if name in point]
+    gap = sum(point["envelope"] - point[name] for point in known)
+    return sum(point["envelope"] - point["mse"] for point in known) / gap if gap > 0.0 else None

@@ -1,0 +1,79 @@
+"""How fast agents learn, as typed YAML."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pydantic
+
+from ..training.checked import Positive, Rate, Share, Strict, parse, read_yaml
+
+
+class Plain(Strict):
+    """Plain PPO as the suite trains it, without memory, for comparison.
+
+    It ends below the memoryless envelope, or after ``budget`` times the processor seconds that the
+    fronts' trainings took.
+    """
+
+    every: Positive = 100_000
+    seeds: Positive = 2
+    budget: Rate = 3.0
+
+
+class Course(Strict):
+    """What is trained in one setting of the suite, and what it is compared with.
+
+    ``front`` is the training's config, ``memoryless`` the class of the committed envelope to get
+    below while learning. The finished front is compared with ``against``: a class of the committed
+    envelope, the ``optimum`` at each price, or the lower hull of ``schedules``; a share of
+    ``allowed`` above it is still good.
+    """
+
+    setting: str
+    front: str
+    memoryless: str | None = None
+    against: str
+    schedules: tuple[str, ...] = ()
+    allowed: Rate = 0.01
+
+    @pydantic.model_validator(mode="after")
+    def _scheduled(self) -> Course:
+        if (self.against == "schedules") != bool(self.schedules):
+            raise ValueError("schedules and against: schedules stand together")
+        return self
+
+
+class Learning(Strict):
+    """All settings; ``timesteps`` and ``test_episodes`` stand for those of configs and suite."""
+
+    suite: str = "benchmark"
+    prices: Positive = 7
+    inner: tuple[Share, Share] = (0.05, 0.95)
+    every: Positive = 25_000
+    episodes: Positive = 128
+    timesteps: Positive | None = None
+    test_episodes: Positive | None = None
+    plain: Plain = Plain()
+    settings: tuple[Course, ...] = pydantic.Field(min_length=1)
+
+
+# What --quick changes: the same work, less of it.
+QUICK: dict[str, Any] = {
+    "timesteps": 50_000,
+    "test_episodes": 100,
+    "episodes": 32,
+    "plain": {"every": 25_000, "seeds": 1, "budget": 1.0},
+}
+
+
+def load_learning(path: str | Path, quick: bool = False) -> Learning:
+    """The config, or its quick version.
+
+    Raises:
+        ConfigurationError: unreadable, an unknown key, or a value that is not allowed.
+    """
+    plain = read_yaml(path)
+    changed = quick and isinstance(plain, dict)  # all else is refused
+    return parse(Learning, plain | QUICK if changed else plain, str(path))

@@ -1,0 +1,159 @@
+"""Tables of how fast agents learn, for the terminal and in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.table import Table
+
+Report = Mapping[str, Any]
+_COLUMNS = (
+    "setting", "steps/s", "with values", "below the rules without memory",
+    "plain PPO", "finished against", "above", "worst", "gap closed",
+)  # fmt: skip
+
+
+def overview(reports: Sequence[Report]) -> Table:
+    """One row a setting."""
+    table = Table(title="what agents learn, and how fast", box=box.SIMPLE_HEAD, show_lines=True)
+    for column in _COLUMNS:
+        table.add_column(column, overflow="fold")
+    for report in reports:
+        table.add_row(*row(report))
+    return table
+
+
+def row(report: Report) -> list[str]:
+    """A setting's cells."""
+    speed, course = report["throughput"] or {}, report["course"]
+    steps = [f"{speed[name]:,.0f}" if name in speed else "–" for name in ("without", "values")]
+    remembering = course["memoryless"] is not None
+    moments = [_moments(report["reached"][kind]) for kind in ("front", "plain")]
+    found = report["finished"]
+    cells = ["–", "–", "–"]
+    if found:
+        worst = found["worst"]
+        cells = [
+            f"{len(found['above'])} of {found['compared']} above {course['allowed']:+.1%}",
+            f"{_difference(worst['difference'])} (seed {worst['seed']}, price "
+            f"{worst['price']:.3g})",
+            ", ".join(
+                f"{share:.0%} to {name}"
+                for name, share in found["closed"].items()
+                if share is not None
+            )
+            or "–",
+        ]
+    moments = moments if remembering else ["–", "–"]
+    return [report["setting"], *steps, *moments, course["against"], *cells]
+
+
+def _moments(reached: Sequence[Mapping[str, Any]]) -> str:
+    """When the seeds' fronts first were below the envelope."""
+    if not reached:
+        return "–"
+    firsts = [one["first"] for one in reached if "first" in one]
+    parts = [f"{len(firsts)} of {len(reached)} seeds"]
+    if firsts:
+        parts += [
+            _span("{:.0f} s", firsts, "cpu_seconds"),
+            _span("{:,} steps", firsts, "timesteps"),
+        ]
+    if len(firsts) < len(reached):
+        late = [one for one in reached if "first" not in one]
+        parts.append(f"not within {min(one['cpu_seconds'] for one in late):.0f} s")
+    return ", ".join(parts)
+
+
+def _span(form: str, found: Sequence[Mapping[str, Any]], name: str) -> str:
+    low, high = (choose(one[name] for one in found) for choose in (min, max))
+    texts = dict.fromkeys((form.format(low), form.format(high)))
+    return " to ".join(texts)
+
+
+def _difference(found: Mapping[str, float]) -> str:
+    return f"{found['mean']:+.1%} [{found['low']:+.1%}, {found['high']:+.1%}]"
+
+
+def text_of(reports: Sequence[Report], command: str) -> str:
+    """All tables in Markdown, with how they are made."""
+    lines = [
+        "# How fast agents learn",
+        "",
+        f"Made by `{command}`; the JSON beside this file has every measurement.",
+        "",
+        "A front is one policy at seven prices of a token. Seconds are the processor's, on all "
+        "threads, of environment, policy and updates; validations and measurements are none of "
+        "them. Steps per second are of the core's loop with 1,024 runs in the same run of the "
+        "command, by the processor's seconds: without memory, and with the value of every "
+        "transmission.",
+        "",
+        "**Below the rules without memory**: the first measurement (on validation seeds) at which "
+        "all seven points lie below the committed envelope of rules without memory at their own "
+        "rates, and mixtures of neighbours below each of its vertices between the lowest and the "
+        "highest rate, which differ by a factor of two at least. Plain PPO is the benchmark's, "
+        "without memory, as far as its budget of seconds.",
+        "",
+        "**Finished**: the fronts of all seeds on the test episodes, beside the committed envelope "
+        "of exactly the same information at the agent's own rate, beside the optimum at each price "
+        "(then it is costs that are compared), or beside the lower hull of the best periodic "
+        "schedules. A seed and price is above where its whole paired 95 % interval lies above the "
+        "share that is named; without the optimum the inner 90 % of the range of prices count. The "
+        "envelope is taken as it is: intervals are over episodes alone. The gap is that between "
+        "the envelope and one improvement by simulation (`rollout`), or a lower `bound`.",
+        "",
+        _joined(_COLUMNS),
+        _joined(["---"] * len(_COLUMNS)),
+        *(_joined(row(report)) for report in reports),
+        "",
+    ]
+    for report in reports:
+        lines += details(report)
+    return "\n".join(lines)
+
+
+def _joined(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def details(report: Report) -> Iterator[str]:
+    """A setting's seeds, learning curves and finished points."""
+    yield f"## {report['title']}"
+    yield ""
+    if report["course"]["memoryless"] is not None:
+        yield from _curves(report)
+    names = ["cost", "optimum"] if report["course"]["against"] == "optimum" else ["mse", "envelope"]
+    yield _joined(["price", "rate", *names, "difference, mean of seeds", "worst seed", "above"])
+    yield _joined(["---"] * (4 + len(names) + 1))
+    allowed = report["course"]["allowed"]
+    for place, price in enumerate(report["prices"]):
+        points = [front["points"][place] for front in report["fronts"]]
+        points = [point for point in points if "difference" in point]
+        if not points:
+            continue
+        worst = max((p["difference"] for p in points), key=lambda d: float(d["mean"]))
+        above = sum(p["difference"]["low"] > allowed for p in points)
+        mean = float(np.mean([p["difference"]["mean"] for p in points]))
+        cells = [f"{np.mean([p[name] for p in points]):.4g}" for name in ("rate", *names)]
+        inner = "" if report["inner"][place] else " (outer)"
+        cells = [f"{price:.3g}{inner}", *cells, f"{mean:+.1%}", _difference(worst)]
+        yield _joined([*cells, f"{above} of {len(points)}"])
+    yield ""
+
+
+def _curves(report: Report) -> Iterator[str]:
+    """The most by which the fronts are above the rules without memory, over steps."""
+    yield _joined(["training", "steps", "seconds", "above the rules without memory by at most"])
+    yield _joined(["---"] * 4)
+    for kind, label in (("fronts", "with credit and memory"), ("plain", "plain PPO")):
+        curves = [one["curve"] for one in report[kind]]
+        for steps in sorted({point["timesteps"] for curve in curves for point in curve}):
+            points = [p for curve in curves for p in curve if p["timesteps"] == steps]
+            known = [p["excess"] for p in points if p["excess"] is not None]
+            ends = dict.fromkeys(f"{end:+.0%}" for end in (min(known), max(known))) if known else {}
+            seconds = np.mean([p["cpu_seconds"] for p in points])
+            yield _joined([label, f"{steps:,}", f"{seconds:.1f}", " to ".join(ends) or "–"])
+    yield ""

@@ -1,0 +1,144 @@
+"""The pieces of work of a study: references on the test episodes, trainings with their curves."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fusion_gym.evaluation.envelope import EnvelopePoint, chosen_mse, height, lower_envelope
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.policies.registry import make_policy
+
+from ..output.files import write
+from ..training.monitor import Measure
+from ..training.run import holds_training, train
+from .envelope_table import at_least, bound_of, measured
+from .envelopes import Test, run_test
+from .fronts import excess_over, is_below, meter
+from .learned import report
+from .study import Lesson, Study
+from .verdict import excess, judge
+from .work import check_vertex
+
+
+def run_reference(test: Test, work: Path) -> None:
+    """Run what a finished front is compared with on the test episodes, if that was not done."""
+    torch.set_num_threads(1)
+    if not test.path(work).exists():
+        run_test(test, work)
+
+
+def run_lesson(lesson: Lesson, seeds: int) -> None:
+    """Train one seed, measure its front on the way, and test it if it is one with credit.
+
+    The study's report, over so many ``seeds``, then holds it.
+
+    Raises:
+        KeyboardInterrupt: the training was interrupted.
+    """
+    torch.set_num_threads(1)
+    experiment, study = lesson.experiment, lesson.study
+    folder, envelope = Path(experiment.output), study.memoryless
+    measure: Measure = meter(experiment, study.prices, study.learning.episodes)
+    enough = False
+
+    def watch(record: dict[str, Any]) -> bool:
+        nonlocal enough
+        if lesson.kind == "plain":
+            below = envelope is not None and is_below(record["front"], envelope)
+            enough = below or record["cpu_seconds"] >= lesson.budget
+        return enough
+
+    summary = train(
+        experiment, resume=holds_training(folder), quiet=True, watch=watch, measure=measure
+    )
+    if not summary["finished"] and not enough:
+        raise KeyboardInterrupt
+    result = {
+        "seed": lesson.seed,
+        "inputs": lesson.inputs,
+        "algorithm": experiment.algorithm.name,
+        "curve": curve(folder, envelope),
+    }
+    if lesson.kind == "front":
+        result["points"] = tested(study, folder / "best_model.zip")
+    write(lesson.path, result)
+    report(study, seeds)
+
+
+def curve(folder: Path, envelope: Sequence[EnvelopePoint] | None) -> list[dict[str, Any]]:
+    """The fronts of a training, with what they are above the envelope by, if there is one.
+
+    ``cpu_seconds`` are of environment, policy and updates, on all threads.
+    """
+    lines = (folder / "validation.jsonl").read_text(encoding="utf-8").splitlines()
+    found = []
+    for record in map(json.loads, lines):
+        point = {key: record[key] for key in ("timesteps", "cpu_seconds", "return", "front")}
+        if envelope is not None:
+            above = excess_over(point["front"], envelope)
+            point["excess"] = above if above < float("inf") else None
+            point["below"] = is_below(point["front"], envelope)
+        found.append(point)
+    return found
+
+
+def tested(study: Study, model: Path) -> list[dict[str, Any]]:
+    """A finished front on the test episodes, price by price, beside what it is compared with.
+
+    Raises:
+        ConfigurationError: a rule does other than its committed envelope says.
+    """
+    references = {test.name: test.read(study.work) for test in study.tests}
+    for vertex in study.vertices if study.episodes == study.suite.episodes else []:
+        check_vertex(vertex, references[vertex["name"]])
+    priced = study.course.against == "optimum"
+    agents = []
+    for price in study.prices:
+        task = study.task(**({"cost_weight": price} if priced else {}))
+        policy = make_policy(f"model:{model},price={price!r}", task)
+        agents.append(run_episodes(task, policy, study.episodes, study.suite.seed))
+    if priced:
+        return [
+            {
+                "price": price,
+                "rate": float(agent.rate.mean()),
+                "mse": float(agent.mse.mean()),
+                "cost": -float(agent.returns.mean()),
+                "optimum": -float(best.returns.mean()),
+                "difference": excess(agent, best),
+            }
+            for price, agent, best in zip(study.prices, agents, references.values(), strict=True)
+        ]
+    if study.course.schedules:
+        references = {point.name: references[point.name] for point in lower_envelope(references)}
+    always = study.envelopes["always"]
+    points = judge([agents], study.prices, references, {}, always)["points"]
+    if study.vertices:
+        for point in points:
+            point |= beyond(study, point["rate"], references)
+    found: list[dict[str, Any]] = points
+    return found
+
+
+def beyond(study: Study, rate: float, envelope: Mapping[str, EpisodeResults]) -> dict[str, float]:
+    """What is known of the best possible at a rate: a ``rollout`` and a lower ``bound``.
+
+    The rollout was run on the first of the test episodes: it is taken as a share of the envelope
+    on these, times the envelope on all.
+    """
+    found, name = {}, f"{study.setting.name}.json"
+    rollout, episodes = measured(study.results / "rollout" / name, study.setting.name)
+    same = study.envelope(study.course.against)["knows"] == "coordinator_memory"
+    inside = same and bool(rollout) and rollout[0].rate <= rate <= rollout[-1].rate
+    below, own = chosen_mse(envelope, rate), height(rollout, rate) if inside else None
+    if own is not None and below is not None:
+        found["rollout"] = own / float(below[:episodes].mean()) * float(below.mean())
+    bound = bound_of(study.results / "bounds" / name)
+    if bound is not None:
+        found["bound"] = at_least(bound, rate)
+    return found

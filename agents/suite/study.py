@@ -1,0 +1,227 @@
+"""What is trained in a setting, what it is compared with, and where all of that is."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from fusion_gym.core.reward import Price
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation.envelope import EnvelopePoint
+from fusion_gym.validation import ConfigurationError, choice
+
+from ..output.files import read_json
+from ..output.folders import check_inputs
+from ..training.checked import load, parse
+from ..training.config import Experiment
+from .committed import path_of, present, read_envelopes
+from .config import Setting, Suite
+from .envelope_table import hull_of
+from .envelopes import Test, task_of
+from .fronts import prices_of
+from .jobs import experiment_of, training_of
+from .learning import Course, Learning
+
+Kind = Literal["front", "plain"]
+# Options that change neither the task nor what a policy may know of it.
+_FREE = ("cost_weight", "price_range", "memory_filter", "memory_features")
+
+
+@dataclass(frozen=True)
+class Study:
+    """A course and where its files are: ``results`` holds the committed ones."""
+
+    learning: Learning
+    suite: Suite
+    course: Course
+    results: Path
+    output: Path
+    work: Path
+
+    @property
+    def setting(self) -> Setting:
+        """The suite's setting.
+
+        Raises:
+            ConfigurationError: there is none of that name.
+        """
+        by_name = {setting.name: setting for setting in self.suite.settings}
+        return by_name[choice("setting", self.course.setting, by_name)]
+
+    @property
+    def prices(self) -> list[float]:
+        """The prices that every front is asked for."""
+        return prices_of(self.setting.price_range, self.learning.prices)
+
+    @property
+    def inner(self) -> list[bool]:
+        """Which prices lie in the inner part of the range, in the logarithm."""
+        low, high = self.setting.price_range
+        price = Price(None, (low, high))
+        first, last = self.learning.inner
+        places = price.encode(np.array(self.prices)).tolist()
+        return [first <= place <= last for place in places]
+
+    @property
+    def episodes(self) -> int:
+        """Test episodes."""
+        return self.learning.test_episodes or self.suite.episodes
+
+    @property
+    def report(self) -> Path:
+        """Its JSON for readers."""
+        return self.output / f"{self.setting.name}.json"
+
+    @property
+    def throughput(self) -> Path:
+        """The JSON of this machine's steps per second."""
+        return self.work / self.setting.name / "throughput.json"
+
+    @functools.cached_property
+    def envelopes(self) -> dict[str, Any]:
+        """The committed file of the setting's envelopes; made from what the suite says now."""
+        present(self.suite, self.setting, self.results)
+        return read_envelopes(path_of(self.results, self.setting.name))
+
+    def envelope(self, name: str) -> dict[str, Any]:
+        """A class of the committed envelopes.
+
+        Raises:
+            ConfigurationError: there is none of that name.
+        """
+        classes = self.envelopes["classes"]
+        found: dict[str, Any] = classes[choice("class", name, classes)]
+        return found
+
+    @property
+    def memoryless(self) -> list[EnvelopePoint] | None:
+        """The envelope to get below while learning, as it was measured on the test seeds."""
+        name = self.course.memoryless
+        return None if name is None else hull_of(self.envelope(name))
+
+    @property
+    def vertices(self) -> list[dict[str, Any]]:
+        """The vertices of the envelope that the finished front is compared with, if it is one."""
+        if self.course.against in ("optimum", "schedules"):
+            return []
+        found: list[dict[str, Any]] = self.envelope(self.course.against)["vertices"]
+        return found
+
+    @property
+    def tests(self) -> list[Test]:
+        """What the finished front is compared with, to be run on the test episodes."""
+
+        def test(policy: str, options: dict[str, Any]) -> Test:
+            return Test(
+                self.setting, tuple(options.items()), policy, self.episodes, self.suite.seed
+            )
+
+        if self.course.against == "optimum":
+            return [test("optimal", {"cost_weight": price}) for price in self.prices]
+        if self.course.schedules:
+            return [test(policy, {}) for policy in self.course.schedules]
+        return [test(vertex["policy"], vertex["options"]) for vertex in self.vertices]
+
+    def experiment(self, kind: Kind, seed: int) -> Experiment:
+        """The training of one seed, with the measurements' spacing.
+
+        Raises:
+            ConfigurationError: a config that is not allowed.
+        """
+        if kind == "front":
+            found, every = load(Experiment, self.course.front, "front"), self.learning.every
+        else:
+            found = experiment_of(self.suite, self.setting, "sensors", seed, self.work)
+            every = self.learning.plain.every
+        plain = found.model_dump()
+        plain["validation"]["every"] = every
+        plain["training"] |= {"seed": seed, "threads": 1}
+        plain["training"]["timesteps"] = self.learning.timesteps or found.training.timesteps
+        plain["output"] = str(self.work / self.setting.name / f"{kind}_{seed}")
+        return parse(Experiment, plain, self.course.front, "front")
+
+    def task(self, **changes: Any) -> Task:
+        """What a finished front is tested in: its own environment, without a price in sight."""
+        where = load(Experiment, self.course.front, "front").environment
+        priced = ("cost_weight", "price_range")
+        own = {key: value for key, value in where.options.items() if key not in priced}
+        return make_task(where.id, **(own | changes))
+
+    def check(self) -> None:
+        """Whether the front knows what it is compared with: neither less nor more.
+
+        Raises:
+            ConfigurationError: another environment, setting or class; names the first difference.
+        """
+        where = load(Experiment, self.course.front, "front").environment
+        options: dict[str, Any] = {}
+        local, free = False, set(_FREE)
+        if self.course.against == "schedules":
+            options = {"information": "centre"}
+        elif self.course.against == "optimum":
+            free.add("memory")  # it knows the errors themselves
+        else:
+            compared = self.envelope(self.course.against)
+            options, local = compared["options"], compared["mode"] == "local"
+        expected = {"id": self.setting.environment.id, "local": local}
+        expected |= task_of(self.setting, options.items()).settings
+        given = {"id": where.id, "local": where.local} | self.task().settings
+        for key in dict.fromkeys([*expected, *given]):
+            if key not in free and given.get(key) != expected.get(key):
+                raise ConfigurationError(
+                    f"front = {self.course.front!r}: {key} = {given.get(key)!r} is not allowed in "
+                    f"{self.setting.name}: what it is compared with has {expected.get(key)!r}"
+                )
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """The training of one seed in a study; ``budget`` in processor seconds ends a plain one."""
+
+    study: Study
+    kind: Kind
+    seed: int
+    budget: float = math.inf
+
+    @property
+    def experiment(self) -> Experiment:
+        """What is trained."""
+        return self.study.experiment(self.kind, self.seed)
+
+    @property
+    def path(self) -> Path:
+        """The JSON of what it taught."""
+        return self.study.work / self.study.setting.name / f"{self.kind}_{self.seed}.json"
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """All that its result depends on, the budget apart."""
+        study, course = self.study, self.study.course
+        names = [name for name in (course.memoryless, course.against) if name]
+        classes = study.envelopes["classes"]
+        return {
+            "training": training_of(self.experiment),
+            "course": course.model_dump(mode="json"),
+            "prices": study.prices,
+            "episodes": study.learning.episodes,
+            "test": {"episodes": study.episodes, "seed": study.suite.seed},
+            "envelopes": {name: classes[name]["sha256"] for name in names if name in classes},
+        }
+
+    def result(self) -> dict[str, Any] | None:
+        """What it taught, if it is finished.
+
+        Raises:
+            ConfigurationError: the file is damaged, or was made from other inputs.
+        """
+        if not self.path.exists():
+            return None
+        found = read_json(self.path, "work")
+        check_inputs(self.inputs, found.get("inputs"), repr(str(self.path)))
+        return found

@@ -1,0 +1,159 @@
+"""How fast agents learn, and how far, in the settings of configs/learning.yaml.
+
+    python -m benchmarks.learning [SETTING …] [--seeds 5] [--workers 2] [--resume] [--quick]
+
+In each setting it trains a front with memory and counterfactual credit with every seed, and plain
+PPO for comparison; measures on the way, over the processor's seconds, when a front is below the
+committed envelope of rules without memory; runs the finished fronts on the test episodes beside the
+envelope of exactly the same information (or the optimum); and measures this machine's steps per
+second. ``OUTPUT/SETTING.json`` is written anew after every training, ``OUTPUT/README.md`` and a
+table at the end. Trainings lie in the work folder, and their checkpoints hold pickles: ``--resume``
+those of your own alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import signal
+import statistics
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from agents.output import tables
+from agents.output.ending import told
+from agents.output.files import read_json, write, write_text
+from agents.output.folders import alone_in
+from agents.suite.config import load_suite
+from agents.suite.learned import finished, report
+from agents.suite.learning import load_learning
+from agents.suite.learning_table import overview, text_of
+from agents.suite.lessons import run_lesson, run_reference
+from agents.suite.study import Kind, Lesson, Study
+from agents.suite.workers import Work, side_by_side
+from fusion_gym.validation import ConfigurationError, choice, integer
+
+from .throughput import measured, remembering, vector
+
+_SPEED = 40_000  # steps of a training in a second, about
+
+
+def main() -> None:
+    """Entry point; exit status 130 after an interrupt."""
+    parser = argparse.ArgumentParser(description="How fast agents learn, and how far.")
+    parser.add_argument("settings", nargs="*", metavar="SETTING", help="all by default")
+    parser.add_argument("--config", default="learning", help="a YAML file or a shipped config")
+    parser.add_argument("--seeds", type=int, default=5, help="trainings of each front")
+    parser.add_argument("--workers", type=int, default=2, help="processes side by side")
+    parser.add_argument("--resume", action="store_true", help="go on with trainings of your own")
+    parser.add_argument("--quick", action="store_true", help="less of everything")
+    parser.add_argument("--results", type=Path, default=Path("results"), help="with envelopes/")
+    parser.add_argument("--output", type=Path, help="for JSON and tables: results/learning")
+    parser.add_argument("--work", type=Path, help="for models and episodes: runs/learning")
+    given = parser.parse_args()
+    words = [word for word in sys.argv[1:] if word != "--resume"]
+    command = shlex.join(["python", "-m", "benchmarks.learning", *words])
+    # Ended from outside like by Ctrl-C: the workers stop too.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with told(lambda: f"interrupted; go on with: {command} --resume"):
+        run(given, command)
+
+
+def run(given: argparse.Namespace, command: str) -> None:
+    """Do what is not finished, write and print the tables.
+
+    Raises:
+        ConfigurationError: anything that is not allowed, before anything runs.
+    """
+    integer("seeds", given.seeds, at_least=1)
+    integer("workers", given.workers, at_least=1, at_most=512)
+    learning = load_learning(given.config, given.quick)
+    suite = load_suite(learning.suite)
+    output = given.output or Path("results/learning/quick" if given.quick else "results/learning")
+    work = given.work or Path("runs/learning/quick" if given.quick else "runs/learning/full")
+    by_name = {course.setting: course for course in learning.settings}
+    chosen = [by_name[choice("setting", name, by_name)] for name in given.settings or by_name]
+    studies = [Study(learning, suite, one, given.results, output, work) for one in chosen]
+    for study in studies:
+        study.check()
+        study.experiment("front", 0)
+        study.experiment("plain", 0)
+    with alone_in(output, "output"), alone_in(work, "work"):
+        there = [study.report for study in studies if study.report.exists()]
+        if there and not given.resume:
+            raise ConfigurationError(
+                f"output = {str(output)!r} holds {there[0].name} already: go on with --resume, or "
+                "give another --output and --work"
+            )
+        for study in studies:
+            measure_throughput(study)
+        teach(studies, given.seeds, given.workers)
+        for study in studies:
+            report(study, given.seeds)
+        files = [output / f"{name}.json" for name in by_name]
+        found = [read_json(path, "output") for path in files if path.exists()]
+        write_text(output / "README.md", text_of(found, command))
+        tables.console().print(overview(found))
+        print(f"results in {output}")
+
+
+def teach(studies: Sequence[Study], seeds: int, workers: int) -> None:
+    """References, then fronts, then plain PPO for a multiple of the seconds that they took."""
+    tests = {test.path(study.work): (test, study.work) for study in studies for test in study.tests}
+    side_by_side(
+        [Work(2.0, run_reference, pair) for path, pair in tests.items() if not path.exists()],
+        workers,
+        "references",
+    )
+    fronts = [Lesson(study, "front", seed) for seed in range(seeds) for study in studies]
+    _side_by_side(fronts, seeds, workers, "front")
+    plain = []
+    for study in studies:
+        if study.memoryless is None:
+            continue
+        trained = finished(study, "front", seeds)
+        taken = statistics.fmean(one["curve"][-1]["cpu_seconds"] for one in trained)
+        budget = study.learning.plain.budget * taken
+        count = min(seeds, study.learning.plain.seeds)
+        plain += [
+            replace(lesson, budget=budget)
+            for lesson in (Lesson(study, "plain", seed) for seed in range(count))
+        ]
+    _side_by_side(plain, seeds, workers, "plain")
+
+
+def _side_by_side(lessons: Sequence[Lesson], seeds: int, workers: int, kind: Kind) -> None:
+    left = [lesson for lesson in lessons if lesson.result() is None]
+    side_by_side(
+        [
+            Work(lesson.experiment.training.timesteps / _SPEED, run_lesson, (lesson, seeds))
+            for lesson in left
+        ],
+        workers,
+        f"{kind} trainings",
+    )
+
+
+def measure_throughput(study: Study, seconds: float = 0.3) -> None:
+    """Keep the steps per second of the processor in the study's setting, if that was not done."""
+    if study.throughput.exists():
+        return
+    where = study.setting.environment
+    clock = time.process_time
+    rows = {
+        "make_vec": vector(where.options, 1024, where.id, clock),
+        "without": remembering(where.id, where.options, "without", clock=clock),
+        "values": remembering(where.id, where.options, "values", clock=clock),
+    }
+    found: dict[str, Any] = {
+        name: round(statistics.median(turns)) for name, turns in measured(rows, seconds).items()
+    }
+    write(study.throughput, found)
+
+
+if __name__ == "__main__":
+    main()
