@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from fusion_gym.evaluation.envelope import EnvelopePoint, chosen_mse, height, lower_envelope
@@ -21,7 +22,7 @@ from .envelopes import Test, run_test
 from .fronts import excess_over, is_below, meter
 from .learned import report
 from .study import Lesson, Study
-from .verdict import excess, judge
+from .verdict import Front, excess, interval
 from .work import check_vertex
 
 
@@ -116,13 +117,27 @@ def tested(study: Study, model: Path) -> list[dict[str, Any]]:
         ]
     if study.course.schedules:
         references = {point.name: references[point.name] for point in lower_envelope(references)}
-    always = study.envelopes["always"]
-    points = judge([agents], study.prices, references, {}, always)["points"]
-    if study.vertices:
-        for point in points:
-            point |= beyond(study, point["rate"], references)
-    found: list[dict[str, Any]] = points
-    return found
+    return [
+        beside(study, price, agent, references)
+        for price, agent in zip(study.prices, agents, strict=True)
+    ]
+
+
+def beside(
+    study: Study, price: float, agent: EpisodeResults, references: Mapping[str, EpisodeResults]
+) -> dict[str, Any]:
+    """A point of the front and the line through the references at its own rate.
+
+    Left of that there is nothing to compare with.
+    """
+    rate = float(agent.rate.mean())
+    point: dict[str, Any] = {"price": price, "rate": rate, "mse": float(agent.mse.mean())}
+    below = chosen_mse(references, rate)
+    if below is None:
+        return point
+    front = Front(agent.mse[None, None], below[None, None], np.array([[rate]]), np.ones((1, 1, 1)))
+    point |= {"envelope": float(below.mean()), "difference": interval(front, np.array([rate]))}
+    return point | (beyond(study, rate, references) if study.vertices else {})
 
 
 def beyond(study: Study, rate: float, envelope: Mapping[str, EpisodeResults]) -> dict[str, float]:

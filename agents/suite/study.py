@@ -100,6 +100,12 @@ class Study:
         return found
 
     @property
+    def classes(self) -> list[str]:
+        """The classes of the committed envelopes that it is compared with."""
+        own = [] if self.course.against in ("optimum", "schedules") else [self.course.against]
+        return own + ([self.course.memoryless] if self.course.memoryless else [])
+
+    @property
     def memoryless(self) -> list[EnvelopePoint] | None:
         """The envelope to get below while learning, as it was measured on the test seeds."""
         name = self.course.memoryless
@@ -108,10 +114,8 @@ class Study:
     @property
     def vertices(self) -> list[dict[str, Any]]:
         """The vertices of the envelope that the finished front is compared with, if it is one."""
-        if self.course.against in ("optimum", "schedules"):
-            return []
-        found: list[dict[str, Any]] = self.envelope(self.course.against)["vertices"]
-        return found
+        own = self.course.against
+        return list(self.envelope(own)["vertices"]) if own in self.classes else []
 
     @property
     def tests(self) -> list[Test]:
@@ -203,15 +207,13 @@ class Lesson:
     def inputs(self) -> dict[str, Any]:
         """All that its result depends on, the budget apart."""
         study, course = self.study, self.study.course
-        names = [name for name in (course.memoryless, course.against) if name]
-        classes = study.envelopes["classes"]
         return {
             "training": training_of(self.experiment),
             "course": course.model_dump(mode="json"),
             "prices": study.prices,
             "episodes": study.learning.episodes,
             "test": {"episodes": study.episodes, "seed": study.suite.seed},
-            "envelopes": {name: classes[name]["sha256"] for name in names if name in classes},
+            "envelopes": {name: study.envelope(name)["sha256"] for name in study.classes},
         }
 
     def result(self) -> dict[str, Any] | None:

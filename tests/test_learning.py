@@ -1,0 +1,329 @@
+"""How fast agents learn: when a front is below an envelope, and the command that measures it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from small_suite import SMALL, small_suite
+from training_configs import read_records, small_config
+
+from agents.suite.committed import complete
+from agents.suite.config import load_suite
+from agents.suite.fronts import excess_over, is_below
+from agents.suite.learned import closed, judged, reached
+from agents.suite.learning import load_learning
+from agents.suite.study import Study
+from agents.training.checked import load
+from agents.training.config import Experiment
+from agents.training.run import train
+from benchmarks import learning
+from fusion_gym.envs.privileged import PrivilegedVecEnv
+from fusion_gym.evaluation.envelope import EnvelopePoint
+from fusion_gym.validation import ConfigurationError
+
+# 4, 2, 1 at the rates 0, .1 and .3: 3 in the middle of the first piece, 1.5 of the second.
+ENVELOPE = [
+    EnvelopePoint("never", 0.0, 4.0),
+    EnvelopePoint("some", 0.1, 2.0),
+    EnvelopePoint("most", 0.3, 1.0),
+]
+
+
+@pytest.mark.parametrize(
+    ("front", "excess"),
+    [
+        ([(0.1, 1.0), (0.3, 0.9)], -0.1),
+        ([(0.3, 0.9), (0.1, 1.0)], -0.1),  # in any order
+        ([(0.05, 2.4), (0.15, 1.4)], -0.05),  # each by 20 %, their mixture at .1 by 5 %
+        ([(0.05, 2.7), (0.2, 1.2)], 0.1),  # each by 10 and 20 %, their mixture has 2.2 at .1
+        ([(0.1, 1.0), (0.2, 1.65), (0.3, 0.9)], 0.1),  # a bad point counts by itself
+        ([(0.4, 0.8)], -0.2),  # right of the envelope its last rule stands
+        ([(0.0, 5.0)], 0.25),
+        ([(0.1, math.nan), (0.3, 0.9)], math.inf),
+    ],
+)
+def test_the_excess_of_a_front_is_the_worst_of_points_and_vertices(
+    front: list[tuple[float, float]], excess: float
+) -> None:
+    assert excess_over(front, ENVELOPE) == pytest.approx(excess)
+    assert excess_over(front, [*ENVELOPE, EnvelopePoint("bad", 0.2, 1.9)]) == pytest.approx(excess)
+
+
+def test_left_of_an_envelope_nothing_is_below_it() -> None:
+    assert excess_over([(0.05, 0.1), (0.2, 0.1)], ENVELOPE[1:]) == math.inf
+
+
+@pytest.mark.parametrize(("high", "below"), [(0.199, False), (0.2, True)])
+def test_a_front_is_more_than_a_point(high: float, below: bool) -> None:
+    assert is_below([(0.1, 1.0), (high, 0.5)], ENVELOPE) == below
+    assert not is_below([(0.1, 2.0), (high, 0.5)], ENVELOPE), "as good is not below"
+
+
+def test_the_first_moment_below_and_what_came_after() -> None:
+    states = [(0.2, False), (-0.1, True), (0.05, False), (-0.2, True)]
+    curve = [
+        {
+            "timesteps": 100 * place,
+            "cpu_seconds": 1.5 * place,
+            "front": [[0.1, 1.0], [0.3, 0.5]],
+            "excess": excess,
+            "below": below,
+        }
+        for place, (excess, below) in enumerate(states)
+    ]
+    found = reached({"seed": 3, "curve": curve})
+    assert (found["seed"], found["timesteps"], found["cpu_seconds"]) == (3, 300, 4.5)
+    assert found["first"] == {
+        "timesteps": 100,
+        "cpu_seconds": 1.5,
+        "excess": -0.1,
+        "rates": (0.1, 0.3),
+        "above_later": 1,
+    }
+    assert "first" not in reached({"seed": 3, "curve": curve[:1]})
+
+
+def study_of(folder: Path, **course: Any) -> Study:
+    """The only course of the config that :func:`school` writes, with changes."""
+    taught = load_learning(folder / "learning.yaml")
+    plain = taught.settings[0].model_dump() | course
+    suite = load_suite(taught.suite)
+    return Study(
+        taught, suite, type(taught.settings[0])(**plain), folder / "results", folder, folder
+    )
+
+
+@pytest.fixture(scope="module")
+def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small suite with its envelopes, and what is to be learned in it, in a second."""
+    folder = tmp_path_factory.mktemp("school")
+    source = {
+        "name": "source",
+        "title": "one source",
+        "environment": {"id": "fusion_gym/RemoteEstimation-v0", "options": {"horizon": 5}},
+        "price_range": [0.1, 1.0],
+    }
+    gain = [family for family in SMALL["families"] if family["label"] == "gain"]
+    suite = small_suite(folder, settings=[*SMALL["settings"], source], families=gain)
+    chosen = load_suite(suite)
+    classes = ["sensors", "sensors_memory"]
+    complete(chosen, chosen.settings[:1], classes, folder / "results", folder / "tuning", 1)
+    options = {
+        "small": {"filter": "tobit", "horizon": 10, "memory": True},
+        "centre": {"filter": "tobit", "horizon": 10, "information": "centre"},
+        "plain": {"filter": "tobit", "horizon": 10},
+        "source": {"horizon": 5},
+    }
+    for name, own in options.items():
+        place = folder / name
+        place.mkdir()
+        at = source if name == "source" else SMALL["settings"][0]
+        priced = {"cost_weight": "random", "price_range": at["price_range"]}
+        small_config(
+            place,
+            environment={"id": at["environment"]["id"], "options": own | priced},
+            algorithm={"name": "counterfactual_ppo", "n_steps": 8, "batch_size": 32},
+            training={"timesteps": 192, "num_envs": 4},
+        )
+    course = {
+        "setting": "small",
+        "front": str(folder / "small" / "config.yaml"),
+        "memoryless": "sensors",
+        "against": "sensors_memory",
+    }
+    content = {
+        "suite": str(suite),
+        "prices": 3,
+        "every": 64,
+        "episodes": 4,
+        "plain": {"every": 64, "seeds": 1, "budget": 1000.0},
+        "settings": [course],
+    }
+    (folder / "learning.yaml").write_text(yaml.safe_dump(content))
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def fewer_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("agents.suite.verdict.RESAMPLES", 20)
+
+
+def given(school: Path, folder: Path, **changes: Any) -> argparse.Namespace:
+    plain = {
+        "settings": [],
+        "config": school / "learning.yaml",
+        "seeds": 2,
+        "workers": 1,
+        "resume": False,
+        "quick": False,
+        "results": school / "results",
+        "output": folder / "learning",
+        "work": folder / "work",
+    }
+    return argparse.Namespace(**(plain | changes))
+
+
+def without_seconds(found: Any) -> Any:
+    if isinstance(found, dict):
+        dropped = ("cpu_seconds", "throughput")
+        return {key: without_seconds(v) for key, v in found.items() if key not in dropped}
+    return [without_seconds(v) for v in found] if isinstance(found, list) else found
+
+
+def test_an_interrupted_run_ends_as_an_undisturbed_one(
+    school: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("benchmarks.throughput.TURNS", 1)
+    monkeypatch.setattr(learning.measure_throughput, "__defaults__", (0.01,))
+    whole = given(school, tmp_path / "whole")
+    learning.run(whole, "the command")
+    found = json.loads((whole.output / "small.json").read_text())
+    assert [front["seed"] for front in found["fronts"]] == [0, 1]
+    assert found["fronts"][0]["curve"] != found["fronts"][1]["curve"]
+    for front in found["fronts"]:
+        assert [point["timesteps"] for point in front["curve"]] == [64, 128, 192]
+        seconds = [point["cpu_seconds"] for point in front["curve"]]
+        assert 0.0 < seconds[0] < seconds[1] < seconds[2]
+        assert [point["price"] for point in front["points"]] == found["prices"]
+    assert [one["algorithm"] for one in found["plain"]] == ["ppo"], "fewer seeds of it"
+    assert found["throughput"]["values"] < found["throughput"]["without"]
+    assert found["finished"]["compared"] == 2, "the inner one of three prices, of two seeds"
+    assert "Made by `the command`" in (whole.output / "README.md").read_text()
+    assert "small" in capsys.readouterr().out
+
+    with pytest.raises(ConfigurationError, match=r"holds small.json already: go on with --resume"):
+        learning.run(whole, "again")
+
+    broken = given(school, tmp_path / "broken")
+    before, counted = PrivilegedVecEnv.step_alternatives, 0
+
+    def step_alternatives(self: PrivilegedVecEnv, *arguments: Any) -> Any:
+        nonlocal counted
+        counted += 1
+        if counted == 70:  # of 48 a training: in the second one
+            os.kill(os.getpid(), signal.SIGINT)
+        return before(self, *arguments)
+
+    monkeypatch.setattr(PrivilegedVecEnv, "step_alternatives", step_alternatives)
+    with pytest.raises(KeyboardInterrupt):
+        learning.run(broken, "broken")
+    kept = json.loads((broken.output / "small.json").read_text())
+    assert [front["seed"] for front in kept["fronts"]] == [0]
+    broken.resume = True
+    learning.run(broken, "broken")
+    assert counted == 96, "nothing is trained twice"
+    again = json.loads((broken.output / "small.json").read_text())
+    assert without_seconds(again) == without_seconds(found)
+    learning.run(broken, "broken")
+    assert counted == 96
+
+
+@pytest.mark.parametrize(
+    "course",
+    [
+        {"setting": "source", "front": "source", "against": "optimum"},
+        {
+            "setting": "small",
+            "front": "centre",
+            "against": "schedules",
+            "schedules": ["never", "periodic:period=4", "always"],
+        },
+    ],
+)
+def test_a_front_beside_the_optimum_or_the_best_of_schedules(
+    school: Path, tmp_path: Path, course: dict[str, Any]
+) -> None:
+    plain = yaml.safe_load((school / "learning.yaml").read_text())
+    course |= {"front": str(school / course["front"] / "config.yaml")}
+    (tmp_path / "learning.yaml").write_text(yaml.safe_dump(plain | {"settings": [course]}))
+    chosen = given(school, tmp_path, config=tmp_path / "learning.yaml", seeds=1)
+    chosen.work.mkdir()
+    (chosen.work / course["setting"]).mkdir()
+    (chosen.work / course["setting"] / "throughput.json").write_text("{}")
+    learning.run(chosen, "the command")
+    found = json.loads((chosen.output / f"{course['setting']}.json").read_text())
+    assert found["plain"] == []
+    points = found["fronts"][0]["points"]
+    if course["against"] == "optimum":
+        assert found["finished"]["compared"] == 3, "all prices"
+        for point in points:
+            excess = point["cost"] / point["optimum"] - 1.0
+            assert point["difference"]["mean"] == pytest.approx(excess)
+        assert points[0]["optimum"] < points[2]["optimum"], "each price has its own"
+    else:
+        assert found["finished"]["compared"] == 1
+        assert points[1]["difference"]["mean"] == pytest.approx(
+            points[1]["mse"] / points[1]["envelope"] - 1.0
+        )
+
+
+@pytest.mark.parametrize(
+    ("course", "wanted"),
+    [
+        ({"against": "sensors"}, r"memory = True is not allowed in small: .* has False"),
+        ({"front": "centre"}, r"memory = False is not allowed in small: .* has True"),
+        (
+            {"front": "plain", "against": "schedules", "schedules": ("never",)},
+            r"information = 'sensors' is not allowed in small: .* has 'centre'",
+        ),
+        ({"front": "source"}, r"id = 'fusion_gym/RemoteEstimation-v0' is not allowed in small"),
+        ({"against": "local_estimate_memory"}, r"class = 'local_estimate_memory' is not allowed"),
+        ({"setting": "large"}, r"setting = 'large' is not allowed"),
+    ],
+)
+def test_a_front_is_compared_with_what_knows_the_same(
+    school: Path, course: dict[str, Any], wanted: str
+) -> None:
+    study_of(school).check()
+    if "front" in course:
+        course = course | {"front": str(school / course["front"] / "config.yaml")}
+    with pytest.raises(ConfigurationError, match=wanted):
+        study_of(school, **course).check()
+
+
+def test_seeds_and_prices_that_lie_above_are_counted(school: Path) -> None:
+    def point(mean: float, low: float, mse: float) -> dict[str, Any]:
+        found = {"mean": mean, "low": low, "high": mean + 1.0}
+        return {"price": 0.01, "envelope": 2.0, "mse": mse, "bound": 1.0, "difference": found}
+
+    bad = point(9.0, 8.0, 9.0)  # outside the inner part
+    fronts = [
+        {"seed": 0, "points": [bad, point(0.02, 0.011, 1.8), bad]},
+        {"seed": 1, "points": [bad, point(0.03, 0.009, 1.4), bad]},
+    ]
+    found = judged(study_of(school), fronts)
+    assert found is not None
+    assert found["compared"] == 2
+    assert [(p["seed"], p["difference"]["low"]) for p in found["above"]] == [(0, 0.011)]
+    assert (found["worst"]["seed"], found["mean"]) == (1, pytest.approx(0.025))
+    assert found["closed"] == {"rollout": None, "bound": pytest.approx((0.2 + 0.6) / 2.0)}
+    assert closed([{"envelope": 1.0, "bound": 1.0, "mse": 1.0}], "bound") is None
+    assert judged(study_of(school), []) is None
+
+
+def test_measuring_is_no_part_of_the_seconds_of_a_training(tmp_path: Path) -> None:
+    def measure(model: Any, seconds: float) -> dict[str, Any]:
+        end = time.process_time() + 0.4
+        while time.process_time() < end:
+            pass
+        return {"seconds": seconds}
+
+    experiment = load(Experiment, small_config(tmp_path))
+    began = time.process_time()
+    train(experiment, quiet=True, measure=measure)
+    records = read_records(tmp_path / "run")
+    assert len(records) == 2
+    assert 0.0 < records[0]["seconds"] < records[1]["seconds"]
+    assert records[1]["seconds"] < time.process_time() - began - 0.8
