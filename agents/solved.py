@@ -65,7 +65,7 @@ class Solved(Command):
         for seed in self.seeds:
             policy = make_policy(f"model:{trained(experiment, seed, self.output)}", task)
             agent = run_episodes(task, policy, self.episodes, self.seed)
-            found = excess(agent, best)
+            found = excess(agent.returns, best.returns)
             report["agents"][str(seed)] = found
             write(self.output / f"{name}.json", report)
             table.add_row(

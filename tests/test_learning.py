@@ -27,7 +27,10 @@ from agents.training.config import Experiment
 from agents.training.run import train
 from benchmarks import learning
 from fusion_gym.envs.privileged import PrivilegedVecEnv
+from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import EnvelopePoint
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 # 4, 2, 1 at the rates 0, .1 and .3: 3 in the middle of the first piece, 1.5 of the second.
@@ -255,18 +258,17 @@ def test_a_front_beside_the_optimum_or_the_best_of_schedules(
     learning.run(chosen, "the command")
     found = json.loads((chosen.output / f"{course['setting']}.json").read_text())
     assert found["plain"] == []
-    points = found["fronts"][0]["points"]
-    if course["against"] == "optimum":
-        assert found["finished"]["compared"] == 3, "all prices"
-        for point in points:
-            excess = point["cost"] / point["optimum"] - 1.0
-            assert point["difference"]["mean"] == pytest.approx(excess)
-        assert points[0]["optimum"] < points[2]["optimum"], "each price has its own"
-    else:
-        assert found["finished"]["compared"] == 1
-        assert points[1]["difference"]["mean"] == pytest.approx(
-            points[1]["mse"] / points[1]["envelope"] - 1.0
+    assert found["finished"]["compared"] == 3, "all prices"
+    suite = load_suite(school / "suite.yaml")
+    where = next(s.environment for s in suite.settings if s.name == course["setting"])
+    for point in found["fronts"][0]["points"]:
+        task = make_task(where.id, **where.options, cost_weight=point["price"])
+        best = min(
+            -run_episodes(task, make_policy(policy, task), 12, 0).returns.mean()
+            for policy in course.get("schedules", ["optimal"])
         )
+        assert point["optimum"] == pytest.approx(best)
+        assert point["difference"]["mean"] == pytest.approx(point["cost"] / best - 1.0)
 
 
 @pytest.mark.parametrize(
@@ -296,7 +298,14 @@ def test_a_front_is_compared_with_what_knows_the_same(
 def test_seeds_and_prices_that_lie_above_are_counted(school: Path) -> None:
     def point(mean: float, low: float, mse: float) -> dict[str, Any]:
         found = {"mean": mean, "low": low, "high": mean + 1.0}
-        return {"price": 0.01, "envelope": 2.0, "mse": mse, "bound": 1.0, "difference": found}
+        return {
+            "price": 0.01,
+            "rate": 0.1 * mse,
+            "mse": mse,
+            "envelope": 2.0,
+            "bound": 1.0,
+            "difference": found,
+        }
 
     bad = point(9.0, 8.0, 9.0)  # outside the inner part
     fronts = [
@@ -308,6 +317,7 @@ def test_seeds_and_prices_that_lie_above_are_counted(school: Path) -> None:
     assert found["compared"] == 2
     assert [(p["seed"], p["difference"]["low"]) for p in found["above"]] == [(0, 0.011)]
     assert (found["worst"]["seed"], found["mean"]) == (1, pytest.approx(0.025))
+    assert found["rates"] == pytest.approx([0.14, 0.18])
     assert found["closed"] == {"rollout": None, "bound": pytest.approx((0.2 + 0.6) / 2.0)}
     assert closed([{"envelope": 1.0, "bound": 1.0, "mse": 1.0}], "bound") is None
     assert judged(study_of(school), []) is None

@@ -78,12 +78,12 @@ def reached(lesson: Mapping[str, Any]) -> dict[str, Any]:
 def judged(study: Study, fronts: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """All seeds' finished fronts at the prices that count, beside what they are compared with.
 
-    With the optimum all prices count, otherwise the inner ones. ``above`` are seeds and prices
+    With an optimum all prices count, otherwise the inner ones. ``above`` are seeds and prices
     whose whole interval lies more than the allowed share above, ``worst`` has the largest
-    difference, ``closed`` the share of the gaps to rollout and bound.
+    difference, ``rates`` are the lowest and the highest, ``closed`` the share of the gaps to
+    rollout and bound.
     """
-    every = study.course.against == "optimum"
-    counted = [every or inside for inside in study.inner]
+    counted = [study.solved or inside for inside in study.inner]
     points = [
         point | {"seed": front["seed"]}
         for front in fronts
@@ -98,6 +98,7 @@ def judged(study: Study, fronts: Sequence[Mapping[str, Any]]) -> dict[str, Any] 
         "compared": len(points),
         "above": [{key: p[key] for key in ("seed", "price", "difference")} for p in above],
         "worst": {key: worst[key] for key in ("seed", "price", "difference")},
+        "rates": [choose(point["rate"] for point in points) for choose in (min, max)],
         "mean": sum(p["difference"]["mean"] for p in points) / len(points),
         "closed": {name: closed(points, name) for name in ("rollout", "bound")},
     }

@@ -27,7 +27,7 @@ class Course(Strict):
 
     ``front`` is the training's config, ``memoryless`` the class of the committed envelope to get
     below while learning. The finished front is compared with ``against``: a class of the committed
-    envelope, the ``optimum`` at each price, or the lower hull of ``schedules``; a share of
+    envelope, the ``optimum`` at each price, or the best of ``schedules`` there; a share of
     ``allowed`` above it is still good.
     """
 

@@ -36,8 +36,10 @@ def row(report: Report) -> list[str]:
     cells = ["–", "–", "–"]
     if found:
         worst = found["worst"]
+        low, high = found["rates"]
         cells = [
-            f"{len(found['above'])} of {found['compared']} above {course['allowed']:+.1%}",
+            f"{len(found['above'])} of {found['compared']} above {course['allowed']:+.1%} "
+            f"(rates {low:.3f} to {high:.3f})",
             f"{_difference(worst['difference'])} (seed {worst['seed']}, price "
             f"{worst['price']:.3g})",
             ", ".join(
@@ -98,10 +100,10 @@ def text_of(reports: Sequence[Report], command: str) -> str:
         "without memory, as far as its budget of seconds.",
         "",
         "**Finished**: the fronts of all seeds on the test episodes, beside the committed envelope "
-        "of exactly the same information at the agent's own rate, beside the optimum at each price "
-        "(then it is costs that are compared), or beside the lower hull of the best periodic "
-        "schedules. A seed and price is above where its whole paired 95 % interval lies above the "
-        "share that is named; without the optimum the inner 90 % of the range of prices count. The "
+        "of exactly the same information at the agent's own rate, or, by the cost of an episode at "
+        "a price, beside the optimum or the best of many periodic schedules there. A seed and "
+        "price is above where its whole paired 95 % interval lies above the share that is named; "
+        "all prices count beside an optimum, otherwise the inner 90 % of their range. The "
         "envelope is taken as it is: intervals are over episodes alone. The gap is that between "
         "the envelope and one improvement by simulation (`rollout`), or a lower `bound`.",
         "",
@@ -125,7 +127,8 @@ def details(report: Report) -> Iterator[str]:
     yield ""
     if report["course"]["memoryless"] is not None:
         yield from _curves(report)
-    names = ["cost", "optimum"] if report["course"]["against"] == "optimum" else ["mse", "envelope"]
+    solved = report["course"]["against"] in ("optimum", "schedules")
+    names = ["cost", "optimum"] if solved else ["mse", "envelope"]
     yield _joined(["price", "rate", *names, "difference, mean of seeds", "worst seed", "above"])
     yield _joined(["---"] * (4 + len(names) + 1))
     allowed = report["course"]["allowed"]

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from fusion_gym.evaluation.envelope import EnvelopePoint, chosen_mse, height, lower_envelope
+from fusion_gym.arrays import Array
+from fusion_gym.evaluation.envelope import EnvelopePoint, chosen_mse, height
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
 
@@ -97,47 +98,57 @@ def tested(study: Study, model: Path) -> list[dict[str, Any]]:
     references = {test.name: test.read(study.work) for test in study.tests}
     for vertex in study.vertices if study.episodes == study.suite.episodes else []:
         check_vertex(vertex, references[vertex["name"]])
-    priced = study.course.against == "optimum"
-    agents = []
-    for price in study.prices:
-        task = study.task(**({"cost_weight": price} if priced else {}))
+    task, found = study.task(), []
+    for place, price in enumerate(study.prices):
         policy = make_policy(f"model:{model},price={price!r}", task)
-        agents.append(run_episodes(task, policy, study.episodes, study.suite.seed))
-    if priced:
-        return [
-            {
-                "price": price,
-                "rate": float(agent.rate.mean()),
-                "mse": float(agent.mse.mean()),
-                "cost": -float(agent.returns.mean()),
-                "optimum": -float(best.returns.mean()),
-                "difference": excess(agent, best),
-            }
-            for price, agent, best in zip(study.prices, agents, references.values(), strict=True)
-        ]
-    if study.course.schedules:
-        references = {point.name: references[point.name] for point in lower_envelope(references)}
-    return [
-        beside(study, price, agent, references)
-        for price, agent in zip(study.prices, agents, strict=True)
-    ]
+        agent = run_episodes(task, policy, study.episodes, study.suite.seed)
+        point: dict[str, Any] = {
+            "price": price,
+            "rate": float(agent.rate.mean()),
+            "mse": float(agent.mse.mean()),
+        }
+        if study.course.against == "optimum":
+            point |= above_optimum(price, task.horizon, agent, [list(references.values())[place]])
+        elif study.course.schedules:
+            point |= above_optimum(price, task.horizon, agent, references.values())
+        else:
+            point |= beside_envelope(study, agent, references)
+        found.append(point)
+    return found
 
 
-def beside(
-    study: Study, price: float, agent: EpisodeResults, references: Mapping[str, EpisodeResults]
+def above_optimum(
+    price: float, horizon: int, agent: EpisodeResults, candidates: Iterable[EpisodeResults]
 ) -> dict[str, Any]:
-    """A point of the front and the line through the references at its own rate.
+    """The cost of an episode at a price, and that of the candidate that costs least there.
 
-    Left of that there is nothing to compare with.
+    All of them with tokens that cost nothing.
     """
+
+    def returns(found: EpisodeResults) -> Array:
+        return found.returns - price * horizon * found.tokens
+
+    own = returns(agent)
+    best = max(map(returns, candidates), key=lambda each: float(each.mean()))
+    return {
+        "cost": -float(own.mean()),
+        "optimum": -float(best.mean()),
+        "difference": excess(own, best),
+    }
+
+
+def beside_envelope(
+    study: Study, agent: EpisodeResults, references: Mapping[str, EpisodeResults]
+) -> dict[str, Any]:
+    """The line through the references at the front's own rate; left of it there is nothing."""
     rate = float(agent.rate.mean())
-    point: dict[str, Any] = {"price": price, "rate": rate, "mse": float(agent.mse.mean())}
     below = chosen_mse(references, rate)
     if below is None:
-        return point
+        return {}
     front = Front(agent.mse[None, None], below[None, None], np.array([[rate]]), np.ones((1, 1, 1)))
-    point |= {"envelope": float(below.mean()), "difference": interval(front, np.array([rate]))}
-    return point | (beyond(study, rate, references) if study.vertices else {})
+    difference = interval(front, np.array([rate]))
+    known = beyond(study, rate, references)
+    return {"envelope": float(below.mean()), "difference": difference} | known
 
 
 def beyond(study: Study, rate: float, envelope: Mapping[str, EpisodeResults]) -> dict[str, float]:

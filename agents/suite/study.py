@@ -102,7 +102,7 @@ class Study:
     @property
     def classes(self) -> list[str]:
         """The classes of the committed envelopes that it is compared with."""
-        own = [] if self.course.against in ("optimum", "schedules") else [self.course.against]
+        own = [] if self.solved else [self.course.against]
         return own + ([self.course.memoryless] if self.course.memoryless else [])
 
     @property
@@ -110,6 +110,11 @@ class Study:
         """The envelope to get below while learning, as it was measured on the test seeds."""
         name = self.course.memoryless
         return None if name is None else hull_of(self.envelope(name))
+
+    @property
+    def solved(self) -> bool:
+        """Whether the finished front is compared with an optimum, by costs."""
+        return self.course.against in ("optimum", "schedules")
 
     @property
     def vertices(self) -> list[dict[str, Any]]:
@@ -126,10 +131,11 @@ class Study:
                 self.setting, tuple(options.items()), policy, self.episodes, self.suite.seed
             )
 
+        free = {"cost_weight": 0.0}  # what was spent is counted at each price
         if self.course.against == "optimum":
-            return [test("optimal", {"cost_weight": price}) for price in self.prices]
+            return [test(f"optimal:price={price!r}", free) for price in self.prices]
         if self.course.schedules:
-            return [test(policy, {}) for policy in self.course.schedules]
+            return [test(policy, free) for policy in self.course.schedules]
         return [test(vertex["policy"], vertex["options"]) for vertex in self.vertices]
 
     def experiment(self, kind: Kind, seed: int) -> Experiment:
@@ -150,12 +156,15 @@ class Study:
         plain["output"] = str(self.work / self.setting.name / f"{kind}_{seed}")
         return parse(Experiment, plain, self.course.front, "front")
 
-    def task(self, **changes: Any) -> Task:
-        """What a finished front is tested in: its own environment, without a price in sight."""
+    def task(self) -> Task:
+        """What a finished front is tested in: its own environment, without a price in sight.
+
+        Where costs are compared tokens are free of charge, and counted at each price.
+        """
         where = load(Experiment, self.course.front, "front").environment
         priced = ("cost_weight", "price_range")
         own = {key: value for key, value in where.options.items() if key not in priced}
-        return make_task(where.id, **(own | changes))
+        return make_task(where.id, **(own | ({"cost_weight": 0.0} if self.solved else {})))
 
     def check(self) -> None:
         """Whether the front knows what it is compared with: neither less nor more.

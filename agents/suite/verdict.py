@@ -175,10 +175,12 @@ def interval(front: Front, grid: Array) -> dict[str, float]:
     return {"mean": mean, "low": float(low), "high": float(high)}
 
 
-def excess(agent: EpisodeResults, best: EpisodeResults) -> dict[str, float]:
-    """The agent's cost above the optimum's, as a share of it, with its paired 95 % interval."""
-    optimum = -float(best.returns.mean())
+def excess(returns: Array, best: Array) -> dict[str, float]:
+    """The cost above the optimum's, as a share of it, with its paired 95 % interval.
+
+    Of the returns (E,) of a policy and of the optimum on the same episodes.
+    """
+    optimum = -float(best.mean())
     return {
-        name: value / optimum
-        for name, value in mean_interval(best.returns - agent.returns)._asdict().items()
+        name: value / optimum for name, value in mean_interval(best - returns)._asdict().items()
     }
