@@ -124,6 +124,7 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "small": {"filter": "tobit", "horizon": 10, "memory": True},
         "centre": {"filter": "tobit", "horizon": 10, "information": "centre"},
         "plain": {"filter": "tobit", "horizon": 10},
+        "narrow": {"filter": "tobit", "horizon": 10, "memory": True, "price_range": [0.01, 0.1]},
         "source": {"horizon": 5},
     }
     for name, own in options.items():
@@ -133,7 +134,7 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
         priced = {"cost_weight": "random", "price_range": at["price_range"]}
         small_config(
             place,
-            environment={"id": at["environment"]["id"], "options": own | priced},
+            environment={"id": at["environment"]["id"], "options": priced | own},
             algorithm={"name": "counterfactual_ppo", "n_steps": 8, "batch_size": 32},
             training={"timesteps": 192, "num_envs": 4},
         )
@@ -281,6 +282,7 @@ def test_a_front_beside_the_optimum_or_the_best_of_schedules(
             r"information = 'sensors' is not allowed in small: .* has 'centre'",
         ),
         ({"front": "source"}, r"id = 'fusion_gym/RemoteEstimation-v0' is not allowed in small"),
+        ({"front": "narrow"}, r"price_range = \[0.01, 0.1\] is not allowed .* has \[0.001, 0.1\]"),
         ({"against": "local_estimate_memory"}, r"class = 'local_estimate_memory' is not allowed"),
         ({"setting": "large"}, r"setting = 'large' is not allowed"),
     ],

@@ -30,7 +30,7 @@ from .learning import Course, Learning
 
 Kind = Literal["front", "plain"]
 # Options that change neither the task nor what a policy may know of it.
-_FREE = ("cost_weight", "price_range", "memory_filter", "memory_features")
+_FREE = ("memory_filter", "memory_features")
 
 
 @dataclass(frozen=True)
@@ -185,6 +185,8 @@ class Study:
         expected = {"id": self.setting.environment.id, "local": local}
         expected |= task_of(self.setting, options.items()).settings
         given = {"id": where.id, "local": where.local} | self.task().settings
+        expected |= {"cost_weight": "random", "price_range": list(self.setting.price_range)}
+        given |= {key: where.options.get(key) for key in ("cost_weight", "price_range")}
         for key in dict.fromkeys([*expected, *given]):
             if key not in free and given.get(key) != expected.get(key):
                 raise ConfigurationError(
