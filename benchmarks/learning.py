@@ -56,14 +56,17 @@ def main() -> None:
     parser.add_argument("--work", type=Path, help="for models and episodes: runs/learning")
     given = parser.parse_args()
     words = [word for word in sys.argv[1:] if word != "--resume"]
-    command = shlex.join(["python", "-m", "benchmarks.learning", *words])
-    # Ended from outside like by Ctrl-C: the workers stop too.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with told(lambda: f"interrupted; go on with: {command} --resume"):
-        run(given, command)
+    again = shlex.join(["python", "-m", "benchmarks.learning", *words, "--resume"])
+    with told(lambda: f"interrupted; go on with: {again}"):
+        # Ended from outside like by Ctrl-C: the workers stop too.
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+        try:
+            run(given)
+        finally:
+            signal.signal(signal.SIGTERM, before)
 
 
-def run(given: argparse.Namespace, command: str) -> None:
+def run(given: argparse.Namespace) -> None:
     """Do what is not finished, write and print the tables.
 
     Raises:
@@ -96,9 +99,17 @@ def run(given: argparse.Namespace, command: str) -> None:
             report(study, given.seeds)
         files = [output / f"{name}.json" for name in by_name]
         found = [read_json(path, "output") for path in files if path.exists()]
-        write_text(output / "README.md", text_of(found, command))
+        write_text(output / "README.md", text_of(found, _command(given)))
         tables.console().print(overview(found))
         print(f"results in {output}")
+
+
+def _command(given: argparse.Namespace) -> str:
+    """The command that makes all tables, some settings' or all."""
+    words = ["python", "-m", "benchmarks.learning", "--seeds", str(given.seeds)]
+    words += ["--quick"] if given.quick else []
+    words += [] if given.config == "learning" else ["--config", str(given.config)]
+    return shlex.join(words)
 
 
 def teach(studies: Sequence[Study], seeds: int, workers: int) -> None:

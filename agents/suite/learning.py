@@ -51,7 +51,7 @@ class Learning(Strict):
     suite: str = "benchmark"
     prices: Positive = 7
     inner: tuple[Share, Share] = (0.05, 0.95)
-    every: Positive = 25_000
+    every: Positive = 50_000
     episodes: Positive = 128
     timesteps: Positive | None = None
     test_episodes: Positive | None = None
@@ -62,6 +62,7 @@ class Learning(Strict):
 # What --quick changes: the same work, less of it.
 QUICK: dict[str, Any] = {
     "timesteps": 50_000,
+    "every": 25_000,
     "test_episodes": 100,
     "episodes": 32,
     "plain": {"every": 25_000, "seeds": 1, "budget": 1.0},

@@ -20,7 +20,7 @@ def overview(reports: Sequence[Report]) -> Table:
     """One row a setting."""
     table = Table(title="what agents learn, and how fast", box=box.SIMPLE_HEAD, show_lines=True)
     for column in _COLUMNS:
-        table.add_column(column, overflow="fold")
+        table.add_column(column, overflow="fold", no_wrap=column == "setting")
     for report in reports:
         table.add_row(*row(report))
     return table
