@@ -22,6 +22,7 @@ from agents.suite.config import load_suite
 from agents.suite.fronts import excess_over, is_below
 from agents.suite.learned import closed, judged, reached
 from agents.suite.learning import load_learning
+from agents.suite.learning_table import row, text_of
 from agents.suite.study import Study
 from agents.training.checked import load
 from agents.training.config import Experiment
@@ -95,6 +96,37 @@ def test_the_first_moment_below_and_what_came_after() -> None:
         "above_later": 1,
     }
     assert "first" not in reached({"seed": 3, "curve": curve[:1]})
+
+
+def test_the_tables_say_when_each_seed_was_below_and_who_never_was() -> None:
+    first = {
+        "timesteps": 57344,
+        "cpu_seconds": 7.8,
+        "excess": -0.225,
+        "rates": [0.013, 0.028],
+        "above_later": 2,
+    }
+    late = {"seed": 1, "timesteps": 90000, "cpu_seconds": 31.0}
+    found = {
+        "setting": "small",
+        "title": "a small setting",
+        "course": {"memoryless": "sensors", "against": "sensors_memory", "allowed": 0.01},
+        "throughput": None,
+        "prices": [],
+        "reached": {"front": [late | {"seed": 0, "first": first}, late], "plain": [late]},
+        "finished": None,
+        "fronts": [],
+        "plain": [],
+    }
+    cells = row(found)
+    assert cells[3] == "1 of 2 seeds, 8 s, 57,344 steps, not within 31 s"
+    assert cells[4] == "0 of 1 seeds, not within 31 s"
+    text = text_of([found], "the command")
+    assert (
+        "| with credit and memory | 0 | 57,344 | 7.8 | -22% | 0.013 to 0.028 | 2 | 90,000 | 31.0 |"
+        in text
+    )
+    assert "| plain PPO | 1 | – | – | – | – | – | 90,000 | 31.0 |" in text
 
 
 def study_of(folder: Path, **course: Any) -> Study:

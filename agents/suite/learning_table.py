@@ -10,9 +10,14 @@ from rich import box
 from rich.table import Table
 
 Report = Mapping[str, Any]
+_LABELS = {"front": "with credit and memory", "plain": "plain PPO"}
 _COLUMNS = (
     "setting", "steps/s", "with values", "below the rules without memory",
     "plain PPO", "finished against", "above", "worst", "gap closed",
+)  # fmt: skip
+_FIRSTS = (
+    "training", "seed", "below after", "seconds", "there by", "over the rates",
+    "later measurements not below", "ended after", "seconds",
 )  # fmt: skip
 
 
@@ -126,6 +131,7 @@ def details(report: Report) -> Iterator[str]:
     yield f"## {report['title']}"
     yield ""
     if report["course"]["memoryless"] is not None:
+        yield from _firsts(report)
         yield from _curves(report)
     solved = report["course"]["against"] in ("optimum", "schedules")
     names = ["cost", "optimum"] if solved else ["mse", "envelope"]
@@ -147,12 +153,29 @@ def details(report: Report) -> Iterator[str]:
     yield ""
 
 
+def _firsts(report: Report) -> Iterator[str]:
+    """When each seed's front first was below the rules without memory, and over which rates."""
+    yield _joined(_FIRSTS)
+    yield _joined(["---"] * len(_FIRSTS))
+    for kind, seeds in report["reached"].items():
+        for one in seeds:
+            cells, first = ["–"] * 5, one.get("first")
+            if first:
+                low, high = first["rates"]
+                cells = [f"{first['timesteps']:,}", f"{first['cpu_seconds']:.1f}"]
+                cells += [f"{first['excess']:+.0%}", f"{low:.3f} to {high:.3f}"]
+                cells.append(str(first["above_later"]))
+            ended = [f"{one['timesteps']:,}", f"{one['cpu_seconds']:.1f}"]
+            yield _joined([_LABELS[kind], str(one["seed"]), *cells, *ended])
+    yield ""
+
+
 def _curves(report: Report) -> Iterator[str]:
     """The most by which the fronts are above the rules without memory, over steps."""
     yield _joined(["training", "steps", "seconds", "above the rules without memory by at most"])
     yield _joined(["---"] * 4)
-    for kind, label in (("fronts", "with credit and memory"), ("plain", "plain PPO")):
-        curves = [one["curve"] for one in report[kind]]
+    for kind, label in _LABELS.items():
+        curves = [one["curve"] for one in report["fronts" if kind == "front" else "plain"]]
         for steps in sorted({point["timesteps"] for curve in curves for point in curve}):
             points = [p for curve in curves for p in curve if p["timesteps"] == steps]
             known = [p["excess"] for p in points if p["excess"] is not None]
