@@ -8,21 +8,25 @@ import json
 import math
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from small_suite import SMALL, small_suite
 from training_configs import read_records, small_config
 
+from agents.output.files import write, write_text
 from agents.suite.committed import complete
 from agents.suite.config import load_suite
 from agents.suite.fronts import excess_over, is_below
 from agents.suite.learned import closed, judged, reached
 from agents.suite.learning import load_learning
 from agents.suite.learning_table import row, text_of
+from agents.suite.lessons import beyond
 from agents.suite.study import Study
 from agents.training.checked import load
 from agents.training.config import Experiment
@@ -357,6 +361,27 @@ def test_seeds_and_prices_that_lie_above_are_counted(school: Path) -> None:
     assert found["closed"] == {"rollout": None, "bound": pytest.approx((0.2 + 0.6) / 2.0)}
     assert closed([{"envelope": 1.0, "bound": 1.0, "mse": 1.0}], "bound") is None
     assert judged(study_of(school), []) is None
+
+
+def test_a_rollout_counts_on_its_own_episodes_and_only_where_it_was_run(
+    school: Path, tmp_path: Path
+) -> None:
+    """Of 4 episodes the first 2 are twice as hard: there the rollout has 3/4 of the envelope."""
+    rollout = {"setting": "small", "episodes": 2, "points": [{"rate": 0.1, "mse": 1.5}] * 2}
+    rollout["points"][1] = {"rate": 0.3, "mse": 1.5}
+    write(tmp_path / "rollout" / "small.json", rollout)
+    costs = [{"price": 1.0, "lower": 0.9}, {"price": 4.0, "lower": 1.5}]
+    write(tmp_path / "bounds" / "small.json", {"sensors": 2, "floor": 0.4, "costs": costs})
+    envelopes = (school / "results" / "envelopes" / "small.json").read_text()
+    write_text(tmp_path / "envelopes" / "small.json", envelopes)
+    hard = np.array([2.0, 2.0, 1.0, 1.0])
+    envelope = {str(rate): SimpleNamespace(rate=np.array([rate]), mse=hard) for rate in (0.0, 1.0)}
+    study = replace(study_of(school), results=tmp_path)
+    assert beyond(study, 0.2, envelope) == {"rollout": 0.75 * 1.5, "bound": pytest.approx(0.5)}
+    assert beyond(study, 0.05, envelope) == {"bound": pytest.approx(1.1)}
+    assert beyond(study, 0.31, envelope) == {"bound": 0.4}
+    course = study.course.model_copy(update={"against": "sensors"})
+    assert "rollout" not in beyond(replace(study, course=course), 0.2, envelope), "it remembers"
 
 
 def test_the_seconds_of_a_training_are_the_processors_without_validations(
