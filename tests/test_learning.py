@@ -26,8 +26,8 @@ from agents.suite.fronts import excess_over, is_below
 from agents.suite.learned import closed, judged, reached
 from agents.suite.learning import load_learning
 from agents.suite.learning_table import row, text_of
-from agents.suite.lessons import beyond
-from agents.suite.study import Study
+from agents.suite.lessons import beyond, run_lesson
+from agents.suite.study import Lesson, Study
 from agents.training.checked import load
 from agents.training.config import Experiment
 from agents.training.run import train
@@ -163,6 +163,7 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "centre": {"filter": "tobit", "horizon": 10, "information": "centre"},
         "plain": {"filter": "tobit", "horizon": 10},
         "narrow": {"filter": "tobit", "horizon": 10, "memory": True, "price_range": [0.01, 0.1]},
+        "alone": {"filter": "tobit", "horizon": 10, "memory": True},
         "source": {"horizon": 5},
     }
     for name, own in options.items():
@@ -172,7 +173,11 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
         priced = {"cost_weight": "random", "price_range": at["price_range"]}
         small_config(
             place,
-            environment={"id": at["environment"]["id"], "options": priced | own},
+            environment={
+                "id": at["environment"]["id"],
+                "options": priced | own,
+                "local": name == "alone",
+            },
             algorithm={"name": "counterfactual_ppo", "n_steps": 8, "batch_size": 32},
             training={"timesteps": 128, "num_envs": 4},
         )
@@ -240,6 +245,7 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
         assert 0.0 < seconds[0] < seconds[1]
         assert [point["price"] for point in front["points"]] == found["prices"]
     assert [one["algorithm"] for one in found["plain"]] == ["ppo"], "fewer seeds of it"
+    assert [point["timesteps"] for point in found["plain"][0]["curve"]] == [128, 256]
     assert found["throughput"]["values"] < found["throughput"]["without"]
     assert found["finished"]["compared"] == 2, "the inner one of three prices, of two seeds"
     assert "`python -m benchmarks.learning --seeds 2" in (whole.output / "README.md").read_text()
@@ -270,6 +276,19 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
     assert without_seconds(again) == without_seconds(found)
     learning.run(broken)
     assert counted == 64
+
+
+@pytest.mark.parametrize(("budget", "below"), [(1e-9, False), (math.inf, True)])
+def test_plain_ppo_ends_with_its_budget_or_below_the_rules(
+    school: Path, tmp_path: Path, budget: float, below: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("agents.suite.lessons.is_below", lambda *_: below)
+    study = replace(study_of(school), work=tmp_path, output=tmp_path)
+    lesson = Lesson(study, "plain", 0, budget)
+    run_lesson(lesson, 1)
+    found = lesson.result()
+    assert found is not None
+    assert [point["timesteps"] for point in found["curve"]] == [128], "not the whole 256"
 
 
 @pytest.mark.parametrize(
@@ -320,6 +339,7 @@ def test_a_front_beside_the_optimum_or_the_best_of_schedules(
             r"information = 'sensors' is not allowed in small: .* has 'centre'",
         ),
         ({"front": "source"}, r"id = 'fusion_gym/RemoteEstimation-v0' is not allowed in small"),
+        ({"front": "alone"}, r"local = True is not allowed in small: .* has False"),
         ({"front": "narrow"}, r"price_range = \[0.01, 0.1\] is not allowed .* has \[0.001, 0.1\]"),
         ({"against": "local_estimate_memory"}, r"class = 'local_estimate_memory' is not allowed"),
         ({"setting": "large"}, r"setting = 'large' is not allowed"),
