@@ -72,10 +72,24 @@ def test_left_of_an_envelope_nothing_is_below_it() -> None:
     assert excess_over([(0.05, 0.1), (0.2, 0.1)], ENVELOPE[1:]) == math.inf
 
 
-@pytest.mark.parametrize(("high", "below"), [(0.199, False), (0.2, True)])
-def test_a_front_is_more_than_a_point(high: float, below: bool) -> None:
-    assert is_below([(0.1, 1.0), (high, 0.5)], ENVELOPE) == below
-    assert not is_below([(0.1, 2.0), (high, 0.5)], ENVELOPE), "as good is not below"
+@pytest.mark.parametrize(
+    ("low", "high", "below"),
+    [(0.1, 0.299, False), (0.1, 0.301, True), (0.0, 0.149, False), (0.0, 0.151, True)],
+)
+def test_a_front_is_more_than_a_point_and_than_silence(
+    low: float, high: float, below: bool
+) -> None:
+    assert is_below([(low, 1.0), (high, 0.5)], ENVELOPE, least=0.05) == below
+    assert not is_below([(0.1, 2.0), (0.3, 0.5)], ENVELOPE, least=0.05), "as good is not below"
+    assert not is_below([(0.0, 3.9)] * 7, ENVELOPE, least=0.05)
+
+
+def test_a_range_counts_from_a_twentieth_of_always_transmitting(school: Path) -> None:
+    study = study_of(school)
+    always = study.envelopes["always"]
+    assert study.below([(0.0, 0.001), (0.151 * always, 0.0005)])
+    assert not study.below([(0.0, 0.001), (0.149 * always, 0.0005)])
+    assert not study_of(school, memoryless=None).below([(0.0, 0.001), (always, 0.0005)])
 
 
 def test_the_first_moment_below_and_what_came_after() -> None:
@@ -282,7 +296,7 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
 def test_plain_ppo_ends_with_its_budget_or_below_the_rules(
     school: Path, tmp_path: Path, budget: float, below: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("agents.suite.lessons.is_below", lambda *_: below)
+    monkeypatch.setattr("agents.suite.study.is_below", lambda *_: below)
     study = replace(study_of(school), work=tmp_path, output=tmp_path)
     lesson = Lesson(study, "plain", 0, budget)
     run_lesson(lesson, 1)

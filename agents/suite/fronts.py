@@ -17,7 +17,7 @@ from ..training.config import Experiment
 from ..training.monitor import Measure
 
 Points = Sequence[Sequence[float]]  # (rate, MSE) at each price
-WIDTH = 2.0  # the least factor between the rates of a front: less is a point
+WIDTH = 3.0  # the least factor between the rates of a front: less is hardly more than a point
 
 
 def prices_of(price_range: tuple[float, float], count: int) -> list[float]:
@@ -59,14 +59,15 @@ def excess_over(front: Points, envelope: Sequence[EnvelopePoint]) -> float:
     return found if np.isfinite(found) else np.inf
 
 
-def is_below(front: Points, envelope: Sequence[EnvelopePoint]) -> bool:
-    """Whether a front is below an envelope over its whole range, and more than a point.
+def is_below(front: Points, envelope: Sequence[EnvelopePoint], least: float) -> bool:
+    """Whether a front is below an envelope over its whole range, and has one.
 
-    A policy that does the same at every price would have no range to be above in: the highest rate
-    is at least twice the lowest.
+    A policy that does the same at every price would have no range to be above in, and one that
+    sends next to nothing is as good as any rule there: the highest rate is at least three times
+    the lowest, and three times the rate ``least``, below which the lowest is taken for it.
     """
     low, high = range_of(front)
-    return excess_over(front, envelope) < 0.0 and high >= WIDTH * low
+    return excess_over(front, envelope) < 0.0 and high >= WIDTH * max(low, least)
 
 
 def range_of(front: Points) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from fusion_gym.arrays import Array
-from fusion_gym.evaluation.envelope import EnvelopePoint, chosen_mse, height
+from fusion_gym.evaluation.envelope import chosen_mse, height
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
 
@@ -20,7 +20,7 @@ from ..training.monitor import Measure
 from ..training.run import holds_training, train
 from .envelope_table import at_least, bound_of, measured
 from .envelopes import Test, run_test
-from .fronts import excess_over, is_below, meter
+from .fronts import excess_over, meter
 from .learned import report
 from .study import Lesson, Study
 from .verdict import Front, excess, interval
@@ -44,15 +44,14 @@ def run_lesson(lesson: Lesson, seeds: int) -> None:
     """
     torch.set_num_threads(1)
     experiment, study = lesson.experiment, lesson.study
-    folder, envelope = Path(experiment.output), study.memoryless
+    folder = Path(experiment.output)
     measure: Measure = meter(experiment, study.prices, study.learning.episodes)
     enough = False
 
     def watch(record: dict[str, Any]) -> bool:
         nonlocal enough
         if lesson.kind == "plain":
-            below = envelope is not None and is_below(record["front"], envelope)
-            enough = below or record["cpu_seconds"] >= lesson.budget
+            enough = study.below(record["front"]) or record["cpu_seconds"] >= lesson.budget
         return enough
 
     summary = train(
@@ -64,7 +63,7 @@ def run_lesson(lesson: Lesson, seeds: int) -> None:
         "seed": lesson.seed,
         "inputs": lesson.inputs,
         "algorithm": experiment.algorithm.name,
-        "curve": curve(folder, envelope),
+        "curve": curve(study, folder),
     }
     if lesson.kind == "front":
         result["points"] = tested(study, folder / "best_model.zip")
@@ -72,8 +71,8 @@ def run_lesson(lesson: Lesson, seeds: int) -> None:
     report(study, seeds)
 
 
-def curve(folder: Path, envelope: Sequence[EnvelopePoint] | None) -> list[dict[str, Any]]:
-    """The fronts of a training, with what they are above the envelope by, if there is one.
+def curve(study: Study, folder: Path) -> list[dict[str, Any]]:
+    """The fronts of a training, with what they are above the rules without memory by.
 
     ``cpu_seconds`` are of environment, policy and updates, on all threads.
     """
@@ -81,10 +80,10 @@ def curve(folder: Path, envelope: Sequence[EnvelopePoint] | None) -> list[dict[s
     found = []
     for record in map(json.loads, lines):
         point = {key: record[key] for key in ("timesteps", "cpu_seconds", "return", "front")}
-        if envelope is not None:
-            above = excess_over(point["front"], envelope)
+        if study.memoryless is not None:
+            above = excess_over(point["front"], study.memoryless)
             point["excess"] = above if above < float("inf") else None
-            point["below"] = is_below(point["front"], envelope)
+            point["below"] = study.below(point["front"])
         found.append(point)
     return found
 

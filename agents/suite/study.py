@@ -24,9 +24,10 @@ from .committed import path_of, present, read_envelopes
 from .config import Setting, Suite
 from .envelope_table import hull_of
 from .envelopes import Test, task_of
-from .fronts import prices_of
+from .fronts import Points, is_below, prices_of
 from .jobs import experiment_of, training_of
 from .learning import Course, Learning
+from .verdict import MIDDLE
 
 Kind = Literal["front", "plain"]
 # Options that change neither the task nor what a policy may know of it.
@@ -85,8 +86,8 @@ class Study:
 
     @functools.cached_property
     def envelopes(self) -> dict[str, Any]:
-        """The committed file of the setting's envelopes; made from what the suite says now."""
-        present(self.suite, self.setting, self.results)
+        """The committed file of the setting's envelopes."""
+        present(self.suite, self.setting, self.results)  # made from what the suite says now
         return read_envelopes(path_of(self.results, self.setting.name))
 
     def envelope(self, name: str) -> dict[str, Any]:
@@ -110,6 +111,12 @@ class Study:
         """The envelope to get below while learning, as it was measured on the test seeds."""
         name = self.course.memoryless
         return None if name is None else hull_of(self.envelope(name))
+
+    def below(self, front: Points) -> bool:
+        """Whether a front is below the rules without memory; it counts from the middle's begin."""
+        if self.memoryless is None:
+            return False
+        return is_below(front, self.memoryless, MIDDLE[0] * self.envelopes["always"])
 
     @property
     def solved(self) -> bool:
