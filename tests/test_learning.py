@@ -303,6 +303,9 @@ def test_plain_ppo_ends_with_its_budget_or_below_the_rules(
     found = lesson.result()
     assert found is not None
     assert [point["timesteps"] for point in found["curve"]] == [128], "not the whole 256"
+    changed = study.learning.model_copy(update={"episodes": 5})
+    with pytest.raises(ConfigurationError, match=r"^episodes = 5 differs from that of .*: 4$"):
+        Lesson(replace(study, learning=changed), "plain", 0).result()
 
 
 @pytest.mark.parametrize(
