@@ -21,10 +21,10 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.metrics import paired_difference, robust_summary, summarise
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import Command, Words, start
+from .input.environment import environment_of
 from .input.files import checked
 from .input.options import Episodes, OutputFile, Seed
 from .output import tables
@@ -70,26 +70,6 @@ class Evaluate(Command):
         """Finished policies are kept."""
         return "interrupted: finished policies are in the JSON, if one was asked for"
 
-    def environment(self) -> tuple[str, dict[str, Any]]:
-        """Id and options from ``--config``, ``--env`` and ``--set``.
-
-        Raises:
-            ConfigurationError: neither an id nor a config, or a config that is not allowed.
-        """
-        options = parse_settings("option", list(chain(*self.options)))
-        if self.config is None:
-            if self.env is None:
-                raise ConfigurationError(
-                    "env = None is not allowed: give --env ID or --config FILE"
-                )
-            return self.env, options
-        # Here, for it needs Stable-Baselines3, which takes seconds to load.
-        from .training.checked import load
-        from .training.config import Experiment
-
-        chosen = load(Experiment, self.config).environment
-        return self.env or chosen.id, dict(chosen.options) | options
-
 
 def evaluate(given: Evaluate) -> dict[str, Any]:
     """Run the evaluation that the command line asks for and return what the JSON holds.
@@ -97,7 +77,7 @@ def evaluate(given: Evaluate) -> dict[str, Any]:
     Raises:
         ConfigurationError: anything that is not allowed, before the first episode.
     """
-    env_id, options = given.environment()
+    env_id, options, _ = environment_of(given.env, given.config, given.options)
     task = make_task(env_id, **options)
     names = list(dict.fromkeys(chain(*given.policies)))
     if not names:

@@ -25,6 +25,10 @@ BASES: dict[str, dict[str, list[str]]] = {
         "env": [ENV], "set": ["horizon=4"], "policies": ["always"], "episodes": ["2"],
         "json": ["made.json"],
     },
+    "mismatch": {
+        "env": [ENV], "set": ["horizon=4"], "policies": ["always"], "episodes": ["2"],
+        "json": ["made.json"],
+    },
     "bound": {
         "env": [ENV], "set": ["horizon=4"], "rates": ["0.1"], "episodes": ["2"],
         "json": ["made.json"],

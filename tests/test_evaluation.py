@@ -96,7 +96,7 @@ def test_results_do_not_depend_on_how_episodes_are_batched(
 ) -> None:
     whole = evaluate(task, "send_on_delta", 11)
     steps: list[int] = []
-    monkeypatch.setattr("fusion_gym.evaluation.episodes._BATCH", 4)
+    monkeypatch.setattr("fusion_gym.evaluation.episodes.BATCH", 4)
     parts = run_episodes(task, make_policy("send_on_delta", task), 11, 10, steps.append)
     assert sum(steps) == 11 * 12
     for field in fields(EpisodeResults):

@@ -10,6 +10,7 @@ from gymnasium.spaces import Discrete, MultiBinary
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fusion_gym.arrays import Array
+from fusion_gym.core.system import System
 from fusion_gym.core.task import Task
 from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_system
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
@@ -18,7 +19,7 @@ from fusion_gym.policies.model import tag_model
 from fusion_gym.validation import ConfigurationError, refusal
 
 from .algorithms import TABLE
-from .config import Experiment
+from .config import EnvironmentConfig, Experiment
 
 
 def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
@@ -43,12 +44,19 @@ def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
     }
     reference = None
     if training.error != "squared":
-        reference = reference_system(where.id, where.options, training.error_filter)
+        reference = _reference(task, where, training.error_filter)
     elif training.error_filter is not None:
         raise refusal("error_filter", training.error_filter, "none with error: squared")
     if reference is None and not TABLE[name].privileged:
         return FusionSB3VecEnv(task, **runs)
     return PrivilegedVecEnv(task, error=training.error, reference=reference, **runs)
+
+
+def _reference(task: Task, where: EnvironmentConfig, error_filter: str | None) -> System[Any]:
+    """What takes in every measurement: the task's own memory where that has the same filter."""
+    if task.shadow is not None and error_filter in (None, where.options.get("memory_filter")):
+        return task.shadow
+    return reference_system(where.id, where.options, error_filter)
 
 
 def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:

@@ -27,6 +27,7 @@ from .checked import load
 from .checkpoint import Journal, read_journal, restore
 from .config import Experiment
 from .constraint import TargetRate, score
+from .mismatch import warn_of_cross_term
 from .models import make_env, make_model
 from .monitor import Interrupt, Measure, Progress, Stop
 
@@ -135,6 +136,8 @@ def train(
         if journal is None:
             journal = Journal(experiment.inputs())
             env.seed(TRAINING_SEEDS + 10_000_019 * experiment.training.seed)
+            if experiment.training.error == "mismatch" and not quiet:
+                warn_of_cross_term(experiment, env)
         else:
             model = restore(folder / "latest.zip", type(model), env)
         plain = experiment.model_dump(mode="json")

@@ -15,7 +15,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy, owner_of
 
-_BATCH = 1024  # episodes side by side; fixed, so that results do not depend on the machine
+BATCH = 1024  # episodes side by side; fixed, so that results do not depend on the machine
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ def run_episodes(
     validation.integer("episodes", episodes, at_least=1)
     validation.integer("seed", seed, at_least=0)
     parts = [
-        _run_batch(task, policy, min(_BATCH, episodes - first), seed + first, progress)
-        for first in range(0, episodes, _BATCH)
+        _run_batch(task, policy, min(BATCH, episodes - first), seed + first, progress)
+        for first in range(0, episodes, BATCH)
     ]
     weights = np.array([part.episodes for part in parts]) / episodes
     joined = {

@@ -21,8 +21,8 @@ class Interval(NamedTuple):
     high: float
 
 
-def mean_interval(samples: Array, seed: int = 0) -> Interval:
-    """Mean of the samples (episodes,) with a 95 % percentile bootstrap interval.
+def mean_interval(samples: Array, seed: int = 0, level: float = LEVEL) -> Interval:
+    """Mean of the samples (episodes,) with a percentile bootstrap interval, by default of 95 %.
 
     A single episode, or episodes that all agree, have the interval [mean, mean]: nothing can be
     said about its width, and no width is invented.
@@ -35,7 +35,7 @@ def mean_interval(samples: Array, seed: int = 0) -> Interval:
         np.mean,
         n_resamples=RESAMPLES,
         batch=200,
-        confidence_level=LEVEL,
+        confidence_level=level,
         method="percentile",
         rng=np.random.default_rng(seed),
     )

@@ -1,0 +1,216 @@
+"""Error, floor, mismatch and cross term: what they are, the command, a training's warning."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_runs import call
+from training_configs import small_config
+
+from agents.training.checked import load
+from agents.training.config import Experiment
+from agents.training.models import make_env
+from agents.training.run import train
+from fusion_gym.core.system import System
+from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_system
+from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation import cross_term
+from fusion_gym.evaluation.cross_term import CrossTerm, cross_terms, usual_policies, worst
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.evaluation.intervals import Interval
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError
+
+OSCILLATOR, INPUT = "fusion_gym/TobitOscillator-v0", "fusion_gym/UnknownInput-v0"
+ORDINARY = {"filter": "tobit", "random_start": True, "token_rate": 2, "horizon": 30}
+PAPER = ORDINARY | {"filter": "paper"}
+
+
+def measured(
+    env_id: str, options: dict[str, Any], policies: list[str], filter: str | None = None,
+    episodes: int = 60, seed: int = 0,
+) -> dict[str, CrossTerm]:  # fmt: skip
+    task = make_task(env_id, **options)
+    made = {name: make_policy(name, task) for name in policies}
+    return cross_terms(task, reference_system(env_id, options, filter), made, episodes, seed)
+
+
+def test_error_and_floor_are_what_an_evaluation_finds_and_the_parts_add_up() -> None:
+    """Independent of how they are measured: the error is the policy's MSE, the floor that of a
+    centre to which everything is delivered."""
+    found = measured(OSCILLATOR, ORDINARY, ["random:rate=0.2"])["random:rate=0.2"]
+    task = make_task(OSCILLATOR, **ORDINARY)
+    policy = run_episodes(task, make_policy("random:rate=0.2", task), 60, 0)
+    free = make_task(OSCILLATOR, **ORDINARY, tokens="unlimited")
+    everything = run_episodes(free, make_policy("always", free), 60, 0)
+    assert found.error == pytest.approx(float(policy.mse.mean()))
+    assert found.rate == pytest.approx(float(policy.rate.mean()))
+    assert found.floor == pytest.approx(float(everything.mse.mean()))
+    parts = found.floor + found.mismatch + found.share.mean * found.error
+    assert parts == pytest.approx(found.error)
+    assert found.share.low < found.share.mean < found.share.high
+
+
+def test_the_weights_are_the_rewards() -> None:
+    task = make_task(OSCILLATOR, **ORDINARY, state_weights=[2.0, 0.0])
+    system = reference_system(OSCILLATOR, ORDINARY)
+    found = cross_terms(task, system, {"a": make_policy("always", task)}, 20, 0)["a"]
+    results = run_episodes(task, make_policy("always", task), 20, 0)
+    assert found.error == pytest.approx(2.0 * float(results.squared_error[:, 0].mean()))
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options", "filter", "share"),
+    [
+        (OSCILLATOR, PAPER, "paper", -0.25),
+        (INPUT, {"tokens": "limited", "token_rate": 2, "horizon": 60}, None, -0.13),
+    ],
+)
+def test_where_the_filter_is_approximate_the_cross_term_is_told(
+    env_id: str, options: dict[str, Any], filter: str | None, share: float
+) -> None:
+    found = measured(env_id, options, ["always"], filter, episodes=150)["always"]
+    assert not found.compatible
+    assert found.share.mean == pytest.approx(share, abs=0.08)
+    assert found.share.low <= found.share.mean <= found.share.high < 0.0
+
+
+def test_where_the_filter_is_good_none_is_told_under_any_policy() -> None:
+    task = make_task(OSCILLATOR, **ORDINARY)
+    found = measured(OSCILLATOR, ORDINARY, usual_policies(task), episodes=150)
+    assert all(part.compatible for part in found.values())
+    assert found["random:rate=0.03"].rate < found["random:rate=0.3"].rate < 0.3
+    exact = measured("fusion_gym/RemoteEstimation-v0", {"horizon": 20}, ["always"])["always"]
+    assert (exact.floor, exact.share) == (0.0, Interval(0.0, 0.0, 0.0))
+
+
+def test_what_is_beside_an_episode_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = measured(OSCILLATOR, ORDINARY, ["random"], episodes=12)["random"]
+    monkeypatch.setattr(cross_term, "BATCH", 5)
+    parts = measured(OSCILLATOR, ORDINARY, ["random"], episodes=12)["random"]
+    np.testing.assert_allclose(np.hstack(parts), np.hstack(whole), rtol=1e-12)
+
+
+def test_more_policies_and_a_higher_level_make_wider_intervals() -> None:
+    def width(found: dict[str, CrossTerm]) -> float:
+        return found["always"].share.high - found["always"].share.low
+
+    alone = measured(OSCILLATOR, ORDINARY, ["always"])
+    assert width(measured(OSCILLATOR, ORDINARY, ["always", "never", "random"])) > width(alone)
+    task = make_task(OSCILLATOR, **ORDINARY)
+    system, policies = (
+        reference_system(OSCILLATOR, ORDINARY),
+        {"always": make_policy("always", task)},
+    )
+    assert width(cross_terms(task, system, policies, 60, 0, level=0.999)) > width(alone)
+    assert width(cross_terms(task, system, policies, 60, 0)) == width(alone)
+
+
+@pytest.mark.parametrize("episodes", [1, 0, 2.5])
+def test_one_episode_says_nothing(episodes: Any) -> None:
+    with pytest.raises(ConfigurationError, match="episodes"):
+        measured(OSCILLATOR, ORDINARY, ["always"], episodes=episodes)
+
+
+def test_the_worst_is_one_that_is_told_from_zero() -> None:
+    def part(low: float, high: float) -> CrossTerm:
+        return CrossTerm(0.1, 1.0, 0.5, 0.5, Interval((low + high) / 2, low, high))
+
+    found = {"wide": part(-1.0, 3.0), "told": part(-0.2, -0.1), "less": part(0.01, 0.02)}
+    assert worst(found)[0] == "told"
+    assert worst({"near": part(-0.2, 0.1), "far": part(-0.2, 0.4)})[0] == "far"
+
+
+def test_the_usual_policies_are_those_that_a_task_allows() -> None:
+    centre = make_task("fusion_gym/MarkovJumpTracking-v0", information="centre")
+    assert usual_policies(centre, (0.25,)) == ["random:rate=0.25", "always"]
+    drawn = make_task(OSCILLATOR, cost_weight="random", price_range=[0.01, 0.04])
+    assert usual_policies(drawn)[-1] == "value_of_information:price=0.02"
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+def test_the_command_writes_what_it_prints(tmp_path: Path) -> None:
+    file = tmp_path / "cross.json"
+    words = ["--env", OSCILLATOR, "--set", *(f"{key}={value}" for key, value in PAPER.items())]
+    words += ["--filter", "paper", "--policies", "always", "never", "--episodes", "40"]
+    ended = call("mismatch", [*words, "--json", str(file)])
+    assert (ended.status, ended.trace) == (0, "")
+    report = json.loads(file.read_text())
+    assert (report["filter"], report["episodes"], report["compatible"]) == ("paper", 40, False)
+    share = report["policies"]["always"]["share"]
+    assert f"{share['mean']:+.2%} [{share['low']:+.2%}, {share['high']:+.2%}]" in ended.out
+    assert report["policies"].keys() == {"always", "never"}
+    assert "error: excess" in " ".join(ended.out.split())
+
+
+def test_the_command_takes_a_trainings_environment_and_filter(tmp_path: Path) -> None:
+    training = {"timesteps": 64, "num_envs": 2, "error": "mismatch", "error_filter": "adf"}
+    config = small_config(tmp_path, training=training)
+    file = tmp_path / "cross.json"
+    words = ["--config", str(config), "--set", "horizon=5", "--episodes", "4", "--json", str(file)]
+    assert call("mismatch", words).status == 0
+    report = json.loads(file.read_text())
+    assert (report["filter"], report["horizon"]) == ("adf", 5)
+    assert len(report["policies"]) == 5
+    assert call("mismatch", [*words, "--filter", "tobit"]).status == 0
+    assert json.loads(file.read_text())["filter"] == "tobit"
+
+
+# --- trainings ------------------------------------------------------------------------------------
+
+
+def mismatch_config(folder: Path, error: str = "mismatch", **options: Any) -> Experiment:
+    environment = {"id": OSCILLATOR, "options": PAPER | options}
+    training = {"timesteps": 128, "num_envs": 8, "error": error, "error_filter": "paper"}
+    return load(Experiment, small_config(folder, environment=environment, training=training))
+
+
+def test_a_training_on_the_mismatch_is_warned_once_where_that_is_not_the_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    experiment = mismatch_config(tmp_path)
+    train(experiment)
+    told = [line for line in capsys.readouterr().err.splitlines() if "cross term" in line]
+    assert len(told) == 1
+    assert told[0].startswith("warning: training.error = 'mismatch' leaves out a cross term of -")
+    train(experiment.changed(None, timesteps=256), resume=True)
+    assert "cross term" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("error", "filter", "quiet"), [
+    ("excess", "paper", False), ("mismatch", "tobit", False), ("mismatch", "paper", True),
+])  # fmt: skip
+def test_no_warning_where_nothing_is_wrong_or_nobody_reads_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], error: str, filter: str, quiet: bool
+) -> None:
+    experiment = mismatch_config(tmp_path, error)
+    training = experiment.training.model_copy(update={"error_filter": filter})
+    train(experiment.model_copy(update={"training": training}), quiet=quiet)
+    assert "cross term" not in capsys.readouterr().err
+
+
+def test_a_memory_that_is_there_is_the_reference_and_changes_no_reward(tmp_path: Path) -> None:
+    options = ORDINARY | {"memory": True, "memory_filter": "adf"}
+    training = {"timesteps": 64, "num_envs": 4, "error": "mismatch"}
+    environment = {"id": OSCILLATOR, "options": options}
+    experiment = load(
+        Experiment, small_config(tmp_path, environment=environment, training=training)
+    )
+    task = make_task(OSCILLATOR, **options)
+    env = make_env(experiment, task)
+    assert env.batch.reference is task.shadow
+
+    def rewards(env: Any) -> list[Any]:
+        env.seed(5)
+        env.reset()
+        return [env.step(np.eye(4, 3, k=step % 3 - 1, dtype=np.int8))[1] for step in range(40)]
+
+    other: System[Any] = reference_system(OSCILLATOR, options)
+    apart = PrivilegedVecEnv(task, 4, error="mismatch", reference=other, stagger=True)
+    np.testing.assert_array_equal(rewards(env), rewards(apart))
