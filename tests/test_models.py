@@ -37,6 +37,7 @@ def experiment(algorithm: str = "ppo", local: bool = False, **options: Any) -> E
         ("a2c", False, {}),
         ("maskable_ppo", False, {}),
         ("ppo", True, {}),
+        ("ppo", True, {"memory": True}),
         ("ppo", False, {"action": "discrete"}),
         ("recurrent_ppo", False, {"action": "discrete"}),
         ("ppo", False, {"access": "single"}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import signal
@@ -17,7 +18,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.evaluation.episodes import run_episodes
@@ -28,6 +28,7 @@ from . import checkpoint
 from .checkpoint import Journal
 from .config import Experiment
 from .constraint import score
+from .diagnosis import by_price, prices_of
 
 # Handed the model and the processor's seconds of its training; more for a validation's record.
 Measure = Callable[[BaseAlgorithm, float], dict[str, Any]]
@@ -148,7 +149,7 @@ class Progress(BaseCallback):
         settings = self.experiment.validation
         policy = ModelPolicy(self.model, self.task, local=self.experiment.environment.local)
         found = run_episodes(self.task, policy, settings.episodes, settings.seed)
-        record = {
+        record: dict[str, Any] = {
             "timesteps": self.num_timesteps,
             "return": float((found.returns * self._weights()).mean()),
             "mse": float(found.mse.mean()),
@@ -156,6 +157,9 @@ class Progress(BaseCallback):
         }
         if self.measure is not None:
             record |= self.measure(self.model, self.journal.cpu_seconds)
+        parts = by_price(self.task, self.prices, found)
+        if parts:
+            record["prices"] = parts
         if score(record, self.target) > self.best:
             self.best = score(record, self.target)
             file = io.BytesIO()
@@ -166,6 +170,10 @@ class Progress(BaseCallback):
         self._write_records()
         for key in ("return", "mse", "rate"):
             self.logger.record(f"validation/{key}", record[key])
+        for part in parts:
+            where = f"price_{part['low']:.3g}-{part['high']:.3g}"
+            for key in ("mse", "rate"):
+                self.logger.record(f"validation/{key}_{where}", part[key])
         self.logger.dump(self.num_timesteps)
         self._show(record)
 
@@ -185,14 +193,18 @@ class Progress(BaseCallback):
         lines = [json.dumps(record) + "\n" for record in self.journal.records]
         write_text(self.folder / "validation.jsonl", "".join(lines))
 
+    @functools.cached_property
+    def prices(self) -> Array:
+        """Of a token in each validation episode."""
+        settings = self.experiment.validation
+        return prices_of(self.task, settings.episodes, settings.seed)
+
     def _weights(self) -> Array:
         """What each validation episode's return counts, by its price."""
         exponent = self.experiment.training.price_exponent
         if exponent == 0.0:
             return np.ones(1)
-        episodes, first = self.experiment.validation.episodes, self.experiment.validation.seed
-        batch = EpisodeBatch.seeded(self.task, episodes, first)
-        return self.task.reward.price.scale(batch.price, exponent)
+        return self.task.reward.price.scale(self.prices, exponent)
 
     def save(self) -> None:
         """Write the checkpoint."""

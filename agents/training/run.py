@@ -27,6 +27,7 @@ from .checked import load
 from .checkpoint import Journal, read_journal, restore
 from .config import Experiment
 from .constraint import TargetRate, score
+from .diagnosis import Traffic
 from .mismatch import warn_of_cross_term
 from .models import make_env, make_model
 from .monitor import Interrupt, Measure, Progress, Stop
@@ -159,7 +160,7 @@ def _learn(
     ):
         progress = Progress(experiment, folder, scored, interrupt, bar, journal, watch, measure)
         progress.init_callback(model)
-        callbacks: list[BaseCallback] = [progress]
+        callbacks: list[BaseCallback] = [Traffic(), progress]
         if experiment.training.target_rate is not None:
             price = env.task.reward.price.fixed
             assert price is not None  # validation_task refuses a drawn price
@@ -184,14 +185,13 @@ def _learn(
         if finished:
             with replacing(folder / "final_model.zip") as partial:
                 model.save(partial)
+    best = max(journal.records, key=lambda record: score(record, progress.target), default=None)
     summary = {
         "timesteps": model.num_timesteps,
         "finished": finished,
         "steps_per_second": round(model.num_timesteps / (sum(journal.seconds.values()) or 1.0)),
         "seconds": {key: round(value, 2) for key, value in journal.seconds.items()},
-        "best_validation": max(
-            journal.records, key=lambda record: score(record, progress.target), default=None
-        ),
+        "best_validation": best and {key: best[key] for key in best if key != "prices"},
         "inputs": fingerprint(journal.inputs),
     }
     write(folder / "summary.json", summary)

@@ -44,6 +44,7 @@ class FusionSB3VecEnv(VecEnv):
         observation_names: a name for each entry of an observation.
         seconds: wall time spent in :meth:`step_wait` and :meth:`reset` so far.
         totals: tokens spent and steps made so far, over all runs.
+        requests: made so far and granted so far, over all runs and sensors, in this process.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class FusionSB3VecEnv(VecEnv):
         )
         self.seconds = 0.0
         self.totals = (0.0, 0)
+        self.requests = (0, 0)
         self.render_mode = None
         super().__init__(num_envs * self._rows, self.view.space, self.view.actions)
         self._actions: Any = None
@@ -120,6 +122,8 @@ class FusionSB3VecEnv(VecEnv):
         self._returns += outcome.reward
         self._spent += outcome.cost
         self.totals = (self.totals[0] + float(outcome.cost.sum()), self.totals[1] + self.runs)
+        made, granted = np.count_nonzero(requests), np.count_nonzero(outcome.granted)
+        self.requests = (self.requests[0] + int(made), self.requests[1] + int(granted))
         done = outcome.truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done.any():
