@@ -34,6 +34,8 @@ def test_a_row_has_what_the_sensor_knows_and_nothing_else(env_id: str) -> None:
     observation = batch.observe()
     rows = view.rows(observation).reshape(5, task.sensors, -1)
     assert rows.shape[-1] == len(view.names) == len(view.space.low)
+    picked = np.arange(5) % task.sensors
+    np.testing.assert_array_equal(view.row(observation, picked), rows[np.arange(5), picked])
     for sensor in range(task.sensors):
         for place, name in enumerate(view.names):
             kind, _, inner = name.partition("[")

@@ -44,7 +44,7 @@ class Decisions:
     """
 
     def __init__(self, env: PrivilegedVecEnv, kind: Kind | None) -> None:
-        self.local = isinstance(env.view, SensorView)
+        self.view, self.local = env.view, isinstance(env.view, SensorView)
         self.sensors, self.runs, self.rows = env.task.sensors, env.runs, env.num_envs
         space = env.action_space
         self.binary = isinstance(space, MultiBinary)
@@ -99,11 +99,12 @@ class Decisions:
 
         All alternatives of a run; for a sensor by itself its own flip.
         """
-        if not self.local:
+        if not isinstance(self.view, SensorView):
             return branched.reward, branched.observation
         row = np.arange(self.rows)
         sensor, run = row % self.sensors, row // self.sensors
-        return branched.reward[sensor, run][None], branched.observation[sensor, row][None]
+        observation = self.view.row(branched.observation[sensor, run], sensor)
+        return branched.reward[sensor, run][None], observation[None]
 
     def arranged(self, chosen: Chosen, taken: Array, stepped: Array) -> Array:
         """Values (rows, D, C) of all choices, from those taken (rows,) and stepped (K, rows)."""

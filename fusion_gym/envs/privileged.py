@@ -30,9 +30,9 @@ _GROUPS = 8
 class Branched(NamedTuple):
     """What A other decisions would have brought, on the same noise.
 
-    ``reward`` (A, N), scaled as the rewards of the step are, and ``observation``
-    (A, N·rows_per_run, entries) float32. Of an episode that has ended it is the state with which
-    it would have gone on.
+    ``reward`` (A, N), scaled as the rewards of the step are, and ``observation`` (A, N, entries)
+    float32 of runs, of which a view makes the rows that are wanted. Of an episode that has ended
+    it is the state with which it would have gone on.
     """
 
     reward: Array
@@ -118,8 +118,7 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         if reference is not None:
             reference = reference[:, None]
         reward = self._error_term(found.error, reference) + found.communication
-        rows = self.view.rows(found.observation.reshape(-1, found.observation.shape[-1]))
-        self._branched = Branched(reward * scale, rows.reshape(len(reward), -1, rows.shape[-1]))
+        self._branched = Branched(reward * scale, found.observation)
         return outcome
 
     def _reward(self, outcome: Outcome) -> Array:

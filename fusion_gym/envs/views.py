@@ -199,6 +199,12 @@ class SensorView:
         shared = np.broadcast_to(identity, (len(observation), *identity.shape))
         return np.concatenate((seen, shared), axis=-1).reshape(-1, len(self.names))
 
+    def row(self, observation: Rows, sensor: NDArray[np.int64]) -> Rows:
+        """The row (N, entries) of one sensor (N,) of each observation (N, its entries)."""
+        seen = np.take_along_axis(observation, self._columns[sensor], axis=1)
+        identity = np.eye(self.rows_per_run, dtype=np.float32)[sensor]
+        return np.concatenate((seen, identity), axis=-1)
+
     def requests(self, actions: Any, runs: int | None) -> Requests:
         """See :class:`View`: actions (N·sensors,), 1 for a request, run by run."""
         given = _numbers(actions, ((1 if runs is None else runs) * self.rows_per_run,))
