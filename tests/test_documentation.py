@@ -32,7 +32,9 @@ from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions, build
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 DOCS = sorted((ROOT / "docs").glob("*.md"))
-PAGES = [path for path in DOCS if path.stem not in ("memory", "bounds")]  # of environments
+PAGES = [
+    path for path in DOCS if path.stem not in ("memory", "bounds", "learning")
+]  # of environments
 TEXTS = README + "".join(path.read_text() for path in (*DOCS, ROOT / "CONTRIBUTING.md"))
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", TEXTS, re.DOTALL | re.MULTILINE)
 EXAMPLES = [text for language, text in BLOCKS if language == "python"]

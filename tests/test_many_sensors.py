@@ -1,0 +1,53 @@
+"""The benchmark of many sensors: its floor, its exponents, and what it plays side by side."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks import many_sensors
+from benchmarks.many_sensors import comparison, cost, exponent, floor
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.solvers import lagrangian_bound
+from fusion_gym.solvers.task import source_problems
+
+
+def task_of(**options: object) -> Task:
+    few = {"sensors": 3, "tokens": "limited", "token_rate": 0.5, "initial_tokens": 1.0}
+    return make_task("fusion_gym/RemoteEstimation-v0", **few, horizon=15, **options)
+
+
+def test_the_floor_of_sources_that_are_alike_is_that_of_all_together() -> None:
+    task = task_of()
+    bound = lagrangian_bound(source_problems(task), (1.0,) * 3, 0.5, horizon=15, initial_tokens=1.0)
+    assert floor(task) == pytest.approx(-bound.cost, rel=1e-3)
+    found = run_episodes(task, make_policy("innovation_threshold:threshold=2", task), 100, 0)
+    assert found.returns.mean() < floor(task)
+    with pytest.raises(ValueError, match="alike"):
+        floor(task_of(noise_deviation=[1.0, 1.0, 1.5]))
+
+
+def test_the_exponent_is_that_of_a_power() -> None:
+    assert exponent([3, 6, 12], [18.0, 72.0, 288.0]) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("local", [False, True])
+def test_a_step_costs_something_of_everything(local: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(many_sensors, "RUNS", 8)
+    assert all(0.0 < part < 1e6 for part in cost(3, local))
+
+
+def test_policies_stand_by_their_return_beside_the_agent() -> None:
+    task = task_of()
+    rows = comparison(task, "innovation_threshold:threshold=2", ["never", "always"], 20, 0)
+    means = [row["return"]["mean"] for row in rows]
+    assert means == sorted(means, reverse=True)
+    by_name = {row["policy"]: row for row in rows}
+    assert by_name["innovation_threshold:threshold=2"]["to_agent"]["mean"] == 0.0
+    never = by_name["never"]
+    assert never["to_agent"]["mean"] == pytest.approx(
+        never["return"]["mean"] - by_name["innovation_threshold:threshold=2"]["return"]["mean"]
+    )
+    assert (never["rate"], by_name["always"]["requests"]) == (0.0, 1.0)
