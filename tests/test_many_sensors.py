@@ -16,12 +16,12 @@ from fusion_gym.solvers.task import source_problems
 
 def task_of(**options: object) -> Task:
     few = {"sensors": 3, "tokens": "limited", "token_rate": 0.5, "initial_tokens": 1.0}
-    return make_task("fusion_gym/RemoteEstimation-v0", **few, horizon=15, **options)
+    return make_task("fusion_gym/RemoteEstimation-v0", **few, horizon=5, **options)
 
 
 def test_the_floor_of_sources_that_are_alike_is_that_of_all_together() -> None:
     task = task_of()
-    bound = lagrangian_bound(source_problems(task), (1.0,) * 3, 0.5, horizon=15, initial_tokens=1.0)
+    bound = lagrangian_bound(source_problems(task), (1.0,) * 3, 0.5, horizon=5, initial_tokens=1.0)
     assert floor(task) == pytest.approx(-bound.cost, rel=1e-3)
     found = run_episodes(task, make_policy("innovation_threshold:threshold=2", task), 100, 0)
     assert found.returns.mean() < floor(task)
