@@ -80,8 +80,8 @@ def test_values_stand_at_the_choices_that_they_are_of(name: str) -> None:
     requests = env.view.requests(decisions.actions(chosen), RUNS)
     wanted = decisions.alternatives(chosen)
     value = (worth * wanted.transpose(1, 0, 2).reshape(sensors, -1)).sum(0).reshape(-1, RUNS)
-    rows = value.repeat(env.view.rows_per_run, axis=1)
-    reward, _ = decisions.relevant(Branched(value, np.zeros((*rows.shape, 1), dtype=np.float32)))
+    seen = np.zeros((*value.shape, len(env.batch.layout.names)), dtype=np.float32)
+    reward, _ = decisions.relevant(Branched(value, seen))
     taken = (worth * requests).sum(0).repeat(env.view.rows_per_run)
     found = decisions.arranged(chosen, taken, reward)
     for factor in range(factors):
