@@ -24,7 +24,7 @@ $(STAMP): pyproject.toml setup.py constraints.txt
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable '.[agents,test]'
 	touch $@
 
-demo: $(STAMP)  ## train an agent, compare it with the baselines, draw the figures
+demo: $(STAMP)  ## train two fronts, compare them with the strongest rules, draw the figures
 	$(BIN)/python -m agents.demo
 
 test: $(STAMP)  ## the tests, without the slow ones

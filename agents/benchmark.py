@@ -13,7 +13,6 @@ whose checkpoints hold pickles. ``python -m agents.report`` makes tables and fig
 from __future__ import annotations
 
 import shlex
-import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from fusion_gym.validation import ConfigurationError, choice
 
 from .command_line import Command, spelled, start
 from .input.options import OutputFolder, Steps, Whole, writable_folder
+from .output.ending import ended_like_by_ctrl_c
 from .output.files import load_results, read_json, write
 from .suite.classes import class_of
 from .suite.committed import FOLDER, complete, present
@@ -62,12 +62,8 @@ class Benchmark(Command):
 
     def run(self) -> None:
         """Do all work that is not finished, and judge every setting."""
-        # Ended from outside like by Ctrl-C: the workers stop too.
-        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-        try:
+        with ended_like_by_ctrl_c():
             self._run()
-        finally:
-            signal.signal(signal.SIGTERM, before)
 
     def interrupted(self) -> str:
         """Finished pieces of work are kept."""

@@ -52,8 +52,7 @@ class Compare(Command):
         baselines = run_all(
             task, sweep.policies, self.episodes, self.seed, "baselines", trust=self.trust
         )
-        names = (chosen.id, chosen.id)
-        compare(names, task, sweep, baselines, self.policy, self.seed, self.output, self.trust)
+        compare(chosen.id, task, sweep, baselines, self.policy, self.seed, self.output, self.trust)
 
 
 def main() -> None:

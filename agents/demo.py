@@ -1,126 +1,231 @@
-"""The project's main job, end to end: baselines, a trained agent, and a fair comparison.
+"""The project's main job, end to end: two fronts learned in minutes, and a fair comparison.
 
     python -m agents.demo [--output runs/demo] [--episodes 1000] [--fresh]
 
-In the benchmark setting and in the paper's it sweeps the analytic policies, trains PPO, compares
-it on the same seeds with the lower envelope of all baselines, and draws the Pareto front and one
-episode. A finished or interrupted training in the output folder is gone on with, not repeated.
+In the Tobit oscillator's benchmark setting it trains an agent for a coordinator and one for sensors
+by themselves, side by side; both see the price of a token. It runs them at seven prices, and on the
+same test episodes the rules of the committed envelopes that know as much, without memory and with
+it; and it draws the agents over the rules. What is finished in the output folder is not done again,
+and an interrupted training is gone on with.
 """
 
 from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from fusion_gym.envs.registration import make_task
+import numpy as np
+from rich import box
+from rich.table import Table
+
+from fusion_gym.evaluation.envelope import points_of
 from fusion_gym.evaluation.episodes import record_episode
-from fusion_gym.policies.registry import make_policy
+from fusion_gym.evaluation.intervals import Interval
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import Command, start
-from .input.options import Episodes, OutputFolder, Seed, Steps
-from .output import figures
-from .suite.comparison import compare, run_all
-from .suite.sweep import Sweep
+from .input.options import Episodes, OutputFolder, Steps
+from .output import figures, front_figure, tables
+from .output.ending import ended_like_by_ctrl_c
+from .output.files import write
+from .output.folders import alone_in
+from .suite.beside_rules import Ground, Trials
+from .suite.envelope_table import at_least
+from .suite.envelopes import task_of
+from .suite.trainings import train_beside
+from .suite.workers import side_by_side
 from .training.checked import load
 from .training.config import Experiment
-from .training.run import holds_training, train
+from .training.run import holds_training
+
+SETTING = "tobit_oscillator"
+WORKERS = 2
 
 
 @dataclass(frozen=True)
-class Setting:
-    """A named setting of the demo: the config that trains in it, and its title."""
+class Learner:
+    """Who learns: the config that trains it, its title, and the classes of rules beside it.
+
+    ``plain`` rules know what the agent does but what it remembers, ``remembering`` ones exactly as
+    much. ``bounded`` where the proven bound and the rollout are for: a coordinator.
+    """
 
     name: str
     config: str
     title: str
+    plain: str
+    remembering: str
+    bounded: bool = False
 
 
-SETTINGS = (
-    Setting(
-        "benchmark",
-        "tobit_oscillator_ppo",
-        "benchmark setting (Tobit filter, random start, 2 tokens a step)",
+LEARNERS = (
+    Learner(
+        name="coordinator",
+        config="tobit_oscillator_front",
+        title="A coordinator that sees all new measurements",
+        plain="sensors",
+        remembering="sensors_memory",
+        bounded=True,
     ),
-    Setting(
-        "paper",
-        "tobit_oscillator_paper_ppo",
-        "paper's setting (its filter and bucket)",
+    Learner(
+        name="alone",
+        config="tobit_oscillator_front_local",
+        title="Sensors by themselves, which hear the centre's estimate",
+        plain="local_estimate",
+        remembering="local_estimate_memory",
     ),
 )
 
 
 @dataclass(frozen=True)
 class Demo(Command):
-    """Baselines, a trained agent, and a fair comparison."""
+    """Two fronts learned in minutes, and a fair comparison with the strongest rules."""
 
     output: Annotated[Path, OutputFolder()] = Path("runs/demo")
     """Folder for the results."""
     episodes: Episodes = 1000
-    """Test episodes of each policy."""
-    seed: Seed = 0
-    """Seed of the first test episode."""
-    sweep: str = "tobit_oscillator_sweep"
-    """The baselines' YAML, or the name of a shipped one."""
+    """Test episodes of each agent at each price, and of each rule."""
     timesteps: Steps = None
     """Steps of each training, instead of the configs'."""
     fresh: bool = False
     """Remove earlier results first."""
 
     def run(self) -> None:
-        """Both settings from baselines to figures."""
-        began = time.perf_counter()
-        sweep = load(Sweep, self.sweep, "sweep")
-        for setting in SETTINGS if self.fresh else ():
-            remove(self.output / setting.name)
-        for setting in SETTINGS:
-            if not demonstrate(setting, load(Experiment, setting.config), sweep, self):
-                raise KeyboardInterrupt
-        seconds = time.perf_counter() - began
-        print(f"\nfigures, tables and models are in {self.output}; {seconds:.0f} s")
+        """From trainings to figures."""
+        ground = Ground.read(SETTING, self.episodes)
+        folders = {one.name: self.output / one.name for one in LEARNERS}
+        experiments = {
+            one.name: load(Experiment, one.config).changed(
+                folders[one.name] / "agent", timesteps=self.timesteps
+            )
+            for one in LEARNERS
+        }
+        with ended_like_by_ctrl_c(), alone_in(self.output, "output"):
+            if self.fresh:
+                remove(folders.values())
+            began = time.perf_counter()
+            train_beside(experiments)
+            trained = time.perf_counter()
+            tests = {
+                one.name: Trials.of(ground, (one.plain, one.remembering), folders[one.name])
+                for one in LEARNERS
+            }
+            side_by_side([work for one in tests.values() for work in one.left()], WORKERS, "tests")
+            tested = time.perf_counter()
+            for one in LEARNERS:
+                conclude(one, tests[one.name], folders[one.name])
+        seconds = (trained - began, tested - trained, time.perf_counter() - tested)
+        parts = "trainings {:.0f} s, tests {:.0f} s, tables and figures {:.0f} s".format(*seconds)
+        print(f"figures, tables and models are in {self.output}; {sum(seconds):.0f} s: {parts}")
 
     def interrupted(self) -> str:
         """Nothing is lost."""
-        return "interrupted: run the same command again to go on"
+        return "interrupted: run the same command again (without --fresh) to go on"
 
 
-def remove(folder: Path) -> None:
-    """Remove what an earlier demo left in a folder, and nothing else.
+def remove(folders: Iterable[Path]) -> None:
+    """Remove what an earlier demo left in these folders, and nothing else.
 
     Raises:
-        ConfigurationError: the folder holds something else.
+        ConfigurationError: one holds something else; all are kept.
     """
-    if not folder.exists():
-        return
-    if any(folder.iterdir()) and not holds_training(folder / "agent"):
-        raise ConfigurationError(
-            f"fresh = True is not allowed: {str(folder)!r} holds no results of a demo, and is kept"
-        )
-    shutil.rmtree(folder)
+    there = [folder for folder in folders if folder.exists()]
+    for folder in there:
+        if any(folder.iterdir()) and not holds_training(folder / "agent"):
+            raise ConfigurationError(
+                f"fresh = True is not allowed: {str(folder)!r} holds no results of a demo, and is "
+                "kept"
+            )
+    for folder in there:
+        shutil.rmtree(folder)
 
 
-def demonstrate(setting: Setting, experiment: Experiment, sweep: Sweep, given: Demo) -> bool:
-    """One setting from baselines to figures; false if its training was interrupted."""
-    folder = given.output / setting.name
-    task = make_task(experiment.environment.id, **experiment.environment.options)
-    print(f"\n{setting.title}")
-    baselines = run_all(task, sweep.policies, given.episodes, given.seed, "baselines")
-    training = experiment.changed(folder / "agent", timesteps=given.timesteps)
-    if not train(training, resume=holds_training(folder / "agent"))["finished"]:
-        return False
-    agent = f"model:{folder / 'agent' / 'best_model.zip'}"
-    names = (experiment.environment.id, setting.title)
-    compare(names, task, sweep, baselines, agent, given.seed, folder)
-    for name, text in (("agent", agent), ("dynamic_event", "dynamic_event")):
-        trajectory = record_episode(task, make_policy(text, task), given.seed)
-        figures.episode(
-            folder / f"episode_{name}.png", f"{setting.name}: {name}", trajectory,
-            task.bucket.capacity,
-        )  # fmt: skip
-    return True
+def conclude(learner: Learner, tests: Trials, folder: Path) -> None:
+    """Write, print and draw what an agent and its rules brought."""
+    report = tests.report()
+    write(folder / "front.json", report)
+    tables.console().print(front_table(learner, tests.ground, report))
+    draw_front(folder / "front.png", learner, tests, report)
+    draw_episodes(folder, learner, tests)
+
+
+def front_table(learner: Learner, ground: Ground, report: Mapping[str, Any]) -> Table:
+    """A row a price: the agent, and the rules of both classes at its rate."""
+    bucket = task_of(ground.setting).bucket
+    caption = (
+        f"{ground.episodes:,} episodes, the same for all, and all under the same token bucket: "
+        f"{bucket.rate:g} tokens a step, at most {bucket.capacity:g}, {bucket.cost[0, 0]:g} a "
+        "transmission. Rate per sensor and step; rules mixed to the agent's rate; paired "
+        "differences to their MSE, with 95 % intervals over episodes."
+    )
+    table = Table(title=title_of(learner, report), box=box.SIMPLE_HEAD, caption=caption)
+    for name in ("price", "rate", "MSE"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name in ("rules without memory", "rules with memory"):
+        table.add_column(name, justify="right")
+        table.add_column("difference", justify="right", no_wrap=True)
+    for point in report["points"]:
+        row = [f"{point['price']:.3g}", f"{point['rate']:.4f}", f"{point['mse']['mean']:.4f}"]
+        for name in (learner.plain, learner.remembering):
+            below = point["rules"].get(name)
+            row += [f"{below['mse']:.4f}", share(below["difference"])] if below else ["–", "–"]
+        table.add_row(*row)
+    return table
+
+
+def share(interval: Mapping[str, float]) -> str:
+    """A relative difference with its interval, in per cent."""
+    mean, low, high = (100.0 * interval[key] for key in ("mean", "low", "high"))
+    return f"{mean:+.1f} % [{low:+.1f}, {high:+.1f}]"
+
+
+def title_of(learner: Learner, report: Mapping[str, Any]) -> str:
+    """Who learned, and where its front lies, on average over the prices."""
+    lies = [
+        f"{100 * abs(mean):.1f} % {'below' if mean < 0 else 'above'} the rules {which} memory"
+        for name, which in ((learner.plain, "without"), (learner.remembering, "with"))
+        if name in report["mean"]
+        for mean in [report["mean"][name]["mean"]]
+    ]
+    return f"{learner.title}:\n" + (", ".join(lies) or "left of the rules at some price")
+
+
+def draw_front(path: Path, learner: Learner, tests: Trials, report: Mapping[str, Any]) -> None:
+    """The agent's front over everything that is known of its classes."""
+    ground, remembering = tests.ground, tests.results(learner.remembering)
+    agent = [(point["rate"], Interval(**point["mse"])) for point in report["points"]]
+    rates = np.linspace(0.0, 1.2 * max(rate for rate, _ in agent), 200)
+    bound = ground.bound if learner.bounded else None
+    layers = front_figure.Layers(
+        single=ground.single(learner.plain),
+        plain=[(point.rate, point.mse) for point in points_of(tests.results(learner.plain))],
+        remembering=[(point.rate, point.mse) for point in points_of(remembering)],
+        rollout=ground.simulations(remembering) if learner.bounded else [],
+        bound=[(rate, at_least(bound, rate)) for rate in rates] if bound else [],
+        agent=agent,
+    )
+    caption = (
+        f"{ground.episodes:,} test episodes, the same for all and under the same token bucket; "
+        "bars are 95 % intervals.\nSingle rules and simulations, which ran on other or fewer "
+        "episodes, are where they lie relative to the lines there."
+    )
+    front_figure.front(path, title_of(learner, report), caption, layers)
+
+
+def draw_episodes(folder: Path, learner: Learner, tests: Trials) -> None:
+    """One episode of the agent at its middle price, and of the rule whose rate is nearest."""
+    agent, rules = tests.agent[len(tests.agent) // 2], tests.results(learner.remembering)
+    rate = agent.read(tests.work).rate.mean()
+    rule = min(rules, key=lambda name: abs(rules[name].rate.mean() - rate))
+    for name, test in (("agent", agent), ("rule", tests.rules[learner.remembering][rule])):
+        task = task_of(test.setting, test.options)
+        trajectory = record_episode(task, test.make(task), test.seed)
+        path, title = folder / f"episode_{name}.png", f"{test.name}\n{learner.name}"
+        figures.episode(path, title, trajectory, task.bucket.capacity)
 
 
 def main() -> None:

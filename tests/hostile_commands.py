@@ -40,7 +40,7 @@ BASES: dict[str, dict[str, list[str]]] = {
     "report": {"results": ["results"]},
     "reproduce": {"config": ["rows.yaml"], "episodes": ["2"]},
     "zoo": {"results": ["results"], "work": ["work"], "zoo": ["made"]},
-    "demo": {"output": ["made"], "episodes": ["2"], "timesteps": ["32"], "sweep": ["sweep.yaml"]},
+    "demo": {"output": ["made"], "episodes": ["2"], "timesteps": ["32"]},
     "solved": {
         "config": ["training.yaml"], "output": ["made"], "episodes": ["2"], "seeds": ["0"],
     },

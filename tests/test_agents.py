@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import json
 import math
 import os
@@ -22,8 +24,10 @@ from training_configs import ENV, SMALL, read_records, small_config
 import fusion_gym
 from agents import demo, evaluate, reproduce
 from agents.command_line import read
+from agents.suite.beside_rules import Ground, Trials
 from agents.suite.config import Suite
 from agents.suite.sweep import Comparison, Sweep
+from agents.suite.trainings import train_beside
 from agents.training import run as train
 from agents.training.algorithms import TABLE
 from agents.training.checked import load
@@ -332,29 +336,120 @@ def test_evaluation_refuses_with_one_line(arguments: list[str], message: str) ->
     assert message in ended.err
 
 
-def test_demo_from_baselines_to_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sweep = tmp_path / "sweep.yaml"
-    curve = {"label": "innovation", "policy": "innovation_threshold:threshold={value}"}
-    content = {"points": ["never", "always"], "curves": [curve | {"values": [0.5, 1.0, 2.0]}]}
-    sweep.write_text(yaml.safe_dump(content))
-    monkeypatch.chdir(ROOT)
-    output = tmp_path / "demo"
-    arguments = ["demo", "--output", str(output), "--sweep", str(sweep), "--episodes", "20"]
-    monkeypatch.setattr(sys, "argv", [*arguments, "--timesteps", "16384"])
+def thinned(ground: Ground, every: int = 9) -> Ground:
+    """With fewer rules, for speed."""
+    envelopes = copy.deepcopy(dict(ground.envelopes))
+    for content in envelopes["classes"].values():
+        content["vertices"] = content["vertices"][::every]
+    return dataclasses.replace(ground, envelopes=envelopes)
+
+
+def test_demo_from_training_to_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ground, learner = thinned(Ground.read(demo.SETTING, 2)), demo.LEARNERS[1]
+    monkeypatch.setattr(demo.Ground, "read", lambda *_: ground)
+    monkeypatch.setattr(demo, "LEARNERS", (learner,))
+    monkeypatch.setattr(demo, "WORKERS", 1)
+    words = ["--output", str(tmp_path), "--episodes", "2", "--timesteps", "8192"]
+    monkeypatch.setattr(sys, "argv", ["demo", *words])
     demo.main()
-    for setting in ("benchmark", "paper"):
-        folder = output / setting
-        for figure in ("pareto.png", "episode_agent.png", "episode_dynamic_event.png"):
-            assert (folder / figure).stat().st_size > 20_000
-        verdict = json.loads((folder / "comparison.json").read_text())
-        assert verdict["difference"]["mean"] == pytest.approx(verdict["mse"] - verdict["envelope"])
-        assert json.loads((folder / "agent" / "summary.json").read_text())["finished"]
-    began = (output / "paper" / "agent" / "final_model.zip").stat().st_mtime
-    monkeypatch.setattr(demo, "SETTINGS", demo.SETTINGS[1:])
-    demo.main()
-    records = read_records(output / "paper" / "agent")
-    assert len(records) == 1, "a finished training is not repeated"
-    assert (output / "paper" / "agent" / "final_model.zip").stat().st_mtime >= began
+    assert learner.title in capsys.readouterr().out
+    folder, classes = tmp_path / learner.name, (learner.plain, learner.remembering)
+    for figure in ("front.png", "episode_agent.png", "episode_rule.png"):
+        assert (folder / figure).stat().st_size > 20_000
+    assert json.loads((folder / "agent" / "summary.json").read_text())["finished"]
+    report = json.loads((folder / "front.json").read_text())
+    prices = [point["price"] for point in report["points"]]
+    assert prices == pytest.approx(np.geomspace(0.003, 0.3, 7))
+    assert list(report["classes"]) == list(classes)
+    agent = f"model:{folder / 'agent' / 'best_model.zip'},price={prices[3]}"
+    task = fusion_gym.make_task(ENV, **report["options"], memory=True)
+    found, point = run_episodes(task, make_policy(agent, task), 2, 0), report["points"][3]
+    assert point["rate"] == pytest.approx(float(found.rate.mean()))
+    assert point["mse"]["mean"] == pytest.approx(float(found.mse.mean()))
+    # The line through the rules, once more.
+    rules = []
+    for vertex in ground.envelopes["classes"][learner.remembering]["vertices"]:
+        task = fusion_gym.make_task(ENV, **report["options"], **vertex["options"])
+        brought = run_episodes(task, make_policy(vertex["policy"], task), 2, 0)
+        rules.append((float(brought.rate.mean()), float(brought.mse.mean())))
+    below = np.interp(point["rate"], *np.array(sorted(rules)).T)
+    beside = point["rules"][learner.remembering]
+    assert beside["mse"] == pytest.approx(below)
+    assert beside["difference"]["mean"] == pytest.approx(found.mse.mean() / below - 1.0)
+    # The same command again has nothing left to test; another model has all of its prices.
+    assert Trials.of(ground, classes, folder).left() == []
+    with (folder / "agent" / "best_model.zip").open("ab") as model:
+        model.write(b"another")
+    assert len(Trials.of(ground, classes, folder).left()) == 7
+
+
+def test_the_demo_trains_in_the_setting_of_its_rules() -> None:
+    """What differs from the environment of the rules with memory is the price, which is drawn."""
+    ground = Ground.read(demo.SETTING, 1)
+    for learner in demo.LEARNERS:
+        plain, remembering = (
+            ground.envelopes["classes"][name] for name in (learner.plain, learner.remembering)
+        )
+        assert (plain["memory"], remembering["memory"]) == (False, True)
+        assert plain["mode"] == remembering["mode"]
+        chosen = load(Experiment, learner.config).environment
+        assert (chosen.id, chosen.local) == (ENV, plain["mode"] == "local")
+        price = {"cost_weight": "random", "price_range": ground.setting.price_range}
+        rules = ground.setting.environment.options | remembering["options"]
+        assert json.dumps(chosen.options, sort_keys=True) == json.dumps(
+            rules | price, sort_keys=True
+        )
+
+
+def test_what_is_drawn_beside_the_rules_lies_as_it_lay_on_its_own_episodes() -> None:
+    ground = Ground.read(demo.SETTING, 100)
+    task = fusion_gym.make_task(ENV, **ground.setting.environment.options)
+    never = run_episodes(task, make_policy("never", task), 100, 0)
+    harder = never.mse.mean() / never.mse[:60].mean()
+    expected = [(point.rate, point.mse * harder) for point in ground.rollout]
+    np.testing.assert_allclose(ground.simulations({"never": never}), expected)
+    fewer = dataclasses.replace(ground, episodes=59)
+    assert fewer.simulations({"never": never}) == []
+    for name in ("sensors", "local_estimate"):
+        vertices = ground.envelopes["classes"][name]["vertices"]
+        middle = [v for v in vertices if 0.02 < v["tuning"]["rate"] < 0.15]
+        drawn = ground.single(name)
+        for vertex in middle:  # on tuning episodes nothing is below; where a rule is one, on it
+            place = vertex["tuning"]["rate"], vertex["test"]["mse"]["mean"]
+            assert any(point == pytest.approx(place) for point in drawn), vertex["name"]
+
+
+@pytest.mark.slow
+def test_an_interrupted_demo_ends_its_trainings_with_a_checkpoint(tmp_path: Path) -> None:
+    words = ["--output", str(tmp_path), "--episodes", "2", "--timesteps", "10000000"]
+    command = [sys.executable, "-m", "agents.demo", *words]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    agents = [tmp_path / learner.name / "agent" for learner in demo.LEARNERS]
+    deadline = time.monotonic() + 120
+    while not all((agent / "tensorboard").exists() for agent in agents):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    time.sleep(1.0)  # into the first rollouts
+    process.terminate()
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert error.decode().splitlines()[-1].startswith("interrupted: run the same command again")
+    assert b"Traceback" not in error
+    for agent in agents:
+        summary = json.loads((agent / "summary.json").read_text())
+        assert not summary["finished"]
+        assert (agent / "latest.zip").exists()
+        assert summary["timesteps"] > 0
+    steps = max(json.loads((agent / "summary.json").read_text())["timesteps"] for agent in agents)
+    resumed = train_beside(
+        {
+            learner.name: load(Experiment, learner.config).changed(agent, timesteps=steps + 8192)
+            for learner, agent in zip(demo.LEARNERS, agents, strict=True)
+        }
+    )
+    assert all(summary["finished"] for summary in resumed.values())
 
 
 def test_reproduce_prints_every_row() -> None:

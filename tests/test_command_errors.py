@@ -174,19 +174,19 @@ def test_an_interrupt_while_a_command_loads_has_no_traceback(line: str) -> None:
 
 def test_a_fresh_demo_removes_nothing_but_a_demo(here: Path) -> None:
     """Neither what is not its own, nor anything when it is refused."""
-    (here / "agent").mkdir()
-    (here / "agent" / "config.yaml").touch()
-    (here / "benchmark").mkdir()
-    (here / "benchmark" / "notes").write_text("kept")
-    for folder in (here / "benchmark", here / "folder"):
-        with pytest.raises(ConfigurationError, match="fresh = True"):
-            remove(folder)
-    ended = call("demo", ["--fresh", "--output", ".", "--sweep", "absent.yaml"])
-    assert ended.status == 1
-    assert (here / "benchmark" / "notes").read_text() == "kept"
-    remove(here)
-    assert not here.exists()
-    here.mkdir()
+    for name in ("coordinator", "alone"):
+        (here / name / "agent").mkdir(parents=True)
+        (here / name / "agent" / "config.yaml").touch()
+    (here / "alone" / "agent" / "config.yaml").rename(here / "alone" / "notes")
+    with pytest.raises(ConfigurationError, match="fresh = True"):
+        remove([here / "folder"])
+    ended = call("demo", ["--fresh", "--output", "."])
+    assert (ended.status, ended.trace) == (1, "")
+    assert "fresh = True is not allowed: 'alone' holds no results of a demo" in ended.err
+    assert (here / "alone" / "notes").exists()
+    assert (here / "coordinator" / "agent" / "config.yaml").exists()
+    remove([here / "coordinator", here / "absent"])
+    assert not (here / "coordinator").exists()
 
 
 @pytest.mark.parametrize("text", ["{[]: 1}", "(" * 5000, "9" * 5000 + "x", "\0"])

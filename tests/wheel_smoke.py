@@ -149,6 +149,9 @@ def use(programs: Path, folder: Path) -> None:
         "training", cwd=folder,
     )  # fmt: skip
     assert json.loads((folder / "training" / "summary.json").read_text())["finished"]
+    quick = ("--episodes", "2", "--timesteps", "8192")
+    call(program, "demo", *quick, "--output", "demo", cwd=folder)
+    assert (folder / "demo" / "coordinator" / "front.png").exists()
     table = call(program, "reproduce", "--episodes", "2", "--markdown", cwd=folder).stdout
     assert table.startswith("| setting |"), table
     (folder / "suite.yaml").write_text(json.dumps(SUITE))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 
@@ -40,6 +41,16 @@ def told(interrupted: Callable[[], str] = lambda: "interrupted") -> Iterator[Non
         sys.exit(f"error: {place}{_joined(error.strerror or error)}")
     except MemoryError as error:
         sys.exit(f"error: there is not enough memory. {_joined(error)}".rstrip(". "))
+
+
+@contextlib.contextmanager
+def ended_like_by_ctrl_c() -> Iterator[None]:
+    """Ended from outside like by Ctrl-C, so that workers stop too."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def flush() -> None:

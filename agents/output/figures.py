@@ -19,8 +19,8 @@ from fusion_gym.evaluation.intervals import mean_interval
 
 from .files import replacing
 
-_INK = "#30343b"
-_AGENT = "#c8102e"
+INK = "#30343b"
+AGENT = "#c8102e"
 _TALLEST = 7.0  # of the least error, where the errors' axis of the fronts ends
 plt.rcParams.update(
     {
@@ -28,7 +28,7 @@ plt.rcParams.update(
         "font.size": 9,
         "axes.spines.top": False,
         "axes.spines.right": False,
-        "axes.edgecolor": _INK,
+        "axes.edgecolor": INK,
         "axes.grid": True,
         "grid.alpha": 0.25,
         "legend.frameon": False,
@@ -63,14 +63,14 @@ def pareto(
     for place, line in enumerate(lines):
         _draw(axes, line.label, line.results, colours(place % 20), marker="o")
     for place, (name, found) in enumerate(points.items()):
-        _draw(axes, name, [found], _INK, marker="sD^vPX"[place % 6], size=4.5)
+        _draw(axes, name, [found], INK, marker="sD^vPX"[place % 6], size=4.5)
     hull = [*envelope]
     right = axes.get_xlim()[1]
     rates = [p.rate for p in hull] + [max(right, hull[-1].rate)]
     errors = [p.mse for p in hull] + [hull[-1].mse]
-    axes.plot(rates, errors, "--", color=_INK, lw=1, label="lower envelope of the baselines")
+    axes.plot(rates, errors, "--", color=INK, lw=1, label="lower envelope of the baselines")
     for name, found in agents.items():
-        _draw(axes, name, [found], _AGENT, marker="*", size=15)
+        _draw(axes, name, [found], AGENT, marker="*", size=15)
     axes.set_xlabel("transmissions per sensor and step")
     axes.set_ylabel("mean squared error of the fused estimate")
     every = [r for line in lines for r in line.results] + [*points.values(), *agents.values()]
@@ -80,7 +80,7 @@ def pareto(
     axes.set_xlim(left=-0.005)
     axes.set_title(title, loc="left", fontsize=10)
     axes.legend(fontsize=7.5, ncols=2)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _draw(
@@ -122,18 +122,16 @@ def fronts(
         axes.plot(rate, mse, line, marker="o", ms=3, lw=0.9, color=colours(place % 20), label=label)
     if informed:
         rate, mse = zip(*informed, strict=True)
-        axes.plot(rate, mse, ":", marker="x", ms=4, color=_INK, label="reference with the model")
+        axes.plot(rate, mse, ":", marker="x", ms=4, color=INK, label="reference with the model")
     for (mode, points), style in zip(agents.items(), ("-", "--", "-."), strict=False):
         rate, mse = zip(*sorted(points), strict=True)
-        axes.plot(
-            rate, mse, style, marker="*", ms=9, color=_AGENT, zorder=3, label=f"agent, {mode}"
-        )
+        axes.plot(rate, mse, style, marker="*", ms=9, color=AGENT, zorder=3, label=f"agent, {mode}")
     everything = [mse for points in (*agents.values(), informed) for _, mse in points]
     bottom = 0.88 * min((mse for mse in everything if mse > 0.0), default=1.0)  # logarithmic
     if genie is not None:
         level = genie["mse"]["mean"]
         label = f"genie ({level:.3g}{', below' if level < bottom else ''})"
-        axes.axhline(max(level, bottom), color=_INK, lw=0.8, label=label)
+        axes.axhline(max(level, bottom), color=INK, lw=0.8, label=label)
     axes.set_yscale("log")
     axes.set_ylim(bottom, _TALLEST * bottom)
     plain = matplotlib.ticker.FuncFormatter(lambda value, _: f"{value:g}")
@@ -146,7 +144,7 @@ def fronts(
     axes.set_ylabel("mean squared error of the fused estimate")
     axes.set_title(title, loc="left", fontsize=10)
     axes.legend(fontsize=7.5, ncols=2)
-    _save(figure, path)
+    save(figure, path)
 
 
 def episode(path: Path, title: str, trajectory: Trajectory, capacity: float) -> None:
@@ -177,7 +175,7 @@ def episode(path: Path, title: str, trajectory: Trajectory, capacity: float) -> 
         deviation = np.sqrt(trajectory.variance[:, state])
         mean = trajectory.mean[:, state]
         panel.fill_between(
-            steps, mean - 2 * deviation, mean + 2 * deviation, color=_AGENT, alpha=0.12, lw=0,
+            steps, mean - 2 * deviation, mean + 2 * deviation, color=AGENT, alpha=0.12, lw=0,
             label="fused ± 2 claimed deviations",
         )  # fmt: skip
         for sensor in range(sensors):
@@ -185,17 +183,18 @@ def episode(path: Path, title: str, trajectory: Trajectory, capacity: float) -> 
                 steps, trajectory.local_mean[:, sensor, state], color=f"C{sensor}", lw=0.7,
                 alpha=0.7, label=f"node {sensor + 1}",
             )  # fmt: skip
-        panel.plot(steps, trajectory.truth[:, state], color=_INK, lw=1.4, label="state")
-        panel.plot(steps, mean, color=_AGENT, lw=1.2, label="fused estimate")
+        panel.plot(steps, trajectory.truth[:, state], color=INK, lw=1.4, label="state")
+        panel.plot(steps, mean, color=AGENT, lw=1.2, label="fused estimate")
         reach = np.abs(trajectory.truth[:, state]).max() * 2
         panel.set_ylim(*np.clip(panel.get_ylim(), -reach, reach))
         panel.set_ylabel(f"x{state + 1}")
-    axes[1].legend(ncols=6, fontsize=7, loc="upper right")
+    axes[1].legend(ncols=6, fontsize=7, loc="lower right", bbox_to_anchor=(1, 1))
     axes[-1].set_xlabel("step")
-    _save(figure, path)
+    save(figure, path)
 
 
-def _save(figure: plt.Figure, path: Path) -> None:
+def save(figure: plt.Figure, path: Path) -> None:
+    """Write a figure in one move, and close it."""
     try:
         with replacing(path) as partial:
             figure.savefig(partial, bbox_inches="tight")

@@ -40,17 +40,14 @@ def run_all(
 
 
 def compare(
-    names: tuple[str, str], task: Task, sweep: Sweep, baselines: dict[str, EpisodeResults],
-    agent: str, seed: int, folder: Path, trust: bool = False,
+    env_id: str, task: Task, sweep: Sweep, baselines: dict[str, EpisodeResults], agent: str,
+    seed: int, folder: Path, trust: bool = False,
 ) -> None:  # fmt: skip
     """Run the agent on the baselines' episodes; write, print and draw the comparison.
-
-    ``names`` are the environment's id and the title.
 
     Raises:
         ConfigurationError: the agent transmits less than every baseline.
     """
-    env_id, title = names
     episodes = next(iter(baselines.values())).episodes
     learned = run_all(task, [agent], episodes, seed, "agent", trust=trust)[agent]
     comparison = compare_with_envelope(learned, baselines)
@@ -79,7 +76,7 @@ def compare(
     console = tables.console()
     console.print(
         tables.evaluation_table(
-            f"{title}: single policies, the lower envelope of all {len(baselines)} baselines, "
+            f"{env_id}: single policies, the lower envelope of all {len(baselines)} baselines, "
             "and the agent",
             {name: report["policies"][name] for name in shown},
             report["quantiles"],
@@ -93,7 +90,7 @@ def compare(
     ]
     points = {name: baselines[name] for name in sweep.points}
     label = "PPO agent" if agent.startswith("model:") else agent
-    figures.pareto(folder / "pareto.png", title, lines, points, {label: learned}, envelope)
+    figures.pareto(folder / "pareto.png", env_id, lines, points, {label: learned}, envelope)
 
 
 def comparison_table(comparison: Comparison, learned: EpisodeResults) -> Table:

@@ -21,6 +21,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import EnvelopePoint, lower_hull, points_of
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.intervals import mean_interval
+from fusion_gym.policies.base import Policy
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
@@ -109,6 +110,10 @@ class Test:
             "seed": self.seed,
         }
 
+    def make(self, task: Task) -> Policy:
+        """The policy itself."""
+        return make_policy(self.policy, task)
+
     def path(self, work: Path) -> Path:
         """Its episodes."""
         return work / self.setting.name / "tested" / f"{fingerprint(self.inputs)}.npz"
@@ -160,7 +165,7 @@ def _finite(mse: Any) -> Any:
 def run_test(test: Test, work: Path) -> None:
     """Measure a policy on the test seeds."""
     task = task_of(test.setting, test.options)
-    results = run_episodes(task, make_policy(test.policy, task), test.episodes, test.seed)
+    results = run_episodes(task, test.make(task), test.episodes, test.seed)
     save_results(test.path(work), {test.policy: results}, fingerprint(test.inputs))
 
 

@@ -44,7 +44,7 @@ def side_by_side(work: Sequence[Work], workers: int, description: str) -> None:
         except BrokenProcessPool:
             raise ConfigurationError(
                 f"workers = {workers}: the system ended one of them, perhaps for want of memory; "
-                "finished pieces of work are kept, go on with --resume"
+                "finished pieces of work are kept: go on as after an interrupt"
             ) from None
     print(f"{description}: {len(work)} pieces of work in {time.perf_counter() - began:.0f} s")
 

@@ -1,0 +1,91 @@
+"""Trainings side by side: a process and a progress bar each, one interrupt for all."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+from fusion_gym.validation import ConfigurationError
+
+from ..output.progress import progress_bars
+from ..training.config import Experiment
+from ..training.run import holds_training, train
+from .workers import end_with
+
+_EVERY = 1.0  # seconds between two looks
+
+
+def train_beside(experiments: Mapping[str, Experiment]) -> dict[str, dict[str, Any]]:
+    """Begin these trainings or go on with them, all at once; returns their summaries by name.
+
+    Bars show what each has written of its validations. An interrupt, or what goes wrong in one of
+    them, ends all after their rollout, with a checkpoint.
+
+    Raises:
+        KeyboardInterrupt: they were interrupted.
+        ConfigurationError: as :func:`agents.training.run.train`, or the system ended a process.
+    """
+    others = set(multiprocessing.active_children())
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(len(experiments), spawn, end_with, (os.getpid(),)) as pool:
+        try:
+            with _interrupts_ignored():  # by the new processes: this one tells them when to end
+                running = {name: _begin(pool, one) for name, one in experiments.items()}
+            _watch(experiments, set(running.values()))
+            return {name: future.result() for name, future in running.items()}
+        except BaseException as error:
+            for child in set(multiprocessing.active_children()) - others:
+                child.terminate()
+            if isinstance(error, BrokenProcessPool):
+                raise ConfigurationError(
+                    f"trainings = {list(experiments)}: the system ended one of them, perhaps for "
+                    "want of memory; what they have learned is kept"
+                ) from None
+            raise
+
+
+def _begin(pool: ProcessPoolExecutor, experiment: Experiment) -> Future[dict[str, Any]]:
+    resume = holds_training(Path(experiment.output))
+    return pool.submit(train, experiment, resume=resume, quiet=True)
+
+
+def _watch(experiments: Mapping[str, Experiment], left: set[Future[dict[str, Any]]]) -> None:
+    """Show how far the trainings are until all have ended.
+
+    Raises:
+        KeyboardInterrupt: one was interrupted; or what went wrong in it.
+    """
+    with progress_bars({name: one.training.timesteps for name, one in experiments.items()}) as show:
+        while left:
+            done, left = wait(left, _EVERY)
+            for name, one in experiments.items():
+                show(name, _last_validation(Path(one.output)))
+            for future in done:
+                if not future.result()["finished"]:
+                    raise KeyboardInterrupt
+
+
+def _last_validation(folder: Path) -> dict[str, Any] | None:
+    """What a training has last written of its validations."""
+    try:
+        lines = (folder / "validation.jsonl").read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        return None
+    return json.loads(lines[-1]) if lines else None
+
+
+@contextlib.contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
