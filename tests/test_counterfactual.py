@@ -15,7 +15,8 @@ from agents.training import run
 from agents.training.algorithms import TABLE
 from agents.training.checked import load
 from agents.training.config import Experiment
-from agents.training.counterfactual import CounterfactualPPO, Decisions, Rollout, _Step
+from agents.training.counterfactual import CounterfactualPPO, Rollout, _Step
+from agents.training.decisions import Decisions
 from fusion_gym.envs.privileged import Branched, PrivilegedVecEnv
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.evaluation.episodes import run_episodes

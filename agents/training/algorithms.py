@@ -19,7 +19,8 @@ from stable_baselines3.common.utils import LinearSchedule
 from fusion_gym.validation import choice
 
 from .checked import Positive, Rate, Several, Share, Strict, Weight
-from .counterfactual import Counterfactual, CounterfactualMaskablePPO, CounterfactualPPO, Kind
+from .counterfactual import Counterfactual, CounterfactualMaskablePPO, CounterfactualPPO
+from .decisions import Kind
 
 # Share of the steps in which the untrained policy lets every sensor request; by default one half.
 # Where that is far more than the tokens pay for, asking for less changes nothing (another sensor's

@@ -1,0 +1,103 @@
+"""What could have been decided instead, as a learner needs it: probabilities, requests, values."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from gymnasium.spaces import MultiBinary
+from numpy.typing import NDArray
+
+from fusion_gym.arrays import Array
+from fusion_gym.envs.privileged import Branched, PrivilegedVecEnv
+from fusion_gym.envs.views import SensorView
+from fusion_gym.validation import ConfigurationError
+
+Kind = Literal["all", "flips"]
+MOST_ALTERNATIVES = 16  # sets of requests that are all stepped unless told otherwise
+Chosen = NDArray[np.int64]  # choices (rows, D)
+
+
+class Decisions:
+    """The alternatives of every row's decision, as D factors of C choices each.
+
+    - ``"all"``: one factor, whose choices are all actions of a coordinator.
+    - ``"flips"``: a factor a sensor, silence or a request, the other sensors as they were; the
+      decision of a sensor by itself is one such factor.
+
+    Raises:
+        ConfigurationError: flips of an action that is one number.
+    """
+
+    def __init__(self, env: PrivilegedVecEnv, kind: Kind | None) -> None:
+        self.view, self.local = env.view, isinstance(env.view, SensorView)
+        self.sensors, self.runs, self.rows = env.task.sensors, env.runs, env.num_envs
+        space = env.action_space
+        self.binary = isinstance(space, MultiBinary)
+        if self.local:
+            self.kind: Kind = "flips"
+        elif not self.binary:
+            self.kind = "all"
+        else:
+            few = self.sensors < 60 and 2**self.sensors <= MOST_ALTERNATIVES
+            self.kind = kind or ("all" if few else "flips")
+        if kind is not None and kind != self.kind:
+            raise ConfigurationError(
+                f"alternatives = {kind!r} is not allowed here: it must be {self.kind!r}, for "
+                + ("sensors decide by themselves" if self.local else "an action is one number")
+            )
+        self.choices = 2
+        if self.kind == "all":
+            self.choices = 2**self.sensors if self.binary else int(space.n)  # type: ignore[attr-defined]
+            numbers = np.arange(self.choices)
+            bits = (numbers[:, None] >> np.arange(self.sensors) & 1).astype(np.bool_)
+            actions = bits if self.binary else numbers
+            self.bits = torch.as_tensor(bits, dtype=torch.float32)
+            self.requests = env.view.requests(actions, self.choices).T[:, :, None]
+
+    def log_probabilities(self, logits: torch.Tensor) -> torch.Tensor:
+        """Of all choices, (rows, D, C), from logits of ``Discrete`` (rows, choices) or, for
+        ``MultiBinary``, of requests (rows, sensors)."""
+        if not self.binary:
+            return torch.log_softmax(logits, -1)[:, None]
+        silent = -torch.nn.functional.softplus(logits)
+        if self.kind == "flips":
+            return torch.stack((silent, logits + silent), -1)
+        return (silent.sum(-1, keepdim=True) + logits @ self.bits.T)[:, None]
+
+    def actions(self, chosen: Chosen) -> NDArray[Any]:
+        """Actions of the space from the choices (rows, D)."""
+        if not self.binary:
+            return chosen[:, 0]
+        if self.kind == "flips":
+            return chosen
+        return chosen >> np.arange(self.sensors) & 1
+
+    def alternatives(self, chosen: Chosen) -> NDArray[Any]:
+        """The requests (A, sensors, N) that are stepped beside those chosen (rows, D)."""
+        if self.kind == "all":
+            return np.broadcast_to(self.requests, (self.choices, self.sensors, self.runs))
+        taken = chosen.reshape(self.runs, self.sensors).T == 1
+        return taken ^ np.eye(self.sensors, dtype=np.bool_)[:, :, None]
+
+    def relevant(self, branched: Branched) -> tuple[Array, NDArray[np.float32]]:
+        """Rewards (K, rows) and observations (K, rows, entries) that a row's choices lead to.
+
+        All alternatives of a run; for a sensor by itself its own flip.
+        """
+        if not isinstance(self.view, SensorView):
+            return branched.reward, branched.observation
+        row = np.arange(self.rows)
+        sensor, run = row % self.sensors, row // self.sensors
+        observation = self.view.row(branched.observation[sensor, run], sensor)
+        return branched.reward[sensor, run][None], observation[None]
+
+    def arranged(self, chosen: Chosen, taken: Array, stepped: Array) -> Array:
+        """Values (rows, D, C) of all choices, from those taken (rows,) and stepped (K, rows)."""
+        if self.kind == "all":
+            return stepped.T[:, None]
+        flipped = stepped.T
+        kept = np.broadcast_to(taken[:, None], flipped.shape)
+        request = chosen == 1
+        return np.stack((np.where(request, flipped, kept), np.where(request, kept, flipped)), -1)
