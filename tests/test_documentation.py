@@ -19,7 +19,9 @@ import pytest
 
 import fusion_gym
 from agents import report
-from agents.suite import envelope_table
+from agents.output.files import read_json
+from agents.suite import envelope_table, learning_table
+from agents.suite.learning import load_learning
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.options import Scenario
 from fusion_gym.envs import pages
@@ -105,6 +107,19 @@ def test_the_committed_envelopes_are_what_the_pages_say() -> None:
     written = (results / "envelopes" / "README.md").read_text()
     assert written == envelope_table.text_of(results, "python -m agents.envelope")
     missing = [line for line in envelope_table.headline_table(results) if line not in README]
+    assert not missing
+
+
+def test_the_committed_fronts_are_what_the_pages_say() -> None:
+    folder = ROOT / "results" / "learning"
+    files = {path.stem: read_json(path, "results") for path in folder.glob("*.json")}
+    known = [course.setting for course in load_learning("learning").settings]
+    reports = [files[name] for name in known if name in files]
+    written = (folder / "README.md").read_text()
+    command = re.search("Made by `(.*)`;", written)
+    assert command
+    assert written == learning_table.text_of(reports, command.group(1))
+    missing = [line for line in learning_table.headline(reports) if line not in README]
     assert not missing
 
 

@@ -85,6 +85,22 @@ def _difference(found: Mapping[str, float]) -> str:
     return f"{found['mean']:+.1%} [{found['low']:+.1%}, {found['high']:+.1%}]"
 
 
+def headline(reports: Sequence[Report]) -> list[str]:
+    """One row a setting, for the front page."""
+    cells = (
+        "setting", "below the rules without memory after", "plain PPO",
+        "finished, against", "mean", "worst", "above",
+    )  # fmt: skip
+    lines = [_joined(cells), _joined(["---"] * len(cells))]
+    for report in reports:
+        found, whole = report["finished"], row(report)
+        mean = f"{found['mean']:+.1%}" if found else "–"
+        title = report["title"].split(",")[0]
+        above = whole[6].split(" (")[0]
+        lines.append(_joined([title, *whole[3:6], mean, whole[7], above]))
+    return lines
+
+
 def text_of(reports: Sequence[Report], command: str) -> str:
     """All tables in Markdown, with how they are made."""
     lines = [
