@@ -23,6 +23,8 @@ Content = dict[str, Any]
 _UNKNOWN = ("nobody_knows_this",)
 NAMES = {
     "a2c": "tobit_oscillator_a2c",
+    "counterfactual_maskable_ppo": "tobit_oscillator_front",
+    "counterfactual_ppo": "biased_tracking_front",
     "dqn": "remote_estimation_dqn",
     "maskable_ppo": "tobit_oscillator_maskable_ppo",
     "ppo": "remote_estimation_ppo",
@@ -34,6 +36,7 @@ def plain(kind: str) -> Content:
     """A shipped config of this algorithm with all its fields, small enough to make in no time."""
     content = load(Experiment, NAMES[kind]).model_dump(mode="json")
     content["environment"]["options"]["horizon"] = 20
+    content["algorithm"]["name"] = kind
     content["training"]["num_envs"] = 2
     content["algorithm"] |= {"network": {"hidden": [4], "activation": "tanh"}, "batch_size": 8}
     if kind == "a2c":
