@@ -31,7 +31,7 @@ from .verdict import MIDDLE
 
 Kind = Literal["front", "plain"]
 # Options that change neither the task nor what a policy may know of it.
-_FREE = ("memory_filter", "memory_features")
+_FREE = ("memory_filter", "memory_features", "error_scale")
 
 
 @dataclass(frozen=True)
