@@ -85,6 +85,22 @@ def test_alternatives_are_the_steps_that_would_have_been(name: str, owner: Owner
         assert contents(batch) == went
 
 
+@pytest.mark.parametrize("sensors", [40, 60, 62, 64])
+def test_grants_of_many_sensors_are_told_apart(sensors: int) -> None:
+    """However many bits they take: each alternative is the request of one of the last sensors."""
+    task = fusion_gym.make_task(
+        "fusion_gym/RemoteEstimation-v0", sensors=sensors, tokens="unlimited"
+    )
+    batch = EpisodeBatch.seeded(task, 512, 0)
+    wanted = np.zeros((6, sensors, 512), dtype=np.bool_)
+    wanted[np.arange(6), np.arange(sensors - 6, sensors)] = True
+    before = batch.branch()
+    found = stepped(batch.branch(), batch, np.zeros((sensors, 512), dtype=np.bool_), wanted)
+    for place, requests in enumerate(wanted):
+        outcome = before.branch().step(requests, batch.normals())
+        np.testing.assert_array_equal(found.error[:, place], outcome.error)
+
+
 def test_requests_that_are_answered_alike_are_stepped_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -11,7 +11,7 @@ from fusion_gym.arrays import Array, take_runs
 from fusion_gym.core.beliefs import Beliefs
 from fusion_gym.core.runs import Branch, Outcome
 
-_MOST_BITS = 62  # sensors whose grants are one whole number
+_MOST_BITS = 62  # of a whole number that holds the sensors' grants and the run
 
 
 class Alternatives(NamedTuple):
@@ -49,7 +49,7 @@ def alternatives(
     error, communication = taken.error, taken.reward_communication
     if other.size:
         first = np.arange(other.size)
-        if sensors <= _MOST_BITS:
+        if sensors + runs.bit_length() <= _MOST_BITS:
             codes = (1 << np.arange(sensors)) @ granted[:, other] * runs + other % runs
             _, first, place = np.unique(codes, return_index=True, return_inverse=True)
             found[other] = runs + place
