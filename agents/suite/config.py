@@ -8,7 +8,7 @@ from typing import Any, Literal
 import pydantic
 
 from ..training.algorithms import AlgorithmConfig, AnyAlgorithm, settings
-from ..training.checked import Positive, Rate, Share, Strict, parse, read_yaml
+from ..training.checked import Positive, Rate, Share, Strict, load_changed
 from ..training.config import EnvironmentConfig
 
 Mode = Literal["sensors", "centre", "local"]
@@ -183,6 +183,4 @@ def load_suite(path: str | Path, quick: bool = False) -> Suite:
     Raises:
         ConfigurationError: unreadable, an unknown key, or a value that is not allowed.
     """
-    plain = read_yaml(path)
-    changed = quick and isinstance(plain, dict)  # all else is refused
-    return parse(Suite, plain | QUICK if changed else plain, str(path))
+    return load_changed(Suite, path, QUICK if quick else {})

@@ -7,7 +7,7 @@ from typing import Any
 
 import pydantic
 
-from ..training.checked import Positive, Rate, Share, Strict, parse, read_yaml
+from ..training.checked import Positive, Rate, Share, Strict, load_changed
 
 
 class Plain(Strict):
@@ -75,6 +75,4 @@ def load_learning(path: str | Path, quick: bool = False) -> Learning:
     Raises:
         ConfigurationError: unreadable, an unknown key, or a value that is not allowed.
     """
-    plain = read_yaml(path)
-    changed = quick and isinstance(plain, dict)  # all else is refused
-    return parse(Learning, plain | QUICK if changed else plain, str(path))
+    return load_changed(Learning, path, QUICK if quick else {})
