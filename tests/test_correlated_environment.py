@@ -238,7 +238,7 @@ def test_long_episodes_of_rare_deliveries() -> None:
     for _ in range(horizon):
         outcome = batch.step(policy(batch.signals()))
         assert np.isfinite(outcome.reward).all()
-    assert outcome.truncated.all()
+    assert outcome.ended.all()
     assert np.isfinite(linalg.cholesky(batch.delivered.covariance)).all()
 
 

@@ -17,7 +17,7 @@ from agents.training.checked import load
 from agents.training.config import Experiment
 from agents.training.counterfactual import CounterfactualPPO, Rollout, _Step
 from agents.training.decisions import Decisions
-from fusion_gym.envs.privileged import Branched, PrivilegedVecEnv
+from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
@@ -48,7 +48,7 @@ def test_choices_are_the_actions_of_the_space(name: str) -> None:
     rows, width = env.num_envs, 3 if decisions.binary else int(env.action_space.n)  # type: ignore[attr-defined]
     generator = torch.Generator().manual_seed(0)
     logits = torch.randn((rows, width), generator=generator)
-    found = decisions.log_probabilities(logits)
+    found = decisions.log_probabilities(decisions.by_run(logits))
     torch.testing.assert_close(found.exp().sum(-1), torch.ones(found.shape[:-1]))
     rng = np.random.default_rng(0)
     for _ in range(4):
@@ -64,7 +64,7 @@ def test_choices_are_the_actions_of_the_space(name: str) -> None:
             else CATEGORICAL(logits=logits).log_prob(torch.as_tensor(actions))
         )
         own = found.gather(-1, torch.as_tensor(chosen)[..., None]).sum((-1, -2))
-        torch.testing.assert_close(own, wanted)
+        torch.testing.assert_close(own, wanted.reshape(RUNS, -1).sum(-1))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -74,30 +74,73 @@ def test_values_stand_at_the_choices_that_they_are_of(name: str) -> None:
     decisions, sensors = Decisions(env, kind), 3
     worth = np.array([1.0, 10.0, 100.0])[:, None]
     rng = np.random.default_rng(1)
-    factors = decisions.log_probabilities(
-        torch.zeros((env.num_envs, 3 if decisions.binary else int(env.action_space.n)))  # type: ignore[attr-defined]
-    ).shape[1]
-    chosen = rng.integers(0, decisions.choices, (env.num_envs, factors))
-    requests = env.view.requests(decisions.actions(chosen), RUNS)
+    width = 3 if decisions.binary else int(env.action_space.n)  # type: ignore[attr-defined]
+    logits = decisions.by_run(torch.zeros((env.num_envs, width)))
+    factors = decisions.log_probabilities(logits).shape[1]
+    chosen = rng.integers(0, decisions.choices, (RUNS, factors))
+
+    def value_of(choices: Any) -> Any:
+        return (worth * env.view.requests(decisions.actions(choices), RUNS)).sum(0)
+
     wanted = decisions.alternatives(chosen)
-    value = (worth * wanted.transpose(1, 0, 2).reshape(sensors, -1)).sum(0).reshape(-1, RUNS)
-    seen = np.zeros((*value.shape, len(env.batch.layout.names)), dtype=np.float32)
-    reward, _ = decisions.relevant(Branched(value, seen))
-    taken = (worth * requests).sum(0).repeat(env.view.rows_per_run)
-    found = decisions.arranged(chosen, taken, reward)
+    stepped = (worth * wanted.transpose(1, 0, 2).reshape(sensors, -1)).sum(0).reshape(-1, RUNS)
+    found = decisions.arranged(chosen, value_of(chosen), stepped)
     for factor in range(factors):
         for choice in range(decisions.choices):
             other = chosen.copy()
-            if decisions.local:
-                for row in range(env.num_envs):
-                    alone = chosen.copy()
-                    alone[row] = choice
-                    value_of = (worth * env.view.requests(decisions.actions(alone), RUNS)).sum(0)
-                    assert found[row, 0, choice] == value_of[row // sensors]
-                continue
             other[:, factor] = choice
-            value_of = (worth * env.view.requests(decisions.actions(other), RUNS)).sum(0)
-            np.testing.assert_array_equal(found[:, factor, choice], value_of)
+            np.testing.assert_array_equal(found[:, factor, choice], value_of(other))
+
+
+def test_where_sensors_decide_a_run_is_worth_the_sum_of_its_rows() -> None:
+    """What lies beyond an alternative too, whose rows are those that its sensors would see."""
+    env, kind = env_of("local")
+    model = CounterfactualPPO("MlpPolicy", env, alternatives=kind, batch_size=30)
+    rows = env.reset()
+    predict: Any = model.policy.predict_values
+    for _ in range(3):
+        with torch.no_grad():
+            apart = predict(torch.as_tensor(rows)).numpy().reshape(RUNS, 3)
+        found = model._value(model._decisions.by_run(rows))
+        np.testing.assert_allclose(found, apart.sum(1), rtol=1e-5)
+        chosen = np.random.default_rng(0).integers(0, 2, (RUNS, 3))
+        before = env.batch.branch()
+        actions = model._decisions.actions(chosen)
+        _, branched = env.step_alternatives(actions, model._decisions.alternatives(chosen))
+        beyond = model._beyond(branched.observation)
+        for sensor in range(3):
+            flipped = chosen.T == 1
+            flipped[sensor] ^= True
+            branch = before.branch()
+            branch.step(flipped, env.batch.normals())
+            with torch.no_grad():
+                apart = predict(torch.as_tensor(env.view.rows(branch.observe()))).numpy()
+            np.testing.assert_allclose(beyond[sensor], apart.reshape(RUNS, 3).sum(1), rtol=1e-5)
+        rows = env._observe()
+
+
+@pytest.mark.parametrize("clock", [False, True])
+@pytest.mark.parametrize("name", CASES)
+def test_nothing_has_a_value_after_an_end_that_the_clock_shows(name: str, clock: bool) -> None:
+    """A critic that says 3 everywhere is asked for what lies beyond the horizon, or is not."""
+    env, kind = env_of(name, horizon=2, clock=clock)
+    model = CounterfactualPPO(
+        "MlpPolicy", env, alternatives=kind, n_steps=2, gamma=0.5, gae_lambda=0.0, batch_size=2
+    )
+    critic: Any = model.policy.value_net
+    torch.nn.init.zeros_(critic.weight)
+    torch.nn.init.constant_(critic.bias, 3.0)
+    env.seed(0)
+    _, callback = model._setup_learn(100)
+    model.collect_rollouts(env, callback, model.rollout_buffer, 2)
+    rollout = model._rollout
+    assert rollout is not None
+    first, last = rollout.returns.reshape(2, -1).numpy()
+    best = 1.5 if not clock else 0.0  # no reward is above 0
+    assert (last < best).all()
+    assert last.max() > best - 0.6
+    assert (first < 1.5).all()
+    assert first.max() > 0.3
 
 
 def test_returns_and_advantages_are_those_of_the_definition() -> None:
@@ -138,15 +181,18 @@ def test_returns_and_advantages_are_those_of_the_definition() -> None:
                 np.testing.assert_allclose(rollout.advantages[row, i], wanted, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["all", "flips"])
+@pytest.mark.parametrize("name", ["all", "flips", "local"])
 def test_the_first_step_climbs_the_expected_value(name: str) -> None:
     """Where nothing has changed yet, the surrogate's gradient is that of Σ π_a Q_a, in each factor,
     and of the log-probability of what was done times δ."""
     env, kind = env_of(name)
-    model = CounterfactualPPO("MlpPolicy", env, alternatives=kind, ent_coef=0.0, vf_coef=0.0)
+    model = CounterfactualPPO(
+        "MlpPolicy", env, alternatives=kind, ent_coef=0.0, vf_coef=0.0, batch_size=30
+    )
     decisions = model._decisions
     generator = torch.Generator().manual_seed(3)
-    observations = torch.randn((6, env.observation_space.shape[0]), generator=generator)  # type: ignore[index]
+    rows = (6, 3) if name == "local" else (6,)
+    observations = torch.randn((*rows, *env.observation_space.shape), generator=generator)  # type: ignore[misc]
     old = decisions.log_probabilities(model._logits(observations, None)).detach()
     values = torch.randn(old.shape, generator=generator)
     surplus = torch.randn(6, generator=generator)

@@ -207,7 +207,7 @@ def test_an_object_tells_of_its_own_observation() -> None:
     env, envs = gym.make(name, filter="imm").unwrapped, gym.make_vec(name, 2, horizon=7)
     assert "`mode_probability[" in str(env.__doc__)
     assert "`mode_probability[" not in str(type(env).__doc__)
-    assert "here 7, never termination" in str(envs.__doc__)
+    assert "after `horizon` steps, here 7;" in str(envs.__doc__)
 
 
 def test_a_page_without_a_text_and_one_with_a_history(monkeypatch: pytest.MonkeyPatch) -> None:

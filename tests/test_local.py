@@ -34,8 +34,6 @@ def test_a_row_has_what_the_sensor_knows_and_nothing_else(env_id: str) -> None:
     observation = batch.observe()
     rows = view.rows(observation).reshape(5, task.sensors, -1)
     assert rows.shape[-1] == len(view.names) == len(view.space.low)
-    picked = np.arange(5) % task.sensors
-    np.testing.assert_array_equal(view.row(observation, picked), rows[np.arange(5), picked])
     for sensor in range(task.sensors):
         for place, name in enumerate(view.names):
             kind, _, inner = name.partition("[")
@@ -51,6 +49,22 @@ def test_a_row_has_what_the_sensor_knows_and_nothing_else(env_id: str) -> None:
     assert measured & kinds, "a sensor must see what it measures"
     assert {"tokens", "price", "sensor"} <= kinds
     assert not kinds & GLOBAL.get(env_id, set())
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_without_its_number_a_row_is_the_same_but_for_that(env_id: str) -> None:
+    """And sensors of one kind in the same place are told nothing apart."""
+    told, untold = (fusion_gym.make_task(env_id, own_number=number) for number in (True, False))
+    view, other = SensorView(told), SensorView(untold)
+    batch = EpisodeBatch.seeded(told, 4, 0)
+    kept = len(other.names)
+    assert view.names[:kept] == other.names
+    assert view.names[kept:] == tuple(f"sensor[{sensor}]" for sensor in range(told.sensors))
+    assert other.space.shape == (kept,)
+    rows, fewer = view.rows(batch.observe()), other.rows(batch.observe())
+    np.testing.assert_array_equal(rows[:, :kept], fewer, strict=True)
+    with pytest.raises(ConfigurationError, match="own_number = 1 "):
+        fusion_gym.make_task(env_id, own_number=1)
 
 
 def test_a_shared_policy_is_trained_saved_and_evaluated(tmp_path: Path) -> None:

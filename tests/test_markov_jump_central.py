@@ -336,4 +336,4 @@ def test_long_episodes(where: str) -> None:
         outcome = batch.step(policy(batch.signals()))
         assert np.isfinite(outcome.reward).all()
     assert np.isfinite(linalg.cholesky(task.system.fused(batch.delivered)[1])).all()
-    assert outcome.truncated.all()
+    assert outcome.ended.all()

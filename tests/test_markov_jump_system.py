@@ -199,7 +199,7 @@ def test_long_episodes_of_rare_deliveries() -> None:
         outcome = batch.step(policy(batch.signals()))
         assert np.isfinite(outcome.reward).all()
         assert np.isfinite(linalg.cholesky(task.system.fused(batch.delivered)[1])).all()
-    assert outcome.truncated.all()
+    assert outcome.ended.all()
 
 
 @pytest.mark.slow

@@ -191,7 +191,16 @@ def test_observed_errors_do_not_saturate_where_the_decision_is_made() -> None:
     for price, weight in ((0.5, 1.0), (5.0, 0.1), (500.0, 2.0)):
         task = build(cost_weight=price, error_weight=weight)
         threshold = float(solve_average(source_problems(task)[0]).threshold[0, 0])
-        assert 0.5 < threshold / task.system.error_scale[0] < 2.0
+        assert 0.2 < threshold / task.system.error_scale[0] < 4.0  # the range is 5 scales wide
+
+
+@pytest.mark.parametrize("network", [{}, {"sensors": 2, "tokens": "limited", "token_rate": 0.5}])
+def test_an_agent_sees_the_same_whatever_a_packet_costs(network: dict[str, Any]) -> None:
+    scales = [
+        build(**network, **price).system.error_scale
+        for price in ({}, {"cost_weight": 0.0}, {"cost_weight": "random", "price_range": (0.1, 9)})
+    ]
+    assert scales[0].tolist() == scales[1].tolist() == scales[2].tolist()
 
 
 # --- the optimal policy --------------------------------------------------------------------------

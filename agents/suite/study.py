@@ -30,8 +30,8 @@ from .learning import Course, Learning
 from .verdict import MIDDLE
 
 Kind = Literal["front", "plain"]
-# Options that change neither the task nor what a policy may know of it.
-_FREE = ("memory_filter", "memory_features", "error_scale")
+# Options that change neither the task nor what a policy may know of it: rules see the time anyway.
+_FREE = ("memory_filter", "memory_features", "clock")
 
 
 @dataclass(frozen=True)

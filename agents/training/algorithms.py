@@ -84,7 +84,8 @@ class CounterfactualConfig(PPOConfig):
     """PPO with counterfactual credit (:mod:`.counterfactual`).
 
     ``alternatives`` of a decision are ``all`` actions, or the requests with one sensor's flipped at
-    a time; by default all where a coordinator has at most 16.
+    a time; by default all where a coordinator has at most 16. Without ``path_credit`` what the view
+    of one step has missed teaches the critic alone.
     """
 
     learning_rate: Rate = 2e-3
@@ -95,6 +96,7 @@ class CounterfactualConfig(PPOConfig):
     batch_size: Several = 1024
     n_epochs: Positive = 8
     alternatives: Kind | None = None
+    path_credit: bool = True
 
 
 class RecurrentPPOConfig(PPOConfig):

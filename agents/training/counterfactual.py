@@ -30,11 +30,11 @@ _CLOSED = -1e8  # the logit of a choice that is masked
 
 
 class Rollout(NamedTuple):
-    """What one stretch of T steps taught, B = T · rows.
+    """What one stretch of T steps taught, B = T · runs.
 
-    ``observations`` (B, entries), ``masks`` (B, choices) or ``None``, ``chosen`` (B, D), ``old``
-    log-probabilities and ``advantages`` (B, D, C), ``surplus`` δ, ``returns`` G and ``values``
-    (B,).
+    ``observations`` (B, entries), ``masks`` (B, choices) or ``None``, and where sensors decide by
+    themselves (B, sensors, …), ``chosen`` (B, D), ``old`` log-probabilities and ``advantages``
+    (B, D, C), ``surplus`` δ, ``returns`` G and ``values`` (B,).
     """
 
     observations: torch.Tensor
@@ -56,6 +56,13 @@ class Counterfactual(OnPolicyAlgorithm):
     G = V̄ + δ, δ = γ λ (G' - V(o'_b)), zero at the end of an episode and of the rollout: G is the
     critic's target, δ what the view of one step has missed. Both are divided by the spread
     √(mean Σ π_a A_a²).
+
+    Where sensors decide by themselves, V of a run is the sum of what the critic says of their
+    rows (value decomposition: Sunehag et al. 2018), so that nobody has to guess what the others
+    see, and δ is weighed with each sensor's own ratio.
+
+    Without ``path_credit`` δ teaches the critic alone: it holds the noise of all that a run's
+    reward is of, which with many sensors is far more than one decision can move.
     """
 
     n_epochs: int
@@ -63,8 +70,14 @@ class Counterfactual(OnPolicyAlgorithm):
     clip_range: Any
     _decisions: Decisions
 
-    def __init__(self, *args: Any, alternatives: Kind | None = None, **kwargs: Any) -> None:
-        self.alternatives = alternatives
+    def __init__(
+        self,
+        *args: Any,
+        alternatives: Kind | None = None,
+        path_credit: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        self.alternatives, self.path_credit = alternatives, path_credit
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
@@ -84,14 +97,15 @@ class Counterfactual(OnPolicyAlgorithm):
         n_rollout_steps: int,
         use_masking: bool = True,
     ) -> bool:
-        """Step all rows and the alternatives of their decisions; false if a callback ends it."""
+        """Step all runs and the alternatives of their decisions; false if a callback ends it."""
         privileged, decisions = _privileged(env), self._decisions
+        first = slice(None, None, privileged.view.rows_per_run)  # of a run's rows
         self.policy.set_training_mode(False)
         callback.on_rollout_start()
         steps: list[_Step] = []
         while len(steps) < n_rollout_steps:
             assert self._last_obs is not None
-            observation = torch.as_tensor(self._last_obs)
+            observation = decisions.by_run(torch.as_tensor(self._last_obs))
             masks = self._masks(privileged)
             with torch.no_grad():
                 old = decisions.log_probabilities(self._logits(observation, masks))
@@ -108,11 +122,12 @@ class Counterfactual(OnPolicyAlgorithm):
             follows = np.array(after)
             for row in np.flatnonzero(dones):
                 follows[row] = infos[row]["terminal_observation"]
-            reward, observed = decisions.relevant(branched)
-            stepped = reward + self.gamma * self._value(observed)
-            value = self._value(follows)
-            found = decisions.arranged(chosen, rewards + self.gamma * value, stepped)
-            steps.append(_Step(observation, masks, chosen, old, found, value, dones))
+            goes_on = ~_terminated(dones, infos)[first]
+            beyond = goes_on * self._beyond(branched.observation)
+            value = goes_on * self._value(decisions.by_run(follows))
+            taken = rewards[first] + self.gamma * value
+            found = decisions.arranged(chosen, taken, branched.reward + self.gamma * beyond)
+            steps.append(_Step(observation, masks, chosen, old, found, value, dones[first]))
             self._last_obs = after  # type: ignore[assignment]
             self._last_episode_starts = dones
         self._rollout = self._credited(steps)
@@ -162,10 +177,11 @@ class Counterfactual(OnPolicyAlgorithm):
         weight = rollout.old.exp()
         spread = float((weight * rollout.advantages**2).sum(-1).mean().sqrt()) + 1e-8
         told: dict[str, list[float]] = {}
+        size = max(self.batch_size // _privileged(self.env).view.rows_per_run, 1)
         for _ in range(self.n_epochs):
             order = np.random.permutation(len(rollout.returns))  # noqa: NPY002
-            for first in range(0, len(order), self.batch_size):
-                batch = torch.as_tensor(order[first : first + self.batch_size])
+            for first in range(0, len(order), size):
+                batch = torch.as_tensor(order[first : first + size])
                 loss, parts = self._loss(rollout, batch, spread, clip)
                 self.policy.optimizer.zero_grad()
                 loss.backward()
@@ -198,10 +214,13 @@ class Counterfactual(OnPolicyAlgorithm):
         credit = rollout.advantages[batch] / spread
         gain = torch.minimum(ratio * credit, ratio.clamp(1.0 - clip, 1.0 + clip) * credit)
         chosen = rollout.chosen[batch][..., None]
-        whole = change.gather(-1, chosen).sum((-1, -2)).exp()
-        surplus = rollout.surplus[batch] / spread
+        taken = change.gather(-1, chosen)
+        whole = (taken if self._decisions.local else taken.sum((-1, -2), keepdim=True)).exp()
+        surplus = rollout.surplus[batch][:, None, None] / spread
         late = torch.minimum(whole * surplus, whole.clamp(1.0 - clip, 1.0 + clip) * surplus)
-        policy = -(weight * gain).sum((-1, -2)).mean() - late.mean()
+        policy = -(weight * gain).sum((-1, -2)).mean()
+        if self.path_credit:
+            policy = policy - late.sum((-1, -2)).mean()
         entropy = -(new.exp() * new).sum((-1, -2)).mean()
         value = (self._critic(observation) - rollout.returns[batch]).square().mean()
         loss = policy - self.ent_coef * entropy + self.vf_coef * value
@@ -218,9 +237,9 @@ class Counterfactual(OnPolicyAlgorithm):
     def _logits(self, observation: torch.Tensor, masks: torch.Tensor | None) -> torch.Tensor:
         """Of the choices of ``Discrete``, of the requests of ``MultiBinary``."""
         policy: Any = self.policy
-        logits: torch.Tensor = policy.action_net(
-            policy.mlp_extractor.forward_actor(policy.pi_features_extractor(observation))
-        )
+        rows = policy.pi_features_extractor(observation.reshape(-1, observation.shape[-1]))
+        logits: torch.Tensor = policy.action_net(policy.mlp_extractor.forward_actor(rows))
+        logits = logits.reshape(*observation.shape[:-1], -1)
         if masks is not None and self._decisions.binary:  # two a sensor, silence and a request
             pairs = logits.reshape(len(logits), -1, 2)
             logits, masks = pairs[..., 1] - pairs[..., 0], masks.reshape(pairs.shape)[..., 1]
@@ -228,19 +247,26 @@ class Counterfactual(OnPolicyAlgorithm):
 
     def _critic(self, observation: torch.Tensor) -> torch.Tensor:
         policy: Any = self.policy
-        latent = policy.mlp_extractor.forward_critic(policy.vf_features_extractor(observation))
-        found: torch.Tensor = policy.value_net(latent).squeeze(-1)
-        return found
+        rows = policy.vf_features_extractor(observation.reshape(-1, observation.shape[-1]))
+        found: torch.Tensor = policy.value_net(policy.mlp_extractor.forward_critic(rows))
+        found = found.reshape(observation.shape[:-1])
+        return found.sum(-1) if self._decisions.local else found
 
     def _value(self, observation: NDArray[np.float32]) -> Array:
-        """V of observations (…, entries), (…,)."""
+        """V of runs whose decisions are made on observations (…, entries) or, where sensors decide
+        by themselves, (…, sensors, entries)."""
         with torch.no_grad():
-            rows = torch.as_tensor(observation).reshape(-1, observation.shape[-1])
-            found = self._critic(rows).numpy().reshape(observation.shape[:-1])
-        return np.asarray(found, dtype=np.float64)
+            return self._critic(torch.as_tensor(observation)).numpy().astype(np.float64)
+
+    def _beyond(self, observation: NDArray[np.float32]) -> Array:
+        """V of what the alternatives led to, (A, runs), from observations (A, runs, entries)."""
+        if not self._decisions.local:
+            return self._value(observation)
+        # One by one: that many rows of that many sensors would not fit into the cache.
+        return np.stack([self._value(self._decisions.seen(one)) for one in observation])
 
     def _masks(self, env: PrivilegedVecEnv) -> torch.Tensor | None:
-        """Open choices (rows, choices), for an algorithm that knows them."""
+        """Open choices of the runs' decisions, for an algorithm that knows them."""
         return None
 
 
@@ -252,14 +278,15 @@ class CounterfactualMaskablePPO(Counterfactual, MaskablePPO):
     """MaskablePPO with counterfactual credit; what it saves are models of MaskablePPO."""
 
     def _masks(self, env: PrivilegedVecEnv) -> torch.Tensor | None:
-        return torch.as_tensor(env.action_masks())
+        found: torch.Tensor = self._decisions.by_run(torch.as_tensor(env.action_masks()))
+        return found
 
 
 class _Step(NamedTuple):
-    """One step of all rows, on the way to a :class:`Rollout`.
+    """One step of all runs, on the way to a :class:`Rollout`.
 
-    ``found`` (rows, D, C) are the values Q of all choices, ``follows`` (rows,) that of the state
-    reached; ``dones`` (rows,) bool.
+    ``found`` (runs, D, C) are the values Q of all choices, ``follows`` (runs,) that of the state
+    reached; ``dones`` (runs,) bool.
     """
 
     observation: torch.Tensor
@@ -269,6 +296,14 @@ class _Step(NamedTuple):
     found: Array
     follows: Array
     dones: NDArray[np.bool_]
+
+
+def _terminated(dones: NDArray[np.bool_], infos: list[dict[str, Any]]) -> NDArray[np.bool_]:
+    """The rows whose episode has ended for good, after which nothing has a value."""
+    found = dones.copy()
+    for row in np.flatnonzero(dones):
+        found[row] = not infos[row]["TimeLimit.truncated"]
+    return found
 
 
 def _privileged(env: Any) -> PrivilegedVecEnv:

@@ -10,21 +10,21 @@ from gymnasium.spaces import MultiBinary
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
-from fusion_gym.envs.privileged import Branched, PrivilegedVecEnv
+from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.envs.views import SensorView
 from fusion_gym.validation import ConfigurationError
 
 Kind = Literal["all", "flips"]
 MOST_ALTERNATIVES = 16  # sets of requests that are all stepped unless told otherwise
-Chosen = NDArray[np.int64]  # choices (rows, D)
+Chosen = NDArray[np.int64]  # choices (runs, D)
 
 
 class Decisions:
-    """The alternatives of every row's decision, as D factors of C choices each.
+    """The alternatives of every run's decision, as D factors of C choices each.
 
     - ``"all"``: one factor, whose choices are all actions of a coordinator.
-    - ``"flips"``: a factor a sensor, silence or a request, the other sensors as they were; the
-      decision of a sensor by itself is one such factor.
+    - ``"flips"``: a factor a sensor, silence or a request, the other sensors as they were; so too
+      where the sensors decide by themselves.
 
     Raises:
         ConfigurationError: flips of an action that is one number.
@@ -32,7 +32,7 @@ class Decisions:
 
     def __init__(self, env: PrivilegedVecEnv, kind: Kind | None) -> None:
         self.view, self.local = env.view, isinstance(env.view, SensorView)
-        self.sensors, self.runs, self.rows = env.task.sensors, env.runs, env.num_envs
+        self.sensors, self.runs = env.task.sensors, env.runs
         space = env.action_space
         self.binary = isinstance(space, MultiBinary)
         if self.local:
@@ -57,44 +57,51 @@ class Decisions:
             self.requests = env.view.requests(actions, self.choices).T[:, :, None]
 
     def log_probabilities(self, logits: torch.Tensor) -> torch.Tensor:
-        """Of all choices, (rows, D, C), from logits of ``Discrete`` (rows, choices) or, for
-        ``MultiBinary``, of requests (rows, sensors)."""
+        """Of all choices, (runs, D, C).
+
+        From the logits of ``Discrete``, (runs, choices) or of sensors by themselves
+        (runs, sensors, 2), or of the requests of ``MultiBinary`` (runs, sensors).
+        """
         if not self.binary:
-            return torch.log_softmax(logits, -1)[:, None]
+            found = torch.log_softmax(logits, -1)
+            return found if self.local else found[:, None]
         silent = -torch.nn.functional.softplus(logits)
         if self.kind == "flips":
             return torch.stack((silent, logits + silent), -1)
         return (silent.sum(-1, keepdim=True) + logits @ self.bits.T)[:, None]
 
+    def by_run(self, rows: Any) -> Any:
+        """Rows (rows, entries) that belong to a run together, (runs, sensors, entries).
+
+        A coordinator's rows are runs already.
+        """
+        return rows.reshape(-1, self.sensors, rows.shape[-1]) if self.local else rows
+
+    def seen(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What is decided on in runs (…, entries of an observation): (…, entries), and with
+        sensors that decide by themselves (…, sensors, entries)."""
+        if not self.local:
+            return observation
+        rows = self.view.rows(observation.reshape(-1, observation.shape[-1]))
+        return rows.reshape(*observation.shape[:-1], self.sensors, -1)
+
     def actions(self, chosen: Chosen) -> NDArray[Any]:
-        """Actions of the space from the choices (rows, D)."""
+        """The rows' actions of the space from the choices (runs, D)."""
         if not self.binary:
-            return chosen[:, 0]
+            return chosen.reshape(-1)
         if self.kind == "flips":
             return chosen
         return chosen >> np.arange(self.sensors) & 1
 
     def alternatives(self, chosen: Chosen) -> NDArray[Any]:
-        """The requests (A, sensors, N) that are stepped beside those chosen (rows, D)."""
+        """The requests (A, sensors, N) that are stepped beside those chosen (runs, D)."""
         if self.kind == "all":
             return np.broadcast_to(self.requests, (self.choices, self.sensors, self.runs))
-        taken = chosen.reshape(self.runs, self.sensors).T == 1
+        taken = chosen.T == 1
         return taken ^ np.eye(self.sensors, dtype=np.bool_)[:, :, None]
 
-    def relevant(self, branched: Branched) -> tuple[Array, NDArray[np.float32]]:
-        """Rewards (K, rows) and observations (K, rows, entries) that a row's choices lead to.
-
-        All alternatives of a run; for a sensor by itself its own flip.
-        """
-        if not isinstance(self.view, SensorView):
-            return branched.reward, branched.observation
-        row = np.arange(self.rows)
-        sensor, run = row % self.sensors, row // self.sensors
-        observation = self.view.row(branched.observation[sensor, run], sensor)
-        return branched.reward[sensor, run][None], observation[None]
-
     def arranged(self, chosen: Chosen, taken: Array, stepped: Array) -> Array:
-        """Values (rows, D, C) of all choices, from those taken (rows,) and stepped (K, rows)."""
+        """Values (runs, D, C) of all choices, from those taken (runs,) and stepped (A, runs)."""
         if self.kind == "all":
             return stepped.T[:, None]
         flipped = stepped.T

@@ -157,7 +157,7 @@ class EpisodeBatch(Runs):
         self.sense(self.normals())
         if self.reference is not None and not self._shared:
             self._beside = self.reference.sense(self._beside, self.noise())
-        self.finished = outcome.truncated.copy()
+        self.finished = outcome.ended.copy()
         return outcome
 
     def normals(self) -> Array:

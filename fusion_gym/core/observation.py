@@ -20,15 +20,17 @@ from fusion_gym.validation import ConfigurationError
 # where a run was starved.
 _DIFFERENCE, _DIFFERENCE_LIMIT = 4.0, 10.0
 _VALUE, _VALUE_LIMIT = 2.0, 20.0
+_SOON = 10.0  # steps before the end: what is near it is told apart, what is far hardly
 
 
 class Network(NamedTuple):
     """The network's side of an observation: ``tokens`` and ``price`` (N,), ``admitted()``
-    (sensors, N) bool."""
+    (sensors, N) bool, and the ``left`` steps of the episode (N,)."""
 
     tokens: Array
     admitted: Callable[[], NDArray[np.bool_]]
     price: Array
+    left: Array
 
 
 class Entry(NamedTuple):
@@ -58,12 +60,19 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
         (numbered(task.sensors),),
         node="own",
     )
+    left = Block(
+        "time_left",
+        f"l/(l + {_SOON:g}), l steps left of the episode",
+        lambda net: net.left / (net.left + _SOON),
+        node="told",
+    )
     place = "place of a token's price in its range, in the logarithm"
     shown = Block("price", place, lambda net: price.encode(net.price), node="told")
     decides = task.access in ("round_robin", "random")
     return (
         tokens,
         *((admitted,) if decides else ()),
+        *((left,) if task.clock else ()),
         *((shown,) if price.span is not None else ()),
     )
 

@@ -33,7 +33,9 @@ class CommonOptions:
     memory_filter: str | None = None
     memory_features: Sequence[str] | None = None
     horizon: int = 100
+    clock: bool = False
     information: str = "sensors"
+    own_number: bool = True
     action: str = "binary"
     error: str = "squared"
     error_weight: float = 1.0

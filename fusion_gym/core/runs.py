@@ -29,7 +29,8 @@ class Outcome(NamedTuple):
     ``requested``, ``granted`` (sensors, N) bool; ``error`` (n, N) of the fused estimate, the truth
     minus it, and ``squared_error``;
     ``diverged`` (N,) bool, whether some state's squared error is not finite or above the task's
-    ``divergence_level``; ``truncated`` (N,) bool.
+    ``divergence_level``; ``ended`` (N,) bool, whether
+    the episode is over.
     """
 
     reward: Array
@@ -41,7 +42,7 @@ class Outcome(NamedTuple):
     error: Array
     squared_error: Array
     diverged: NDArray[np.bool_]
-    truncated: NDArray[np.bool_]
+    ended: NDArray[np.bool_]
 
 
 class Position(NamedTuple):
@@ -112,7 +113,7 @@ class Runs:
             error=error,
             squared_error=squared_error,
             diverged=np.asarray(~(squared_error <= task.divergence_level).all(0)),
-            truncated=self.steps >= self._limit,
+            ended=self.steps >= self._limit,
         )
 
     def answer(self, requests: NDArray[np.bool_]) -> Grants:
@@ -179,7 +180,8 @@ class Runs:
 
     def observe(self) -> NDArray[np.float32]:
         """Observations (N, entries) of all runs, a fresh array."""
-        network = Network(self.tokens, self.admitted, self.price)
+        left = (self._limit - self.steps).astype(np.float64)
+        network = Network(self.tokens, self.admitted, self.price, left)
         return self.layout.encode(self.state, network, self.beliefs)
 
     def beliefs(self) -> Beliefs:

@@ -40,7 +40,9 @@ class Task:
     0 for nobody or the number of the sensor, counted from 1.
     ``packet``, ``broadcast``, ``memory``, ``shadow`` and ``memory_features`` are those of
     :mod:`fusion_gym.core.communication`; ``feedback`` says that the nodes get the centre's
-    estimate back.
+    estimate back. With ``clock`` the observation shows what is left of the episode, whose end then
+    belongs to the problem: a termination, no truncation. Without ``own_number`` a sensor that
+    decides by itself does not see which one it is, so that sensors of one kind learn together.
     ``settings`` is what a user chose, for reports; ``policy_defaults`` the scenario's own
     parameters of named policies.
 
@@ -61,6 +63,8 @@ class Task:
     shadow: System[Any] | None = None
     memory_features: tuple[str, ...] = ()
     feedback: bool = False
+    clock: bool = False
+    own_number: bool = True
     settings: dict[str, Any] = field(default_factory=dict)
     policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
 
@@ -72,6 +76,8 @@ class Task:
                 f"{', '.join(map(repr, INFORMATION_MODES))}; sensors that decide by themselves are "
                 "fusion_gym.parallel_env(id) and make_sb3_vec_env(id, n, local=True)"
             )
+        validation.boolean("clock", self.clock)
+        validation.boolean("own_number", self.own_number)
         validation.choice("information", self.information, INFORMATION_MODES)
         validation.choice("action", self.action, ACTION_KINDS)
         validation.choice("access", self.access, ACCESS_RULES)
@@ -125,6 +131,8 @@ class Task:
             shadow=how.shadow,
             memory_features=how.features,
             feedback=scenario.feedback,
+            clock=chosen.clock,
+            own_number=chosen.own_number,
             settings=plain(asdict(chosen)),
             policy_defaults=scenario.policy_defaults,
         )

@@ -65,8 +65,8 @@ which a policy may be able to game. `cost_weight="random"` draws the price of a 
 `price_range` for each episode, evenly in its logarithm.
 
 ## Episode end
-Truncation after `horizon` steps, here {horizon}, never termination. `max_episode_steps` truncates
-earlier without changing any scale.
+Truncation after `horizon` steps, here {horizon}; with `clock=True`, which shows the time that is
+left, it is a termination. `max_episode_steps` ends episodes earlier without changing any scale.
 
 ## Info
 `cost` = `cost_tokens` (tokens spent, never negative), `rewards` (its terms
@@ -85,6 +85,7 @@ The fields of `{options}`, of which `fusion_gym.make_task` also takes an object.
 # Blocks of the network that not every task has, and when they are there.
 _NETWORK = {
     "admitted": 'only with `access="round_robin"` or `"random"`',
+    "time_left": "only with `clock=True`",
     "price": "only with a `price_range`",
 }
 # What memory adds to the observation of the coordinator, and to a sensor's own.
@@ -146,7 +147,7 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
             rows[block.name] = _row(task, block, "" if shown else condition)
     always = [block.name for block in network_blocks(task)]
     price = replace(task.reward, price=Price(None, (0.01, 1.0)))
-    for block in network_blocks(replace(task, access="round_robin", reward=price)):
+    for block in network_blocks(replace(task, access="round_robin", clock=True, reward=price)):
         rows[block.name] = _row(task, block, "" if block.name in always else _NETWORK[block.name])
     return _table(("entries", "range", "a sensor sees", "meaning"), rows.values())
 

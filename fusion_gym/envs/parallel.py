@@ -79,7 +79,7 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
             )
         chosen = [actions[agent] for agent in self.agents]
         outcome = self.batch.step(self.view.requests(chosen, None))
-        reward, ended = float(outcome.reward[0]), bool(outcome.truncated[0])
+        reward, ended = float(outcome.reward[0]), bool(outcome.ended[0])
         agents = self.agents
         costs = outcome.granted[:, 0] * self.task.bucket.cost[:, 0]
         infos = {
@@ -89,8 +89,8 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         result = (
             self._observations(),
             dict.fromkeys(agents, reward),
-            dict.fromkeys(agents, False),
-            dict.fromkeys(agents, ended),
+            dict.fromkeys(agents, ended and self.task.clock),
+            dict.fromkeys(agents, ended and not self.task.clock),
             infos,
         )
         if ended:

@@ -124,7 +124,7 @@ class FusionSB3VecEnv(VecEnv):
         self.totals = (self.totals[0] + float(outcome.cost.sum()), self.totals[1] + self.runs)
         made, granted = np.count_nonzero(requests), np.count_nonzero(outcome.granted)
         self.requests = (self.requests[0] + int(made), self.requests[1] + int(granted))
-        done = outcome.truncated
+        done = outcome.ended
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done.any():
             self._finish(np.flatnonzero(done), lengths, infos)
@@ -164,7 +164,7 @@ class FusionSB3VecEnv(VecEnv):
             for row in range(run * self._rows, (run + 1) * self._rows):
                 infos[row] = {
                     "terminal_observation": final[row],
-                    "TimeLimit.truncated": True,
+                    "TimeLimit.truncated": not self.task.clock,
                     "episode": {
                         "r": float(self._returns[run]),
                         "l": int(lengths[run]) + 1,

@@ -61,7 +61,9 @@ class FusionEnv(gymnasium.Env[Any, Any]):
         outcome = self.batch.step(self.view.requests(action, None))
         observation = self.batch.observe()[0]
         infos = _first(step_infos(outcome))
-        return observation, float(outcome.reward[0]), False, bool(outcome.truncated[0]), infos
+        ended, clock = bool(outcome.ended[0]), self.task.clock
+        reward = float(outcome.reward[0])
+        return observation, reward, ended and clock, ended and not clock, infos
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Open choices (choices,), for sb3-contrib's MaskablePPO."""

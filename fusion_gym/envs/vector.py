@@ -132,21 +132,22 @@ class FusionVectorEnv(VectorEnv[Any, Any, Any]):
                 "options={'reset_mask': mask} before the next step"
             )
         outcome = batch.step(requests)
-        terminated = np.zeros(self.num_envs, dtype=np.bool_)
-        reward, truncated = outcome.reward, outcome.truncated
+        reward, ended = outcome.reward, outcome.ended
         infos = step_infos(outcome)
         if self.autoreset_mode == AutoresetMode.NEXT_STEP and finished.any():
             batch.reset(np.flatnonzero(finished))
             reward = np.where(finished, 0.0, reward)
-            truncated = truncated & ~finished
+            ended = ended & ~finished
             infos = _cleared(infos, finished)
-        elif self.autoreset_mode == AutoresetMode.SAME_STEP and truncated.any():
-            final = _final_infos(infos, truncated, batch.observe())
-            batch.reset(np.flatnonzero(truncated))
-            cleared = _with_mask(_cleared(infos, truncated), self._everyone)
-            return batch.observe(), reward, terminated, truncated, cleared | final
-        observation = batch.observe()
-        return observation, reward, terminated, truncated, _with_mask(infos, self._everyone)
+        final: Infos = {}
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and ended.any():
+            final = _final_infos(infos, ended, batch.observe())
+            batch.reset(np.flatnonzero(ended))
+            infos = _cleared(infos, ended)
+        never = np.zeros_like(ended)
+        terminated, truncated = (ended, never) if self.task.clock else (never, ended)
+        infos = _with_mask(infos, self._everyone) | final
+        return batch.observe(), reward, terminated, truncated, infos
 
 
 def refuse_rendering(owner: str, render_mode: Any) -> None:

@@ -146,8 +146,9 @@ class SensorView:
     """One row for each sensor of each run: what it sees by itself, and its own decision.
 
     A sensor sees the entries that its own node knows, what all nodes are told (the token level,
-    the price, an estimate that is fed back) and its own number. With ``broadcast="estimate"`` it
-    also sees the centre's own entries, with ``"packets"`` all that the centre knows.
+    the price, an estimate that is fed back) and, unless the task's ``own_number`` is off, its own
+    number. With ``broadcast="estimate"`` it also sees the centre's own entries, with ``"packets"``
+    all that the centre knows.
 
     Row run · sensors + sensor belongs to that sensor of that run; ``names`` are without the
     sensor's index. The action space is ``Discrete(2)``, 1 for a request: one shared policy, honest
@@ -185,25 +186,20 @@ class SensorView:
             )
         self._columns = np.array(columns)
         self.rows_per_run = count
-        identity = [f"sensor[{sensor}]" for sensor in range(count)]
+        # Which sensor it is, one-hot: a row a sensor, (sensors, sensors) or without entries.
+        self._identity = np.eye(count, dtype=np.float32)[:, : count if task.own_number else 0]
+        identity = [f"sensor[{sensor}]" for sensor in range(self._identity.shape[1])]
         self.names = (*names[0], *(layout.names[place] for place in told), *identity)
-        low = np.concatenate((layout.low[columns[0]], np.zeros(count, dtype=np.float32)))
-        high = np.concatenate((layout.high[columns[0]], np.ones(count, dtype=np.float32)))
+        low = np.concatenate((layout.low[columns[0]], np.zeros_like(self._identity[0])))
+        high = np.concatenate((layout.high[columns[0]], np.ones_like(self._identity[0])))
         self.space = spaces.Box(low, high, dtype=np.float32)
         self.actions: spaces.Discrete[Any] = spaces.Discrete(2)
 
     def rows(self, observation: Rows) -> Rows:
         """See :class:`View`: (N, coordinator's entries) to (N·sensors, entries)."""
         seen = observation[:, self._columns]
-        identity = np.eye(self.rows_per_run, dtype=np.float32)
-        shared = np.broadcast_to(identity, (len(observation), *identity.shape))
+        shared = np.broadcast_to(self._identity, (len(observation), *self._identity.shape))
         return np.concatenate((seen, shared), axis=-1).reshape(-1, len(self.names))
-
-    def row(self, observation: Rows, sensor: NDArray[np.int64]) -> Rows:
-        """The row (N, entries) of one sensor (N,) of each observation (N, its entries)."""
-        seen = np.take_along_axis(observation, self._columns[sensor], axis=1)
-        identity = np.eye(self.rows_per_run, dtype=np.float32)[sensor]
-        return np.concatenate((seen, identity), axis=-1)
 
     def requests(self, actions: Any, runs: int | None) -> Requests:
         """See :class:`View`: actions (N·sensors,), 1 for a request, run by run."""

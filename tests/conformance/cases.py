@@ -28,7 +28,7 @@ IDS = [name for name in ENVIRONMENTS if name != OWN_ID] + [OWN_ID]
 
 Options = dict[str, Any]
 LIMITED: Options = {"tokens": "limited", "token_rate": 1.0, "initial_tokens": 5.0}
-DRAWN: Options = {"cost_weight": "random", "price_range": (0.001, 1.0)}
+DRAWN: Options = {"cost_weight": "random", "price_range": (0.001, 1.0), "clock": True}
 LOSSY: Options = {"sensors": 3, "channel": "gilbert_elliott", "coefficient": (0.9, 1.0, 1.02)}
 GIVEN = np.sin(np.arange(41.0) / 3.0)[:, None].tolist()
 STARVED: Options = {"bias_aware": False, "access": "round_robin", **LIMITED}

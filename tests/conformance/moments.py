@@ -69,6 +69,7 @@ class Moment:
             np.repeat(batch.tokens[:1], runs),
             lambda: np.repeat(batch.admitted()[:, :1], runs, axis=1),
             np.repeat(batch.price[:1], runs),
+            np.repeat((batch.task.horizon - batch.steps)[:1], runs),
         )
         return batch.layout.encode(self.state, network, self.beliefs)
 

@@ -172,4 +172,4 @@ def _changed_rows(view: SensorView, observation: NDArray[np.float32]) -> NDArray
 
 
 def _network(batch: EpisodeBatch) -> Network:
-    return Network(batch.tokens, batch.admitted, batch.price)
+    return Network(batch.tokens, batch.admitted, batch.price, batch.task.horizon - batch.steps)

@@ -57,14 +57,14 @@ def test_one_five_and_a_thousand_runs_are_the_same(case: Case) -> None:
         assert numbers(info) == of_run(infos, 2)
         outcome = many.step(wanted)
         action = actions(case.task(), wanted[:, CHOSEN])
-        observation, reward, _, truncated, infos = five.step(action)
-        alone, value, _, over, info = one.step(action[2])
+        observation, reward, *ended, infos = five.step(action)
+        alone, value, *over, info = one.step(action[2])
         expected = step_infos(outcome)
         for run, place in enumerate(range(MANY)[CHOSEN]):
             assert of_run(infos, run) == of_run(expected, place)
         np.testing.assert_array_equal(outcome.reward[CHOSEN], reward, strict=True)
-        np.testing.assert_array_equal(outcome.truncated[CHOSEN], truncated)
-        assert (value, over) == (reward[2], truncated[2])
+        np.testing.assert_array_equal(outcome.ended[CHOSEN], np.logical_or(*ended))
+        assert [value, *over] == [reward[2], *(each[2] for each in ended)]
 
 
 @each_lasting
@@ -84,13 +84,14 @@ def test_a_run_does_not_depend_on_its_neighbours(case: Case) -> None:
             together.reset(others)
 
 
+@pytest.mark.parametrize("clock", [False, True])
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 @each_default
 def test_agrees_with_gymnasiums_vector_of_single_environments(
-    case: Case, mode: AutoresetMode
+    case: Case, mode: AutoresetMode, clock: bool
 ) -> None:
     """Runs 1 and 3 are reset in mid-episode, so that episodes end at different times."""
-    options: dict[str, Any] = {"num_envs": 4, "horizon": 5}
+    options: dict[str, Any] = {"num_envs": 4, "horizon": 5, "clock": clock}
     ours: Any = gymnasium.make_vec(
         case.env_id, vectorization_mode="vector_entry_point", autoreset_mode=mode, **options
     )
@@ -110,7 +111,7 @@ def test_agrees_with_gymnasiums_vector_of_single_environments(
         action = actions(case.task(), wanted)
         mine, other = ours.step(action), theirs.step(action)
         same(mine, other)
-        over = other[3].copy()
+        over = other[2 if clock else 3].copy()
         endings.add(tuple(over.tolist()))
         if mode is AutoresetMode.DISABLED and over.any():
             reset(None, over)
@@ -146,7 +147,8 @@ def test_stable_baselines_rows_are_the_vector_environments(case: Case) -> None:
     for step, wanted in enumerate(requests(case.task(), 3, 2 * horizon + 1), start=1):
         action = actions(case.task(), wanted)
         observation, reward, done, infos = ours.step(action)
-        expected, value, _, over, info = theirs.step(action)
+        expected, value, terminated, truncated, info = theirs.step(action)
+        over = terminated if case.task().clock else truncated
         np.testing.assert_array_equal(observation, expected, strict=True)
         np.testing.assert_array_equal(reward, value.astype(np.float32), strict=True)
         np.testing.assert_array_equal(done, over)
@@ -158,7 +160,7 @@ def test_stable_baselines_rows_are_the_vector_environments(case: Case) -> None:
             continue
         for run in range(3):
             assert infos[run].keys() == {"terminal_observation", "TimeLimit.truncated", "episode"}
-            assert infos[run]["TimeLimit.truncated"] is True
+            assert infos[run]["TimeLimit.truncated"] is not case.task().clock
             last = info["final_obs"][run]
             np.testing.assert_array_equal(infos[run]["terminal_observation"], last, strict=True)
             episode = infos[run]["episode"]

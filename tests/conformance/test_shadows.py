@@ -68,9 +68,9 @@ class Company:
         outcome = self.batch.step(wanted)
         for other, asked in self.others:
             other.step(asked(outcome.granted))
-        if outcome.truncated.any():
+        if outcome.ended.any():
             for batch in (self.batch, *(other for other, _ in self.others)):
-                batch.reset(np.flatnonzero(outcome.truncated))
+                batch.reset(np.flatnonzero(outcome.ended))
 
 
 @each(WITH)

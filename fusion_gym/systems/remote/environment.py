@@ -6,6 +6,7 @@ Markovian state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,6 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.channel import CHANNELS, INITIAL_STATES, Channel
 from fusion_gym.core.options import CommonOptions, Scenario
-from fusion_gym.core.reward import Price
 from fusion_gym.core.task import MOST_SENSORS, make_bucket
 from fusion_gym.systems.remote.system import RemoteEstimationSystem
 from fusion_gym.validation import ConfigurationError
@@ -62,6 +62,7 @@ class RemoteEstimationOptions(CommonOptions):
     state_weights: ArrayLike | None = None
 
 
+_USUAL_PRICE = 5.0  # of a packet, in squared deviations of the noise
 _DROP: dict[str, ArrayLike] = {"independent": 0.2, "gilbert_elliott": (0.7, 0.2)}
 _TRANSITION: ArrayLike = ((0.7, 0.3), (0.1, 0.9))
 
@@ -86,7 +87,7 @@ def build(chosen: RemoteEstimationOptions) -> Scenario:
             "initial_deviation", chosen.initial_deviation, (sensors,)
         ),
         channel=_channel(chosen, sensors),
-        error_scale=_error_scale(chosen, deviation, weights),
+        error_scale=_error_scale(chosen, deviation),
         state_weights=weights,
     )
     return Scenario(
@@ -120,24 +121,22 @@ def _channel(chosen: RemoteEstimationOptions, sensors: int) -> Channel:
     return Channel.gilbert_elliott(transition, drop, sensors, chosen.initial_channel)
 
 
-def _error_scale(chosen: RemoteEstimationOptions, deviation: Array, weights: Array) -> Array:
+def _error_scale(chosen: RemoteEstimationOptions, deviation: Array) -> Array:
     """What observed errors are divided by (n,): about the optimal threshold of a random walk.
 
-    A price alone makes it (6 price/weight)^¼ σ^½ in continuous time, a limited rate r of
-    transmissions σ/√r; a scale is never below σ.
+    Without a limit that is (6 price)^1/4 in continuous time, at unit noise and the environment's
+    own price, and σ/√r at a rate r of transmissions, where they are limited. No option of the price
+    changes it: an agent sees the same whatever it is asked for.
     """
     sensors = len(deviation)
     if chosen.error_scale is not None:
         return validation.positive("error_scale", chosen.error_scale, (sensors,))
-    price = Price.create(chosen.cost_weight, chosen.price_range)
     bucket = make_bucket(chosen, sensors)
-    weights = weights * validation.number("error_weight", chosen.error_weight, at_least=0.0)
-    middle = float(np.sqrt(np.prod(price.span))) if price.span else float(price.fixed or 0.0)
-    cost = bucket.cost[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(weights > 0.0, 6.0 * middle * cost / weights, 0.0)
-    threshold = ratio**0.25 * np.sqrt(deviation)
-    sharing = float(sensors) if chosen.access != "any" else 1.0
-    if not bucket.unlimited:
-        sharing = max(sharing, float(cost.sum()) / max(bucket.rate, 1e-3))
-    return np.maximum(np.maximum(threshold, deviation * np.sqrt(sharing)), deviation)
+    if bucket.unlimited:
+        alone = (6.0 * _USUAL_PRICE) ** 0.25
+        shared = math.sqrt(sensors) if chosen.access != "any" else 1.0
+        return deviation * max(alone, shared)
+    steps = float(bucket.cost.sum()) / max(bucket.rate, 1e-3)
+    if chosen.access != "any":
+        steps = max(steps, float(sensors))
+    return deviation * math.sqrt(max(steps, 1.0))
