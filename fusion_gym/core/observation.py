@@ -20,7 +20,6 @@ from fusion_gym.validation import ConfigurationError
 # where a run was starved.
 _DIFFERENCE, _DIFFERENCE_LIMIT = 4.0, 10.0
 _VALUE, _VALUE_LIMIT = 2.0, 20.0
-_SOON = 10.0  # steps before the end: what is near it is told apart, what is far hardly
 
 
 class Network(NamedTuple):
@@ -62,8 +61,8 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
     )
     left = Block(
         "time_left",
-        f"l/(l + {_SOON:g}), l steps left of the episode",
-        lambda net: net.left / (net.left + _SOON),
+        "steps left of the episode over the horizon",
+        lambda net: net.left / task.horizon,
         node="told",
     )
     place = "place of a token's price in its range, in the logarithm"

@@ -233,7 +233,7 @@ def transmission_value(see: Seen) -> Array:
 NETWORK: dict[str, Formula] = {
     "tokens": lambda see: see.batch.tokens / see.batch.task.bucket.capacity,
     "admitted": lambda see: see.batch.admitted(),
-    "time_left": lambda see: 1.0 - 10.0 / (see.batch.task.horizon - see.batch.steps + 10.0),
+    "time_left": lambda see: 1.0 - see.batch.steps / see.batch.task.horizon,
     "price": lambda see: (
         np.log(see.batch.price / see.batch.task.reward.price.span[0])
         / np.diff(np.log(see.batch.task.reward.price.span))
