@@ -133,7 +133,7 @@ def remembering(
     def step() -> None:
         if how in ("values", "own"):
             batch.beliefs().value()
-        if batch.step(wanted[next(count) % 16]).truncated.any():
+        if batch.step(wanted[next(count) % 16]).ended.any():
             batch.reset()
 
     return _timed(step, num_envs, clock)
