@@ -91,7 +91,7 @@ class Demo(Command):
     """Test episodes of each agent at each price, and of each rule."""
     timesteps: Steps = 700_000
     """Steps of each training: fewer than its config's, for the last per cent takes half the time."""
-    fresh: bool = False
+    """Steps of each training, fewer than its config's: the last per cent takes half the time."""
     """Remove earlier results first."""
 
     def run(self) -> None:

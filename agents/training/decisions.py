@@ -78,12 +78,10 @@ class Decisions:
         return rows.reshape(-1, self.sensors, rows.shape[-1]) if self.local else rows
 
     def seen(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """What is decided on in runs (…, entries of an observation): (…, entries), and with
-        sensors that decide by themselves (…, sensors, entries)."""
-        if not self.local:
-            return observation
-        rows = self.view.rows(observation.reshape(-1, observation.shape[-1]))
-        return rows.reshape(*observation.shape[:-1], self.sensors, -1)
+        """What the sensors of runs see by themselves, (runs, sensors, entries of a row), from
+        observations (runs, entries)."""
+        found: NDArray[np.float32] = self.by_run(self.view.rows(observation))
+        return found
 
     def actions(self, chosen: Chosen) -> NDArray[Any]:
         """The rows' actions of the space from the choices (runs, D)."""
