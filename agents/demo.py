@@ -90,8 +90,8 @@ class Demo(Command):
     episodes: Episodes = 1000
     """Test episodes of each agent at each price, and of each rule."""
     timesteps: Steps = 700_000
-    """Steps of each training: fewer than its config's, for the last per cent takes half the time."""
     """Steps of each training, fewer than its config's: the last per cent takes half the time."""
+    fresh: bool = False
     """Remove earlier results first."""
 
     def run(self) -> None:
