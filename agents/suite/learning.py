@@ -28,8 +28,7 @@ class Course(Strict):
     ``front`` is the training's config, ``memoryless`` the class of the committed envelope to get
     below while learning. The finished front is compared with ``against``: a class of the committed
     envelope, the ``optimum`` at each price, or the best of ``schedules`` there; a share of
-    ``allowed`` above it is still good. While it learns the front is measured at so many prices
-    ``between`` each two as well.
+    ``allowed`` above it is still good.
     """
 
     setting: str
@@ -38,7 +37,6 @@ class Course(Strict):
     against: str
     schedules: tuple[str, ...] = ()
     allowed: Rate = 0.01
-    between: int = pydantic.Field(default=0, ge=0)
 
     @pydantic.model_validator(mode="after")
     def _scheduled(self) -> Course:

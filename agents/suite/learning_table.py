@@ -115,12 +115,11 @@ def text_of(reports: Sequence[Report], command: str) -> str:
         "transmission.",
         "",
         "**Below the rules without memory**: the first measurement (on validation seeds) at which "
-        "all points lie below the committed envelope of rules without memory at their own rates, "
-        "and mixtures of neighbours below each of its vertices between the lowest and the highest "
-        "rate. The points are those at the seven prices, and at as many prices `between` each two "
-        "as the setting's config says. The two rates differ by a factor of three at least, counted "
-        "from 5 % of the rate of always transmitting: next to nothing sent is as good as any rule. "
-        "Plain PPO is the benchmark's, without memory, as far as its budget of seconds.",
+        "all seven points lie below the committed envelope of rules without memory at their own "
+        "rates, and mixtures of neighbours below each of its vertices between the lowest and the "
+        "highest rate. These differ by a factor of three at least, counted from 5 % of the rate "
+        "of always transmitting: next to nothing sent is as good as any rule. Plain PPO is the "
+        "benchmark's, without memory, as far as its budget of seconds.",
         "",
         "**Finished**: the fronts of all seeds on the test episodes, beside the committed envelope "
         "of exactly the same information at the agent's own rate, or, by the cost of an episode at "

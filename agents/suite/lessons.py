@@ -45,7 +45,7 @@ def run_lesson(lesson: Lesson, seeds: int) -> None:
     torch.set_num_threads(1)
     experiment, study = lesson.experiment, lesson.study
     folder = Path(experiment.output)
-    measure: Measure = meter(experiment, study.measured, study.learning.episodes)
+    measure: Measure = meter(experiment, study.prices, study.learning.episodes)
     enough = False
 
     def watch(record: dict[str, Any]) -> bool:

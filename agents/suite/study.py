@@ -61,12 +61,6 @@ class Study:
         return prices_of(self.setting.price_range, self.learning.prices)
 
     @property
-    def measured(self) -> list[float]:
-        """The prices at which a front is measured while it is learned, these among them."""
-        count = (self.learning.prices - 1) * (self.course.between + 1) + 1
-        return prices_of(self.setting.price_range, count)
-
-    @property
     def inner(self) -> list[bool]:
         """Which prices lie in the inner part of the range, in the logarithm."""
         low, high = self.setting.price_range
@@ -233,12 +227,12 @@ class Lesson:
         study, course = self.study, self.study.course
         return {
             "training": training_of(self.experiment),
-            "course": course.model_dump(mode="json", exclude={"between"}),
+            "course": course.model_dump(mode="json"),
             "prices": study.prices,
             "episodes": study.learning.episodes,
             "test": {"episodes": study.episodes, "seed": study.suite.seed},
             "envelopes": {name: study.envelope(name)["sha256"] for name in study.classes},
-        } | ({"between": course.between} if course.between else {})
+        }
 
     def result(self) -> dict[str, Any] | None:
         """What it taught, if it is finished.
