@@ -228,7 +228,7 @@ class Counterfactual(OnPolicyAlgorithm):
             parts = {
                 "policy_gradient_loss": policy,
                 "value_loss": value,
-                "entropy_loss": -entropy,
+                "entropy_loss": -entropy / (new.shape[1] if self._decisions.local else 1),
                 "approx_kl": ((whole - 1.0) - whole.log()).mean(),
                 "clip_fraction": ((whole - 1.0).abs() > clip).float().mean(),
             }

@@ -67,7 +67,8 @@ def test_noise_is_the_same_whatever_is_asked(case: Case) -> None:
         same(latent(silent.batch), latent(busy.batch))
         ended = np.zeros(3, dtype=np.bool_)
         for place, (env, asked) in enumerate(((silent, wanted & False), (busy, wanted))):
-            _, _, _, ended, info = env.step(actions(task, asked))
+            *_, terminated, truncated, info = env.step(actions(task, asked))
+            ended = terminated | truncated
             errors[place] += info["squared_error"].sum(1)
         begin = ended | np.array([step in (3, 9), step in (6, 7), step == 15])
         episodes += begin

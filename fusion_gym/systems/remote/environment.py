@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.access import ACCESS_RULES
 from fusion_gym.core.channel import CHANNELS, INITIAL_STATES, Channel
 from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.task import MOST_SENSORS, make_bucket
@@ -132,11 +133,12 @@ def _error_scale(chosen: RemoteEstimationOptions, deviation: Array) -> Array:
     if chosen.error_scale is not None:
         return validation.positive("error_scale", chosen.error_scale, (sensors,))
     bucket = make_bucket(chosen, sensors)
+    access = validation.choice("access", chosen.access, ACCESS_RULES)
     if bucket.unlimited:
         alone = (6.0 * _USUAL_PRICE) ** 0.25
-        shared = math.sqrt(sensors) if chosen.access != "any" else 1.0
+        shared = math.sqrt(sensors) if access != "any" else 1.0
         return deviation * max(alone, shared)
     steps = float(bucket.cost.sum()) / max(bucket.rate, 1e-3)
-    if chosen.access != "any":
+    if access != "any":
         steps = max(steps, float(sensors))
     return deviation * math.sqrt(max(steps, 1.0))
