@@ -1,0 +1,211 @@
+"""Covariance intersection of many estimates against optimisers, and the gap that it certifies."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from difficult_estimates import KINDS, Array, estimates, many
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from scipy.optimize import LinearConstraint, minimize
+
+from fusion_gym.fusion.intersection import covariance_intersection
+
+
+def slsqp_trace(covariance: Array) -> float:
+    """Smallest trace over the simplex of weights by a general-purpose optimiser, (l, n, n)."""
+    unit = np.sqrt(np.diag(covariance[0]))
+    information = np.linalg.inv(covariance / (unit[:, None] * unit))
+    scale = float(np.trace(covariance.mean(0)))
+
+    def trace(weights: Array) -> float:
+        fused = np.linalg.inv(np.tensordot(weights, information, 1))
+        return float(unit**2 @ np.diag(fused)) / scale
+
+    count = len(covariance)
+    starts = [np.full(count, 1 / count), *(0.9 * np.eye(count) + 0.1 / count)]
+    results = [
+        minimize(
+            trace,
+            start,
+            method="SLSQP",
+            bounds=[(0.0, 1.0)] * count,
+            constraints=LinearConstraint(np.ones(count), 1.0, 1.0),
+            options={"ftol": 1e-13, "maxiter": 500},
+        )
+        for start in starts
+    ]
+    return scale * min(float(r.fun) for r in results if abs(r.x.sum() - 1) < 1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("count", "size"), [(3, 2), (3, 3), (4, 3), (5, 1), (6, 2)])
+def test_many_estimates_reach_the_optimum(count: int, size: int, kind: str) -> None:
+    runs = 5
+    mean, covariance = estimates(kind, count, size, runs)
+    fused_mean, fused, weights = many(mean, covariance)
+    assert np.all(weights >= 0.0)
+    np.testing.assert_allclose(weights.sum(0), 1.0, rtol=1e-12)
+    for run in range(runs):
+        each, p = covariance[..., run], fused[..., run]
+        best = slsqp_trace(each)
+        assert np.trace(p) <= best * (1 + 1e-6)
+        assert np.trace(p) >= best * (1 - 1e-5)  # the optimiser's own accuracy
+        parts = [w * np.linalg.inv(c) for w, c in zip(weights[:, run], each, strict=True)]
+        gradient = [np.trace(p @ np.linalg.inv(c) @ p) for c in each]
+        assert max(gradient) - np.trace(p) <= 1.1e-6 * np.trace(p)
+        unit = np.sqrt(np.diag(p))
+        wanted = np.sum([part @ mean[s, :, run] for s, part in enumerate(parts)], axis=0)
+        np.testing.assert_allclose(fused_mean[:, run] / unit, p @ wanted / unit, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("count", "size"), [(3, 2), (4, 3), (6, 2), (8, 3)])
+def test_the_gap_closes_in_every_lane(count: int, size: int, kind: str) -> None:
+    """Many lanes, so that the few on which Newton's direction leaves the simplex are among them."""
+    mean, covariance = estimates(kind, count, size, runs=300, seed=5)
+    _, fused, _ = many(mean, covariance)
+    units = np.einsum("iiN->iN", fused) ** 0.5
+    scaled = covariance / units[:, None] / units
+    information = np.linalg.inv(np.moveaxis(scaled, -1, 1))
+    square = np.einsum("ijN,jkN->ikN", fused, fused) / units[:, None] / units
+    gain = np.einsum("sNij,jiN->sN", information, square)
+    assert np.all(gain.max(0) <= (1 + 1.1e-6) * np.einsum("iiN->N", fused))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("size", [1, 2, 3, 4])
+def test_of_two_estimates_the_many_form_is_the_pair(size: int, kind: str) -> None:
+    mean, covariance = estimates(kind, 2, size, 60)
+    pair = covariance_intersection(mean[0], covariance[0], mean[1], covariance[1])
+    _, fused, weights = many(mean, covariance)
+    wanted = np.einsum("iiN->N", pair.covariance)
+    np.testing.assert_allclose(np.einsum("iiN->N", fused), wanted, rtol=1e-6)
+    np.testing.assert_allclose(weights[0], pair.weights[0], atol=2e-3)
+
+
+def test_inactive_estimates_are_not_read() -> None:
+    mean, covariance = estimates("alike", 4, 3, 4)
+    active = np.array([[1, 1, 0, 0], [0, 1, 1, 0], [1, 0, 0, 0], [1, 1, 0, 0]], dtype=np.bool_)
+    dirty_mean = np.where(active[:, None], mean, np.nan)
+    dirty = np.where(active[:, None, None], covariance, np.nan)
+    fused_mean, fused, weights = many(dirty_mean, dirty, active)
+    assert np.all(weights[~active] == 0.0)
+    for run in (0, 1, 2):
+        kept, one = active[:, run], slice(run, run + 1)
+        wanted = many(mean[kept][..., one], covariance[kept][..., one])
+        np.testing.assert_allclose(fused_mean[:, one], wanted[0], rtol=1e-9)
+        np.testing.assert_allclose(fused[..., one], wanted[1], rtol=1e-9)
+        np.testing.assert_allclose(weights[kept][:, one], wanted[2], rtol=1e-9)
+    assert weights[1, 2] == 1.0  # alone
+    np.testing.assert_allclose(fused[..., 2], covariance[1, :, :, 2], rtol=1e-9)
+    assert np.all(np.isnan(fused[..., 3]))  # nobody
+    assert np.all(np.isnan(fused_mean[:, 3]))
+
+
+def gap(covariance: Array, fused: Array) -> Array:
+    """max_i tr(P Y_i P) / tr P - 1 (N,), in unit deviations of P; never below -1e-8 or so."""
+    units = np.einsum("iiN->iN", fused) ** 0.5
+    information = np.linalg.inv(np.moveaxis(covariance / units[:, None] / units, -1, 1))
+    square = np.einsum("ijN,jkN->ikN", fused, fused) / units[:, None] / units
+    gain = np.einsum("sNij,jiN->sN", information, square)
+    result: Array = gain.max(0) / np.einsum("iiN->N", fused) - 1.0
+    return result
+
+
+@given(
+    count=st.integers(2, 6),
+    size=st.integers(1, 6),
+    spread=st.floats(0.0, 4.0),
+    likeness=st.sampled_from([0.0, 1e-9, 1e-5, 1e-2, 1.0]),
+    seed=st.integers(0, 2**32 - 1),
+)
+@example(count=5, size=3, spread=0.75, likeness=0.01, seed=25010)
+@settings(deadline=None, max_examples=200)
+def test_the_gap_closes_for_alike_and_for_extreme_estimates(
+    count: int, size: int, spread: float, likeness: float, seed: int
+) -> None:
+    """Ratios of variances up to 1e8 in random directions; from identical to unrelated estimates."""
+    generator = np.random.default_rng(seed)
+    runs = 8
+    shared = generator.normal(size=(1, size, size + 1, runs))
+    own = generator.normal(size=(count, size, size + 1, runs))
+    factor = (1.0 - likeness) * shared + likeness * own
+    stretch = 10.0 ** generator.uniform(-spread / 2, spread / 2, size=(count, size, 1, runs))
+    factor = factor * stretch ** min(likeness, 1.0)
+    covariance = np.einsum("sikN,sjkN->sijN", factor, factor)
+    covariance += 1e-6 * np.einsum("siiN->sN", covariance)[:, None, None] * np.eye(size)[..., None]
+    mean = generator.normal(size=(count, size, runs))
+    _, fused, weights = many(mean, covariance)
+    assert np.all(weights >= 0.0)
+    np.testing.assert_allclose(weights.sum(0), 1.0, rtol=1e-12)
+    allowed = 1.1e-6 if count > 2 else 1e-9  # of more than two the search ends at a gap
+    if count > 2:
+        assert np.all(gap(covariance, fused) <= allowed)
+    alone = np.einsum("siiN->sN", covariance)
+    assert np.all(np.einsum("iiN->N", fused) <= alone.min(0) * (1 + allowed))
+    for run in (0, runs - 1):
+        one = slice(run, run + 1)
+        single = many(mean[..., one], covariance[..., one])
+        np.testing.assert_array_equal(single[1], fused[..., one])
+        np.testing.assert_array_equal(single[2], weights[:, one])
+
+
+@given(
+    count=st.integers(2, 6),
+    size=st.integers(1, 6),
+    kind=st.sampled_from(KINDS),
+    seed=st.integers(0, 10**6),
+)
+@settings(deadline=None, max_examples=25)
+def test_the_optimum_of_a_general_purpose_optimiser(
+    count: int, size: int, kind: str, seed: int
+) -> None:
+    mean, covariance = estimates(kind, count, size, 1, seed)
+    _, fused, _ = many(mean, covariance)
+    assert np.trace(fused[..., 0]) <= slsqp_trace(covariance[..., 0]) * (1 + 1.1e-6)
+
+
+def test_lanes_of_every_number_of_active_estimates_stand_side_by_side() -> None:
+    """One alone, two, three, four, nobody, and a broken one: each as if it were on its own."""
+    generator = np.random.default_rng(8)
+    mean, covariance = estimates("crossed", 4, 3, 120)
+    active = generator.random((4, 120)) < 0.6
+    covariance[1, 2, 2, ::10] = -1.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        batch = many(mean, covariance, active)
+    broken = ~active.any(0) | (active[1] & (np.arange(120) % 10 == 0))
+    assert np.array_equal(np.isnan(batch[1]).all((0, 1)), broken)
+    assert np.array_equal(np.isnan(batch[0]).all(0), broken)
+    assert not np.isnan(batch[1][..., ~broken]).any()
+    assert set(active[:, ~broken].sum(0)) == {1, 2, 3, 4}
+    assert np.all(batch[2][~active] == 0.0)
+    for run in range(120):
+        one = slice(run, run + 1)
+        alone = many(mean[..., one], covariance[..., one], active[:, one])
+        for single, batched in zip(alone, batch, strict=True):
+            np.testing.assert_array_equal(single, batched[..., one])
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_identical_estimates_are_kept(count: int) -> None:
+    _, covariance = estimates("alike", 1, 3, 10)
+    mean = np.zeros((count, 3, 10))
+    _, fused, weights = many(mean, np.repeat(covariance, count, axis=0))
+    np.testing.assert_allclose(fused, covariance[0], rtol=1e-9)
+    np.testing.assert_allclose(weights.sum(0), 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_a_weight_that_is_almost_one_is_found(count: int) -> None:
+    """One estimate is 1e8 times better in all directions but one, in which it is a little worse."""
+    covariance = np.stack([np.eye(3) * 1e8] * count)[..., None]
+    covariance[0] = np.diag([1.0, 1.0, 1.5e8])[..., None]
+    covariance[2, 0, 0] = 2e8
+    _, fused, weights = many(np.zeros((count, 3, 1)), covariance)
+    assert np.trace(fused[..., 0]) <= slsqp_trace(covariance[..., 0]) * (1 + 1.1e-6)
+    assert gap(covariance, fused)[0] <= 1.1e-6
+    assert np.all(weights >= 0.0)
