@@ -29,6 +29,7 @@ from .suite.classes import class_of
 from .suite.committed import FOLDER, complete, present
 from .suite.config import Setting, Suite, load_suite
 from .suite.jobs import Folders, finished, jobs, setting_task
+from .suite.team import BackendName, Team
 from .suite.verdict import judge
 from .suite.work import run
 from .suite.workers import Work, side_by_side
@@ -54,7 +55,11 @@ class Benchmark(Command):
     work: Annotated[Path | None, OutputFolder()] = None
     """Folder for models and episodes, instead of runs/benchmark/full or quick."""
     workers: Annotated[int, Whole(1, 512)] = 2
-    """Processes side by side."""
+    """Processes side by side, of this machine."""
+    backend: BackendName = "loky"
+    """Who works: loky's processes of this machine, or a dask or ray cluster."""
+    address: str | None = None
+    """Where dask's scheduler or ray's head is; without it a cluster of --workers begins here."""
     seeds: Annotated[int | None, Whole(1, 10_000)] = None
     """Number of training seeds, instead of the config's."""
     timesteps: Steps = None
@@ -84,7 +89,10 @@ class Benchmark(Command):
 
     def _run(self) -> None:
         suite = self.suite()
+        team = Team(self.workers, self.backend, self.address)
         folders = Folders.chosen(self.results, self.work, self.quick)
+        if not team.here:  # whoever works has another working directory
+            folders = Folders(folders.results.absolute(), folders.work.absolute())
         writable_folder("results", folders.results)
         writable_folder("work", folders.work)
         by_name = {setting.name: setting for setting in suite.settings}
@@ -106,7 +114,7 @@ class Benchmark(Command):
                 )
             for setting in chosen:
                 compared = [class_of(setting, mode).name for mode in suite.modes]
-                complete(suite, [setting], compared, folders.results, folders.work, self.workers)
+                complete(suite, [setting], compared, folders.results, folders.work, team)
             work = jobs(suite, chosen, modes, folders.results)
             # All of the settings' pieces, for the verdict is over all of them.
             every = jobs(suite, chosen, suite.modes, folders.results)
@@ -117,7 +125,7 @@ class Benchmark(Command):
                     for job in work
                     if job.place not in done
                 ],
-                self.workers,
+                team,
                 "benchmark",
             )
             for setting in chosen:

@@ -36,6 +36,7 @@ from .output.folders import alone_in
 from .suite.beside_rules import Ground, Trials
 from .suite.envelope_table import at_least
 from .suite.envelopes import task_of
+from .suite.team import Team
 from .suite.trainings import train_beside
 from .suite.workers import side_by_side
 from .training.checked import load
@@ -43,7 +44,7 @@ from .training.config import Experiment
 from .training.run import holds_training
 
 SETTING = "tobit_oscillator"
-WORKERS = 2
+TEAM = Team(2)
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ class Demo(Command):
                 one.name: Trials.of(ground, (one.plain, one.remembering), folders[one.name])
                 for one in LEARNERS
             }
-            side_by_side([work for one in tests.values() for work in one.left()], WORKERS, "tests")
+            side_by_side([work for one in tests.values() for work in one.left()], TEAM, "tests")
             tested = time.perf_counter()
             for one in LEARNERS:
                 conclude(one, tests[one.name], folders[one.name])

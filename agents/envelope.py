@@ -27,6 +27,7 @@ from .suite.committed import FOLDER, complete, path_of, present
 from .suite.config import load_suite
 from .suite.envelope_table import text_of
 from .suite.jobs import Folders
+from .suite.team import Team
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,9 @@ class Envelope(Command):
                     f"results = {str(folders.results)!r} holds {len(there)} of these envelopes: go "
                     "on with --resume, or give another --results"
                 )
-            complete(suite, settings, self.classes, folders.results, folders.work, self.workers)
+            complete(
+                suite, settings, self.classes, folders.results, folders.work, Team(self.workers)
+            )
             readme = folders.results / FOLDER / "README.md"
             write_text(readme, text_of(folders.results, spelled("envelope")))
         print(f"envelopes in {path_of(folders.results, '').parent}, the table in {readme}")

@@ -34,6 +34,7 @@ from agents.suite.learning import load_learning
 from agents.suite.learning_table import overview, text_of
 from agents.suite.lessons import run_lesson, run_reference
 from agents.suite.study import Kind, Lesson, Study
+from agents.suite.team import Team
 from agents.suite.workers import Work, side_by_side
 from fusion_gym.validation import ConfigurationError, choice, integer
 
@@ -94,7 +95,7 @@ def run(given: argparse.Namespace) -> None:
             )
         for study in studies:
             measure_throughput(study)
-        teach(studies, given.seeds, given.workers)
+        teach(studies, given.seeds, Team(given.workers))
         for study in studies:
             report(study, given.seeds)
         files = [output / f"{name}.json" for name in by_name]
@@ -112,16 +113,16 @@ def _command(given: argparse.Namespace) -> str:
     return shlex.join(words)
 
 
-def teach(studies: Sequence[Study], seeds: int, workers: int) -> None:
+def teach(studies: Sequence[Study], seeds: int, team: Team) -> None:
     """References, then fronts, then plain PPO for a multiple of the seconds that they took."""
     tests = {test.path(study.work): (test, study.work) for study in studies for test in study.tests}
     side_by_side(
         [Work(2.0, run_reference, pair) for path, pair in tests.items() if not path.exists()],
-        workers,
+        team,
         "references",
     )
     fronts = [Lesson(study, "front", seed) for seed in range(seeds) for study in studies]
-    _side_by_side(fronts, seeds, workers, "front")
+    _side_by_side(fronts, seeds, team, "front")
     plain = []
     for study in studies:
         if study.memoryless is None:
@@ -134,17 +135,17 @@ def teach(studies: Sequence[Study], seeds: int, workers: int) -> None:
             replace(lesson, budget=budget)
             for lesson in (Lesson(study, "plain", seed) for seed in range(count))
         ]
-    _side_by_side(plain, seeds, workers, "plain")
+    _side_by_side(plain, seeds, team, "plain")
 
 
-def _side_by_side(lessons: Sequence[Lesson], seeds: int, workers: int, kind: Kind) -> None:
+def _side_by_side(lessons: Sequence[Lesson], seeds: int, team: Team, kind: Kind) -> None:
     left = [lesson for lesson in lessons if lesson.result() is None]
     side_by_side(
         [
             Work(lesson.experiment.training.timesteps / _SPEED, run_lesson, (lesson, seeds))
             for lesson in left
         ],
-        workers,
+        team,
         f"{kind} trainings",
     )
 

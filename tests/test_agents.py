@@ -27,6 +27,7 @@ from agents.command_line import read
 from agents.suite.beside_rules import Ground, Trials
 from agents.suite.config import Suite
 from agents.suite.sweep import Comparison, Sweep
+from agents.suite.team import Team
 from agents.suite.trainings import train_beside
 from agents.training import run as train
 from agents.training.algorithms import TABLE
@@ -350,7 +351,7 @@ def test_demo_from_training_to_figures(
     ground, learner = thinned(Ground.read(demo.SETTING, 2)), demo.LEARNERS[1]
     monkeypatch.setattr(demo.Ground, "read", lambda *_: ground)
     monkeypatch.setattr(demo, "LEARNERS", (learner,))
-    monkeypatch.setattr(demo, "WORKERS", 1)
+    monkeypatch.setattr(demo, "TEAM", Team(1))
     words = ["--output", str(tmp_path), "--episodes", "2", "--timesteps", "8192"]
     monkeypatch.setattr(sys, "argv", ["demo", *words])
     demo.main()

@@ -30,6 +30,7 @@ from .envelopes import (
     tests_of,
 )
 from .reports import Interval, Shape, read
+from .team import Team
 from .workers import Work, side_by_side
 
 FOLDER = "envelopes"  # in that of the results
@@ -122,7 +123,7 @@ def present(suite: Suite, setting: Setting, results: Path) -> dict[str, Any]:
 
 def complete(
     suite: Suite, settings: Sequence[Setting], names: Sequence[str], results: Path, work: Path,
-    workers: int,
+    team: Team,
 ) -> None:  # fmt: skip
     """Tune, choose and measure what is missing of these classes (none: all), setting by setting.
 
@@ -140,17 +141,17 @@ def complete(
             search.check()
     for setting in settings:
         if missing[setting.name]:
-            _complete(suite, setting, missing[setting.name], results, work, workers)
+            _complete(suite, setting, missing[setting.name], results, work, team)
 
 
 def _complete(
-    suite: Suite, setting: Setting, wanted: Sequence[Class], results: Path, work: Path, workers: int
+    suite: Suite, setting: Setting, wanted: Sequence[Class], results: Path, work: Path, team: Team
 ) -> None:
     searches = searches_of(suite, setting, wanted)
     left = [search for search in searches if not search.path(work).exists()]
     left.sort(key=lambda search: -len(search.family.parameters))  # the long ones first
     side_by_side(
-        [Work(10.0, run_search, (one, work)) for one in left], workers, f"{setting.name}: tuning"
+        [Work(10.0, run_search, (one, work)) for one in left], team, f"{setting.name}: tuning"
     )
     vertices = [
         vertex for of in wanted for vertex in chosen(candidates_of(setting, of, searches, work)[0])
@@ -158,7 +159,7 @@ def _complete(
     tests = {one.path(work): one for one in tests_of(suite, setting, vertices)}
     side_by_side(
         [Work(2.0, run_test, (one, work)) for path, one in tests.items() if not path.exists()],
-        workers,
+        team,
         f"{setting.name}: testing",
     )
     classes = present(suite, setting, results)

@@ -1,4 +1,4 @@
-"""Work on several cores: processes that end with the process that they work for."""
+"""Pieces of work, done by a team; processes that end with the process that they work for."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from tqdm import tqdm
 
 from fusion_gym.validation import ConfigurationError
 
+from .team import Team
+
 _EVERY = 1.0  # seconds between two looks
 
 
@@ -26,32 +28,35 @@ class Work(NamedTuple):
     arguments: tuple[Any, ...]
 
 
-def side_by_side(work: Sequence[Work], workers: int, description: str) -> None:
-    """Do the work on several cores, with an estimate of the remaining time.
+def side_by_side(work: Sequence[Work], team: Team, description: str) -> None:
+    """Let the team do the work, with an estimate of the remaining time.
 
     Raises:
-        ConfigurationError: some of it does not fit, or the system ended a worker.
+        ConfigurationError: some of it does not fit, there is no such team, or the system ended a
+            worker of this machine. A cluster gives the work of a worker that is gone to another.
     """
     total = sum(one.weight for one in work)
     began = time.perf_counter()
-    with tqdm(total=round(total), desc=description, unit="s of work", smoothing=0.0) as bar:
-        weights = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")(
-            joblib.delayed(_do)(one, os.getpid()) for one in work
+    parent = os.getpid() if team.here else None
+    bar = tqdm(total=round(total), desc=description, unit="s of work", smoothing=0.0)
+    with bar, team.gathered():
+        weights = joblib.Parallel(return_as="generator_unordered", batch_size=1)(
+            joblib.delayed(_do)(one, parent) for one in work
         )
         try:
             for weight in weights:
                 bar.update(min(weight, bar.total - bar.n))
         except BrokenProcessPool:
             raise ConfigurationError(
-                f"workers = {workers}: the system ended one of them, perhaps for want of memory; "
-                "finished pieces of work are kept: go on as after an interrupt"
+                f"workers = {team.workers}: the system ended one of them, perhaps for want of "
+                "memory; finished pieces of work are kept: go on as after an interrupt"
             ) from None
     print(f"{description}: {len(work)} pieces of work in {time.perf_counter() - began:.0f} s")
 
 
-def _do(work: Work, parent: int) -> float:
-    """Do a piece of work; returns its weight. A worker ends with its ``parent``."""
-    if os.getpid() != parent:
+def _do(work: Work, parent: int | None) -> float:
+    """Do a piece of work; returns its weight. A worker of this machine ends with its ``parent``."""
+    if parent is not None and os.getpid() != parent:
         end_with(parent)
     work.function(*work.arguments)
     return work.weight

@@ -6,6 +6,7 @@ import functools
 import io
 import json
 import signal
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -35,14 +36,19 @@ Measure = Callable[[BaseAlgorithm, float], dict[str, Any]]
 
 
 class Interrupt:
-    """Turns Ctrl-C and SIGTERM into a flag while it is entered; a second Ctrl-C gets through."""
+    """Turns Ctrl-C and SIGTERM into a flag while it is entered; a second Ctrl-C gets through.
+
+    In a thread, as a cluster's workers have, signals belong to somebody else: nothing happens.
+    """
 
     def __init__(self) -> None:
         self.raised = False
 
     def __enter__(self) -> Interrupt:
+        mine = threading.current_thread() is threading.main_thread()
         self._before = {
-            number: signal.signal(number, self._raise) for number in (signal.SIGINT, signal.SIGTERM)
+            number: signal.signal(number, self._raise)
+            for number in ((signal.SIGINT, signal.SIGTERM) if mine else ())
         }
         return self
 

@@ -1,0 +1,109 @@
+"""Who does the work: processes of this machine, or a cluster that is there already.
+
+joblib hands it out, through its own processes (``loky``), a dask scheduler or a ray cluster. On
+other machines every path must be the same: the folders of results and work are shared.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import joblib
+
+from fusion_gym.validation import ConfigurationError
+
+BackendName = Literal["loky", "dask", "ray"]
+_PACKAGES = {"dask": "distributed", "ray": "ray"}
+_PATIENCE = 30.0  # seconds until a scheduler that does not answer is given up
+
+
+@dataclass(frozen=True)
+class Team:
+    """``workers`` processes here, or all those of the cluster at ``address``.
+
+    With ``dask`` or ``ray`` and without an address a cluster of so many workers is begun here.
+
+    Raises:
+        ConfigurationError: an address where there is no cluster.
+    """
+
+    workers: int = 2
+    backend: BackendName = "loky"
+    address: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.address is not None and self.backend == "loky":
+            raise ConfigurationError(
+                f"address = {self.address!r} is not allowed with backend='loky', which has none: "
+                "it belongs to 'dask' and 'ray'"
+            )
+
+    @property
+    def here(self) -> bool:
+        """Whether the workers are processes of this one."""
+        return self.backend == "loky"
+
+    @contextlib.contextmanager
+    def gathered(self) -> Iterator[None]:
+        """joblib's work goes to the team while this is entered.
+
+        Raises:
+            ConfigurationError: the backend's package is not installed, or nobody is at the address.
+        """
+        with contextlib.ExitStack() as stack:
+            if self.backend == "dask":
+                stack.enter_context(self._dask())
+            elif self.backend == "ray":
+                stack.enter_context(self._ray())
+            jobs = self.workers if self.here else -1
+            stack.enter_context(joblib.parallel_config(self.backend, n_jobs=jobs))
+            yield
+
+    @contextlib.contextmanager
+    def _dask(self) -> Iterator[None]:
+        distributed = self._package()
+        try:
+            if self.address is None:
+                client = distributed.Client(n_workers=self.workers, threads_per_worker=1)
+            else:
+                client = distributed.Client(self.address, timeout=_PATIENCE)
+        except (OSError, ValueError) as error:
+            raise self._nobody(error) from None
+        with client:
+            yield
+
+    @contextlib.contextmanager
+    def _ray(self) -> Iterator[None]:
+        ray = self._package()
+        try:
+            if self.address is None:
+                ray.init(num_cpus=self.workers, include_dashboard=False)
+            else:
+                ray.init(address=self.address)
+        except (OSError, ValueError) as error:
+            raise self._nobody(error) from None
+        try:
+            importlib.import_module("ray.util.joblib").register_ray()
+            yield
+        finally:
+            ray.shutdown()
+
+    def _package(self) -> Any:
+        name = _PACKAGES[self.backend]
+        try:
+            return importlib.import_module(name)
+        except ImportError:
+            raise ConfigurationError(
+                f"backend = {self.backend!r} is not allowed: it needs {name}, which "
+                f"'fusion-gym[{self.backend}]' installs"
+            ) from None
+
+    def _nobody(self, error: Exception) -> ConfigurationError:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        return ConfigurationError(
+            f"address = {self.address!r} is not allowed with backend={self.backend!r}: {reason}"
+        )

@@ -1,0 +1,103 @@
+"""The benchmark on a cluster: dask's scheduler and workers, one of which is ended in the middle."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from small_suite import small_suite
+
+from agents.suite.team import Team
+from fusion_gym.validation import ConfigurationError
+
+pytest.importorskip("distributed")
+ROOT = Path(__file__).resolve().parent.parent
+PATIENCE = 240.0
+
+
+@contextlib.contextmanager
+def started(folder: Path, name: str, *words: str) -> Iterator[subprocess.Popen[bytes]]:
+    """A process of the cluster, which is killed in the end."""
+    with (folder / f"{name}.log").open("wb") as log:
+        process = subprocess.Popen([sys.executable, "-m", *words], cwd=ROOT, stdout=log, stderr=log)
+        try:
+            yield process
+        finally:
+            process.kill()
+            process.wait()
+
+
+@contextlib.contextmanager
+def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """A scheduler's address, and its workers."""
+    told = folder / "scheduler.json"
+    with contextlib.ExitStack() as stack:
+        words = ["distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"]
+        stack.enter_context(started(folder, "scheduler", *words, "--scheduler-file", str(told)))
+        deadline = time.monotonic() + PATIENCE
+        while not told.exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        words = ["distributed.cli.dask_worker", "--nthreads", "1", "--no-nanny", "--no-dashboard"]
+        words += ["--scheduler-file", str(told), "--local-directory", str(folder)]
+        begun = [
+            stack.enter_context(started(folder, f"worker{number}", *words))
+            for number in range(workers)
+        ]
+        yield json.loads(told.read_text())["address"], begun
+
+
+def benchmark(suite: Path, folder: Path, *words: str) -> list[str]:
+    places = ["--results", str(folder / "results"), "--work", str(folder / "work")]
+    return [sys.executable, "-m", "agents.benchmark", "--config", str(suite), *places, *words]
+
+
+def found(folder: Path) -> dict[str, Any]:
+    """All that was found, without the seconds that it took."""
+    content = {}
+    for path in sorted((folder / "results").glob("*/*.json")):
+        content[path.name] = json.loads(path.read_text())
+        content[path.name].pop("seconds", None)
+    return content
+
+
+@pytest.mark.slow
+def test_a_worker_that_ends_in_the_middle_loses_nothing(tmp_path: Path) -> None:
+    suite = small_suite(tmp_path, timesteps=8_000, modes=["sensors"])
+    alone, many = tmp_path / "alone", tmp_path / "many"
+    subprocess.run(benchmark(suite, alone, "--workers", "2"), cwd=ROOT, check=True)
+    with cluster(tmp_path, 2) as (address, workers):
+        run = subprocess.Popen(
+            benchmark(suite, many, "--backend", "dask", "--address", address), cwd=ROOT
+        )
+        try:
+            deadline = time.monotonic() + PATIENCE
+            while len(list(many.glob("work/small/sensors_*/config.yaml"))) < 2:
+                assert run.poll() is None
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+            workers[0].kill()
+            assert run.wait(PATIENCE) == 0
+        finally:
+            run.kill()
+            run.wait()
+        assert workers[1].poll() is None
+    assert found(many) == found(alone)
+    assert {"agent_sensors_0.json", "agent_sensors_1.json", "verdict.json"} <= found(many).keys()
+
+
+def test_a_team_that_is_not_there_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match=r"address = 'tcp://x' .*backend='loky'"):
+        Team(2, "loky", "tcp://x")
+    with (
+        pytest.raises(ConfigurationError, match=r"address = 'nowhere' .*backend='dask'"),
+        Team(2, "dask", "nowhere").gathered(),
+    ):
+        pass
