@@ -8,14 +8,21 @@ has the trials asked for, as if it had not been interrupted. The first trial is 
 where its values lie in the search. Trials that fall behind at a validation
 are pruned, and so are those that diverge. ``best.yaml`` is the config with what was found, and the
 command that found it.
+
+With ``--storage`` the study is in a database that several processes share, on this machine or
+others, each with an output folder of its own: the same command for all of them does the trials
+together. What a trial tries then depends on who is first, and the trial of a process that is gone
+is made anew.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import shlex
 import sqlite3
 import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,8 +30,9 @@ from typing import Annotated, Any
 import numpy as np
 import optuna
 import yaml
-from optuna.exceptions import StorageInternalError
+from optuna.exceptions import ExperimentalWarning, StorageInternalError
 from optuna.trial import TrialState
+from sqlalchemy.exc import SQLAlchemyError
 from tqdm import tqdm
 
 from fusion_gym.validation import ConfigurationError
@@ -47,6 +55,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "n_epochs": (2, 4, 8),
     "hidden": ("64,64", "128,128"),
 }
+_HEARTBEAT = 60  # seconds between two signs of life of who makes a trial in a shared study
 FACTORS = (0.25, 0.5, 1, 2)  # of the config's steps between two updates
 
 
@@ -62,6 +71,8 @@ class Tune(Command):
     """Trials of the study in all."""
     timesteps: Steps = None
     """Steps of a trial, instead of the config's."""
+    storage: str | None = None
+    """A database that processes share, as Optuna names it: postgresql://… or sqlite:///FILE."""
 
     def run(self) -> None:
         """Search, and write the best config under the command that found it."""
@@ -70,7 +81,9 @@ class Tune(Command):
         if self.timesteps is not None:
             plain["training"]["timesteps"] = self.timesteps
             plain["validation"]["every"] = max(self.timesteps // 5, 1)
-        study = tune(parse(Experiment, plain, "command line"), self.trials, self.output)
+        study = tune(
+            parse(Experiment, plain, "command line"), self.trials, self.output, self.storage
+        )
         if not study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             raise ConfigurationError(
                 f"trials = {self.trials} is not enough: all of them were pruned"
@@ -110,13 +123,15 @@ def suggest(trial: optuna.Trial, experiment: Experiment, output: Path) -> Experi
     return Experiment.model_validate(plain)
 
 
-def tune(experiment: Experiment, trials: int, folder: Path) -> optuna.Study:
+def tune(
+    experiment: Experiment, trials: int, folder: Path, storage: str | None = None
+) -> optuna.Study:
     """Trials until the study in the folder has so many that ended.
 
     A trial's value is its best validation return. With a target rate, which that does not
     measure, tuning is refused. A study that is gone on with makes the trials that it would have
     made uninterrupted: each draws from a generator of its own, and an unfinished one is gone on
-    with.
+    with. In a ``storage`` other processes make trials of the same study.
 
     Raises:
         ConfigurationError: a target rate, an environment or algorithm that is not allowed, or a
@@ -130,14 +145,15 @@ def tune(experiment: Experiment, trials: int, folder: Path) -> optuna.Study:
     check(experiment)
     try:
         with alone_in(folder, "output"):
+            if storage is not None:
+                return together(shared_study(experiment, storage), experiment, trials, folder)
             study = open_study(experiment, folder)
             search(study, experiment, trials, folder)
             return study
     except (sqlite3.Error, StorageInternalError) as error:
         reason = str(error.__cause__ or error).splitlines()[0]
-        raise ConfigurationError(
-            f"study = {str(folder / 'study.db')!r} cannot be read or written: {reason}"
-        ) from None
+        where = f"storage = {storage!r}" if storage else f"study = {str(folder / 'study.db')!r}"
+        raise ConfigurationError(f"{where} cannot be read or written: {reason}") from None
 
 
 def open_study(experiment: Experiment, folder: Path) -> optuna.Study:
@@ -148,7 +164,7 @@ def open_study(experiment: Experiment, folder: Path) -> optuna.Study:
         sqlite3.Error: it is damaged.
     """
     path = folder / "study.db"
-    inputs = {"timesteps": experiment.training.timesteps} | experiment.inputs()
+    inputs = inputs_of(experiment)
     if path.exists() and path.stat().st_size > 0:
         with contextlib.closing(sqlite3.connect(path)) as connection:
             told = connection.execute("PRAGMA quick_check").fetchone()[0]
@@ -164,13 +180,23 @@ def open_study(experiment: Experiment, folder: Path) -> optuna.Study:
         storage=f"sqlite:///{path}",
         load_if_exists=True,
         direction="maximize",
-        pruner=optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=1),
+        pruner=pruner(),
     )
     if study.get_trials(deepcopy=False) or "inputs" in study.user_attrs:
         check_inputs(inputs, study.user_attrs.get("inputs"), f"the study in {str(folder)!r}")
     study.set_user_attr("inputs", inputs)
     study.set_user_attr("made_from", fingerprint(inputs))
     return study
+
+
+def inputs_of(experiment: Experiment) -> dict[str, Any]:
+    """All that a study depends on."""
+    return {"timesteps": experiment.training.timesteps} | experiment.inputs()
+
+
+def pruner() -> optuna.pruners.BasePruner:
+    """What ends trials that fall behind."""
+    return optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=1)
 
 
 def search(study: optuna.Study, experiment: Experiment, trials: int, folder: Path) -> None:
@@ -183,8 +209,57 @@ def search(study: optuna.Study, experiment: Experiment, trials: int, folder: Pat
             if not ended(study) and not study.get_trials(states=(TrialState.WAITING,)):
                 begin_with(study, experiment)
             study.sampler = sampler(experiment, ended(study))
-            study.optimize(lambda trial: run_trial(trial, experiment, folder), n_trials=1)
+            output = folder / f"trial_{ended(study)}"
+            study.optimize(functools.partial(run_trial, experiment=experiment, output=output), 1)
             bar.update()
+
+
+def shared_study(experiment: Experiment, storage: str) -> optuna.Study:
+    """The study of this experiment in a storage, a new one if there is none: each has its name.
+
+    Raises:
+        ConfigurationError: a storage that cannot be opened.
+    """
+    inputs = inputs_of(experiment)
+    try:
+        with warnings.catch_warnings():  # signs of life are an experiment of Optuna's
+            warnings.simplefilter("ignore", ExperimentalWarning)
+            found = optuna.storages.RDBStorage(
+                storage, heartbeat_interval=_HEARTBEAT, grace_period=3 * _HEARTBEAT
+            )
+    except (SQLAlchemyError, ImportError) as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigurationError(
+            f"storage = {storage!r} is not allowed: it must be a database's URL ({reason})"
+        ) from None
+    study = optuna.create_study(
+        study_name=f"tune_{fingerprint(inputs)[:16]}",
+        storage=found,
+        sampler=optuna.samplers.TPESampler(constant_liar=True),
+        load_if_exists=True,
+        direction="maximize",
+        pruner=pruner(),
+    )
+    study.set_user_attr("inputs", inputs)
+    return study
+
+
+def together(
+    study: optuna.Study, experiment: Experiment, trials: int, folder: Path
+) -> optuna.Study:
+    """Make trials beside other processes until so many have ended, or are being made by them."""
+    active = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.RUNNING)
+    if not study.get_trials(deepcopy=False):
+        begin_with(study, experiment)
+    with tqdm(total=trials, desc="tuning", unit="trial") as bar:
+        while len(study.get_trials(deepcopy=False, states=active)) < trials:
+            study.optimize(
+                lambda trial: run_trial(trial, experiment, folder / f"trial_{trial.number}"),
+                n_trials=1,
+            )
+            bar.n = min(ended(study), trials)
+            bar.refresh()
+    return study
 
 
 def begin_with(study: optuna.Study, experiment: Experiment) -> None:
@@ -196,7 +271,7 @@ def begin_with(study: optuna.Study, experiment: Experiment) -> None:
     own["hidden"] = ",".join(str(size) for size in experiment.algorithm.network.hidden)
     inside = all(low <= own[name] <= high for name, (low, high) in NUMBERS.items() if name in own)
     if inside and all(own[name] in some for name, some in values.items() if name in own):
-        study.enqueue_trial(own)
+        study.enqueue_trial(own, skip_if_exists=True)
 
 
 def ended(study: optuna.Study) -> int:
@@ -211,14 +286,13 @@ def sampler(experiment: Experiment, place: int) -> optuna.samplers.BaseSampler:
     return optuna.samplers.TPESampler(seed=int(seeds.generate_state(1)[0]))
 
 
-def run_trial(trial: optuna.Trial, experiment: Experiment, folder: Path) -> float:
-    """Train with a trial's hyper-parameters; returns the best validation return.
+def run_trial(trial: optuna.Trial, experiment: Experiment, output: Path) -> float:
+    """Train with a trial's hyper-parameters in a folder; returns the best validation return.
 
     Raises:
         TrialPruned: it fell behind, or diverged.
         KeyboardInterrupt: it was interrupted.
     """
-    output = folder / f"trial_{ended(trial.study)}"
     trial.set_user_attr("folder", output.name)
     chosen = suggest(trial, experiment, output)
     best = -float("inf")

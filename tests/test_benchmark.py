@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import subprocess
 import sys
 import xml.etree.ElementTree
 from pathlib import Path
@@ -25,6 +26,8 @@ from agents.suite.config import load_suite
 from agents.suite.envelope_table import BEFORE
 from agents.suite.envelopes import searches_of
 from agents.training.algorithms import PPOConfig
+from agents.training.checked import load
+from agents.training.config import Experiment
 from fusion_gym.core.system import covers, least_covering
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.periodic_optimum import Schedule
@@ -331,6 +334,44 @@ def other_seed(config: Path) -> Path:
     other = config.with_name("other.yaml")
     other.write_text(yaml.safe_dump(content))
     return other
+
+
+def test_processes_share_a_study(tmp_path: Path) -> None:
+    """Two at once make so many trials in all; a third finds them made, and says what was best."""
+    config, storage = tmp_path / "config.yaml", f"sqlite:///{tmp_path / 'shared.db'}"
+    config.write_text(
+        yaml.safe_dump(
+            {
+                "environment": {"id": ENV, "options": {"filter": "tobit", "horizon": 10}},
+                "algorithm": {"name": "ppo", "batch_size": 64},
+                "training": {"timesteps": 1024, "num_envs": 8},
+                "validation": {"every": 512, "episodes": 4},
+                "output": "runs/x",
+            }
+        )
+    )
+
+    def begun(name: str) -> subprocess.Popen[bytes]:
+        words = ["--config", str(config), "--trials", "4", "--storage", storage]
+        return subprocess.Popen(
+            [sys.executable, "-m", "agents.tune", *words, "--output", str(tmp_path / name)],
+            cwd=Path(__file__).parent.parent,
+        )
+
+    both = [begun(name) for name in ("one", "two")]
+    assert [process.wait(120) for process in both] == [0, 0]
+    assert begun("three").wait(120) == 0
+    (name,) = optuna.get_all_study_names(storage)
+    study = optuna.load_study(study_name=name, storage=storage)
+    folders = [path.name for one in ("one", "two") for path in (tmp_path / one).glob("trial_*")]
+    assert len(folders) == len(set(folders)) == len(study.trials)
+    assert 4 <= len(study.trials) <= 5  # both may begin the last one
+    assert not list((tmp_path / "three").glob("trial_*"))
+    told = yaml.safe_load((tmp_path / "three" / "best.yaml").read_text())
+    assert told["algorithm"]["learning_rate"] == study.best_params["learning_rate"]
+    for wrong in ("nonsense://x", "sqlite:////nowhere/x.db"):
+        with pytest.raises(ConfigurationError, match=f"storage = '{wrong}' is not allowed"):
+            tune.tune(load(Experiment, config), 1, tmp_path / "four", wrong)
 
 
 def test_tuning_goes_on_with_its_study(
