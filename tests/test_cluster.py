@@ -17,7 +17,6 @@ from small_suite import small_suite
 from agents.suite.team import Team
 from fusion_gym.validation import ConfigurationError
 
-pytest.importorskip("distributed")
 ROOT = Path(__file__).resolve().parent.parent
 PATIENCE = 240.0
 
@@ -70,7 +69,7 @@ def found(folder: Path) -> dict[str, Any]:
 
 @pytest.mark.slow
 def test_a_worker_that_ends_in_the_middle_loses_nothing(tmp_path: Path) -> None:
-    suite = small_suite(tmp_path, timesteps=8_000, modes=["sensors"])
+    suite = small_suite(tmp_path, timesteps=8_000, classes=["sensors"])
     alone, many = tmp_path / "alone", tmp_path / "many"
     subprocess.run(benchmark(suite, alone, "--workers", "2"), cwd=ROOT, check=True)
     with cluster(tmp_path, 2) as (address, workers):
