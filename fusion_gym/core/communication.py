@@ -44,10 +44,13 @@ def communication(scenario: Scenario) -> Communication:
             "memory = True is not allowed with information='centre': it must be False, for the "
             "centre has nothing to remember but what was sent"
         )
-    for name in ("memory_filter", "memory_features"):
-        value = getattr(chosen, name)
-        if value is not None and not remembers:
-            raise validation.refusal(name, value, "None unless memory=True")
+    if chosen.memory_filter is not None and not remembers:
+        raise validation.refusal("memory_filter", chosen.memory_filter, "None unless memory=True")
+    features = _features(chosen.belief_features, remembers)
+    if features and chosen.information == "centre":
+        raise validation.refusal(
+            "belief_features", chosen.belief_features, "None or empty with information='centre'"
+        )
     if chosen.memory_filter is not None and scenario.memory_system is None:
         raise validation.refusal(
             "memory_filter", chosen.memory_filter, "None here, for this system has one filter"
@@ -59,7 +62,7 @@ def communication(scenario: Scenario) -> Communication:
         _broadcast(scenario),
         remembers,
         shadow if remembers else None,
-        _features(chosen.memory_features),
+        features,
     )
 
 
@@ -90,10 +93,13 @@ def _broadcast(scenario: Scenario) -> str:
     return broadcast
 
 
-def _features(value: Any) -> tuple[str, ...]:
-    given = FEATURES if value is None else (value,) if isinstance(value, str) else value
+def _features(value: Any, remembers: bool) -> tuple[str, ...]:
+    """What the observation shows of what is believed: with memory all of it by default."""
+    if value is None:
+        return FEATURES if remembers else ()
+    given = (value,) if isinstance(value, str) else value
     if not isinstance(given, Sequence):
-        raise validation.refusal("memory_features", value, f"a list of some of {FEATURES}")
+        raise validation.refusal("belief_features", value, f"a list of some of {FEATURES}")
     for name in given:
-        validation.choice("memory_features", name, FEATURES)
+        validation.choice("belief_features", name, FEATURES)
     return tuple(name for name in FEATURES if name in given)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fusion_gym.arrays import Array
 from fusion_gym.core.beliefs import Beliefs
 from fusion_gym.core.memory import Owner
-from fusion_gym.core.system import Block, covers, numbered
+from fusion_gym.core.system import Block, Knowledge, covers, numbered
 from fusion_gym.core.task import Task
 from fusion_gym.validation import ConfigurationError
 
@@ -76,9 +76,12 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
     )
 
 
-def memory_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
-    """What memory adds to a system's own blocks; their values are made of `Beliefs`."""
-    if not task.memory:
+def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
+    """What is believed beyond a system's own blocks, with memory or from what is new alone.
+
+    Their values are made of `Beliefs`.
+    """
+    if not task.belief_features:
         return ()
     deviation = np.sqrt(task.open_loop)
     whole = float((task.relative_weights * task.open_loop).sum())
@@ -101,7 +104,8 @@ def memory_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
         "expected to take off it, over open loop"
     )
     if owner == "own":
-        own = partial(Block, knowledge="own_memory", node="own")
+        known: Knowledge = "own_memory" if task.memory else "own"
+        own = partial(Block, knowledge=known, node="own")
         found = {
             "difference": own(
                 "own_difference", apart, difference, (nodes, states), limit=_DIFFERENCE_LIMIT
@@ -111,7 +115,8 @@ def memory_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
             ),
         }
     else:
-        every = partial(Block, knowledge="coordinator_memory")
+        known = "coordinator_memory" if task.memory else "coordinator"
+        every = partial(Block, knowledge=known)
         found = {
             "difference": every(
                 "belief_difference",
@@ -128,7 +133,7 @@ def memory_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
                 limit=_VALUE_LIMIT,
             ),
         }
-    return tuple(found[name] for name in task.memory_features)
+    return tuple(found[name] for name in task.belief_features)
 
 
 class ObservationLayout:
@@ -150,7 +155,7 @@ class ObservationLayout:
 
         self._task, self._owner = task, owner
         self._own, self._network = shown(task.system.observation), shown(network_blocks(task))
-        self._memory = shown(memory_blocks(task, owner))
+        self._memory = shown(belief_blocks(task, owner))
         self.blocks = self._own + self._memory + self._network
         names = [block.name for block in self.blocks]
         for name in names:

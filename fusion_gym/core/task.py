@@ -38,7 +38,7 @@ class Task:
     ``"binary"`` (one bit a sensor) or ``"discrete"`` (the bits as one number, sensor 0 the lowest).
     ``access`` is a rule of :mod:`fusion_gym.core.access`; with ``"single"`` the action is
     0 for nobody or the number of the sensor, counted from 1.
-    ``packet``, ``broadcast``, ``memory``, ``shadow`` and ``memory_features`` are those of
+    ``packet``, ``broadcast``, ``memory``, ``shadow`` and ``belief_features`` are those of
     :mod:`fusion_gym.core.communication`; ``feedback`` says that the nodes get the centre's
     estimate back. With ``clock`` the observation shows what is left of the episode, whose end then
     belongs to the problem: a termination, no truncation. Without ``own_number`` a sensor that
@@ -61,7 +61,7 @@ class Task:
     broadcast: str = "none"
     memory: bool = False
     shadow: System[Any] | None = None
-    memory_features: tuple[str, ...] = ()
+    belief_features: tuple[str, ...] = ()
     feedback: bool = False
     clock: bool = False
     own_number: bool = True
@@ -129,7 +129,7 @@ class Task:
             broadcast=how.broadcast,
             memory=how.memory,
             shadow=how.shadow,
-            memory_features=how.features,
+            belief_features=how.features,
             feedback=scenario.feedback,
             clock=chosen.clock,
             own_number=chosen.own_number,

@@ -23,8 +23,8 @@ from fusion_gym.core.communication import FEATURES
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.observation import (
     ObservationLayout,
+    belief_blocks,
     block_entries,
-    memory_blocks,
     network_blocks,
 )
 from fusion_gym.core.options import CommonOptions, plain
@@ -88,10 +88,10 @@ _NETWORK = {
     "time_left": "only with `clock=True`",
     "price": "only with a `price_range`",
 }
-# What memory adds to the observation of the coordinator, and to a sensor's own.
-_MEMORY: dict[Owner, str] = {
-    "coordinator": "only with `memory=True`",
-    "own": "only with `memory=True`, for a sensor that decides by itself",
+# What is believed, in the observation of the coordinator and in a sensor's own.
+_BELIEFS: dict[Owner, str] = {
+    "coordinator": "only with `memory=True` or `belief_features`",
+    "own": "the same, for a sensor that decides by itself",
 }
 _SEES = {"own": "its own", "told": "all", "hidden": "none"}
 _MARKED = re.compile(r"(<!-- observation: (.*?) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -140,10 +140,10 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
     for name, other in others:
         for block in other.system.observation:
             rows.setdefault(block.name, _row(other, block, f"only with {name}"))
-    remembering = replace(task, memory=True, memory_features=task.memory_features or FEATURES)
-    for owner, condition in _MEMORY.items():
-        for block in memory_blocks(remembering, owner):
-            shown = task.memory and owner == "coordinator"
+    remembering = replace(task, memory=True, belief_features=task.belief_features or FEATURES)
+    for owner, condition in _BELIEFS.items():
+        for block in belief_blocks(remembering, owner):
+            shown = bool(task.belief_features) and owner == "coordinator"
             rows[block.name] = _row(task, block, "" if shown else condition)
     always = [block.name for block in network_blocks(task)]
     price = replace(task.reward, price=Price(None, (0.01, 1.0)))

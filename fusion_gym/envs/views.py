@@ -161,7 +161,7 @@ class SensorView:
 
     def __init__(self, task: Task) -> None:
         self.knowledge: Knowledge = "own_memory" if task.memory else "own"
-        self.owner: Owner | None = "own" if task.memory else None
+        self.owner: Owner | None = "own" if task.memory or task.belief_features else None
         if task.packet == "estimate":
             raise ConfigurationError(
                 "packet = 'estimate' is not allowed with a local view: it must be 'measurement', "

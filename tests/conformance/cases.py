@@ -49,8 +49,9 @@ VARIANTS: dict[str, list[Options]] = {
         UNCENSORED,
         {"filter": "tobit", "measurement_matrices": (((1.0, 0.0),),)},
         {"filter": "tobit", "random_start": True} | REMEMBERING | LIMITED,
-        REMEMBERING | {"memory_features": "value", "access": "single"} | DRAWN,
-        UNCENSORED | ESTIMATES | {"memory_features": ("difference",), "action": "discrete"},
+        REMEMBERING | {"belief_features": "value", "access": "single"} | DRAWN,
+        {"filter": "tobit", "belief_features": "value", "action": "discrete"},
+        UNCENSORED | ESTIMATES | {"belief_features": ("difference",), "action": "discrete"},
     ],
     CORRELATED: [
         {"fusion": "sci", "order": (2, 0, 1), "information": "centre", **LIMITED},
@@ -67,6 +68,7 @@ VARIANTS: dict[str, list[Options]] = {
         },
         REMEMBERING | {"access": "round_robin", "noise_scale": "random"} | DRAWN,
         ESTIMATES | LIMITED,
+        {"belief_features": ("difference", "value"), "broadcast": "packets", **LIMITED},
     ],
     JUMP: [
         {"fusion": "ci", "access": "single", **DRAWN},
