@@ -1,6 +1,6 @@
 """The benchmark of policies: tuned envelopes, learned fronts and references in every setting.
 
-    python -m agents.benchmark [--envs NAME …] [--modes sensors …] [--quick] [--resume]
+    python -m agents.benchmark [--envs NAME …] [--classes sensors_memory …] [--quick] [--resume]
 
 Envelopes that are missing are tuned first, as ``python -m agents.envelope`` does; every agent keeps
 the hash of the one that it is compared with. Every piece of work (one training seed of one agent,
@@ -14,23 +14,24 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from fusion_gym.evaluation.envelope import points_of
 from fusion_gym.validation import ConfigurationError, choice
 
 from .command_line import Command, spelled, start
 from .input.options import OutputFolder, Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
-from .output.files import load_results, read_json, write
-from .suite.classes import class_of
-from .suite.committed import FOLDER, complete, present
+from .suite.beside_rules import SHIPPED
+from .suite.classes import names_of, trained
+from .suite.committed import FOLDER, Shelf, complete
+from .suite.conclude import conclude
 from .suite.config import Setting, Suite, load_suite
-from .suite.jobs import Folders, finished, jobs, setting_task
+from .suite.envelopes import run_test
+from .suite.jobs import Folders, finished, jobs, rules_of, setting_task
 from .suite.team import BackendName, Team
-from .suite.verdict import judge
 from .suite.work import run
 from .suite.workers import Work, side_by_side
 from .training.checked import parse
@@ -44,8 +45,8 @@ class Benchmark(Command):
     """The suite: a YAML file, or the name of a shipped config."""
     envs: tuple[str, ...] = ()
     """Settings by name; none stands for all."""
-    modes: tuple[str, ...] = ()
-    """Some of sensors, centre and local; none stands for all."""
+    classes: tuple[str, ...] = ()
+    """Agents of these classes, as sensors_memory or local_packets; none stands for all."""
     quick: bool = False
     """Less of everything, in minutes."""
     resume: bool = False
@@ -97,81 +98,60 @@ class Benchmark(Command):
         writable_folder("work", folders.work)
         by_name = {setting.name: setting for setting in suite.settings}
         chosen = [by_name[choice("envs", name, by_name)] for name in self.envs or by_name]
-        for mode in self.modes:
-            choice("modes", mode, suite.modes)
-        modes = [mode for mode in suite.modes if not self.modes or mode in self.modes]
+        for name in self.classes:
+            choice("classes", name, names_of(suite))
+        classes = self.classes or names_of(suite)
         for setting in chosen:
             setting_task(setting)
         with folders.alone():
-            names = [f"{s.name}/*.json" for s in chosen] + [
-                f"{FOLDER}/{s.name}.json" for s in chosen
-            ]
-            there = [path for name in names for path in folders.results.glob(name)]
-            if there and not self.resume:
-                raise ConfigurationError(
-                    f"results = {str(folders.results)!r} holds {len(there)} finished pieces of "
-                    "work: go on with --resume, or give another --results and --work"
-                )
+            self._check_resumed(folders, chosen)
+            shelf = self._shelf(suite, chosen, folders)
             for setting in chosen:
-                compared = [class_of(setting, mode).name for mode in suite.modes]
-                complete(suite, [setting], compared, folders.results, folders.work, team)
-            work = jobs(suite, chosen, modes, folders.results)
+                compared = [of.name for of in trained(suite, setting)]
+                complete(shelf.suite, [setting], compared, shelf.results, folders.work, team)
+            rules = [
+                Work(4.0, run_test, (test, folders.work))
+                for setting in chosen
+                for test in rules_of(suite, setting, shelf)
+                if not test.path(folders.work).exists()
+            ]
+            side_by_side(rules, team, "rules")
             # All of the settings' pieces, for the verdict is over all of them.
-            every = jobs(suite, chosen, suite.modes, folders.results)
+            every = jobs(suite, chosen, names_of(suite), shelf)
             done = [job.place for job in every if finished(job, suite, folders)]
             side_by_side(
                 [
-                    Work(job.weight, run, (job, suite, folders))
-                    for job in work
+                    Work(job.weight, run, (job, suite, folders, shelf))
+                    for job in jobs(suite, chosen, classes, shelf)
                     if job.place not in done
                 ],
                 team,
                 "benchmark",
             )
             for setting in chosen:
-                conclude(suite, setting, folders)
+                conclude(suite, setting, folders, shelf)
         report = f"{spelled('report')} --results {folders.results}"
         print(f"results in {folders.results}: {report}")
 
+    def _check_resumed(self, folders: Folders, chosen: Sequence[Setting]) -> None:
+        """Raises ConfigurationError where there are results and no --resume."""
+        names = [f"{s.name}/*.json" for s in chosen] + [f"{FOLDER}/{s.name}.json" for s in chosen]
+        there = [path for name in names for path in folders.results.glob(name)]
+        if there and not self.resume:
+            raise ConfigurationError(
+                f"results = {str(folders.results)!r} holds {len(there)} finished pieces of "
+                "work: go on with --resume, or give another --results and --work"
+            )
 
-def conclude(suite: Suite, setting: Setting, folders: Folders) -> dict[str, Any] | None:
-    """The verdict over whatever agents of a setting are finished, written as ``verdict.json``.
-
-    Raises:
-        ConfigurationError: results that are damaged or were made from other settings.
-    """
-    every = jobs(suite, [setting], suite.modes, folders.results)
-    pieces = [job for job in every if finished(job, suite, folders)]
-    reports = {job.name: read_json(folders.report(job), "results") for job in pieces}
-    found = {
-        job.name: load_results(folders.episodes(job), reports[job.name]["made_from"])
-        for job in pieces
-    }
-    if "baselines" not in found:
-        return None
-    rules, known = found["baselines"], found.get("references", {})
-    references = {"sensors": found.get("informed", {}) | known, "centre": known, "local": {}}
-    always = float(rules["always"].rate.mean())
-    classes = present(suite, setting, folders.results)
-    verdict: dict[str, Any] = {"setting": setting.name, "title": setting.title, "modes": {}}
-    for mode in suite.modes:
-        done = [job.name for job in pieces if job.mode == mode]
-        if not done:
-            continue
-        name = class_of(setting, mode).name
-        envelope = {vertex["name"]: rules[vertex["name"]] for vertex in classes[name]["vertices"]}
-        agents = [list(found[job].values()) for job in done]
-        prices = reports[done[0]]["prices"]
-        verdict["modes"][mode] = judge(
-            agents, prices, envelope, references[mode], always, found.get("hindsight", {}),
-            classes[name]["searches"],
-        ) | {
-            "class": name,
-            "sha256": classes[name]["sha256"],
-            "envelope": [point._asdict() for point in points_of(envelope)],
-        }  # fmt: skip
-    write(folders.results / setting.name / "verdict.json", verdict)
-    return verdict
+    def _shelf(self, suite: Suite, chosen: Sequence[Setting], folders: Folders) -> Shelf:
+        """The quick benchmark takes the envelopes that are shipped, if they are of this config."""
+        shipped = Shelf(load_suite(self.config), SHIPPED)
+        if self.quick and all(
+            {of.name for of in trained(suite, setting)} <= shipped.found(setting).keys()
+            for setting in chosen
+        ):
+            return shipped
+        return Shelf(suite, folders.results)
 
 
 def main() -> None:

@@ -30,7 +30,7 @@ SUITE = {
     "timesteps": 32,
     "num_envs": 2,
     "prices": 2,
-    "modes": ["sensors"],
+    "classes": ["sensors"],
     "tuning": {"trials": 2, "prices": 2, "episodes": 2, "seeds": 2},
     "algorithm": TRAINING["algorithm"],
     "families": [],

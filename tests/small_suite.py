@@ -38,6 +38,7 @@ SMALL: dict[str, Any] = {
             "environment": {"id": ENV, "options": {"filter": "tobit", "horizon": 10}},
             "price_range": [0.001, 0.1],
             "broadcasts": ["estimate", "packets"],
+            "agents": ["centre", "local_estimate", "local_packets_memory", "sensors"],
             "informed": ["lookahead:steps=1,price=0.01", "lookahead:steps=1,price=1e9"],
             "references": ["periodic:period=7"],
             "genie": {"options": {"tokens": "unlimited"}, "assumes": "everything arrives"},

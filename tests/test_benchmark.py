@@ -21,11 +21,10 @@ import fusion_gym
 from agents import benchmark, report, solved, tune, zoo
 from agents.output.files import load_results, save_results
 from agents.suite import jobs
-from agents.suite.classes import classes_of
+from agents.suite.classes import classes_of, trained
 from agents.suite.config import load_suite
 from agents.suite.envelope_table import BEFORE
 from agents.suite.envelopes import searches_of
-from agents.training.algorithms import PPOConfig
 from agents.training.checked import load
 from agents.training.config import Experiment
 from fusion_gym.core.system import covers, least_covering
@@ -51,10 +50,10 @@ def test_from_tuning_to_report_and_zoo(
         "--config", str(small_suite(tmp_path)), "--results", str(results), "--work", str(work),
         "--workers", "1",
     ]  # fmt: skip
-    run_main(monkeypatch, benchmark, *arguments, "--seeds", "1", "--modes", "sensors")
+    run_main(monkeypatch, benchmark, *arguments, "--seeds", "1", "--classes", "sensors")
     folder = results / "small"
     first = json.loads((folder / "verdict.json").read_text())
-    assert first["modes"]["sensors"]["seeds"] == 1
+    assert first["classes"]["sensors"]["seeds"] == 1
     stamp = (folder / "agent_sensors_0.json").stat().st_mtime_ns
     with pytest.raises(SystemExit, match="--resume"):
         run_main(monkeypatch, benchmark, *arguments)
@@ -70,8 +69,8 @@ def test_from_tuning_to_report_and_zoo(
             run_main(monkeypatch, benchmark, *arguments, "--resume", option, value)
         assert "\n" not in str(caught.value)
     verdict = json.loads((folder / "verdict.json").read_text())
-    assert {mode: front["seeds"] for mode, front in verdict["modes"].items()} == {
-        "sensors": 2, "centre": 2, "local": 2,
+    assert {name: front["seeds"] for name, front in verdict["classes"].items()} == {
+        "centre": 2, "local_estimate": 2, "local_packets_memory": 2, "sensors": 2,
     }  # fmt: skip
     baselines = json.loads((folder / "baselines.json").read_text())
     assert baselines["curves"]["gain"]["knows"] == "centre"
@@ -83,19 +82,19 @@ def test_from_tuning_to_report_and_zoo(
     assert dear < hindsight["policies"]["hindsight at price 0.001"]["tokens"]["mean"]
     # The envelope that an agent was compared with, and that it is one of the agent's inputs.
     committed = json.loads((results / "envelopes" / "small.json").read_text())["classes"]
-    front = verdict["modes"]["local"]
-    assert front["class"] == "local_estimate"
+    front = verdict["classes"]["local_estimate"]
     assert front["sha256"] == committed["local_estimate"]["sha256"]
-    kept = json.loads((folder / "agent_local_1.json").read_text())["inputs"]["envelope"]
+    kept = json.loads((folder / "agent_local_estimate_1.json").read_text())["inputs"]["envelope"]
     assert kept == {"class": "local_estimate", "sha256": front["sha256"]}
-    in_local = {point["name"] for point in verdict["modes"]["local"]["envelope"]}
+    in_local = {point["name"] for point in verdict["classes"]["local_estimate"]["envelope"]}
     assert not any(name.startswith("information_gain") for name in in_local)
-    agent = json.loads((folder / "agent_local_1.json").read_text())
+    agent = json.loads((folder / "agent_local_estimate_1.json").read_text())
     assert agent["training"]["environment"]["local"]
     assert len(agent["points"]) == 3
     # The written numbers are those that the saved model reaches on the test seeds.
     task = fusion_gym.make_task(ENV, filter="tobit", horizon=10)
-    model = f"model:{work / 'small' / 'local_1' / 'best_model.zip'},price={agent['prices'][1]!r}"
+    path = work / "small" / "local_estimate_1" / "best_model.zip"
+    model = f"model:{path},price={agent['prices'][1]!r}"
     again = run_episodes(task, make_policy(model, task), 12, seed=0)
     assert agent["points"][1]["mse"]["mean"] == pytest.approx(again.mse.mean())
 
@@ -155,27 +154,49 @@ def test_agents_were_compared_with_the_rules_that_know_no_more(path: Path) -> No
 
 
 def test_trainings_of_the_committed_suite(tmp_path: Path) -> None:
-    """Local agents train on as many rows as a coordinator, in whole batches; settings override."""
+    """Agents see what their class knows and the price, nothing else; settings override."""
     suite = load_suite(ROOT / "configs" / "benchmark.yaml")
+    seen: set[tuple[str, str]] = set()
     for setting in suite.settings:
-        sensors = jobs.setting_task(setting).sensors
-        whole, own = (
-            jobs.experiment_of(suite, setting, mode, 3, tmp_path) for mode in ("sensors", "local")
-        )
-        assert whole.training.num_envs == suite.num_envs
-        rows = own.training.num_envs * sensors
-        assert suite.num_envs - sensors < rows <= suite.num_envs
-        for experiment, together in ((whole, suite.num_envs), (own, rows)):
-            algorithm = experiment.algorithm
-            assert isinstance(algorithm, PPOConfig)
-            assert algorithm.n_steps * together % algorithm.batch_size == 0
-            assert experiment.training.seed == 3
+        for of in trained(suite, setting):
+            seen.add((setting.name, of.name))
+            experiment = jobs.experiment_of(suite, setting, of, 3, tmp_path)
+            options, training = experiment.environment.options, experiment.training
+            assert experiment.environment.local == (of.mode == "local")
+            assert options.get("memory", False) == of.memory
+            assert options.get("packet", "measurement") == of.packet
+            assert ("belief_features" in options) == (of.mode != "centre" and not of.memory)
+            assert (options.get("information") == "centre") == (of.mode == "centre")
+            assert options["price_range"] == list(setting.price_range)
+            task = jobs.agent_task(setting, of)
+            if of.mode == "local":
+                assert task.broadcast == of.broadcast
+            assert training.seed == 3
+            assert training.num_envs == (setting.num_envs or suite.num_envs)
+            assert training.error == (setting.error or suite.error)
             wanted = setting.price_exponent
-            given = experiment.training.price_exponent
-            assert given == (suite.price_exponent if wanted is None else wanted)
-            for key, value in setting.algorithm.items():
-                if key != "batch_size":
-                    assert getattr(algorithm, key) == value
+            assert training.price_exponent == (suite.price_exponent if wanted is None else wanted)
+            changes = setting.algorithm | suite.algorithms.get(of.mode, {})
+            changes |= setting.algorithms.get(of.mode, {})
+            given = experiment.algorithm.model_dump()
+            assert {key: given.get(key) for key in changes if key != "network"} == {
+                key: value for key, value in changes.items() if key != "network"
+            }
+    every = {(s.name, c.name) for s in suite.settings for c in classes_of(s)}
+    # Nodes that remember by themselves, and sources that leave nothing to remember.
+    left = ("markov_jump", "remote_estimation")
+    assert every - seen == {
+        (name, class_name)
+        for name, class_name in every
+        if name in left and class_name.endswith("_memory")
+    }  # fmt: skip
+
+
+def test_a_class_that_a_setting_has_not_is_refused(tmp_path: Path) -> None:
+    wrong = SMALL["settings"][0] | {"agents": ["local_none"]}
+    suite = load_suite(small_suite(tmp_path, settings=[wrong]))
+    with pytest.raises(ConfigurationError, match=r"agents of small = 'local_none' is not allowed"):
+        trained(suite, suite.settings[0])
 
 
 def test_results_survive_the_disk(tmp_path: Path) -> None:
@@ -211,7 +232,7 @@ def test_a_suite_that_is_not_allowed(tmp_path: Path, changes: Any, message: str)
     ("arguments", "message"),
     [
         (["--envs", "smal"], "did you mean 'small'"),
-        (["--modes", "sensor"], "did you mean 'sensors'"),
+        (["--classes", "sensor"], "did you mean 'sensors'"),
         (["--seeds", "0"], "seeds = 0 is not allowed"),
         (["--workers", "0"], "workers = 0"),
         (["--timesteps", "-5"], "timesteps = -5 is not allowed"),
@@ -239,7 +260,7 @@ def test_the_report_shows_what_it_is_told_as_text(tmp_path: Path) -> None:
     baselines = json.loads((folder / "baselines.json").read_text())
     verdict["title"] = title + "\n\n<script>alert(3)</script>"
     baselines["env"] = "a`<script>alert(4)</script>|b"
-    first = verdict["modes"]["sensors"]["envelope"][0]
+    first = verdict["classes"]["sensors"]["envelope"][0]
     strange = "model:<b>`|x"
     baselines["policies"][strange] = baselines["policies"][first["name"]]
     first["name"] = strange

@@ -77,10 +77,10 @@ def test_options_that_are_not_understood_are_told_in_one_line(
 
 
 def test_lists_flags_and_negative_numbers_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    words = "--envs a b --seeds -3 --quick --modes local --work deep/er --resume"
+    words = "--envs a b --seeds -3 --quick --classes local_none --work deep/er --resume"
     monkeypatch.setattr(sys, "argv", ["program", *words.split()])
     given = command_line.read(Benchmark)
-    assert (given.envs, given.modes, given.seeds) == (("a", "b"), ("local",), -3)
+    assert (given.envs, given.classes, given.seeds) == (("a", "b"), ("local_none",), -3)
     assert (given.quick, given.resume, given.work) == (True, True, Path("deep/er"))
     assert (given.config, given.results, given.workers) == ("benchmark", None, 2)
 

@@ -65,7 +65,7 @@ def arguments(command: str, folder: Path, seed: int = 0) -> list[str]:
         options = ["--env", ENV, "--set", "horizon=5", "--policies", "always", "never"]
         return [*options, "--episodes", "3", "--seed", str(seed), "--json", f"{folder}/result.json"]
     if command == "benchmark":
-        config = small_suite(folder, training_seeds=1, modes=["sensors"], seed=seed)
+        config = small_suite(folder, training_seeds=1, classes=["sensors"], seed=seed)
         places = ["--results", str(folder / "results"), "--work", str(folder / "work")]
         return ["--config", str(config), *places, "--workers", "1"]
     training = {"timesteps": 256, "num_envs": 8, "seed": seed}

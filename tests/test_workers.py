@@ -53,7 +53,7 @@ def test_a_worker_ends_soon_after_its_parent_was_killed() -> None:
 
 @pytest.mark.slow
 def test_workers_of_a_killed_benchmark_train_no_longer(tmp_path: Path) -> None:
-    config = small_suite(tmp_path, timesteps=50_000_000, modes=["sensors"], training_seeds=2)
+    config = small_suite(tmp_path, timesteps=50_000_000, classes=["sensors"], training_seeds=2)
     work = tmp_path / "work"
     words = ["--config", str(config), "--results", str(tmp_path / "results"), "--work", str(work)]
     command = [sys.executable, "-m", "agents.benchmark", *words, "--workers", "2"]

@@ -33,7 +33,7 @@ SUITE = {
     "timesteps": 256,
     "num_envs": 4,
     "prices": 2,
-    "modes": ["sensors"],
+    "classes": ["sensors"],
     "tuning": {"trials": 4, "prices": 2, "episodes": 4, "seeds": 2},
     "algorithm": {"name": "ppo", "n_steps": 8, "batch_size": 32},
     "families": [

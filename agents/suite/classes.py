@@ -6,9 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from fusion_gym.core.communication import FEATURES
 from fusion_gym.core.system import Knowledge, covers
+from fusion_gym.validation import choice
 
-from .config import Broadcast, Mode, Setting
+from .config import Broadcast, Mode, Packet, Setting, Suite
 
 KNOWS: dict[tuple[Mode, bool], Knowledge] = {
     ("centre", False): "centre",
@@ -17,12 +19,14 @@ KNOWS: dict[tuple[Mode, bool], Knowledge] = {
     ("local", False): "own",
     ("local", True): "own_memory",
 }
-_HEARD: tuple[Broadcast, ...] = ("none", "estimate", "packets")  # each tells all of those before
+HEARD: tuple[Broadcast, ...] = ("none", "estimate", "packets")  # each tells all of those before
+Options = tuple[tuple[str, Any], ...]
 
 
 @dataclass(frozen=True)
 class Class:
-    """Who decides, whether it remembers, and what a sensor by itself hears (else None).
+    """Who decides, whether it remembers, what a sensor by itself hears (else None), and what a
+    packet holds.
 
     ``options`` are those of the environment in which its rules see what the class knows.
     """
@@ -30,13 +34,34 @@ class Class:
     mode: Mode
     memory: bool = False
     broadcast: Broadcast | None = None
-    options: tuple[tuple[str, Any], ...] = ()
+    options: Options = ()
+    packet: Packet = "measurement"
 
     @property
     def name(self) -> str:
-        """For example ``sensors_memory`` or ``local_packets``."""
-        parts = [self.mode, self.broadcast, "memory" if self.memory else None]
+        """For example ``sensors_memory``, ``local_packets`` or ``sensors_estimates_memory``."""
+        held = "estimates" if self.packet == "estimate" else None
+        parts = [self.mode, self.broadcast, held, "memory" if self.memory else None]
         return "_".join(part for part in parts if part)
+
+    @property
+    def world(self) -> Options:
+        """The options in which rules are tuned that look neither at memory nor at what is heard.
+
+        Packets that hold the estimate take a coordinator that remembers.
+        """
+        return () if self.packet == "measurement" else self.options
+
+    @property
+    def information(self) -> dict[str, Any]:
+        """The options of the environment in which an agent sees what the class knows.
+
+        Rules that remember nothing look at what a packet would change too, so agents are shown it.
+        """
+        if self.mode == "centre":
+            return dict(self.options) | {"information": "centre"}
+        shown = {} if self.memory else {"belief_features": list(FEATURES)}
+        return dict(self.options) | shown
 
     @property
     def knows(self) -> Knowledge:
@@ -44,27 +69,43 @@ class Class:
         return KNOWS[self.mode, self.memory]
 
     def contains(self, other: Class) -> bool:
-        """Whether whoever is of this class knows all that the other one does."""
-        if not covers(self.knows, other.knows):
+        """Whether whoever is of this class knows all that the other one does, of such packets."""
+        if self.packet != other.packet or not covers(self.knows, other.knows):
             return False
         if self.broadcast is None or other.broadcast is None:
             return True
-        return _HEARD.index(other.broadcast) <= _HEARD.index(self.broadcast)
+        return HEARD.index(other.broadcast) <= HEARD.index(self.broadcast)
 
 
 def classes_of(setting: Setting) -> Iterator[Class]:
     """All classes of a setting, each after those that it contains."""
     yield Class("centre")
-    for broadcast in sorted(setting.broadcasts, key=_HEARD.index):
+    for broadcast in sorted(setting.broadcasts, key=HEARD.index):
         heard = () if broadcast == setting.broadcasts[0] else (("broadcast", broadcast),)
         for memory in (False, True):
-            remembered = (("memory", True),) if memory else ()
-            yield Class("local", memory, broadcast, heard + remembered)
+            remembers = (("memory", True),) if memory else ()
+            yield Class("local", memory, broadcast, heard + remembers)
     for memory in (False, True):
         yield Class("sensors", memory, None, (("memory", True),) if memory else ())
+    if setting.estimates:
+        remembered = (("packet", "estimate"), ("memory", True))
+        yield Class("sensors", True, None, remembered, "estimate")
 
 
-def class_of(setting: Setting, mode: Mode) -> Class:
-    """The class of an agent that remembers nothing, in the environment as the setting has it."""
-    found = [c for c in classes_of(setting) if c.mode == mode and not c.options]
-    return found[0]
+def trained(suite: Suite, setting: Setting) -> list[Class]:
+    """The classes of a setting in which the suite trains agents.
+
+    Raises:
+        ConfigurationError: ``agents`` of the setting names none of its classes.
+    """
+    every = {c.name: c for c in classes_of(setting)}
+    own = list(every) if setting.agents is None else setting.agents
+    for name in own:
+        choice(f"agents of {setting.name}", name, every)
+    wanted = own if suite.classes is None else suite.classes
+    return [c for name, c in every.items() if name in own and name in wanted]
+
+
+def names_of(suite: Suite) -> list[str]:
+    """The names of all classes, of all settings."""
+    return list(dict.fromkeys(c.name for setting in suite.settings for c in classes_of(setting)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +120,31 @@ def present(suite: Suite, setting: Setting, results: Path) -> dict[str, Any]:
     check_inputs(inputs_of(suite, setting), found["inputs"], repr(str(path)))
     classes: dict[str, Any] = found["classes"]
     return classes
+
+
+@dataclass(frozen=True)
+class Shelf:
+    """Where the envelopes are that agents are compared with, and the suite that made them."""
+
+    suite: Suite
+    results: Path
+
+    def classes(self, setting: Setting) -> dict[str, Any]:
+        """What is there of a setting, as :func:`present`."""
+        return present(self.suite, setting, self.results)
+
+    def found(self, setting: Setting) -> dict[str, Any]:
+        """What is there of a setting; nothing, if that was made from another suite."""
+        try:
+            return self.classes(setting)
+        except ConfigurationError:
+            return {}
+
+    def vertices(self, setting: Setting, names: Sequence[str]) -> list[dict[str, Any]]:
+        """The rules of some classes, each once."""
+        classes = self.classes(setting)
+        found = {v["name"]: v for name in names for v in classes[name]["vertices"]}
+        return list(found.values())
 
 
 def complete(

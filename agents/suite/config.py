@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import pydantic
 
@@ -13,6 +13,8 @@ from ..training.config import EnvironmentConfig
 
 Mode = Literal["sensors", "centre", "local"]
 Broadcast = Literal["none", "estimate", "packets"]
+Packet = Literal["measurement", "estimate"]
+Error = Literal["squared", "excess", "mismatch"]
 
 
 class Range(Strict):
@@ -89,11 +91,16 @@ class Setting(Strict):
     """One environment in one setting; ``families`` are labels, all of them by default.
 
     ``informed`` are policies that know the model and all new signals, ``references`` computed
-    ones that know no more than the centre. ``longer`` multiplies the length of its trainings,
-    ``price_exponent``, ``algorithm`` and ``tuning`` replace the suite's. ``broadcasts`` are what a
-    sensor by itself may hear, by rising knowledge, the environment's default first. ``known`` are
-    policies that earlier searches found: they compete with what the search finds, as if every
-    tuning seed had found them.
+    ones that know no more than the centre. ``broadcasts`` are what a sensor by itself may hear, by
+    rising knowledge, the environment's default first; with ``estimates`` there is a class of
+    coordinators whose packets hold the estimate. ``known`` are policies that earlier searches
+    found: they compete with what the search finds, as if every tuning seed had found them.
+
+    ``agents`` are the classes in which agents are trained, by name (all by default), and
+    ``agent_options`` tell them what rules know anyway. ``longer`` multiplies the length of their
+    trainings, ``price_exponent``, ``num_envs``, ``error`` and ``tuning`` replace the suite's;
+    ``algorithm`` changes entries of the suite's, ``algorithms`` those of one mode; ``pace`` is
+    about how many steps a second they train, for the time that is told to remain.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
@@ -107,15 +114,22 @@ class Setting(Strict):
     references: tuple[str, ...] = ()
     longer: float = pydantic.Field(default=1.0, gt=0)
     price_exponent: Share | None = None
+    num_envs: Positive | None = None
+    error: Error | None = None
+    agents: tuple[str, ...] | None = None
+    agent_options: dict[str, Any] = pydantic.Field(default_factory=dict)
     algorithm: dict[str, Any] = pydantic.Field(default_factory=dict)
+    algorithms: dict[Mode, dict[str, Any]] = pydantic.Field(default_factory=dict)
+    pace: Positive = 10_000
     tuning: dict[str, Any] = pydantic.Field(default_factory=dict)
     broadcasts: tuple[Broadcast, ...] = pydantic.Field(default=("none",), min_length=1)
+    estimates: bool = False
     genie: Genie | None = None
     hindsight: Hindsight | None = None
 
 
 class Suite(Strict):
-    """The whole benchmark."""
+    """The whole benchmark; ``classes`` are those in which agents are trained, by name (all)."""
 
     episodes: Positive = 1000
     seed: int = pydantic.Field(default=0, ge=0)
@@ -125,19 +139,22 @@ class Suite(Strict):
     prices: Positive = 7
     price_exponent: Share = 0.5
     hindsight_episodes: Positive = 100
-    modes: tuple[Mode, ...] = ("sensors", "centre", "local")
+    error: Error = "squared"
+    classes: tuple[str, ...] | None = None
     tuning: Tuning = Tuning()
     algorithm: AnyAlgorithm
+    algorithms: dict[Mode, dict[str, Any]] = pydantic.Field(default_factory=dict)
     families: tuple[Family, ...]
     settings: tuple[Setting, ...]
 
-    def algorithm_of(self, setting: Setting) -> AlgorithmConfig:
-        """The setting's algorithm, checked again.
+    def algorithm_of(self, setting: Setting, mode: Mode) -> AlgorithmConfig:
+        """The algorithm of a setting's agents of a mode, checked again.
 
         Raises:
             ValueError: a hyper-parameter that is unknown or not allowed.
         """
-        return settings(self.algorithm.model_dump() | setting.algorithm)
+        of_mode = self.algorithms.get(mode, {}) | setting.algorithms.get(mode, {})
+        return settings(self.algorithm.model_dump() | setting.algorithm | of_mode)
 
     def tuning_of(self, setting: Setting) -> Tuning:
         """The setting's budget of tuning, checked again.
@@ -158,7 +175,8 @@ class Suite(Strict):
         if len(set(labels)) < len(labels):
             raise ValueError(f"labels of families must differ: {labels}")
         for setting in self.settings:
-            self.algorithm_of(setting)
+            for mode in get_args(Mode):
+                self.algorithm_of(setting, mode)
             self.tuning_of(setting)
             for name in setting.families or ():
                 if name not in labels:

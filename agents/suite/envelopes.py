@@ -177,14 +177,15 @@ def searches_of(suite: Suite, setting: Setting, wanted: Sequence[Class]) -> list
     found = []
     for family in [*suite.families_of(setting), *points]:
         if family.tuned_in == "setting":
-            found.append(Search(setting, (), family, tuning))
+            worlds = dict.fromkeys(c.world for c in within)
+            found += [Search(setting, world, family, tuning) for world in worlds]
         else:
             found += [
                 Search(setting, c.options, family, tuning)
                 for c in within
                 if c.mode == family.tuned_in
             ]
-    if setting.known:
+    if setting.known and any(c.world == () for c in within):
         earlier = Family(label="found before", policy="", parameters={})
         found.append(Search(setting, (), earlier, tuning, setting.known))
     return found
@@ -217,7 +218,7 @@ def candidates_of(
     trials = 0
     for search in searches:
         able = [c for c in inside if search.family.tuned_in in ("setting", c.mode)]
-        if not any(search.options in ((), c.options) for c in able):
+        if not any(search.options in (c.world, c.options) for c in able):
             continue
         tuned = read_json(search.path(work), "work")
         kept = [

@@ -16,9 +16,12 @@ from fusion_gym.validation import ConfigurationError
 from ..output.files import load_results, read_json
 from ..output.folders import alone_in, check_inputs
 from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, ValidationConfig
-from .classes import class_of
-from .committed import path_of, present
-from .config import Mode, Setting, Suite
+from .classes import Class, classes_of, trained
+from .committed import Shelf, path_of
+from .config import Setting, Suite
+from .envelopes import Test
+
+VALIDATIONS = 2  # of a training
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,7 @@ class Job:
 
     setting: Setting
     kind: str
-    mode: Mode | None = None
+    of: Class | None = None
     seed: int = 0
     weight: float = 1.0
     envelopes: tuple[tuple[str, str], ...] = ()
@@ -38,7 +41,7 @@ class Job:
     @property
     def name(self) -> str:
         """Name of its JSON, without the suffix."""
-        return self.kind if self.mode is None else f"agent_{self.mode}_{self.seed}"
+        return self.kind if self.of is None else f"agent_{self.of.name}_{self.seed}"
 
     @property
     def place(self) -> str:
@@ -88,17 +91,17 @@ class Folders:
 
 
 def jobs(
-    suite: Suite, settings: Sequence[Setting], modes: Sequence[Mode], results: Path
+    suite: Suite, settings: Sequence[Setting], classes: Sequence[str], shelf: Shelf
 ) -> Iterator[Job]:
-    """All work, what everything else needs first; the settings' envelopes are there.
+    """All work, what everything else needs first; agents of some classes, by name.
 
     Raises:
         ConfigurationError: a class that an agent would be compared with is not there.
     """
-    hashes = {setting.name: _hashes(suite, setting, results) for setting in settings}
+    wanted = {setting.name: trained(suite, setting) for setting in settings}
+    hashes = {one.name: _hashes(shelf, one, wanted[one.name]) for one in settings}
     for setting in settings:
-        kept = tuple(hashes[setting.name].values())
-        yield Job(setting, "baselines", weight=60.0, envelopes=kept)
+        yield Job(setting, "baselines", weight=5.0, envelopes=tuple(hashes[setting.name].items()))
     for setting in settings:
         for kind in ("informed", "references"):
             if computed(setting, kind):
@@ -106,25 +109,34 @@ def jobs(
         if setting.hindsight:
             yield Job(setting, "hindsight", weight=0.6 * suite.hindsight_episodes)
     for seed in range(suite.training_seeds):
-        for mode in modes:
-            for setting in settings:
-                length = suite.timesteps * setting.longer
-                weight = 30.0 + length / 40_000
-                kept = (hashes[setting.name][mode],)
-                yield Job(setting, "agent", mode, seed, weight, kept)
+        for setting in settings:
+            for of in wanted[setting.name]:
+                if of.name in classes:
+                    weight = 10.0 + suite.timesteps * setting.longer / setting.pace
+                    kept = ((of.name, hashes[setting.name][of.name]),)
+                    yield Job(setting, "agent", of, seed, weight, kept)
 
 
-def _hashes(suite: Suite, setting: Setting, results: Path) -> dict[Mode, tuple[str, str]]:
-    """The class of each mode's agents, with its hash."""
-    there = present(suite, setting, results)
-    names = {mode: class_of(setting, mode).name for mode in suite.modes}
-    for name in names.values():
-        if name not in there:
-            path = str(path_of(results, setting.name))
+def _hashes(shelf: Shelf, setting: Setting, wanted: Sequence[Class]) -> dict[str, str]:
+    """The hash of each class of agents, and of those without agents that are there as well."""
+    there = shelf.classes(setting)
+    for of in wanted:
+        if of.name not in there:
+            path = str(path_of(shelf.results, setting.name))
             raise ConfigurationError(
-                f"envelopes = {path!r} is not allowed: it has no class {name!r}"
+                f"envelopes = {path!r} is not allowed: it has no class {of.name!r}"
             )
-    return {mode: (name, there[name]["sha256"]) for mode, name in names.items()}
+    names = {of.name for of in wanted}
+    return {c.name: there[c.name]["sha256"] for c in classes_of(setting) if c.name in names}
+
+
+def rules_of(suite: Suite, setting: Setting, shelf: Shelf) -> list[Test]:
+    """The rules of the envelopes that agents are compared with, to be run on the test episodes."""
+    names = [of.name for of in trained(suite, setting)]
+    return [
+        Test(setting, tuple(v["options"].items()), v["policy"], suite.episodes, suite.seed)
+        for v in shelf.vertices(setting, names)
+    ]
 
 
 def computed(setting: Setting, kind: str) -> tuple[str, ...]:
@@ -132,10 +144,19 @@ def computed(setting: Setting, kind: str) -> tuple[str, ...]:
     return setting.informed if kind == "informed" else setting.references
 
 
-def setting_task(setting: Setting, mode: Mode = "sensors") -> Task:
-    """The setting's task, with what a policy of this mode may know."""
-    information = {"information": "centre"} if mode == "centre" else {}
-    return make_task(setting.environment.id, **(setting.environment.options | information))
+def setting_task(setting: Setting) -> Task:
+    """The setting's task, as it is."""
+    return make_task(setting.environment.id, **setting.environment.options)
+
+
+def agent_options(setting: Setting, of: Class) -> dict[str, Any]:
+    """The options of the environment in which an agent of a class decides."""
+    return setting.environment.options | of.information | setting.agent_options
+
+
+def agent_task(setting: Setting, of: Class) -> Task:
+    """The task in which an agent of a class is tested: no price is drawn."""
+    return make_task(setting.environment.id, **agent_options(setting, of))
 
 
 def training_of(experiment: Experiment) -> dict[str, Any]:
@@ -163,8 +184,8 @@ def inputs_of(job: Job, suite: Suite) -> dict[str, Any]:
         assert setting.hindsight is not None
         chosen = setting.hindsight.model_dump(mode="json")
         return found | {"hindsight": chosen | {"episodes": suite.hindsight_episodes}}
-    assert job.mode is not None
-    experiment = experiment_of(suite, setting, job.mode, job.seed, Path())
+    assert job.of is not None
+    experiment = experiment_of(suite, setting, job.of, job.seed, Path())
     tested = {"prices": suite.prices, "price_range": list(setting.price_range)}
     envelope = {"class": job.envelopes[0][0], "sha256": job.envelopes[0][1]}
     return found | {"training": training_of(experiment), "envelope": envelope} | tested
@@ -185,34 +206,26 @@ def finished(job: Job, suite: Suite, folders: Folders) -> bool:
     return True
 
 
-def experiment_of(suite: Suite, setting: Setting, mode: Mode, seed: int, work: Path) -> Experiment:
+def experiment_of(suite: Suite, setting: Setting, of: Class, seed: int, work: Path) -> Experiment:
     """The training of one agent: the price drawn for each episode and seen."""
-    options = setting.environment.options | {
+    options = agent_options(setting, of) | {
         "cost_weight": "random",
         "price_range": list(setting.price_range),
     }
-    if mode == "centre":
-        options["information"] = "centre"
     timesteps = round(suite.timesteps * setting.longer)
     own = setting.price_exponent
-    exponent = suite.price_exponent if own is None else own
-    algorithm, runs = suite.algorithm_of(setting), suite.num_envs
-    if mode == "local":
-        # As many rows side by side as a coordinator has runs, and as many batches an update.
-        sensors = setting_task(setting).sensors
-        runs = max(suite.num_envs // sensors, 1)
-        size = getattr(algorithm, "batch_size", None)
-        if size is not None:
-            batch = max(size * runs * sensors // suite.num_envs, 1)
-            algorithm = algorithm.model_copy(update={"batch_size": batch})
     return Experiment(
         environment=EnvironmentConfig(
-            id=setting.environment.id, options=options, local=mode == "local"
+            id=setting.environment.id, options=options, local=of.mode == "local"
         ),
-        algorithm=algorithm,
+        algorithm=suite.algorithm_of(setting, of.mode),
         training=TrainingConfig(
-            timesteps=timesteps, num_envs=runs, seed=seed, price_exponent=exponent
+            timesteps=timesteps,
+            num_envs=setting.num_envs or suite.num_envs,
+            seed=seed,
+            price_exponent=suite.price_exponent if own is None else own,
+            error=setting.error or suite.error,
         ),
-        validation=ValidationConfig(every=max(timesteps // 8, 1), episodes=512),
-        output=str(work / setting.name / f"{mode}_{seed}"),
+        validation=ValidationConfig(every=max(timesteps // VALIDATIONS, 1), episodes=512),
+        output=str(work / setting.name / f"{of.name}_{seed}"),
     )

@@ -7,11 +7,12 @@ from typing import Any
 
 import pydantic
 
+from ..training.algorithms import AlgorithmConfig, AnyAlgorithm, PPOConfig, settings
 from ..training.checked import Positive, Rate, Share, Strict, load_changed
 
 
 class Plain(Strict):
-    """Plain PPO as the suite trains it, without memory, for comparison.
+    """Plain PPO without memory in the suite's settings, for comparison.
 
     It ends below the memoryless envelope, or after ``budget`` times the processor seconds that the
     fronts' trainings took.
@@ -20,6 +21,16 @@ class Plain(Strict):
     every: Positive = 100_000
     seeds: Positive = 2
     budget: Rate = 3.0
+    timesteps: Positive = 3_200_000
+    num_envs: Positive = 256
+    algorithm: AnyAlgorithm = PPOConfig(name="ppo")
+
+
+class PlainChanges(Strict):
+    """What is other in a setting; ``longer`` multiplies the length."""
+
+    longer: float = pydantic.Field(default=1.0, gt=0)
+    algorithm: dict[str, Any] = pydantic.Field(default_factory=dict)
 
 
 class Course(Strict):
@@ -37,6 +48,7 @@ class Course(Strict):
     against: str
     schedules: tuple[str, ...] = ()
     allowed: Rate = 0.01
+    plain: PlainChanges = PlainChanges()
 
     @pydantic.model_validator(mode="after")
     def _scheduled(self) -> Course:
@@ -57,6 +69,20 @@ class Learning(Strict):
     test_episodes: Positive | None = None
     plain: Plain = Plain()
     settings: tuple[Course, ...] = pydantic.Field(min_length=1)
+
+    def algorithm_of(self, course: Course) -> AlgorithmConfig:
+        """Plain PPO's hyper-parameters in a setting, checked again.
+
+        Raises:
+            ValueError: a hyper-parameter that is unknown or not allowed.
+        """
+        return settings(self.plain.algorithm.model_dump() | course.plain.algorithm)
+
+    @pydantic.model_validator(mode="after")
+    def _trainable(self) -> Learning:
+        for course in self.settings:
+            self.algorithm_of(course)
+        return self
 
 
 # What --quick changes: the same work, less of it.

@@ -19,19 +19,19 @@ from fusion_gym.validation import ConfigurationError, choice
 from ..output.files import read_json
 from ..output.folders import check_inputs
 from ..training.checked import load, parse
-from ..training.config import Experiment
+from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, ValidationConfig
 from .committed import path_of, present, read_envelopes
 from .config import Setting, Suite
 from .envelope_table import hull_of
 from .envelopes import Test, task_of
 from .fronts import Points, is_below, prices_of
-from .jobs import experiment_of, training_of
+from .jobs import training_of
 from .learning import Course, Learning
 from .verdict import MIDDLE
 
 Kind = Literal["front", "plain"]
 # Options that change neither the task nor what a policy may know of it: rules see the time anyway.
-_FREE = ("memory_filter", "memory_features", "clock")
+_FREE = ("memory_filter", "belief_features", "clock")
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class Study:
         if kind == "front":
             found, every = load(Experiment, self.course.front, "front"), self.learning.every
         else:
-            found = experiment_of(self.suite, self.setting, "sensors", seed, self.work)
+            found = self._plain()
             every = self.learning.plain.every
         plain = found.model_dump()
         plain["validation"]["every"] = every
@@ -162,6 +162,25 @@ class Study:
         plain["training"]["timesteps"] = self.learning.timesteps or found.training.timesteps
         plain["output"] = str(self.work / self.setting.name / f"{kind}_{seed}")
         return parse(Experiment, plain, self.course.front, "front")
+
+    def _plain(self) -> Experiment:
+        """Plain PPO's training: without memory, on the squared error, at the suite's prices."""
+        setting, plain, course = self.setting, self.learning.plain, self.course
+        own = setting.price_exponent
+        priced = {"cost_weight": "random", "price_range": list(setting.price_range)}
+        return Experiment(
+            environment=EnvironmentConfig(
+                id=setting.environment.id, options=setting.environment.options | priced
+            ),
+            algorithm=self.learning.algorithm_of(course),
+            training=TrainingConfig(
+                timesteps=round(plain.timesteps * course.plain.longer),
+                num_envs=plain.num_envs,
+                price_exponent=self.suite.price_exponent if own is None else own,
+            ),
+            validation=ValidationConfig(episodes=512),
+            output=str(self.work),
+        )
 
     def task(self) -> Task:
         """What a finished front is tested in: its own environment, without a price in sight.

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from fusion_gym.arrays import Array
 from fusion_gym.evaluation.envelope import EnvelopePoint, chosen_mse, envelope_mse, height
@@ -82,7 +81,7 @@ def judge(
         if all(floor is not None for floor in floors):
             below = np.array(floors)
             point["envelope"] = float(below.mean())
-            columns.append((learned, below, rates, _shares(searches, rates)))
+            columns.append((learned, below, rates, shares_of(searches, rates)))
             kept.append(point)
             known = [envelope_mse(references, own) for own in rates] if references else []
             sound = [found.mean() for found in known if found is not None]
@@ -122,7 +121,7 @@ def _in_middle(point: Mapping[str, float], always: float) -> bool:
     return MIDDLE[0] * always <= point["rate"] <= MIDDLE[1] * always
 
 
-def _shares(searches: Searches, rates: Sequence[float]) -> Array:
+def shares_of(searches: Searches, rates: Sequence[float]) -> Array:
     """Height (K, seeds) of each search's own envelope at these rates, as a share of their mean.
 
     One search, or a rate at which some search has nothing, says nothing of the spread: shares of 1.
@@ -137,23 +136,39 @@ def _shares(searches: Searches, rates: Sequence[float]) -> Array:
     return found
 
 
+def middles(always: float) -> Array:
+    """The grid's rates: the middles of its parts."""
+    edges = np.geomspace(MIDDLE[0] * always, MIDDLE[1] * always, RATES + 1)
+    return np.asarray(np.sqrt(edges[:-1] * edges[1:]))
+
+
 def grid_of(front: Front, always: float) -> Array:
     """The grid's rates, of those of its parts that the front reaches; moved to its nearest end."""
     edges = np.geomspace(MIDDLE[0] * always, MIDDLE[1] * always, RATES + 1)
     rates = front.rates.mean(0)
     low, high = rates.min(), rates.max()
     reached = (edges[:-1] <= high) & (edges[1:] >= low)
-    middles = np.sqrt(edges[:-1] * edges[1:])
-    return np.asarray(np.clip(middles[reached], low, high))
+    return np.asarray(np.clip(middles(always)[reached], low, high))
 
 
 def score(shares: Array, rates: Array, grid: Array) -> Array:
     """Interquartile mean over seeds of the ``shares`` (seeds, P), at the rates of the ``grid``."""
-    middle = stats.trim_mean(shares, 0.25, axis=0)
-    places, which = np.unique(rates.mean(0), return_inverse=True)
-    values = np.bincount(which, weights=middle) / np.bincount(which)
+    return _between(trimmed(shares), rates.mean(0), grid)
+
+
+def trimmed(shares: Array) -> Array:
+    """Mean over the first axis without its lowest and highest quarter, each rounded down."""
+    cut = len(shares) // 4
+    kept = np.sort(shares, axis=0)[cut : len(shares) - cut]
+    return np.asarray(kept.mean(0))
+
+
+def _between(values: Array, rates: Array, grid: Array) -> Array:
+    """The values (P,) at the grid's rates, interpolated in the logarithm of the rates (P,)."""
+    places, which = np.unique(rates, return_inverse=True)
+    means = np.bincount(which, weights=values) / np.bincount(which)
     tiny = np.finfo(np.float64).tiny  # of an agent that never transmits
-    return np.interp(np.log(np.maximum(grid, tiny)), np.log(np.maximum(places, tiny)), values)
+    return np.interp(np.log(np.maximum(grid, tiny)), np.log(np.maximum(places, tiny)), means)
 
 
 def interval(front: Front, grid: Array) -> dict[str, float]:
@@ -162,14 +177,19 @@ def interval(front: Front, grid: Array) -> dict[str, float]:
     generator = np.random.default_rng(0)
     seeds, _, episodes = front.learned.shape
     searches = len(front.tuned)
-    drawn = np.empty(RESAMPLES)
-    for place in range(RESAMPLES):
-        counts = generator.multinomial(episodes, np.full(episodes, 1.0 / episodes))
-        chosen = generator.integers(0, seeds, seeds)
-        tuned = front.tuned[generator.integers(0, searches, searches)].mean(0)
-        shares = (front.learned @ counts) / (tuned * (front.envelope @ counts)) - 1.0
-        scores = score(shares[chosen], front.rates[chosen], grid)
-        drawn[place] = scores[generator.integers(0, len(grid), len(grid))].mean()
+    weights = generator.multinomial(
+        episodes, np.full(episodes, 1.0 / episodes), size=RESAMPLES
+    ).T.astype(np.float64)
+    tuned = front.tuned[generator.integers(0, searches, (RESAMPLES, searches))].mean(1)
+    below = np.moveaxis(tuned, 0, -1) * (front.envelope @ weights)
+    shares = (front.learned @ weights) / below - 1.0  # (seeds, P, resamples)
+    chosen = generator.integers(0, seeds, (seeds, RESAMPLES))
+    middle = trimmed(np.take_along_axis(shares, chosen[:, None], axis=0))
+    rates = front.rates[chosen].mean(0)  # (resamples, P)
+    places = generator.integers(0, len(grid), (RESAMPLES, len(grid)))
+    drawn = [
+        _between(middle[:, one], rates[one], grid)[places[one]].mean() for one in range(RESAMPLES)
+    ]
     low, high = np.quantile(drawn, (0.025, 0.975))
     mean = float(score(found, front.rates, grid).mean())
     return {"mean": mean, "low": float(low), "high": float(high)}

@@ -20,18 +20,28 @@ from fusion_gym.validation import ConfigurationError
 from ..output.files import save_results, write
 from ..output.folders import fingerprint
 from ..training.run import holds_training, train
-from .committed import present
+from .committed import Shelf
 from .config import Suite
-from .envelopes import task_of
+from .envelopes import run_test, task_of
 from .fronts import prices_of
-from .jobs import Folders, Job, computed, experiment_of, inputs_of, setting_task, training_of
+from .jobs import (
+    Folders,
+    Job,
+    agent_task,
+    computed,
+    experiment_of,
+    inputs_of,
+    rules_of,
+    setting_task,
+    training_of,
+)
 
 
-def run(job: Job, suite: Suite, folders: Folders) -> None:
+def run(job: Job, suite: Suite, folders: Folders, shelf: Shelf) -> None:
     """Do a job and write its results."""
     torch.set_num_threads(1)
     if job.kind == "baselines":
-        _run_baselines(job, suite, folders)
+        _run_baselines(job, suite, folders, shelf)
     elif job.kind in ("informed", "references"):
         _run_references(job, suite, folders)
     elif job.kind == "hindsight":
@@ -47,22 +57,23 @@ def _test(task: Task, policies: list[str], suite: Suite) -> dict[str, EpisodeRes
     }
 
 
-def _run_baselines(job: Job, suite: Suite, folders: Folders) -> None:
-    """Test the rules of the committed envelopes, the single policies and the genie.
+def _run_baselines(job: Job, suite: Suite, folders: Folders, shelf: Shelf) -> None:
+    """Gather the tested rules of the committed envelopes, test the single policies and the genie.
 
     Raises:
         ConfigurationError: a rule does other than its envelope says.
     """
     setting = job.setting
-    classes = present(suite, setting, folders.results)
-    vertices = [vertex for name, _ in job.envelopes for vertex in classes[name]["vertices"]]
     curves: dict[str, dict[str, Any]] = {}
     found: dict[str, EpisodeResults] = {}
-    for vertex in {vertex["name"]: vertex for vertex in vertices}.values():
-        task = task_of(setting, vertex["options"].items())
-        policy = make_policy(vertex["policy"], task)
-        results = run_episodes(task, policy, suite.episodes, suite.seed)
-        check_vertex(vertex, results)
+    vertices = shelf.vertices(setting, [name for name, _ in job.envelopes])
+    for vertex, test in zip(vertices, rules_of(suite, setting, shelf), strict=True):
+        if not test.path(folders.work).exists():
+            run_test(test, folders.work)
+        results = test.read(folders.work)
+        if suite.episodes == shelf.suite.episodes and suite.seed == shelf.suite.seed:
+            check_vertex(vertex, results)
+        policy = make_policy(vertex["policy"], task_of(setting, vertex["options"].items()))
         found[vertex["name"]] = results
         curve = curves.setdefault(vertex["family"], {"knows": [], "policies": []})
         curve["knows"].append(policy.knowledge)
@@ -118,20 +129,22 @@ def _run_hindsight(job: Job, suite: Suite, folders: Folders) -> None:
 
 def _run_agent(job: Job, suite: Suite, folders: Folders) -> None:
     """Train one agent that sees the price, then test it at prices over the whole range."""
-    setting, mode = job.setting, job.mode
-    assert mode is not None
-    experiment = experiment_of(suite, setting, mode, job.seed, folders.work)
+    setting, of = job.setting, job.of
+    assert of is not None
+    experiment = experiment_of(suite, setting, of, job.seed, folders.work)
     folder = Path(experiment.output)
     summary = train(experiment, resume=holds_training(folder), quiet=True)
     if not summary["finished"]:
         raise KeyboardInterrupt
-    task, model = setting_task(setting, mode), folder / "best_model.zip"
+    task, model = agent_task(setting, of), folder / "best_model.zip"
     prices = prices_of(setting.price_range, suite.prices)
     names = [f"model:{model},price={price!r}" for price in prices]
     found = _test(task, names, suite)
     report = {
         **_header(job, suite, task),
-        "mode": mode,
+        "mode": of.mode,
+        "class": of.name,
+        "class_options": of.information | setting.agent_options,
         "training_seed": job.seed,
         "training": training_of(experiment),
         "seconds": summary["seconds"],

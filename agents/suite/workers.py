@@ -35,6 +35,8 @@ def side_by_side(work: Sequence[Work], team: Team, description: str) -> None:
         ConfigurationError: some of it does not fit, there is no such team, or the system ended a
             worker of this machine. A cluster gives the work of a worker that is gone to another.
     """
+    if not work:
+        return
     total = sum(one.weight for one in work)
     began = time.perf_counter()
     parent = os.getpid() if team.here else None
