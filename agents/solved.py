@@ -15,6 +15,7 @@ from typing import Annotated, Any
 from rich import box
 from rich.table import Table
 
+from fusion_gym.core.options import nature_of
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
@@ -51,6 +52,7 @@ class Solved(Command):
         experiment = load(Experiment, self.config)
         name, chosen = experiment.algorithm.name, experiment.environment
         task = make_task(chosen.id, **chosen.options)
+        nature_of(task.system).refuse("for the solved optimum")
         best = run_episodes(task, make_policy("optimal", task), self.episodes, self.seed)
         if best.returns.mean() == 0.0:
             raise ConfigurationError(

@@ -35,6 +35,10 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
         {"sensors": 2, "channel": "gilbert_elliott", "memory": True, "cost_weight": "random",
          "price_range": (0.1, 1.0)},
     ),
+    "departed": (
+        OSCILLATOR, {"filter": "tobit", "memory": True, "true_process_noise": (0.5, 2.0),
+                     "true_transition": (0.9, 1.1), "true_threshold_shift": 0.3},
+    ),
     "many": ("fusion_gym/RemoteEstimation-v0", {"sensors": 70, "token_rate": 3.0}),
 }  # fmt: skip
 RUNS = 4

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.options import true_motion
 
 
 def covariance_factor(matrix: Array) -> Array:
@@ -81,9 +82,26 @@ class LinearPlant:
         """Draw x(0), shape (n, N), about ``mean`` (n, N) from standard normals (n, N)."""
         return mean + linalg.matvec(self.initial_factor, noise)
 
-    def advance(self, state: Array, noise: Array) -> Array:
-        """x(t+1), shape (n, N), from x(t) (n, N) and standard normals (r, N)."""
-        return linalg.matvec(self.transition, state) + linalg.matvec(self.process_factor, noise)
+    def advance(self, state: Array, noise: Array, departure: Array | None = None) -> Array:
+        """x(t+1), shape (n, N), from x(t) (n, N) and standard normals (r, N).
+
+        With a ``departure`` (4, N) the plant moves by I + c (A - I) in the place of A.
+        """
+        moved = true_motion(departure, state, linalg.matvec(self.transition, state))
+        return moved + linalg.matvec(self.process_factor, noise)
+
+    def true_radius(self, factor: float) -> float:
+        """Spectral radius of I + c (A - I)."""
+        still = np.eye(self.size)
+        moved = still + factor * (self.transition[..., 0] - still)
+        return float(np.abs(np.linalg.eigvals(moved)).max())
+
+    @property
+    def unmoved(self) -> tuple[str, ...]:
+        """The options of the true plant that can change nothing."""
+        still = np.array_equal(self.transition[..., 0], np.eye(self.size))
+        found = {"true_process_noise": not self.process_factor.any(), "true_transition": still}
+        return tuple(name for name, absent in found.items() if absent)
 
     def predict(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Prior mean (n, N) and covariance A P Aᵀ + W (n, n, N) of the next state.

@@ -14,6 +14,7 @@ from cases import (
     INPUT,
     JUMP,
     LOSSY,
+    NOISY,
     OWN_ID,
     REMOTE,
     TOBIT,
@@ -41,6 +42,8 @@ SETTINGS: dict[str, tuple[str, Options]] = {
     "biased": (BIASED, {"access": "any"}),
     "biased target": (TRACKING, {"access": "any"}),
     "remote, losses": (REMOTE, LOSSY),
+    "oscillator, departed": (TOBIT, {"filter": "tobit", "true_threshold_shift": 0.5} | NOISY),
+    "correlated, departed": (CORRELATED, NOISY),
     "mine": (OWN_ID, {}),
 }
 ALIKE = ("oscillator, paper", "oscillator, uncensored", "markov, centralised", "biased target")

@@ -35,6 +35,8 @@ STARVED: Options = {"bias_aware": False, "access": "round_robin", **LIMITED}
 UNCENSORED: Options = {"filter": "kalman", "censoring_threshold": -np.inf, "random_start": True}
 REMEMBERING: Options = {"memory": True}
 ESTIMATES: Options = {"memory": True, "packet": "estimate"}
+DEPARTED: Options = {"true_process_noise": (0.5, 2.0), "true_transition": (0.9, 1.1)}
+NOISY: Options = DEPARTED | {"true_measurement_noise": 2.0}
 UNALIKE: Options = {"token_cost": (1.0, 2.0, 4.0), "process_noise": "full", "sharing": "fixed"}
 
 # Options that change what an environment is made of.
@@ -52,6 +54,7 @@ VARIANTS: dict[str, list[Options]] = {
         REMEMBERING | {"belief_features": "value", "access": "single"} | DRAWN,
         {"filter": "tobit", "belief_features": "value", "action": "discrete"},
         UNCENSORED | ESTIMATES | {"belief_features": ("difference",), "action": "discrete"},
+        {"filter": "tobit", "true_threshold_shift": (-1.0, 1.0)} | NOISY | REMEMBERING,
     ],
     CORRELATED: [
         {"fusion": "sci", "order": (2, 0, 1), "information": "centre", **LIMITED},
@@ -69,6 +72,7 @@ VARIANTS: dict[str, list[Options]] = {
         REMEMBERING | {"access": "round_robin", "noise_scale": "random"} | DRAWN,
         ESTIMATES | LIMITED,
         {"belief_features": ("difference", "value"), "broadcast": "packets", **LIMITED},
+        {"noise_scale": "random"} | NOISY | REMEMBERING,
     ],
     JUMP: [
         {"fusion": "ci", "access": "single", **DRAWN},
@@ -78,6 +82,8 @@ VARIANTS: dict[str, list[Options]] = {
         {"filter": "imm", "information": "centre", "action": "discrete"},
         REMEMBERING | LIMITED,
         REMEMBERING | {"filter": "centralised", "memory_filter": "imm"},
+        NOISY,
+        REMEMBERING | {"filter": "imm"} | NOISY,
     ],
     INPUT: [
         {"filter": "predict", "fusion": "exact_ci", "access": "random", **DRAWN},
@@ -88,12 +94,14 @@ VARIANTS: dict[str, list[Options]] = {
         {"input_signal": GIVEN, "horizon": 40, "fusion": "sci"},
         REMEMBERING | {"filter": "predict"} | LIMITED,
         REMEMBERING | {"filter": "paper", "error": "trace"},
+        REMEMBERING | NOISY,
     ],
     BIASED: [
         {"filter": "adf", "access": "any", "information": "centre"},
         {"filter": "kalman", "access": "random", "random_start": True, **DRAWN},
         STARVED,
         ESTIMATES | {"memory_filter": "kalman"},
+        {"access": "any", "true_threshold_shift": 0.5} | NOISY | REMEMBERING,
     ],
     TRACKING: [
         {"filter": "stochastic", "stochastic_weight": 1.0, "access": "any", "fusion": "ici"},
@@ -105,6 +113,7 @@ VARIANTS: dict[str, list[Options]] = {
         {"sensors": 2, "channel": "independent", "action": "discrete", "error": "trace"},
         LOSSY | LIMITED | {"information": "centre"},
         LOSSY | REMEMBERING | DRAWN,
+        LOSSY | REMEMBERING | {"coefficient": (0.9, 1.0, 0.5)} | DEPARTED,
     ],
     OWN_ID: [
         {"access": "random", **DRAWN},

@@ -82,6 +82,7 @@ def _system(task: Task) -> CensoredSystem:
             "bias_aware = False is not allowed for the bound: the filters must predict with the "
             "plant's own matrix"
         )
+    system.nature.refuse("for the bound")
     if not _predicts(system.centre):
         raise ConfigurationError(
             "filter is not allowed for the bound: in silence the centre must predict, so neither "

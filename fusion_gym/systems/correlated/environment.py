@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.core.options import CommonOptions, Nature, Scenario
 from fusion_gym.core.reward import equal_weights
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.correlated.filters import JointErrorCovariance, RobustKalmanFilter
@@ -89,6 +89,10 @@ def build(chosen: CorrelatedTrackingOptions) -> Scenario:
         else validation.not_negative("state_weights", chosen.state_weights, open_loop.shape)
     )
     track = validation.boolean("track_actual", chosen.track_actual)
+    nature = Nature.create(chosen, (*plant.unmoved, "true_threshold_shift"))
+    nature.check_growth(plant.true_radius, horizon)
+    if track:
+        nature.refuse("with track_actual=True")
     system = CorrelatedTrackingSystem(
         plant=plant,
         filter=RobustKalmanFilter(sensors),
@@ -99,6 +103,7 @@ def build(chosen: CorrelatedTrackingOptions) -> Scenario:
         magnitude=typical_magnitude(plant, horizon, random_start=False),
         reference=open_loop,
         joint=JointErrorCovariance.create(plant, sensors) if track else None,
+        nature=nature,
     )
     trigger = _trigger(chosen, sensors.count)
     return Scenario(chosen, system, weights, {"adaptive_innovation": trigger})

@@ -16,6 +16,7 @@ from scipy.special import ndtr
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.core.options import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.systems.correlated.filters import (
@@ -39,7 +40,8 @@ class CorrelatedTrackingState:
     last delivered measurement · ``age`` (l, N), steps since then · ``prior_mean`` (l + 1, n, N),
     ``prior_covariance`` (l + 1, n, n, N), predictions · ``expected`` (l, m, N) and ``outcomes`` at
     the nodes · ``mean`` (l + 1, n, N), ``covariance`` (l + 1, n, n, N), posteriors · ``joint``
-    (l + 1, l + 1, n, n, N), the actual covariances, if they are tracked.
+    (l + 1, l + 1, n, n, N), the actual covariances, if they are tracked · ``departure`` (4, N) of
+    the truth from the model, if it departs.
     """
 
     truth: Array
@@ -54,6 +56,7 @@ class CorrelatedTrackingState:
     mean: Array
     covariance: Array
     joint: Array | None
+    departure: Array | None = None
 
 
 _COMPONENTS = "(sensors, m, N)"
@@ -84,7 +87,7 @@ class CorrelatedTrackingSystem:
     ``noise_scale`` is the ratio of actual variances to bounds, ``None`` draws it for each episode
     from ``RANDOM_SCALE``. ``state_weights`` (n,) weigh the traces among the signals, ``magnitude``
     (n,) divides observed estimates and ``reference`` (n,) observed variances. ``joint`` tracks
-    the actual covariances.
+    the actual covariances. ``nature`` says how the truth departs from all of this.
     """
 
     plant: LinearPlant
@@ -96,6 +99,7 @@ class CorrelatedTrackingSystem:
     magnitude: Array
     reference: Array
     joint: JointErrorCovariance | None = None
+    nature: Nature = AS_ASSUMED
 
     @property
     def sensor_count(self) -> int:
@@ -109,8 +113,8 @@ class CorrelatedTrackingSystem:
 
     @property
     def start_channels(self) -> int:
-        """Normals of a start: the state's deviation, then the noise scale."""
-        return self.plant.initial_factor.shape[1] + 1
+        """Normals of a start: the state's deviation, the noise scale, nature's."""
+        return self.plant.initial_factor.shape[1] + 1 + self.nature.channels
 
     @property
     def covariance_cycle(self) -> int:
@@ -164,6 +168,7 @@ class CorrelatedTrackingSystem:
     def start(self, noise: Array) -> CorrelatedTrackingState:
         """Time 0: the state is drawn about the initial mean; nothing has been measured."""
         runs, nodes, n = noise.shape[-1], self.sensor_count, self.plant.size
+        noise, departure = self.nature.begin(noise)
         scale = self._scale(noise[-1])
         plant = self.plant
         mean = np.broadcast_to(plant.initial_mean, (nodes + 1, n, runs)).copy()
@@ -182,6 +187,7 @@ class CorrelatedTrackingSystem:
             mean=mean,
             covariance=covariance,
             joint=None if self.joint is None else self.joint.start(scale),
+            departure=departure,
         )
 
     def sense(self, state: CorrelatedTrackingState, noise: Array) -> CorrelatedTrackingState:
@@ -190,7 +196,8 @@ class CorrelatedTrackingSystem:
         Source: adaptive_innovation, equations (1)-(3), (12), (40), (52).
         """
         actual, r = np.sqrt(state.scale) * noise, self.plant.noise_channels
-        truth = self.plant.advance(state.truth, actual[:r])
+        process, own = true_noise(state.departure, actual[:r], actual[r:])
+        truth = self.plant.advance(state.truth, process, state.departure)
         prior_mean, prior_covariance = self.plant.predict(state.mean, state.covariance)
         joint = state.joint
         if self.joint is not None and joint is not None:
@@ -198,7 +205,7 @@ class CorrelatedTrackingSystem:
         return replace(
             state,
             truth=truth,
-            measurement=self.filter.sensors.measure(truth, actual[:r], actual[r:]),
+            measurement=self.filter.sensors.measure(truth, process, own),
             age=state.age + 1.0,
             prior_mean=prior_mean,
             prior_covariance=prior_covariance,
@@ -256,9 +263,9 @@ class CorrelatedTrackingSystem:
         }
 
     def visible(self, state: CorrelatedTrackingState) -> CorrelatedTrackingState:
-        """The state without the truth, the actual noise scale and the actual covariances."""
+        """The state without truth, actual noise scale, actual covariances and departure."""
         hidden = np.full_like(state.truth, np.nan)
-        return replace(state, truth=hidden, scale=hidden[0], joint=None)
+        return replace(state, truth=hidden, scale=hidden[0], joint=None, departure=None)
 
     @property
     def imagination_channels(self) -> int:
@@ -271,7 +278,8 @@ class CorrelatedTrackingSystem:
         """The noise scale is drawn by its law, whatever was measured, the truth from that share of
         the covariance: it is a bound, and actual covariances are proportional to the scale."""
         scale = self._scale(noise[-1])
-        return replace(state, truth=linalg.draw(mean, scale * covariance, noise[:-1]), scale=scale)
+        truth = linalg.draw(mean, scale * covariance, noise[:-1])
+        return replace(state, truth=truth, scale=scale, departure=None)
 
     def adopt(
         self,

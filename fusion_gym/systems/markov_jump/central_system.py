@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.core.options import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.reward import equal_weights
 from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 from fusion_gym.systems.markov_jump.centralised_linear import (
@@ -46,7 +47,8 @@ class MarkovJumpCentralState:
     the plant next · ``measurement`` (l, N), the held value where a sensor does not sample ·
     ``held`` (l, N), the last delivered measurement · ``age`` (l, N), steps since then ·
     ``belief`` of the centre, a prior until delivery · ``prediction`` made from that prior ·
-    ``mean`` (n, N), ``covariance`` (n, n, N), the centre's after the delivery.
+    ``mean`` (n, N), ``covariance`` (n, n, N), the centre's after the delivery ·
+    ``departure`` (4, N) of the truth from the model, if it departs.
     """
 
     time: Times
@@ -60,6 +62,7 @@ class MarkovJumpCentralState:
     prediction: Prediction | None
     mean: Array
     covariance: Array
+    departure: Array | None = None
 
 
 _SCALAR = "(sensors, 1, N)"
@@ -113,6 +116,7 @@ class MarkovJumpCentralSystem:
     magnitude: Array
     reference: Array
     scale: Array
+    nature: Nature = AS_ASSUMED
 
     @classmethod
     def create(
@@ -123,6 +127,7 @@ class MarkovJumpCentralSystem:
         state_names: tuple[str, ...],
         state_weights: Array | None,
         horizon: int,
+        nature: Nature = AS_ASSUMED,
     ) -> MarkovJumpCentralSystem:
         """With :class:`InteractingModels` or the linear filter, for ``horizon`` steps.
 
@@ -142,6 +147,7 @@ class MarkovJumpCentralSystem:
             magnitude=magnitude,
             reference=reference,
             scale=_measured(linear, horizon),
+            nature=nature,
         )
 
     @property
@@ -156,8 +162,8 @@ class MarkovJumpCentralSystem:
 
     @property
     def start_channels(self) -> int:
-        """Normals of a start: the state's deviation, the mode, the first process noise."""
-        return self.plant.size + 1 + self.plant.noise_channels
+        """Normals of a start: the state, the mode, the first process noise, nature's."""
+        return self.plant.size + 1 + self.plant.noise_channels + self.nature.channels
 
     @property
     def covariance_cycle(self) -> int | None:
@@ -222,7 +228,9 @@ class MarkovJumpCentralSystem:
     def start(self, noise: Array) -> MarkovJumpCentralState:
         """Time 0: nothing is measured; what is held is what would be expected."""
         runs, n = noise.shape[-1], self.plant.size
+        noise, departure = self.nature.begin(noise)
         truth, mode = self.plant.start(noise[: n + 1])
+        process = true_noise(departure, noise[n + 1 :], noise[:0])[0]
         belief, time = self.estimator.start(runs), np.zeros(runs, dtype=np.int64)
         mean, covariance = self.estimator.estimate(belief)
         held = self.estimator.prediction(belief, time).mean[n:]
@@ -230,7 +238,7 @@ class MarkovJumpCentralSystem:
             time=time,
             truth=truth,
             mode=mode,
-            process_noise=self.plant.process_noise(noise[n + 1 :]),
+            process_noise=self.plant.process_noise(process),
             measurement=held,
             held=held,
             age=np.zeros((self.sensor_count, runs)),
@@ -238,6 +246,7 @@ class MarkovJumpCentralSystem:
             prediction=None,
             mean=mean,
             covariance=covariance,
+            departure=departure,
         )
 
     def sense(self, state: MarkovJumpCentralState, noise: Array) -> MarkovJumpCentralState:
@@ -246,7 +255,13 @@ class MarkovJumpCentralSystem:
         Source: markov_jump, equations (3), (4).
         """
         truth, mode, process_noise, measurement = move(
-            self.plant, self.sensors, state.truth, state.mode, state.process_noise, noise
+            self.plant,
+            self.sensors,
+            state.truth,
+            state.mode,
+            state.process_noise,
+            noise,
+            state.departure,
         )
         time = state.time + 1
         belief = self.estimator.predict(state.belief, state.time)

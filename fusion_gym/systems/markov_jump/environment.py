@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.core.options import CommonOptions, Nature, Scenario
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.markov_jump.central_system import MarkovJumpCentralSystem
@@ -114,12 +114,14 @@ def build(chosen: MarkovJumpTrackingOptions) -> Scenario:
         if chosen.state_weights is None
         else validation.not_negative("state_weights", chosen.state_weights, (plant.size,))
     )
-    system = _system(where, chosen.fusion, plant, sensors, weights, horizon)
+    nature = Nature.create(chosen, (*plant.unmoved, "true_threshold_shift"))
+    nature.check_growth(plant.true_radius, horizon)
+    system = _system(where, chosen.fusion, plant, sensors, weights, horizon, nature)
     remembering = None
     if chosen.memory_filter is not None:
         kind = validation.choice("memory_filter", chosen.memory_filter, FILTERS)
         fusion = chosen.fusion if kind == where else None
-        remembering = _system(kind, fusion, plant, sensors, weights, horizon)
+        remembering = _system(kind, fusion, plant, sensors, weights, horizon, nature)
     defaults, refusal = {}, None
     if isinstance(system, MarkovJumpSystem):
         defaults = {"local_variance": {"reference": float(system.full_rate_traces().mean())}}
@@ -142,15 +144,16 @@ def _system(
     sensors: FadingSensors,
     weights: Array | None,
     horizon: int,
+    nature: Nature,
 ) -> MarkovJumpSystem | MarkovJumpCentralSystem:
     """The system of a filter and a fusion rule."""
     names = _state_names(plant.size)
     fusion = _fusion(kind, where, sensors.count)
     if fusion is None:
         return MarkovJumpCentralSystem.create(
-            plant, sensors, where == "imm", names, weights, horizon
+            plant, sensors, where == "imm", names, weights, horizon, nature
         )
-    return MarkovJumpSystem.create(plant, sensors, fusion, names, weights, horizon)
+    return MarkovJumpSystem.create(plant, sensors, fusion, names, weights, horizon, nature)
 
 
 def _fusion(kind: str | None, where: str, sensors: int) -> FusionRule | None:

@@ -6,7 +6,7 @@ systems with correlated noises and fading measurements).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ from scipy.special import ndtr
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.options import true_motion
 from fusion_gym.systems.linear_plant import covariance_factor
 from fusion_gym.validation import ConfigurationError
 
@@ -147,6 +148,20 @@ class MarkovJumpPlant:
         )
         return float(np.abs(np.linalg.eigvals(operator)).max())
 
+    def true_radius(self, factor: float) -> float:
+        """Root of the :meth:`second_moment_radius` with I + c (Φ - I) in the place of each Φ."""
+        still = np.eye(self.size)[..., None]
+        moved = replace(self, transition=still + factor * (self.transition - still))
+        return moved.second_moment_radius() ** 0.5
+
+    @property
+    def unmoved(self) -> tuple[str, ...]:
+        """The options of the true plant that can change nothing."""
+        still = bool((self.transition == np.eye(self.size)[..., None]).all())
+        quiet = not (self.noise_factor.any() and self.process_gain.any())
+        found = {"true_process_noise": quiet, "true_transition": still}
+        return tuple(name for name, absent in found.items() if absent)
+
     def start(self, noise: Array) -> tuple[Array, Modes]:
         """x(0) (n, N) and θ(0) (N,) from standard normals (n + 1, N), the last one the mode's."""
         state = self.initial_mean + linalg.matvec(self.initial_factor, noise[:-1])
@@ -156,12 +171,17 @@ class MarkovJumpPlant:
         """w (r, N) from standard normals (noise_channels, N)."""
         return linalg.matvec(self.noise_factor, noise)
 
-    def advance(self, state: Array, mode: Modes, process_noise: Array) -> Array:
+    def advance(
+        self, state: Array, mode: Modes, process_noise: Array, departure: Array | None = None
+    ) -> Array:
         """x(k+1) (n, N) from x(k) (n, N), θ(k) (N,) and w(k) (r, N).
+
+        With a ``departure`` (4, N) the plant moves by I + c (Φ_θ - I) in the place of each Φ_θ.
 
         Source: markov_jump, equation (3).
         """
         moved = linalg.matvec(self.transition.take(mode, -1), state)
+        moved = true_motion(departure, state, moved)
         return moved + linalg.matvec(self.process_gain.take(mode, -1), process_noise)
 
     def jump(self, mode: Modes, noise: Array) -> Modes:

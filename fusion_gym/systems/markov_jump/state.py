@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.core.options import true_noise
 from fusion_gym.core.system import Block, Signal, numbered
 from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagCovariances
 from fusion_gym.systems.markov_jump.linear_minimum_variance import Times
@@ -41,18 +42,22 @@ def move(
     mode: Modes,
     process_noise: Array,
     noise: Array,
+    departure: Array | None = None,
 ) -> Motion:
     """The plant moves and jumps, the sensors measure.
 
-    ``noise`` (channels, N) holds the normals of the process noise, the mode, the sensors.
+    ``noise`` (channels, N) holds the normals of the process noise, the mode, the sensors;
+    ``process_noise`` is as it really is, and so is what is returned.
 
     Source: markov_jump, equations (3), (4).
     """
     moving = plant.noise_channels
-    following = plant.advance(truth, mode, process_noise)
+    fading, own = np.split(noise[moving + 1 :], (sensors.count,))
+    process, own = true_noise(departure, noise[:moving], own)
+    following = plant.advance(truth, mode, process_noise, departure)
     jumped = plant.jump(mode, noise[moving])
-    drawn = plant.process_noise(noise[:moving])
-    measurement = sensors.measure(following, jumped, drawn, noise[moving + 1 :])
+    drawn = plant.process_noise(process)
+    measurement = sensors.measure(following, jumped, drawn, np.concatenate((fading, own)))
     return Motion(following, jumped, drawn, measurement)
 
 
@@ -67,7 +72,8 @@ class MarkovJumpState:
     ``held`` (l, n, N), the last delivered estimates · ``age`` (l, N), steps since then ·
     ``sent`` (l, N) bool, the last deliveries · ``lags`` and ``prediction``, covariances ·
     ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N), fused if nobody transmits ·
-    ``mean`` (n, N), ``covariance`` (n, n, N), fused after the delivery.
+    ``mean`` (n, N), ``covariance`` (n, n, N), fused after the delivery · ``departure`` (4, N) of
+    the truth from the model, if it departs.
     """
 
     time: Times
@@ -88,6 +94,7 @@ class MarkovJumpState:
     prior_covariance: Array
     mean: Array
     covariance: Array
+    departure: Array | None = None
 
 
 _ESTIMATES = "(sensors, n, N)"
@@ -138,12 +145,13 @@ AnyState = TypeVar("AnyState", bound=Any)
 
 
 def without_truth(state: AnyState) -> AnyState:
-    """A state of this family without the truth, the mode and the process noise to come."""
+    """A state of this family without truth, mode, process noise to come and departure."""
     return replace(
         state,
         truth=np.full_like(state.truth, np.nan),
         mode=np.zeros_like(state.mode),
         process_noise=np.full_like(state.process_noise, np.nan),
+        departure=None,
     )
 
 
@@ -170,4 +178,5 @@ def imagined(
         truth=linalg.draw(mean, covariance, noise[:n]),
         mode=draw(np.cumsum(law, 0)[:-1], noise[n]),
         process_noise=plant.process_noise(noise[n + 1 :]),
+        departure=None,
     )

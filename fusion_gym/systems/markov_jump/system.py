@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.core.options import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.reward import equal_weights
 from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
@@ -54,6 +55,7 @@ class MarkovJumpSystem:
     state_weights: Array
     magnitude: Array
     reference: Array
+    nature: Nature = AS_ASSUMED
 
     @classmethod
     def create(
@@ -64,6 +66,7 @@ class MarkovJumpSystem:
         state_names: tuple[str, ...],
         state_weights: Array | None,
         horizon: int,
+        nature: Nature = AS_ASSUMED,
     ) -> MarkovJumpSystem:
         """Tables for ``horizon`` steps; weights of ``None`` make open loop cost one."""
         model = AugmentedModel.create(plant, sensors)
@@ -81,6 +84,7 @@ class MarkovJumpSystem:
             state_weights=equal if state_weights is None else state_weights,
             magnitude=magnitude,
             reference=reference,
+            nature=nature,
         )
 
     @property
@@ -95,8 +99,8 @@ class MarkovJumpSystem:
 
     @property
     def start_channels(self) -> int:
-        """Normals of a start: the state's deviation, the mode, the first process noise."""
-        return self.plant.size + 1 + self.plant.noise_channels
+        """Normals of a start: the state, the mode, the first process noise, nature's."""
+        return self.plant.size + 1 + self.plant.noise_channels + self.nature.channels
 
     @property
     def covariance_cycle(self) -> int:
@@ -140,7 +144,9 @@ class MarkovJumpSystem:
     def start(self, noise: Array) -> MarkovJumpState:
         """Time 0: all estimates are the mean of ζ(0); nothing is measured, nothing lags behind."""
         runs, n, count = noise.shape[-1], self.plant.size, self.sensor_count
+        noise, departure = self.nature.begin(noise)
         truth, mode = self.plant.start(noise[: n + 1])
+        process = true_noise(departure, noise[n + 1 :], noise[:0])[0]
         first = self.model.initial_mean
         mean = np.broadcast_to(first[:, None], (count, len(first), runs)).copy()
         noise_mean = np.zeros((count, self.plant.process_gain.shape[1], runs))
@@ -150,7 +156,7 @@ class MarkovJumpSystem:
             time=np.zeros(runs, dtype=np.int64),
             truth=truth,
             mode=mode,
-            process_noise=self.plant.process_noise(noise[n + 1 :]),
+            process_noise=self.plant.process_noise(process),
             innovation=np.zeros((count, runs)),
             node_mean=mean,
             node_noise=noise_mean,
@@ -165,6 +171,7 @@ class MarkovJumpSystem:
             prior_covariance=covariance,
             mean=state_mean,
             covariance=covariance,
+            departure=departure,
         )
 
     def sense(self, state: MarkovJumpState, noise: Array) -> MarkovJumpState:
@@ -173,7 +180,13 @@ class MarkovJumpSystem:
         Source: markov_jump, equations (3), (4), (12)-(22), (36)-(39).
         """
         truth, mode, process_noise, measurement = move(
-            self.plant, self.sensors, state.truth, state.mode, state.process_noise, noise
+            self.plant,
+            self.sensors,
+            state.truth,
+            state.mode,
+            state.process_noise,
+            noise,
+            state.departure,
         )
         time = state.time + 1
         before, place = self.filters.at(state.time), self.filters.at(time)

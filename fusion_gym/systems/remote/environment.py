@@ -16,7 +16,7 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.access import ACCESS_RULES
 from fusion_gym.core.channel import CHANNELS, INITIAL_STATES, Channel
-from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.core.options import CommonOptions, Nature, Scenario
 from fusion_gym.core.task import MOST_SENSORS, make_bucket
 from fusion_gym.systems.remote.system import RemoteEstimationSystem
 from fusion_gym.validation import ConfigurationError
@@ -81,8 +81,9 @@ def build(chosen: RemoteEstimationOptions) -> Scenario:
         else validation.not_negative("state_weights", chosen.state_weights, (sensors,))
     )
     deviation = validation.positive("noise_deviation", chosen.noise_deviation, (sensors,))
+    coefficient = validation.spread("coefficient", chosen.coefficient, (sensors,))
     system = RemoteEstimationSystem(
-        coefficient=validation.spread("coefficient", chosen.coefficient, (sensors,)),
+        coefficient=coefficient,
         deviation=deviation,
         initial_deviation=validation.not_negative(
             "initial_deviation", chosen.initial_deviation, (sensors,)
@@ -90,6 +91,7 @@ def build(chosen: RemoteEstimationOptions) -> Scenario:
         channel=_channel(chosen, sensors),
         error_scale=_error_scale(chosen, deviation),
         state_weights=weights,
+        nature=_nature(chosen, coefficient),
     )
     return Scenario(
         chosen,
@@ -98,6 +100,15 @@ def build(chosen: RemoteEstimationOptions) -> Scenario:
         nodes_remember=True,  # a source's value is all that there is to know of it
         no_estimates="a packet carries the source's value itself",
     )
+
+
+def _nature(chosen: RemoteEstimationOptions, coefficient: Array) -> Nature:
+    """A source moves by c a in the place of a."""
+    absent = ("true_measurement_noise", "true_threshold_shift")
+    nature = Nature.create(chosen, absent if coefficient.any() else (*absent, "true_transition"))
+    largest = float(np.abs(coefficient).max())
+    nature.check_growth(lambda factor: factor * largest, validation.horizon(chosen.horizon))
+    return nature
 
 
 def _channel(chosen: RemoteEstimationOptions, sensors: int) -> Channel:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.channel import STATES, Channel
+from fusion_gym.core.options import AS_ASSUMED, Nature, true_motion, true_noise
 from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 
 _RANGE = 5.0  # scaled errors are clipped here
@@ -28,7 +29,7 @@ class RemoteEstimationState:
     ``prior_variance`` and ``variance`` (n, N), of the errors by age · ``held`` (n, N), the last
     delivered value · ``age`` (n, N), steps since then · ``channel`` (n, N), the state S(t-1) that
     was fed back · ``next_channel`` (n, N), S(t) · ``lost`` (n, N) bool, whether a packet sent now
-    is lost.
+    is lost · ``departure`` (4, N) of the truth from the model, if it departs.
     """
 
     truth: Array
@@ -41,6 +42,7 @@ class RemoteEstimationState:
     channel: NDArray[np.int64]
     next_channel: NDArray[np.int64]
     lost: NDArray[np.bool_]
+    departure: Array | None = None
 
 
 _ONE = "(sensors, 1, N)"
@@ -74,7 +76,8 @@ class RemoteEstimationSystem:
     sensor knows x̂.
 
     Shapes: ``coefficient`` a, ``deviation`` σ, ``initial_deviation`` of x(0), ``error_scale`` that
-    divides observed errors, and ``state_weights``: (n,).
+    divides observed errors, and ``state_weights``: (n,). Where the truth departs by ``nature``, a
+    source moves by c a in the place of a, for I + c (a - I) would let a random walk be.
     """
 
     coefficient: Array
@@ -83,6 +86,7 @@ class RemoteEstimationSystem:
     channel: Channel
     error_scale: Array
     state_weights: Array
+    nature: Nature = AS_ASSUMED
 
     @property
     def sensor_count(self) -> int:
@@ -102,8 +106,8 @@ class RemoteEstimationSystem:
 
     @property
     def start_channels(self) -> int:
-        """Normals of a start: x(0), then the channel's state."""
-        return self.sensor_count * (1 + (self.channel.states > 1))
+        """Normals of a start: x(0), the channel's state, nature's."""
+        return self.sensor_count * (1 + (self.channel.states > 1)) + self.nature.channels
 
     @property
     def signals(self) -> tuple[Signal, ...]:
@@ -135,6 +139,7 @@ class RemoteEstimationSystem:
     def start(self, noise: Array) -> RemoteEstimationState:
         """Time 0: x(0) is drawn about zero, which is all that the centre knows."""
         sensors, runs = self.sensor_count, noise.shape[-1]
+        noise, departure = self.nature.begin(noise)
         truth = self.initial_deviation[:, None] * noise[:sensors]
         nothing = np.zeros((sensors, runs))
         variance = np.repeat(self.initial_deviation[:, None] ** 2, runs, axis=1)
@@ -152,6 +157,7 @@ class RemoteEstimationSystem:
             channel=known,
             next_channel=known,
             lost=np.zeros((sensors, runs), dtype=np.bool_),
+            departure=departure,
         )
 
     def sense(self, state: RemoteEstimationState, noise: Array) -> RemoteEstimationState:
@@ -159,9 +165,11 @@ class RemoteEstimationSystem:
         sensors = self.sensor_count
         a, sigma = self.coefficient[:, None], self.deviation[:, None]
         following, lost = self._coming(state.next_channel, noise[sensors:])
+        moved = true_motion(state.departure, np.zeros(1), a * state.truth)
+        drawn = true_noise(state.departure, noise[:sensors], noise[:0])[0]
         return replace(
             state,
-            truth=a * state.truth + sigma * noise[:sensors],
+            truth=moved + sigma * drawn,
             prior=a * state.estimate,
             prior_variance=a * a * state.variance + sigma * sigma,
             age=state.age + 1.0,
@@ -205,11 +213,12 @@ class RemoteEstimationSystem:
         }
 
     def visible(self, state: RemoteEstimationState) -> RemoteEstimationState:
-        """The state without what the channel is about to do: every grant arrives.
+        """The state without its departure and what the channel is about to do: every grant arrives.
 
         The sources are what the sensors measure, so they stay.
         """
-        return replace(state, next_channel=state.channel, lost=np.zeros_like(state.lost))
+        lost = np.zeros_like(state.lost)
+        return replace(state, next_channel=state.channel, lost=lost, departure=None)
 
     @property
     def imagination_channels(self) -> int:
@@ -224,7 +233,7 @@ class RemoteEstimationSystem:
         The sources are what the sensors measure, so they stay, whatever ``mean`` is.
         """
         following, lost = self._coming(state.channel, noise)
-        return replace(state, next_channel=following, lost=lost)
+        return replace(state, next_channel=following, lost=lost, departure=None)
 
     def arrival_probability(self, state: RemoteEstimationState) -> Array | None:
         """Probability (sensors, N) that a packet sent now arrives, given the channel before."""

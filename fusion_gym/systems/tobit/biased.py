@@ -26,6 +26,7 @@ from fusion_gym.systems.tobit.options import (
     make_centre,
     remembering_system,
     stochastic_defaults,
+    true_nature,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredSystem
@@ -153,6 +154,7 @@ def _build(chosen: BiasedOscillatorOptions) -> Scenario:
         + (("b",) if biases == 1 else tuple(f"b{i + 1}" for i in range(biases))),
         scale=typical_magnitude(plant, horizon, random_start),
         reference=plant.open_loop(min(horizon, _REFERENCE_HORIZON)),
+        nature=true_nature(chosen, plant, sensors, horizon),
     )
     weights = equal_weights(system.open_loop(horizon))
     remembering = remembering_system(system, chosen.memory_filter, _FILTERS, chosen, sensors)

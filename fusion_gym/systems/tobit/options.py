@@ -8,9 +8,10 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from fusion_gym.core.options import CommonOptions, plain
+from fusion_gym.core.options import CommonOptions, Nature, plain
 from fusion_gym.errors import ConfigurationError, shown
 from fusion_gym.fusion.table import Structure, choose_rule
+from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.centre import Centre, Feedback, FeedbackCentre, SequentialCentre
 from fusion_gym.systems.tobit.filters import KalmanFilter, NodeFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -70,6 +71,20 @@ def make_centre(
         if name != kind:
             _refuse(chosen, row.own, f"filter={kind!r}", f"filter={name!r}")
     return filters[kind].make(chosen, sensors)
+
+
+def true_nature(
+    chosen: FeedbackOptions, plant: LinearPlant, sensors: CensoredSensors, horizon: int
+) -> Nature:
+    """How the truth departs from this plant and these sensors.
+
+    Raises:
+        ConfigurationError: a departure that is not allowed, or that can change nothing.
+    """
+    absent = (*plant.unmoved, *(("true_threshold_shift",) if sensors.unlimited else ()))
+    nature = Nature.create(chosen, absent)
+    nature.check_growth(plant.true_radius, horizon)
+    return nature
 
 
 def remembering_system(

@@ -28,6 +28,7 @@ from fusion_gym.systems.tobit.options import (
     make_centre,
     remembering_system,
     stochastic_defaults,
+    true_nature,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredSystem
@@ -118,6 +119,7 @@ def build(chosen: TobitOscillatorOptions) -> Scenario:
         state_names=tuple(f"x{i + 1}" for i in range(plant.size)),
         scale=typical_magnitude(plant, horizon, random_start),
         reference=plant.open_loop(horizon),
+        nature=true_nature(chosen, plant, sensors, horizon),
     )
     defaults = {"dynamic_event": trigger} | stochastic_defaults(chosen)
     return Scenario(

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.options import true_limits
 from fusion_gym.validation import ConfigurationError
 
 # In units of the resolution: beyond it, differences of covariances have too few digits left.
@@ -98,13 +99,23 @@ class CensoredSensors:
         """Standard normals that one measurement of all sensors consumes."""
         return self.count * self.size
 
-    def measure(self, state: Array, noise: Array) -> Array:
-        """Censored measurements (sensors, m, N) of the state (n, N) from normals (sensors·m, N)."""
+    def measure(self, state: Array, noise: Array, departure: Array | None = None) -> Array:
+        """Censored measurements (sensors, m, N) of the state (n, N) from normals (sensors·m, N).
+
+        A ``departure`` (4, N) moves the thresholds that the sensors have.
+        """
         shape = (self.count, self.size, noise.shape[-1])
         latent = linalg.matvec(self.measurement_matrix, state)
         latent += self.deviation * noise.reshape(shape)
-        np.maximum(latent, self.threshold, out=latent)
-        return np.minimum(latent, self.upper, out=latent) if self.two_sided else latent
+        np.maximum(latent, true_limits(departure, self.threshold), out=latent)
+        if not self.two_sided:
+            return latent
+        return np.minimum(latent, true_limits(departure, self.upper), out=latent)
+
+    @property
+    def unlimited(self) -> bool:
+        """Whether no threshold is finite."""
+        return bool(self.uncensored.all()) and not self.two_sided
 
     @functools.cached_property
     def resolution(self) -> Array:

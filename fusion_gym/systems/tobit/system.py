@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.core.options import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.centre import Centre, FeedbackCentre, Prediction
@@ -32,7 +33,8 @@ class CensoredState:
     measurement · ``age`` (l, N), steps since then · ``time`` (N,), the step in the episode ·
     ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N), the centre's prediction · ``prediction``,
     what is expected of the measurements · ``local_mean`` (l, n, N), the nodes' posterior before
-    the feedback · ``mean`` (n, N), ``covariance`` (n, n, N), the fused posterior.
+    the feedback · ``mean`` (n, N), ``covariance`` (n, n, N), the fused posterior ·
+    ``departure`` (4, N) of the truth from the model, if it departs.
     """
 
     truth: Array
@@ -46,6 +48,7 @@ class CensoredState:
     local_mean: Array
     mean: Array
     covariance: Array
+    departure: Array | None = None
 
 
 _COMPONENTS = "(sensors, m, N)"
@@ -74,7 +77,8 @@ SIGNALS = (
 class CensoredSystem:
     """Joins a plant, censored sensors, and a centre with or without nodes.
 
-    ``model`` is the plant that the filters believe in; the true one is ``plant``.
+    ``model`` is the plant that the filters believe in; the true one is ``plant``, from which
+    ``nature`` makes it depart, and the sensors with it.
 
     ``random_start`` draws the initial mean, known to the filters, in a uniformly random direction
     with the length of the plant's initial mean; for the oscillator that is a random phase.
@@ -89,6 +93,7 @@ class CensoredSystem:
     state_names: tuple[str, ...]
     scale: Array
     reference: Array
+    nature: Nature = AS_ASSUMED
 
     @property
     def sensor_count(self) -> int:
@@ -107,8 +112,9 @@ class CensoredSystem:
 
     @property
     def start_channels(self) -> int:
-        """Normals of a start: its direction, its deviation, the noise of the first measurement."""
-        return 2 * self.plant.size + self.centre.sensors.noise_channels
+        """Normals of a start: direction, deviation, noise of the first measurement, nature's."""
+        own = 2 * self.plant.size + self.centre.sensors.noise_channels
+        return own + self.nature.channels
 
     @property
     def covariance_cycle(self) -> int | None:
@@ -119,7 +125,7 @@ class CensoredSystem:
         """
         sensors, centre = self.centre.sensors, self.centre
         linear = isinstance(centre, FeedbackCentre) and isinstance(centre.filter, KalmanFilter)
-        return 1 if linear and sensors.uncensored.all() and not sensors.two_sided else None
+        return 1 if linear and sensors.unlimited else None
 
     @property
     def signals(self) -> tuple[Signal, ...]:
@@ -162,12 +168,14 @@ class CensoredSystem:
     def start(self, noise: Array) -> CensoredState:
         """Time 0: the state is drawn and every first measurement is known, free of charge."""
         n, sensors = self.plant.size, self.centre.sensors
+        noise, departure = self.nature.begin(noise)
         mean = np.broadcast_to(self.plant.initial_mean, (n, noise.shape[-1])).copy()
         if self.random_start:
             direction = noise[:n] / np.sqrt(linalg.dot(noise[:n], noise[:n]))
             mean = np.sqrt(linalg.dot(mean, mean)) * direction
         truth = self.plant.start(mean, noise[n : 2 * n])
-        measurement = sensors.measure(truth, noise[2 * n :])
+        first = true_noise(departure, noise[:0], noise[2 * n :])[1]
+        measurement = sensors.measure(truth, first, departure)
         runs = noise.shape[-1]
         covariance = np.broadcast_to(self.model.initial_covariance, (n, n, runs)).copy()
         return CensoredState(
@@ -182,6 +190,7 @@ class CensoredSystem:
             local_mean=np.broadcast_to(mean, (sensors.count, *mean.shape)).copy(),
             mean=mean,
             covariance=covariance,
+            departure=departure,
         )
 
     def sense(self, state: CensoredState, noise: Array) -> CensoredState:
@@ -189,14 +198,15 @@ class CensoredSystem:
 
         Source: tobit_token_bucket, equations (1), (2), (21), (23), (29).
         """
-        r = self.plant.noise_channels
-        truth = self.plant.advance(state.truth, noise[:r])
+        r, departure = self.plant.noise_channels, state.departure
+        process, own = true_noise(departure, noise[:r], noise[r:])
+        truth = self.plant.advance(state.truth, process, departure)
         prior_mean, prior_covariance = self.model.predict(state.mean, state.covariance)
         time = state.time + 1.0
         return replace(
             state,
             truth=truth,
-            measurement=self.centre.sensors.measure(truth, noise[r:]),
+            measurement=self.centre.sensors.measure(truth, own, departure),
             age=state.age + 1.0,
             time=time,
             prior_mean=prior_mean,
@@ -250,8 +260,8 @@ class CensoredSystem:
         return np.log(linalg.diagonal(state.prior_covariance) / self.reference[:, None])
 
     def visible(self, state: CensoredState) -> CensoredState:
-        """The state without the truth; nothing else is hidden."""
-        return replace(state, truth=np.full_like(state.truth, np.nan))
+        """The state without the truth and its departure; nothing else is hidden."""
+        return replace(state, truth=np.full_like(state.truth, np.nan), departure=None)
 
     @property
     def imagination_channels(self) -> int:
@@ -261,8 +271,8 @@ class CensoredSystem:
     def imagine(
         self, state: CensoredState, mean: Array, covariance: Array, noise: Array
     ) -> CensoredState:
-        """The state with a truth drawn by what is believed."""
-        return replace(state, truth=linalg.draw(mean, covariance, noise))
+        """The state with a truth drawn by what is believed, which moves as the model says."""
+        return replace(state, truth=linalg.draw(mean, covariance, noise), departure=None)
 
     def adopt(
         self, state: CensoredState, mean: Array, covariance: Array, runs: NDArray[np.bool_]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.core.options import CommonOptions, Nature, Scenario
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.unknown_input.bound_filter import BoundTables
 from fusion_gym.systems.unknown_input.examples import EXAMPLES
@@ -121,6 +121,8 @@ def build(chosen: UnknownInputOptions) -> Scenario:
             "be uncertain at the start"
         )
     weights = _weights(chosen, open_loop, plant.inputs)
+    nature = Nature.create(chosen, (*plant.unmoved, "true_threshold_shift"))
+    nature.check_growth(plant.true_radius, horizon)
     system = UnknownInputSystem(
         plant=plant,
         signal=signal,
@@ -129,6 +131,7 @@ def build(chosen: UnknownInputOptions) -> Scenario:
         state_weights=weights,
         magnitude=plant.magnitude(signal, horizon),
         reference=open_loop,
+        nature=nature,
     )
     return Scenario(
         chosen,

@@ -14,6 +14,7 @@ from scipy.special import ndtr
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.options import true_motion
 from fusion_gym.systems.linear_plant import covariance_factor
 from fusion_gym.systems.unknown_input.signals import InputSignal
 
@@ -121,13 +122,32 @@ class UnknownInputPlant:
             return self.initial_mean + linalg.matvec(self.initial_factor, noise)
         return self.initial_mean + self.initial_half_width * (2.0 * ndtr(noise) - 1.0)
 
-    def advance(self, state: Array, inputs: Array, noise: Array) -> Array:
-        """x(k + 1) (n, N) from x(k) (n, N), d(k) (q, N) and standard normals (r, N)."""
-        moved = linalg.matvec(self.transition, state)
+    def advance(
+        self, state: Array, inputs: Array, noise: Array, departure: Array | None = None
+    ) -> Array:
+        """x(k + 1) (n, N) from x(k) (n, N), d(k) (q, N) and standard normals (r, N).
+
+        With a ``departure`` (4, N) the plant moves by I + c (𝒜 - I) in the place of 𝒜, from one
+        instant to the next; the input acts as it did.
+        """
+        moved = true_motion(departure, state, linalg.matvec(self.transition, state))
         moved += linalg.matvec(self.input_matrix, inputs)
         if self.noise_channels:
             moved += linalg.matvec(self.process_factor, noise)
         return moved
+
+    def true_radius(self, factor: float) -> float:
+        """Spectral radius of I + c (𝒜 - I)."""
+        still = np.eye(self.size)
+        moved = still + factor * (self.transition[..., 0] - still)
+        return float(np.abs(np.linalg.eigvals(moved)).max())
+
+    @property
+    def unmoved(self) -> tuple[str, ...]:
+        """The options of the true plant that can change nothing."""
+        still = np.array_equal(self.transition[..., 0], np.eye(self.size))
+        found = {"true_process_noise": not self.process_factor.any(), "true_transition": still}
+        return tuple(name for name, absent in found.items() if absent)
 
     def open_loop(self, signal: InputSignal, horizon: int) -> Array:
         """Mean squared error (n + q,) over k = 1..horizon of a centre that takes the input for 0.

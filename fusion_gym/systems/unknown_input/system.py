@@ -17,6 +17,7 @@ from scipy.special import ndtr
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.core.options import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 from fusion_gym.systems.unknown_input.nodes import Estimates, Nodes, Prediction, RunNodes
 from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
@@ -33,7 +34,8 @@ class UnknownInputState:
     ``truth`` (s, N), the state x(k) and the input d(k - 1) that has just acted · ``signal``
     (rows, N), the memory of the input signal · ``time`` (N,), sampling instants since the start ·
     ``measurement`` (l, m, N) · ``held`` (l, m, N), the last delivered measurement · ``age`` (l, N),
-    instants since then · ``estimates``, the posteriors · ``prediction``, the predictions.
+    instants since then · ``estimates``, the posteriors · ``prediction``, the predictions ·
+    ``departure`` (4, N) of the truth from the model, if it departs.
     """
 
     truth: Array
@@ -44,6 +46,7 @@ class UnknownInputState:
     age: Array
     estimates: Estimates
     prediction: Prediction | None
+    departure: Array | None = None
 
 
 _COMPONENTS = "(sensors, m, N)"
@@ -92,6 +95,7 @@ class UnknownInputSystem:
     state_weights: Array
     magnitude: Array
     reference: Array
+    nature: Nature = AS_ASSUMED
 
     @property
     def sensor_count(self) -> int:
@@ -106,9 +110,10 @@ class UnknownInputSystem:
 
     @property
     def start_channels(self) -> int:
-        """Normals of a start: the initial state, the first measurements' noise, the signal."""
+        """Normals of a start: the initial state, the first measurements' noise, the signal,
+        nature's."""
         own = self.plant.start_channels + self.nodes.sensors.noise_channels
-        return own + self.signal.start_channels
+        return own + self.signal.start_channels + self.nature.channels
 
     @property
     def covariance_cycle(self) -> int | None:
@@ -156,8 +161,10 @@ class UnknownInputSystem:
         """Time 0: the state is drawn and every first measurement is known, free of charge."""
         n, sensors = self.plant.size, self.nodes.sensors
         runs, count = noise.shape[-1], sensors.noise_channels
+        noise, departure = self.nature.begin(noise)
         state = self.plant.start(noise[:n])
-        measurement = sensors.measure(state, noise[n : n + count])
+        first = true_noise(departure, noise[:0], noise[n : n + count])[1]
+        measurement = sensors.measure(state, first)
         return UnknownInputState(
             truth=np.concatenate((state, np.zeros((self.plant.inputs, runs)))),
             signal=self.signal.start(noise[n + count :]),
@@ -167,6 +174,7 @@ class UnknownInputSystem:
             age=np.zeros((sensors.count, runs)),
             estimates=self.nodes.start(runs),
             prediction=None,
+            departure=departure,
         )
 
     def sense(self, state: UnknownInputState, noise: Array) -> UnknownInputState:
@@ -176,14 +184,16 @@ class UnknownInputSystem:
         """
         r, drawn = self.plant.noise_channels, self.signal.noise_channels
         inputs = self.signal.value(state.signal, state.time)
-        moved = self.plant.advance(state.truth[: self.plant.size], inputs, noise[drawn : drawn + r])
+        departure = state.departure
+        process, own = true_noise(departure, noise[drawn : drawn + r], noise[drawn + r :])
+        moved = self.plant.advance(state.truth[: self.plant.size], inputs, process, departure)
         time = state.time + 1.0
         return replace(
             state,
             truth=np.concatenate((moved, inputs)),
             signal=self.signal.advance(state.signal, noise[:drawn]),
             time=time,
-            measurement=self.nodes.sensors.measure(moved, noise[drawn + r :]),
+            measurement=self.nodes.sensors.measure(moved, own),
             age=state.age + 1.0,
             prediction=self.nodes.predict(state.estimates, time),
         )
@@ -228,11 +238,12 @@ class UnknownInputSystem:
         }
 
     def visible(self, state: UnknownInputState) -> UnknownInputState:
-        """The state without the truth and the input to come."""
+        """The state without the truth, the input to come and the departure."""
         return replace(
             state,
             truth=np.full_like(state.truth, np.nan),
             signal=np.full_like(state.signal, np.nan),
+            departure=None,
         )
 
     @property
@@ -273,6 +284,7 @@ class UnknownInputSystem:
             state,
             truth=np.concatenate((linalg.draw(moved, left, first), mean[n:] + off)),
             signal=self.signal.advance(memory, moving),
+            departure=None,
         )
 
     def truth(self, state: UnknownInputState) -> Array:

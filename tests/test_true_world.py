@@ -1,0 +1,368 @@
+"""The truth departs from what filters, rules and memory assume: by how much, and who knows."""
+
+from __future__ import annotations
+
+import re
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import ENVIRONMENTS, make_task
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.solvers.silence import silence_bound
+from fusion_gym.validation import ConfigurationError
+
+TOBIT = "fusion_gym/TobitOscillator-v0"
+BIASED = "fusion_gym/BiasedOscillator-v0"
+CORRELATED = "fusion_gym/CorrelatedTracking-v0"
+JUMP = "fusion_gym/MarkovJumpTracking-v0"
+INPUT = "fusion_gym/UnknownInput-v0"
+REMOTE = "fusion_gym/RemoteEstimation-v0"
+RUNS = 40_000
+ANGLE = 0.052 * np.pi
+TURN = np.array([[np.cos(ANGLE), np.sin(ANGLE)], [-np.sin(ANGLE), np.cos(ANGLE)]])
+AS_ASSUMED = {
+    "true_process_noise": 1,
+    "true_measurement_noise": 1.0,
+    "true_threshold_shift": 0,
+    "true_transition": 1.0,
+}
+
+
+def sensed(env_id: str, steps: int = 1, **options: Any) -> tuple[Any, list[Any]]:
+    """The task, and the states of many runs at time 0 and after each of some silent steps."""
+    task = make_task(env_id, **options)
+    draw, system = np.random.default_rng(5), task.system
+    states = [system.start(draw.standard_normal((system.start_channels, RUNS)))]
+    silence = np.zeros((task.sensors, RUNS), dtype=np.bool_)
+    for _ in range(steps):
+        noise = draw.standard_normal((system.noise_channels, RUNS))
+        states.append(system.deliver(system.sense(states[-1], noise), silence))
+    return task, states
+
+
+def close_variance(values: Any, expected: float) -> bool:
+    """Whether the variance of independent normal values is the expected one."""
+    return bool(abs(np.var(values) / expected - 1.0) < 4.5 * np.sqrt(2.0 / np.size(values)))
+
+
+class TestNothingChangesWithoutDeparture:
+    @pytest.mark.parametrize("env_id", [name for name in ENVIRONMENTS if "fusion_gym/" in name])
+    def test_bitwise(self, env_id: str) -> None:
+        """Also where the options stand there, with the values of the model."""
+
+        def course(**options: Any) -> bytes:
+            batch = EpisodeBatch.seeded(make_task(env_id, **options), 3, 8)
+            seen = []
+            for _ in range(10):
+                outcome = batch.step(np.ones((batch.task.sensors, 3), dtype=np.bool_))
+                seen += [batch.observe().tobytes(), outcome.error.tobytes()]
+            return b"".join(seen)
+
+        assert course(**AS_ASSUMED) == course()
+        assert course(true_process_noise=1.5) != course()
+
+    def test_numbers_take_no_noise(self) -> None:
+        plain = make_task(TOBIT).system
+        moved = make_task(TOBIT, true_process_noise=2.0, true_threshold_shift=0.5).system
+        drawn = make_task(TOBIT, true_process_noise=(0.5, 2.0), true_transition=(0.9, 1.1)).system
+        assert moved.start_channels == plain.start_channels
+        assert drawn.start_channels == plain.start_channels + 2
+        assert moved.noise_channels == drawn.noise_channels == plain.noise_channels
+
+
+class TestNoise:
+    @pytest.mark.parametrize("factor", [0.5, 2.0])
+    def test_process_noise_of_linear_plants(self, factor: float) -> None:
+        _, states = sensed(TOBIT, process_noise="full", true_process_noise=factor)
+        moved = states[1].truth - TURN @ states[0].truth
+        assert close_variance(moved, 0.05 * factor**2)
+
+    def test_process_noise_of_a_source(self) -> None:
+        _, states = sensed(REMOTE, coefficient=0.9, true_process_noise=2.0)
+        assert close_variance(states[1].truth - 0.9 * states[0].truth, 4.0)
+
+    def test_shared_noise_multiplies_the_scale(self) -> None:
+        """In correlated tracking the sensors' noise has a part of the plant's, which grows too."""
+        _, states = sensed(
+            CORRELATED,
+            noise_scale=0.5,
+            true_process_noise=3.0,
+            true_measurement_noise=2.0,
+        )
+        shaken = states[1].measurement[:, 0] - states[1].truth
+        for sensor, (variance, coupling) in enumerate(
+            zip((0.64, 0.36, 0.49), (0.2, 0.4, 0.1), strict=True)
+        ):
+            expected = 0.5 * (4.0 * variance + 9.0 * coupling**2 * 0.16)
+            assert close_variance(shaken[sensor], expected)
+
+    def test_of_two_motions(self) -> None:
+        """The first process noise is drawn at the start, and is larger already."""
+        _, states = sensed(JUMP, true_process_noise=2.0)
+        assert close_variance(states[0].process_noise, 4.0 * 0.64)
+        assert close_variance(states[1].process_noise, 4.0 * 0.64)
+
+    def test_measurement_noise_of_two_motions(self) -> None:
+        """With a fading of zero a measurement is noise alone: α w + η."""
+        _, states = sensed(
+            JUMP,
+            filter="centralised",
+            fading_values=((0.0, 1.0),) * 3,
+            fading_probabilities=((0.999999, 0.000001),) * 3,
+            true_measurement_noise=3.0,
+        )
+        expected = 9.0 * 0.49 + 0.2**2 * 0.64
+        assert close_variance(states[1].measurement[0], expected)
+
+    def test_measurement_noise_at_the_start_too(self) -> None:
+        _, states = sensed(INPUT, true_measurement_noise=2.0)
+        matrix = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
+        for state in states:
+            shaken = state.measurement[0] - matrix @ state.truth[:4]
+            assert close_variance(shaken[0], 4.0 * 0.0009)
+            assert close_variance(shaken[1], 4.0 * 0.0064)
+
+
+class TestThresholds:
+    @pytest.mark.parametrize("shift", [-0.4, 0.7])
+    def test_share_of_what_is_censored(self, shift: float) -> None:
+        """The second state starts as N(0, 0.1) and is measured with noise of variance 0.5."""
+        _, states = sensed(TOBIT, steps=0, true_threshold_shift=shift)
+        measured = states[0].measurement[:, 1]
+        share = stats.norm.cdf(shift / np.sqrt(0.6))
+        found = (measured == shift).mean(-1)
+        assert np.abs(found - share).max() < 4.5 * np.sqrt(share * (1.0 - share) / RUNS)
+        assert measured.min() == shift
+
+    def test_both_limits_move(self) -> None:
+        _, states = sensed(BIASED, steps=3, true_threshold_shift=0.25, true_process_noise=20.0)
+        measured = np.stack([state.measurement for state in states])
+        assert (measured.min(), measured.max()) == (-4.75, 5.25)
+
+    def test_filters_and_signals_know_the_old_ones(self) -> None:
+        task = make_task(TOBIT, filter="tobit", true_threshold_shift=0.5)
+        batch = EpisodeBatch.seeded(task, 50, 0)
+        signals = batch.signals()
+        assert (signals["measurement"] == 0.5).any()
+        assert not signals["censored"].any()
+
+
+class TestMotion:
+    def test_open_loop(self) -> None:
+        """The error of a centre that only predicts, by the recursion of x and x̂ together."""
+        c, steps = 1.1, 20
+        task, states = sensed(
+            TOBIT, steps, filter="kalman", censoring_threshold=-np.inf, true_transition=c,
+            true_process_noise=1.5,
+        )  # fmt: skip
+        gain = np.array([0.16, 0.18])
+        true = np.eye(2) + c * (TURN - np.eye(2))
+        joint = np.zeros((4, 4))
+        joint[:2, :2], joint[2:, 2:] = true, TURN
+        mean = np.array([5.0, 0.0, 5.0, 0.0])
+        moment = np.outer(mean, mean)
+        moment[:2, :2] += 0.1 * np.eye(2)
+        for _ in range(steps):
+            moment = joint @ moment @ joint.T
+            moment[:2, :2] += 1.5**2 * 0.05 * np.outer(gain, gain)
+        apart = np.concatenate((np.eye(2), -np.eye(2)), axis=1)
+        expected = np.diagonal(apart @ moment @ apart.T)
+        error = states[-1].truth - task.system.fused(states[-1])[0]
+        squared = error**2
+        margin = 4.5 * squared.std(-1) / np.sqrt(RUNS)
+        assert (np.abs(squared.mean(-1) - expected) < margin).all()
+        # The claimed variance stays that of the model.
+        assert (np.diagonal(states[-1].covariance[..., 0]) < 0.5 * expected).any()
+
+    def test_both_motions(self) -> None:
+        """x + c (Φ x - x) plus Γ w, with the matrices of the mode that holds."""
+        _, states = sensed(JUMP, true_transition=0.5, true_process_noise=2.0)
+        phi = np.array([[[0.8, 0.1], [0.0, 0.6]], [[1.0, 0.5], [0.0, 0.5]]])
+        gamma = np.array([[1.5, 0.6], [0.125, 0.5]])
+        before, after = states
+        for mode in (0, 1):
+            runs = before.mode == mode
+            moved = 0.5 * (np.eye(2) + phi[mode]) @ before.truth[:, runs]
+            moved += gamma[mode][:, None] * before.process_noise[0, runs]
+            np.testing.assert_allclose(after.truth[:, runs], moved, atol=1e-12)
+
+    def test_between_two_instants(self) -> None:
+        """The force acts as it did."""
+        task, states = sensed(INPUT, process_covariance=np.zeros((4, 4)), true_transition=1.2)
+        plant = task.system.plant
+        matrix = np.eye(4) + 1.2 * (plant.transition[..., 0] - np.eye(4))
+        force = plant.input_matrix[..., 0] @ states[1].truth[4:]
+        expected = matrix @ states[0].truth[:4] + force
+        np.testing.assert_allclose(states[1].truth[:4], expected, atol=1e-12)
+
+    def test_of_a_source(self) -> None:
+        """A random walk is one no more: its coefficient itself is multiplied."""
+        _, states = sensed(REMOTE, steps=30, coefficient=1.0, true_transition=0.8)
+        stationary = (1.0 - 0.8**60) / (1.0 - 0.8**2)
+        assert close_variance(states[-1].truth, stationary)
+
+
+class TestDraws:
+    OPTIONS: ClassVar[dict[str, Any]] = {
+        "true_process_noise": (0.5, 2.0),
+        "true_threshold_shift": (-0.3, 0.6),
+        "true_transition": (0.9, 1.1),
+    }
+
+    def test_laws(self) -> None:
+        _, states = sensed(TOBIT, steps=0, **self.OPTIONS)
+        process, measurement, shift, transition = states[0].departure
+        assert (measurement == 1.0).all()
+        laws = (
+            (process, stats.loguniform(0.5, 2.0)),
+            (shift, stats.uniform(-0.3, 0.9)),
+            (transition, stats.loguniform(0.9, 1.1)),
+        )
+        for values, law in laws:
+            assert stats.kstest(values, law.cdf).pvalue > 1e-3
+        assert abs(np.corrcoef(process, transition)[0, 1]) < 0.03
+
+    def test_an_episode_has_one_whatever_is_requested(self) -> None:
+        task = make_task(TOBIT, **self.OPTIONS)
+        one, other = (EpisodeBatch.seeded(task, 4, 3) for _ in range(2))
+        first = one.state.departure.copy()
+        for _ in range(5):
+            one.step(np.ones((3, 4), dtype=np.bool_))
+            other.step(np.zeros((3, 4), dtype=np.bool_))
+        np.testing.assert_array_equal(one.state.departure, first)
+        np.testing.assert_array_equal(other.state.departure, first)
+        np.testing.assert_array_equal(one.state.truth, other.state.truth)
+        one.reset(np.array([1]))
+        assert (one.state.departure[0] != first[0]).tolist() == [False, True, False, False]
+
+    def test_a_single_environment_draws_as_a_batch(self) -> None:
+        env = fusion_gym.make_sb3_vec_env(TOBIT, 2, seed=3, **self.OPTIONS)
+        env.reset()
+        task = make_task(TOBIT, **self.OPTIONS)
+        alone = EpisodeBatch.seeded(task, 1, 3)
+        np.testing.assert_array_equal(env.batch.state.departure[:, :1], alone.state.departure)
+
+
+class TestWhoKnows:
+    @pytest.mark.parametrize("env_id", [TOBIT, BIASED, CORRELATED, JUMP, INPUT, REMOTE])
+    def test_nobody_who_plans(self, env_id: str) -> None:
+        """What a policy sees of a state, and simulates from it, moves as the model says."""
+        departed = make_task(env_id, true_process_noise=2.0, true_transition=0.9)
+        batch = EpisodeBatch.seeded(departed, 4, 0)
+        assert batch.state.departure is not None
+        seen = batch.signals()["model"]
+        assert seen.departure is None
+        nominal = make_task(env_id).system
+        draw = np.random.default_rng(1)
+        size = len(nominal.state_names)
+        noise = draw.standard_normal((nominal.imagination_channels, 4))
+        believed = np.repeat(np.eye(size)[..., None], 4, axis=-1)
+        wide = [
+            system.imagine(seen, draw_mean, believed, noise)
+            for system in (departed.system, nominal)
+            for draw_mean in (np.ones((size, 4)),)
+        ]
+        moving = draw.standard_normal((nominal.noise_channels, 4))
+        quiet = np.zeros((departed.sensors, 4), dtype=np.bool_)
+        after = [
+            system.sense(system.deliver(state, quiet), moving)
+            for system, state in zip((departed.system, nominal), wide, strict=True)
+        ]
+        np.testing.assert_array_equal(after[0].truth, after[1].truth)
+
+    def test_a_shadow_lives_in_the_same_world(self) -> None:
+        task = make_task(
+            JUMP, filter="centralised", memory=True, memory_filter="imm", true_process_noise=2.0,
+            true_transition=(0.8, 0.9), true_measurement_noise=3.0,
+        )  # fmt: skip
+        batch = EpisodeBatch.seeded(task, 4, 0)
+        for _ in range(5):
+            batch.step(np.zeros((3, 4), dtype=np.bool_))
+            assert batch.shadows is not None
+            np.testing.assert_array_equal(batch.shadows.every.truth, batch.state.truth)
+            sampled = task.system.sensors.sampled(batch.state.time)
+            np.testing.assert_array_equal(
+                batch.shadows.every.measurement[sampled], batch.state.measurement[sampled]
+            )
+
+    def test_a_rule_is_made_from_the_model(self) -> None:
+        """The Whittle index and a searched schedule are those of the model."""
+        other = {"true_process_noise": 3.0, "true_transition": 0.9}
+        for env_id, text in ((REMOTE, "whittle:price=2"), (JUMP, "periodic_optimum:packets=1")):
+            tasks = [make_task(env_id, **options) for options in ({}, other)]
+            batch = EpisodeBatch.seeded(tasks[1], 5, 0)
+            wanted = []
+            for task in tasks:
+                policy = make_policy(text, task)
+                policy.reset(5, 0)
+                wanted.append(policy(batch.signals()))
+            np.testing.assert_array_equal(*wanted)
+
+    def test_a_proven_bound_is_refused(self) -> None:
+        task = make_task(TOBIT, filter="kalman", censoring_threshold=-np.inf, true_transition=1.1)
+        with pytest.raises(ConfigurationError, match=r"^true_transition = 1.1 is not .* bound"):
+            silence_bound(task, [0.1])
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options", "said"),
+    [
+        (TOBIT, {"true_process_noise": 0.0}, "from 0.001 to 1000"),
+        (TOBIT, {"true_process_noise": "twice"}, "number"),
+        (TOBIT, {"true_process_noise": None}, "number"),
+        (TOBIT, {"true_process_noise": True}, "number"),
+        (TOBIT, {"true_measurement_noise": -1.0}, "from 0.001 to 1000"),
+        (TOBIT, {"true_measurement_noise": (2.0, 0.5)}, "low < high"),
+        (TOBIT, {"true_measurement_noise": (1.0, 1.0)}, "low < high"),
+        (TOBIT, {"true_measurement_noise": (0.5, 1.0, 2.0)}, "number"),
+        (TOBIT, {"true_threshold_shift": np.inf}, "finite"),
+        (TOBIT, {"true_threshold_shift": (1.0, -1.0)}, "low < high"),
+        (TOBIT, {"true_transition": np.nan}, "finite"),
+        (TOBIT, {"true_transition": 50.0}, "spectral radius"),
+        (REMOTE, {"true_transition": 1.5}, "spectral radius"),
+        (JUMP, {"true_transition": (1.0, 9.0)}, "spectral radius"),
+        (INPUT, {"true_transition": 30.0}, "spectral radius"),
+        (REMOTE, {"true_measurement_noise": 2.0}, "it must be 1 here, .* without noise"),
+        (REMOTE, {"true_threshold_shift": 0.1}, "it must be 0 here, .* no sensor is censored"),
+        (REMOTE, {"coefficient": 0.0, "true_transition": 0.9}, "it must be 1 here"),
+        (JUMP, {"true_threshold_shift": 0.1}, "it must be 0 here"),
+        (INPUT, {"true_threshold_shift": (-0.1, 0.1)}, "it must be 0 here"),
+        (CORRELATED, {"true_threshold_shift": 0.1}, "it must be 0 here"),
+        (CORRELATED, {"track_actual": True, "true_transition": 0.9}, "with track_actual=True"),
+        (
+            TOBIT,
+            {"filter": "kalman", "censoring_threshold": -np.inf, "true_threshold_shift": 0.1},
+            "it must be 0 here",
+        ),
+        (TOBIT, {"transition": np.eye(2), "true_transition": 0.9}, "it must be 1 here"),
+        (
+            INPUT,
+            {"process_covariance": np.zeros((4, 4)), "true_process_noise": 2.0},
+            "it must be 1 here, .* no process noise",
+        ),
+    ],
+)
+def test_what_is_not_allowed(env_id: str, options: dict[str, Any], said: str) -> None:
+    """One line that names the option, its value and what is allowed."""
+    option = next(name for name in reversed(options) if name.startswith("true_"))
+    with pytest.raises(
+        ConfigurationError, match=rf"^{option} = .* is not allowed.*{said}"
+    ) as found:
+        make_task(env_id, **options)
+    assert "\n" not in str(found.value)
+    assert re.search(r"must|may", str(found.value))
+
+
+def test_a_system_that_knows_no_departure_refuses_it() -> None:
+    """A system of one's own takes the common options, and none is ignored."""
+    chosen = CommonOptions(true_process_noise=2.0, token_cost=1.0)
+    scenario = Scenario(chosen, make_task(REMOTE).system, np.ones(1))
+    with pytest.raises(ConfigurationError, match=r"true_process_noise = 2 is not allowed here: "):
+        Task.create(scenario)
