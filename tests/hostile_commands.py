@@ -49,6 +49,10 @@ BASES: dict[str, dict[str, list[str]]] = {
     "benchmark": {
         "config": ["suite.yaml"], "results": ["made"], "work": ["made_too"], "workers": ["1"],
     },
+    "robustness": {
+        "config": ["robust.yaml"], "results": ["made"], "work": ["made_too"], "workers": ["1"],
+        "class": ["sensors"],
+    },
     "envelope": {
         "config": ["suite.yaml"], "results": ["made"], "work": ["made_too"], "workers": ["1"],
     },
@@ -97,8 +101,9 @@ def options(name: str) -> dict[str, Any]:
     kind: type[Command] = getattr(importlib.import_module(f"agents.{name}"), name.capitalize())
     hints = typing.get_type_hints(kind, include_extras=True)
     found = {field.name: hints[field.name] for field in dataclasses.fields(kind)}
-    if "options" in found:
-        found["set"] = found.pop("options")
+    for field, option in (("options", "set"), ("of", "class")):
+        if field in found:
+            found[option] = found.pop(field)
     return found
 
 

@@ -44,6 +44,12 @@ SUITE = {
     ],
 }
 
+ROBUST = {
+    "suite": "suite.yaml",
+    "cases": [],
+    "settings": [{"setting": "one", "drawn": {"true_process_noise": [0.5, 2.0]}}],
+}
+
 # Files that are no config and no result, by name.
 BROKEN: dict[str, bytes] = {
     "empty": b"",
@@ -66,7 +72,8 @@ BROKEN: dict[str, bytes] = {
 def scratch(folder: Path) -> None:
     """A folder with what the tries need, where everybody may write."""
     for name, content in (
-        ("training", TRAINING), ("sweep", SWEEP), ("rows", ROWS), ("suite", SUITE)
+        ("training", TRAINING), ("sweep", SWEEP), ("rows", ROWS), ("suite", SUITE),
+        ("robust", ROBUST),
     ):  # fmt: skip
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(content))
     for name, raw in BROKEN.items():

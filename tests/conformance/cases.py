@@ -113,7 +113,7 @@ VARIANTS: dict[str, list[Options]] = {
         {"sensors": 2, "channel": "independent", "action": "discrete", "error": "trace"},
         LOSSY | LIMITED | {"information": "centre"},
         LOSSY | REMEMBERING | DRAWN,
-        LOSSY | REMEMBERING | {"coefficient": (0.9, 1.0, 0.5)} | DEPARTED,
+        LOSSY | REMEMBERING | DEPARTED | {"true_transition": (0.8, 0.95)},
     ],
     OWN_ID: [
         {"access": "random", **DRAWN},
@@ -162,6 +162,7 @@ class Case:
     def __str__(self) -> str:
         words = [value for value in self.options.values() if isinstance(value, str)]
         words += ["memory"] * ("memory" in self.options)
+        words += ["departed"] * any(name.startswith("true_") for name in self.options)
         return "-".join([self.env_id.partition("/")[2].removesuffix("-v0"), *words])
 
 

@@ -142,9 +142,9 @@ def predicted_with_input(see: Seen) -> Array:
 
 
 def censored(see: Seen) -> Any:
-    """At one of the thresholds."""
+    """At one of the thresholds, or beyond it where the sensors' are not those that are assumed."""
     sensors, y = see.system.centre.sensors, see.signals["measurement"]
-    return (y == sensors.threshold) | (y == sensors.upper)
+    return (y <= sensors.threshold) | (y >= sensors.upper)
 
 
 def noise_variances(see: Seen) -> Array:

@@ -1,0 +1,157 @@
+"""Try rules and agents where the truth is not what they assume: noises, limits, motion, tokens.
+
+    python -m agents.robustness [--envs NAME …] [--class sensors_memory] [--trained] [--resume]
+
+The rules of a committed envelope and the agents of its class run under every case of a config, as
+they were tuned and trained, on the same test episodes. Every piece of work writes its JSON into
+``robustness/`` of the results folder as it is finished, and its episodes into the work folder;
+``--resume`` skips what is there, if it was made from the same inputs. ``robustness/README.md`` has
+the table. With ``--trained`` agents are trained besides over draws of the perturbations.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from fusion_gym.validation import ConfigurationError
+
+from .command_line import Command, spelled, start
+from .input.options import Episodes, InputFolder, OutputFolder, Steps, Whole, writable_folder
+from .output.ending import ended_like_by_ctrl_c
+from .output.folders import alone_in
+from .suite.committed import Shelf
+from .suite.config import Suite, load_suite
+from .suite.robust_pieces import (
+    FOLDER,
+    Folders,
+    agents_of,
+    class_named,
+    envelope_of,
+    run_piece,
+    run_training,
+)
+from .suite.robust_table import write_table
+from .suite.robust_trial import Trial
+from .suite.robustness import Perturbed, chosen, load_robustness
+from .suite.robustness import Robustness as Config
+from .suite.team import Team
+from .suite.workers import Work, side_by_side
+from .training.checked import parse
+
+USUAL = Path("runs/benchmark/full")
+
+
+@dataclass(frozen=True)
+class Robustness(Command):
+    """Try rules and agents where the truth is not what they assume."""
+
+    config: str = "robustness"
+    """The cases: a YAML file, or the name of a shipped config."""
+    envs: tuple[str, ...] = ()
+    """Settings by name; none stands for all."""
+    of: Annotated[str, tyro.conf.arg(name="class")] = "sensors_memory"
+    """The class of rules and agents, as sensors or local_packets_memory."""
+    agents: tuple[str, ...] = ()
+    """Files of agents, patterns with {setting} and {class}; none stands for those of --models."""
+    models: Annotated[Path | None, InputFolder()] = None
+    """A benchmark's work folder with agents, instead of runs/benchmark/full, and of the zoo."""
+    trained: bool = False
+    """Train agents over draws of the perturbations, and try them too."""
+    seeds: Annotated[int | None, Whole(1, 10_000)] = None
+    """Number of these trainings in each setting, instead of the suite's."""
+    timesteps: Steps = None
+    """Steps of each of them, instead of the suite's."""
+    episodes: Episodes = 300
+    """Test episodes of each policy in each case."""
+    resume: bool = False
+    """Skip what is finished, go on with trainings of one's own: their checkpoints hold pickles."""
+    results: Annotated[Path, OutputFolder()] = Path("results")
+    """Folder with the committed envelopes, into which the results go."""
+    work: Annotated[Path, OutputFolder()] = Path("runs/robustness")
+    """Folder for models and episodes."""
+    workers: Annotated[int, Whole(1, 512)] = 2
+    """Processes side by side."""
+
+    def run(self) -> None:
+        """Do all work that is not finished, judge every case and write the table."""
+        with ended_like_by_ctrl_c():
+            self._run()
+
+    def interrupted(self) -> str:
+        """Finished pieces of work are kept."""
+        words = [word for word in sys.argv[1:] if word != "--resume"]
+        command = shlex.join([*spelled("robustness").split(), *words, "--resume"])
+        return f"interrupted; go on with: {command}"
+
+    def _run(self) -> None:
+        config = load_robustness(self.config)
+        folders = Folders(self.results, self.work)
+        trials = [self._trial(config, one, folders) for one in chosen(config, self.envs)]
+        place = self.results / FOLDER
+        writable_folder("results", place)
+        with alone_in(place, "results"), alone_in(self.work, "work"):
+            there = [
+                path for t in trials for path in place.glob(f"{t.setting.name}/{self.of}/*/*.json")
+            ]
+            if there and not self.resume:
+                raise ConfigurationError(
+                    f"results = {str(self.results)!r} holds {len(there)} finished pieces of work: "
+                    "go on with --resume, or give another --results and --work"
+                )
+            self._work(trials, ("rules", "agents"), folders)
+            trainings = [one for trial in trials for one in trial.trainings]
+            if trainings:
+                work = [
+                    Work(30.0 + one.training.timesteps / 10_000, run_training, (one,))
+                    for one in trainings
+                ]
+                side_by_side(work, Team(self.workers), "trainings over draws")
+                self._work(trials, ("trained",), folders)
+            rows = [Work(20.0, trial.judge, (case,)) for trial in trials for case in trial.worlds]
+            side_by_side(rows, Team(self.workers), "verdicts")
+            for trial in trials:
+                trial.conclude()
+            known = [one.setting for one in config.settings]
+            table = write_table(self.results, known, spelled("robustness"))
+        print(f"results in {place}, the table in {table}")
+
+    def _trial(self, config: Config, one: Perturbed, folders: Folders) -> Trial:
+        """A setting with its agents, everything checked."""
+        suite = load_suite(config.suite)
+        shelf = Shelf(suite, self.results)
+        changed = {"training_seeds": self.seeds, "timesteps": self.timesteps}
+        changed = {key: value for key, value in changed.items() if value is not None}
+        suite = parse(Suite, suite.model_dump() | changed, "command line")
+        setting = next(setting for setting in suite.settings if setting.name == one.setting)
+        of = class_named(setting, self.of)
+        agents = agents_of(setting, of, self.agents, self.models, USUAL)
+        return Trial.create(
+            suite, setting, one, config.cases_of(one), of, envelope_of(shelf, setting, of), agents,
+            self.trained, self.episodes, folders,
+        )  # fmt: skip
+
+    def _work(self, trials: Sequence[Trial], kinds: tuple[str, ...], folders: Folders) -> None:
+        """Do what is not finished of some kinds."""
+        pieces = [piece for trial in trials for piece in trial.pieces(kinds)]
+        left = [piece for piece in pieces if not folders.finished(piece)]
+        side_by_side(
+            [Work(piece.weight, run_piece, (piece, folders)) for piece in left],
+            Team(self.workers),
+            " and ".join(kinds),
+        )
+
+
+def main() -> None:
+    """Entry point; exit status 130 after an interrupt."""
+    start(Robustness)
+
+
+if __name__ == "__main__":
+    main()

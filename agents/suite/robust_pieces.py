@@ -1,0 +1,267 @@
+"""Pieces of work under perturbed cases: some policies of one class, run on the test episodes.
+
+All that is taken from the benchmark's own work is taken here: its tasks, trainings and envelopes.
+"""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fusion_gym import zoo
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.intervals import mean_interval
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError, refusal
+
+from ..output.files import load_results, read_json, save_results, write
+from ..output.folders import check_inputs, fingerprint
+from ..training.config import Experiment
+from ..training.run import holds_training, train
+from .classes import Class, classes_of
+from .committed import Shelf, path_of
+from .config import Setting, Suite
+from .envelopes import task_of
+from .fronts import prices_of
+from .jobs import agent_options, experiment_of
+
+FOLDER = "robustness"  # in that of the results
+RULES = "rules"
+Options = tuple[tuple[str, Any], ...]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A policy with the options that it adds to those of the case.
+
+    ``told`` stands for its text among the inputs where that is a file's path; one that is ``added``
+    is no rule of the envelope.
+    """
+
+    name: str
+    policy: str
+    options: Options
+    told: str | None = None
+    added: bool = False
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Some policies in a case: the rules of a class, or an agent at all its prices.
+
+    ``setting`` is the setting as it is in the case; ``weight`` is about how long the piece takes,
+    in seconds on one core.
+    """
+
+    setting: Setting
+    of: Class
+    case: str
+    label: str
+    entries: tuple[Entry, ...]
+    episodes: int
+    seed: int
+    weight: float
+
+    @property
+    def place(self) -> str:
+        """Path of its files in the folders, without the suffix."""
+        return f"{self.setting.name}/{self.of.name}/{self.case}/{self.label}"
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """All that its results depend on."""
+        return {
+            "environment": self.setting.environment.model_dump(mode="json"),
+            "policies": {
+                one.name: {"policy": one.told or one.policy, "options": dict(one.options)}
+                for one in self.entries
+            },
+            "episodes": self.episodes,
+            "seed": self.seed,
+        }
+
+    def task(self, entry: Entry) -> Task:
+        """The task in which a policy runs."""
+        return task_of(self.setting, entry.options)
+
+
+@dataclass(frozen=True)
+class Folders:
+    """``results`` holds JSON for readers, ``work`` models and episodes."""
+
+    results: Path
+    work: Path
+
+    def report(self, piece: Piece) -> Path:
+        """The JSON of a piece."""
+        return self.results / FOLDER / f"{piece.place}.json"
+
+    def episodes(self, piece: Piece) -> Path:
+        """The episodes of a piece."""
+        return self.work / f"{piece.place}.npz"
+
+    def finished(self, piece: Piece) -> bool:
+        """Whether a piece's results are there.
+
+        Raises:
+            ConfigurationError: they are damaged, or were made from other inputs; says which.
+        """
+        path = self.report(piece)
+        if not (path.exists() and self.episodes(piece).exists()):
+            return False
+        check_inputs(piece.inputs, read_json(path, "results").get("inputs"), repr(str(path)))
+        self.read(piece)
+        return True
+
+    def read(self, piece: Piece) -> dict[str, EpisodeResults]:
+        """The episodes of a finished piece, by the names of its policies.
+
+        Raises:
+            ConfigurationError: they are damaged.
+        """
+        return load_results(self.episodes(piece), fingerprint(piece.inputs))
+
+
+def run_piece(piece: Piece, folders: Folders) -> None:
+    """Run the policies of a piece and keep what they did."""
+    torch.set_num_threads(1)
+    found = {}
+    for entry in piece.entries:
+        task = piece.task(entry)
+        policy = make_policy(entry.policy, task)
+        found[entry.name] = run_episodes(task, policy, piece.episodes, piece.seed)
+    save_results(folders.episodes(piece), found, fingerprint(piece.inputs))
+    report = {
+        "setting": piece.setting.name,
+        "case": piece.case,
+        "inputs": piece.inputs,
+        "policies": {
+            name: {
+                "rate": float(one.rate.mean()),
+                "mse": mean_interval(one.mse)._asdict(),
+                "diverged": float(one.diverged.mean()),
+            }
+            for name, one in found.items()
+        },
+    }
+    write(folders.report(piece), report)
+
+
+def class_named(setting: Setting, name: str) -> Class:
+    """A setting's class.
+
+    Raises:
+        ConfigurationError: it has none of that name.
+    """
+    every = {one.name: one for one in classes_of(setting)}
+    if name not in every:
+        raise refusal("class", name, f"one of those of {setting.name}: {', '.join(every)}")
+    return every[name]
+
+
+def envelope_of(shelf: Shelf, setting: Setting, of: Class) -> dict[str, Any]:
+    """The committed envelope of a class.
+
+    Raises:
+        ConfigurationError: there is none.
+    """
+    found = shelf.classes(setting)
+    if of.name not in found:
+        path = str(path_of(shelf.results, setting.name))
+        raise ConfigurationError(f"results: {path!r} has no class {of.name!r}: tune it first")
+    envelope: dict[str, Any] = found[of.name]
+    return envelope
+
+
+def rules_piece(
+    setting: Setting, of: Class, case: str, vertices: Sequence[Mapping[str, Any]], episodes: int,
+    seed: int,
+) -> Piece:  # fmt: skip
+    """The rules of an envelope in a case, and what transmits always."""
+    entries = [Entry(one["name"], one["policy"], tuple(one["options"].items())) for one in vertices]
+    if "always" not in [entry.name for entry in entries]:
+        entries.append(Entry("always", "always", (), added=True))
+    weight = 0.005 * episodes * len(entries)
+    return Piece(setting, of, case, RULES, tuple(entries), episodes, seed, weight)
+
+
+def agent_piece(
+    suite: Suite, setting: Setting, of: Class, case: str, label: str, agent: str, episodes: int,
+    seed: int,
+) -> Piece:  # fmt: skip
+    """An agent in a case, at prices over the whole range."""
+    told = f"{label} {_digest(agent)}"
+    options = tuple(agent_options(setting, of).items())
+    entries = tuple(
+        Entry(f"price={price!r}", f"{agent},price={price!r}", options, f"{told},price={price!r}")
+        for price in prices_of(setting.price_range, suite.prices)
+    )
+    return Piece(setting, of, case, label, entries, episodes, seed, 0.01 * episodes * len(entries))
+
+
+def _digest(agent: str) -> str:
+    """The first half of the SHA-256 of an agent's model."""
+    kind, _, name = agent.partition(":")
+    path = Path(zoo.model_path(name) if kind == "zoo" else name)
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:32]
+
+
+def agents_of(
+    setting: Setting, of: Class, patterns: Sequence[str], models: Path | None, usual: Path
+) -> list[str]:
+    """The texts of a setting's agents: files that fit patterns, a benchmark's, or the zoo's.
+
+    ``{setting}`` and ``{class}`` in a pattern are filled in. ``models`` is a benchmark's work
+    folder, which must hold some if it is given; ``usual`` is looked into otherwise.
+
+    Raises:
+        ConfigurationError: there are none.
+    """
+    if patterns:
+        found: list[str] = []
+        for pattern in patterns:
+            filled = pattern.replace("{setting}", setting.name).replace("{class}", of.name)
+            files = sorted(glob.glob(filled))
+            if not files and "{setting}" not in pattern:
+                raise refusal("agents", pattern, "a file, or a pattern that some file fits")
+            found += files
+        if not found:
+            raise refusal(
+                "agents", list(patterns), f"patterns that some file of {setting.name} fits"
+            )
+        return [f"model:{path}" for path in found]
+    folder = usual if models is None else models
+    found = [
+        f"model:{path}"
+        for path in sorted(folder.glob(f"{setting.name}/{of.name}_[0-9]*/best_model.zip"))
+    ]
+    if found:
+        return found
+    if models is not None:
+        raise refusal("models", str(models), f"a folder with agents {setting.name}/{of.name}_SEED")
+    name = f"{setting.name}_{of.name}"
+    if name not in zoo.names():
+        raise ConfigurationError(
+            f"agents = () is not allowed: neither {str(usual)!r} nor the zoo has agents of "
+            f"{setting.name} in the class {of.name!r}; name files, or train some"
+        )
+    return [f"zoo:{name}"]
+
+
+def training(suite: Suite, setting: Setting, of: Class, seed: int, work: Path) -> Experiment:
+    """The training of an agent over draws, the benchmark's in all else."""
+    return experiment_of(suite, setting, of, seed, work / "trained")
+
+
+def run_training(experiment: Experiment) -> None:
+    """Train as far as it is not."""
+    folder = Path(experiment.output)
+    if not train(experiment, resume=holds_training(folder), quiet=True)["finished"]:
+        raise KeyboardInterrupt

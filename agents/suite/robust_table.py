@@ -1,0 +1,162 @@
+"""What perturbed cases leave of the rules and of the agents' gain, judged and as a table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fusion_gym.evaluation.envelope import chosen_mse
+from fusion_gym.evaluation.episodes import EpisodeResults
+from fusion_gym.evaluation.intervals import mean_interval
+
+from ..output.files import read_json, write_text
+from .robust_pieces import FOLDER, RULES, Folders, Piece
+from .robustness import NOMINAL
+from .verdict import MIDDLE, Searches, judge
+
+VERDICT = "verdict.json"
+Rules = Mapping[str, EpisodeResults]
+KINDS = {"agents": "agent_", "trained": "trained_"}  # what their labels begin with
+
+_TEXT = """\
+# What is left where the truth is not what everybody assumes
+
+Made by `{command}`; [docs/robustness.md](../../docs/robustness.md) says what the cases are. Rules
+and agents are as they were tuned and trained for the case "as assumed".
+
+- **rules' error**: the error of the envelope's rules, measured anew under the case, relative to
+  theirs as assumed, both at the middle rate of the case "as assumed": the geometric mean of 5 % and
+  50 % of the rate that transmitting always gets. Some of it no choice of transmissions could
+  change, for noise itself is larger.
+- **agents**: how far their error lies above (+) or below (-) that of the rules under the same case,
+  at the agents' own rates, over the middle of the front.
+- **left of the gain**: the agents' gain over the rules under the case, as a share of their gain as
+  assumed; empty where they have no gain as assumed.
+- **trained over draws**: as "agents", of those whose training drew the perturbations anew in every
+  episode.
+
+Brackets hold 95 % intervals, over paired episodes, training seeds, rates and tuning seeds.
+"""
+_HEAD = """
+## {of}
+
+{episodes} test episodes of every policy in every case.
+
+| setting | case | rules' error | agents | left of the gain | trained over draws |
+|---|---|---|---|---|---|
+"""
+
+
+def judged(
+    pieces: Mapping[str, Piece],
+    nominal: Piece,
+    prices: Sequence[float],
+    searches: Searches,
+    folders: Folders,
+) -> dict[str, Any]:
+    """A case: what it does to the rules, and every kind of agent beside them.
+
+    ``pieces`` are its finished pieces by label, ``nominal`` that of the rules as assumed, and
+    ``searches`` what each tuning seed alone would have made of the envelope.
+    """
+    before = folders.read(nominal)
+    middle = math.sqrt(MIDDLE[0] * MIDDLE[1]) * float(before["always"].rate.mean())
+    every = folders.read(pieces[RULES])
+    always = float(every["always"].rate.mean())
+    envelope = _without_added(every, pieces[RULES])
+    row: dict[str, Any] = {
+        "always": always,
+        "rules": change(_without_added(before, nominal), envelope, middle),
+    }
+    for kind, prefix in KINDS.items():
+        tested = [
+            list(folders.read(piece).values())
+            for label, piece in pieces.items()
+            if label.startswith(prefix)
+        ]
+        if tested:
+            row[kind] = judge(tested, prices, envelope, {}, always, searches=searches)
+    return row
+
+
+def with_shares(cases: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The cases, with what each leaves of the nominal gain of every kind of agent."""
+    for kind in KINDS:
+        for row in cases.values():
+            left = _left(row.get(kind), cases[NOMINAL].get(kind))
+            if left is not None:
+                row[kind]["left"] = left
+    return cases
+
+
+def _without_added(found: Rules, piece: Piece) -> Rules:
+    added = {one.name for one in piece.entries if one.added}
+    return {name: one for name, one in found.items() if name not in added}
+
+
+def change(nominal: Rules, case: Rules, rate: float) -> dict[str, float] | None:
+    """The relative change of the rules' error at a rate, with its interval over paired episodes.
+
+    That of a ratio of means, by its linear part; ``None`` left of either's first rule.
+    """
+    before, after = chosen_mse(nominal, rate), chosen_mse(case, rate)
+    if before is None or after is None:
+        return None
+    ratio = float(after.mean() / before.mean())
+    linear = ratio - 1.0 + (after - ratio * before) / before.mean()
+    return mean_interval(np.asarray(linear))._asdict()
+
+
+def _left(row: Mapping[str, Any] | None, nominal: Mapping[str, Any] | None) -> float | None:
+    """The gain of a case as a share of the nominal one, where there is one."""
+    if row is None or nominal is None or "middle" not in row or "middle" not in nominal:
+        return None
+    gain = -nominal["middle"]["mean"]
+    return -row["middle"]["mean"] / gain if gain > 0.0 else None
+
+
+def write_table(results: Path, settings: Sequence[str], command: str) -> Path:
+    """The tables of all settings that have a verdict, in their order, by class; returns their file.
+
+    Raises:
+        ConfigurationError: a verdict that is damaged.
+    """
+    folder = results / FOLDER
+    found: dict[str, list[dict[str, Any]]] = {}
+    for name in settings:
+        for path in sorted(folder.glob(f"{name}/*/{VERDICT}")):
+            report = read_json(path, "results")
+            found.setdefault(report["class"], []).append(report)
+    parts = [_TEXT.format(command=command)]
+    for of, reports in sorted(found.items()):
+        counts = {report["episodes"] for report in reports}
+        asked = " or ".join(str(count) for count in sorted(counts))
+        parts.append(_HEAD.format(of=of, episodes=asked))
+        parts.append("\n".join(line for report in reports for line in _lines(report)) + "\n")
+    path = folder / "README.md"
+    write_text(path, "".join(parts))
+    return path
+
+
+def _lines(report: Mapping[str, Any]) -> Iterator[str]:
+    for row in report["cases"].values():
+        left = row.get("agents", {}).get("left")
+        cells = (
+            report["setting"],
+            row["title"],
+            _percent(row["rules"]),
+            *(_percent(row.get(kind, {}).get("middle")) for kind in KINDS),
+        )
+        share = "" if left is None else f"{left:.0%}"
+        yield f"| {' | '.join((*cells[:4], share, cells[4]))} |"
+
+
+def _percent(found: Mapping[str, float] | None) -> str:
+    """Mean and ends of an interval in per cent."""
+    if found is None:
+        return ""
+    return f"{found['mean']:+.1%} [{found['low']:+.1%}, {found['high']:+.1%}]"

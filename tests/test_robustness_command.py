@@ -1,0 +1,239 @@
+"""``fusion-gym robustness`` from the outside: its pieces, its table, how it goes on, its errors."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from command_runs import call
+from small_suite import small_suite
+
+from agents.suite import verdict
+from agents.suite.classes import classes_of
+from agents.suite.config import load_suite
+from agents.suite.jobs import experiment_of
+from agents.suite.robust_table import change
+from agents.suite.robustness import Case, load_robustness, world
+from agents.training.config import Experiment
+from agents.training.run import train
+from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation.envelope import chosen_mse
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError
+
+CASES = [
+    {"name": "loud", "title": "measurement noise ×2", "options": {"true_measurement_noise": 2.0}},
+    {"name": "poor", "title": "half the tokens", "scaled": {"token_rate": 0.5}},
+]
+COMMON = ["--class", "sensors", "--workers", "1", "--episodes", "8"]
+
+
+@pytest.fixture(autouse=True)
+def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Intervals are made in no time."""
+    monkeypatch.setattr(verdict, "RESAMPLES", 20)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a suite, its envelope, an agent and a config of cases."""
+    folder = tmp_path_factory.mktemp("robust")
+    suite_path = small_suite(folder)
+    words = ["--config", str(suite_path), "--classes", "sensors", "--workers", "1"]
+    words += ["--results", str(folder / "results"), "--work", str(folder / "tuned")]
+    ended = call("envelope", words, seconds=120.0)
+    assert ended.status == 0, ended.err + ended.trace
+    suite = load_suite(suite_path)
+    of = next(one for one in classes_of(suite.settings[0]) if one.name == "sensors")
+    experiment: Experiment = experiment_of(suite, suite.settings[0], of, 0, folder / "models")
+    train(experiment, quiet=True)
+    write_config(folder / "robust.yaml", suite_path)
+    return folder
+
+
+def write_config(path: Path, suite: Path, **changes: Any) -> Path:
+    setting = {
+        "setting": "small",
+        "shared": ["loud"],
+        "own": [CASES[1]],
+        "drawn": {"true_process_noise": [0.5, 2.0]},
+    }
+    content = {"suite": str(suite), "cases": CASES[:1], "settings": [setting | changes]}
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def words_of(made: Path, results: Path, *more: str) -> list[str]:
+    given = {"--config": made / "robust.yaml", "--models": made / "models", "--results": results}
+    given |= {"--work": results / "work"}
+    return [*COMMON, *(str(word) for pair in given.items() for word in pair), *more]
+
+
+def with_envelopes(made: Path, folder: Path) -> Path:
+    target = folder / "envelopes"
+    target.mkdir()
+    for path in (made / "results" / "envelopes").glob("*.json"):
+        (target / path.name).write_bytes(path.read_bytes())
+    return folder
+
+
+def test_all_of_it(made: Path, tmp_path: Path) -> None:
+    """Rules, an agent and one trained over draws in three cases; then a piece that was lost."""
+    results = with_envelopes(made, tmp_path)
+    line = words_of(made, results, "--trained", "--seeds", "1")
+    ended = call("robustness", line, seconds=300.0)
+    assert (ended.status, ended.trace) == (0, ""), ended.err
+    place = results / "robustness" / "small" / "sensors"
+    pieces = sorted(str(path.relative_to(place)) for path in place.glob("*/*.json"))
+    labels = ("agent_0", "rules", "trained_0")
+    assert pieces == [f"{c}/{p}.json" for c in ("as_assumed", "loud", "poor") for p in labels]
+    found = json.loads((place / "verdict.json").read_text())
+    assert list(found["cases"]) == ["as_assumed", "loud", "poor"]
+    nominal, loud, poor = found["cases"].values()
+    assert nominal["rules"]["mean"] == 0.0
+    assert loud["rules"]["low"] > 0.0
+    assert poor["always"] < nominal["always"]
+    trained = json.loads((place / "loud" / "trained_0.json").read_text())
+    assert trained["inputs"]["environment"]["options"]["true_measurement_noise"] == 2.0
+    config = yaml.safe_load((results / "work/trained/small/sensors_0/config.yaml").read_text())
+    assert config["environment"]["options"]["true_process_noise"] == [0.5, 2.0]
+    table = (results / "robustness" / "README.md").read_text()
+    rows = re.findall(r"^\| small \| (.*?) \| (.*?) \|", table, re.M)
+    assert [row[0] for row in rows] == ["as assumed", "measurement noise ×2", "half the tokens"]
+    assert rows[0][1] == "+0.0% [+0.0%, +0.0%]"
+
+    again = call("robustness", line)
+    assert again.status == 1
+    assert "holds 9 finished pieces of work: go on with --resume" in again.err
+    before = {path: path.stat().st_mtime_ns for path in place.glob("*/*.json")}
+    lost = place / "loud" / "rules.json"
+    lost.unlink()
+    ended = call("robustness", [*line, "--resume"], seconds=120.0)
+    assert (ended.status, ended.trace) == (0, ""), ended.err
+    changed = [path for path, time in before.items() if path.stat().st_mtime_ns != time]
+    assert changed == [lost]
+    assert json.loads((place / "verdict.json").read_text()) == found
+    assert (results / "robustness" / "README.md").read_text() == table
+
+    other = [word if word != "8" else "9" for word in line]
+    ended = call("robustness", [*other, "--resume"])
+    assert ended.status == 1
+    assert "episodes = 9 differs from that of" in ended.err
+
+
+def test_a_piece_holds_what_a_rule_does_in_its_case(made: Path, tmp_path: Path) -> None:
+    results = with_envelopes(made, tmp_path)
+    ended = call("robustness", words_of(made, results), seconds=120.0)
+    assert (ended.status, ended.trace) == (0, ""), ended.err
+    place = results / "robustness" / "small" / "sensors"
+    report = json.loads((place / "loud" / "rules.json").read_text())
+    suite = load_suite(made / "suite.yaml")
+    chosen = suite.settings[0].environment
+    for name, found in report["policies"].items():
+        entry = report["inputs"]["policies"][name]
+        options = chosen.options | entry["options"] | {"true_measurement_noise": 2.0}
+        task = make_task(chosen.id, **options)
+        results_of = run_episodes(task, make_policy(entry["policy"], task), 8, suite.seed)
+        assert found["mse"]["mean"] == pytest.approx(float(results_of.mse.mean()))
+    assert "trained_0.json" not in [path.name for path in place.glob("*/*")]
+
+
+def test_change_is_the_ratio_of_the_errors() -> None:
+    """Of the same rule the ratio itself, with an interval that holds about 95 % of tries."""
+    task = make_task("fusion_gym/RemoteEstimation-v0", horizon=20, tokens="unlimited")
+    loud = make_task("fusion_gym/RemoteEstimation-v0", horizon=20, true_process_noise=2.0)
+    names = ("never", "always")
+    before, after = (
+        {name: run_episodes(one, make_policy(name, one), 50, 0) for name in names}
+        for one in (task, loud)
+    )
+    found = change(before, after, 0.5)
+    assert found is not None
+    assert found["mean"] == pytest.approx(3.0)  # four times the variance, on the same noise
+    assert found["high"] - found["low"] < 1e-6
+    other = {name: run_episodes(loud, make_policy(name, loud), 50, 900) for name in names}
+    found = change(before, other, 0.5)
+    assert found is not None
+    assert found["low"] < 3.0 < found["high"]
+    below = chosen_mse(before, 0.5)
+    assert below is not None
+    assert change({"always": before["always"]}, after, 0.5) is None
+
+
+class TestErrors:
+    def said(self, made: Path, tmp_path: Path, *more: str, **changes: Any) -> str:
+        results = with_envelopes(made, tmp_path)
+        config = write_config(tmp_path / "other.yaml", made / "suite.yaml", **changes)
+        words = words_of(made, results, *more)
+        words[words.index(str(made / "robust.yaml"))] = str(config)
+        ended = call("robustness", words)
+        assert (ended.status, ended.trace) == (1, "")
+        assert not list((results / "robustness").glob("*/*/*"))
+        return ended.err.splitlines()[-1]
+
+    def test_a_case_that_does_not_fit(self, made: Path, tmp_path: Path) -> None:
+        case = {"name": "odd", "title": "odd", "options": {"true_transition": -1.0}}
+        said = self.said(made, tmp_path, own=[case])
+        assert said.startswith("error: odd of small: true_transition = -1.0 is not allowed")
+
+    def test_a_scaled_word(self, made: Path, tmp_path: Path) -> None:
+        case = {"name": "odd", "title": "odd", "scaled": {"filter": 2.0}}
+        said = self.said(made, tmp_path, own=[case])
+        assert "scaled = {'filter': 2} of the case 'odd'" in said
+        assert "must be a number, and is 'tobit'" in said
+
+    def test_twice_the_same_case(self, made: Path, tmp_path: Path) -> None:
+        case = {"name": "loud", "title": "loud"}
+        assert "cases of small must differ" in self.said(made, tmp_path, own=[case])
+
+    def test_a_case_that_is_not_there(self, made: Path, tmp_path: Path) -> None:
+        assert "'silent' is none of ['loud']" in self.said(made, tmp_path, shared=["silent"])
+
+    def test_a_setting_that_is_not_there(self, made: Path, tmp_path: Path) -> None:
+        said = self.said(made, tmp_path, setting="large")
+        assert "setting = 'large' is not allowed: it must be one of 'small'" in said
+
+    def test_a_class_without_an_envelope(self, made: Path, tmp_path: Path) -> None:
+        said = self.said(made, tmp_path, "--class", "centre", "--agents", f"{made}/suite.yaml")
+        assert "has no class 'centre'" in said
+
+    def test_no_draws(self, made: Path, tmp_path: Path) -> None:
+        said = self.said(made, tmp_path, "--trained", drawn={})
+        assert "trained = True is not allowed with small" in said
+
+    def test_no_agents(self, made: Path, tmp_path: Path) -> None:
+        assert "agents = 'absent/*.zip'" in self.said(made, tmp_path, "--agents", "absent/*.zip")
+
+
+def test_shipped_cases_fit_the_shipped_suite() -> None:
+    """Every case of every setting makes a task, and none is the setting itself."""
+    config = load_robustness("robustness")
+    suite = load_suite(config.suite)
+    by_name = {setting.name: setting for setting in suite.settings}
+    assert {one.setting for one in config.settings} == set(by_name)
+    for one in config.settings:
+        for case in config.cases_of(one):
+            changed = world(by_name[one.setting], case).environment
+            make_task(changed.id, **changed.options)
+            same = changed == by_name[one.setting].environment
+            assert same == (case.name == "as_assumed")
+        drawn = by_name[one.setting].environment.options | one.drawn
+        assert make_task(by_name[one.setting].environment.id, **drawn)
+
+
+def test_scaled_options_have_defaults() -> None:
+    """An option that the setting does not name is scaled from the environment's default."""
+    suite = load_suite("benchmark")
+    setting = next(one for one in suite.settings if one.name == "tobit_oscillator")
+    case = Case(name="a", title="a", scaled={"token_capacity": 0.5, "token_rate": 0.5})
+    options = world(setting, case).environment.options
+    assert (options["token_capacity"], options["token_rate"]) == (15.0, 1.0)
+    with pytest.raises(ConfigurationError, match="must be a number, and is None"):
+        world(setting, Case(name="a", title="a", scaled={"nothing": 2.0}))
+    assert np.isfinite(options["token_rate"])
