@@ -59,7 +59,7 @@ class Robustness(Command):
     of: Annotated[str, tyro.conf.arg(name="class")] = "sensors_memory"
     """The class of rules and agents, as sensors or local_packets_memory."""
     agents: tuple[str, ...] = ()
-    """Files of agents, patterns with {setting} and {class}; none stands for those of --models."""
+    """Files of agents, patterns with {setting} and {class}; none stands for those of models."""
     models: Annotated[Path | None, InputFolder()] = None
     """A benchmark's work folder with agents, instead of runs/benchmark/full, and of the zoo."""
     trained: bool = False

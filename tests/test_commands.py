@@ -36,8 +36,9 @@ def test_help_shows_every_option_with_a_sentence_and_its_default(
     assert shown.startswith(f"usage: python -m agents.{name} ")
     kind = getattr(module, name.capitalize())
     options = {field.name: field for field in dataclasses.fields(kind)}
-    if "options" in options:
-        options["set"] = options.pop("options")
+    for own, option in (("options", "set"), ("of", "class")):
+        if own in options:
+            options[option] = options.pop(own)
     listed = shown.partition("--help")[2]  # the usage above it may name options as well
     for option, field in options.items():
         entry = listed.split(f"--{option.replace('_', '-')} ")[1].split(" --")[0]

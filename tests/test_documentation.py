@@ -35,7 +35,9 @@ ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [
-    path for path in DOCS if path.stem not in ("memory", "bounds", "learning")
+    path
+    for path in DOCS
+    if path.stem not in ("memory", "bounds", "learning", "cluster", "robustness")
 ]  # of environments
 TEXTS = README + "".join(path.read_text() for path in (*DOCS, ROOT / "CONTRIBUTING.md"))
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", TEXTS, re.DOTALL | re.MULTILINE)
