@@ -33,9 +33,10 @@ and agents are as they were tuned and trained for the case "as assumed".
   50 % of the rate that transmitting always gets. Some of it no choice of transmissions could
   change, for noise itself is larger.
 - **agents**: how far their error lies above (+) or below (-) that of the rules under the same case,
-  at the agents' own rates, over the middle of the front.
+  at the agents' own rates, over the middle of the front; a dash where they were not tried, or have
+  a rate in the middle at none of their prices.
 - **left of the gain**: the agents' gain over the rules under the case, as a share of their gain as
-  assumed; empty where they have no gain as assumed.
+  assumed; a dash where they have no gain as assumed.
 - **trained over draws**: as "agents", of those whose training drew the perturbations anew in every
   episode.
 
@@ -151,12 +152,12 @@ def _lines(report: Mapping[str, Any]) -> Iterator[str]:
             _percent(row["rules"]),
             *(_percent(row.get(kind, {}).get("middle")) for kind in KINDS),
         )
-        share = "" if left is None else f"{left:.0%}"
+        share = "–" if left is None else f"{left:.0%}"
         yield f"| {' | '.join((*cells[:4], share, cells[4]))} |"
 
 
 def _percent(found: Mapping[str, float] | None) -> str:
     """Mean and ends of an interval in per cent."""
     if found is None:
-        return ""
+        return "–"
     return f"{found['mean']:+.1%} [{found['low']:+.1%}, {found['high']:+.1%}]"
