@@ -6,11 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-import matplotlib.ticker
 import numpy as np
 
 from fusion_gym.evaluation.envelope import EnvelopePoint
@@ -18,23 +14,7 @@ from fusion_gym.evaluation.episodes import EpisodeResults, Trajectory
 from fusion_gym.evaluation.intervals import mean_interval
 
 from .files import replacing
-
-INK = "#30343b"
-AGENT = "#c8102e"
-_TALLEST = 7.0  # of the least error, where the errors' axis of the fronts ends
-plt.rcParams.update(
-    {
-        "figure.dpi": 130,
-        "font.size": 9,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.edgecolor": INK,
-        "axes.grid": True,
-        "grid.alpha": 0.25,
-        "legend.frameon": False,
-        "svg.hashsalt": "fusion-gym",
-    }
-)
+from .palette import AGENT, INK
 
 
 @dataclass(frozen=True)
@@ -102,51 +82,6 @@ def _draw(
     )  # fmt: skip
 
 
-def fronts(
-    path: Path,
-    title: str,
-    curves: Mapping[str, Sequence[tuple[float, float]]],
-    informed: Sequence[tuple[float, float]],
-    agents: Mapping[str, Sequence[tuple[float, float]]],
-    genie: Mapping[str, Mapping[str, float]] | None,
-) -> None:
-    """Learned fronts beside tuned baselines and informed references, as points (rate, MSE).
-
-    The errors' axis ends at seven times the least of them: what lies above is of no interest.
-    """
-    figure, axes = plt.subplots(figsize=(8.6, 5.6))
-    colours = plt.get_cmap("tab20")
-    for place, (label, points) in enumerate(curves.items()):
-        rate, mse = zip(*sorted(points), strict=True)
-        line = "" if len(points) == 1 else "-"
-        axes.plot(rate, mse, line, marker="o", ms=3, lw=0.9, color=colours(place % 20), label=label)
-    if informed:
-        rate, mse = zip(*informed, strict=True)
-        axes.plot(rate, mse, ":", marker="x", ms=4, color=INK, label="reference with the model")
-    for (mode, points), style in zip(agents.items(), ("-", "--", "-."), strict=False):
-        rate, mse = zip(*sorted(points), strict=True)
-        axes.plot(rate, mse, style, marker="*", ms=9, color=AGENT, zorder=3, label=f"agent, {mode}")
-    everything = [mse for points in (*agents.values(), informed) for _, mse in points]
-    bottom = 0.88 * min((mse for mse in everything if mse > 0.0), default=1.0)  # logarithmic
-    if genie is not None:
-        level = genie["mse"]["mean"]
-        label = f"genie ({level:.3g}{', below' if level < bottom else ''})"
-        axes.axhline(max(level, bottom), color=INK, lw=0.8, label=label)
-    axes.set_yscale("log")
-    axes.set_ylim(bottom, _TALLEST * bottom)
-    plain = matplotlib.ticker.FuncFormatter(lambda value, _: f"{value:g}")
-    axes.yaxis.set_major_formatter(plain)
-    axes.yaxis.set_minor_formatter(plain)
-    reach = max(rate for points in agents.values() for rate, _ in points)
-    ends = [rate for points in curves.values() for rate, _ in points]
-    axes.set_xlim(-0.005, min(max(1.15 * reach, 0.05), max(ends) * 1.05))
-    axes.set_xlabel("transmissions per sensor and step")
-    axes.set_ylabel("mean squared error of the fused estimate")
-    axes.set_title(title, loc="left", fontsize=10)
-    axes.legend(fontsize=7.5, ncols=2)
-    save(figure, path)
-
-
 def episode(path: Path, title: str, trajectory: Trajectory, capacity: float) -> None:
     """One episode: tokens with requests and grants above, states and estimates below."""
     steps = np.arange(1, len(trajectory.truth) + 1)
@@ -193,10 +128,12 @@ def episode(path: Path, title: str, trajectory: Trajectory, capacity: float) -> 
     save(figure, path)
 
 
-def save(figure: plt.Figure, path: Path) -> None:
-    """Write a figure in one move, and close it."""
+def save(figure: plt.Figure, *paths: Path) -> None:
+    """Write a figure in one move a path, and close it; the same figure gives the same bytes."""
     try:
-        with replacing(path) as partial:
-            figure.savefig(partial, bbox_inches="tight")
+        for path in paths:
+            metadata = {"Date": None} if path.suffix == ".svg" else {}
+            with replacing(path) as partial:
+                figure.savefig(partial, bbox_inches="tight", metadata=metadata)
     finally:
         plt.close(figure)

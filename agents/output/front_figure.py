@@ -11,7 +11,8 @@ import numpy as np
 
 from fusion_gym.evaluation.intervals import Interval
 
-from .figures import AGENT, INK, save
+from .figures import save
+from .palette import AGENTS_MEMORY, BOUND, GREY, ROLLOUT, RULES, RULES_MEMORY
 
 Points = Sequence[tuple[float, float]]  # rate and error
 
@@ -40,23 +41,23 @@ def front(path: Path, title: str, caption: str, layers: Layers) -> None:
     errors = [interval for _, interval in layers.agent]
     right = 1.12 * max(rates.max(), 0.02)
     if layers.single:
-        axes.plot(*_columns(layers.single), "o", ms=2.5, color="0.75", label="single tuned rules")
-    axes.plot(*_columns(layers.plain), "o--", ms=3.5, color="0.45", label="rules without memory")
-    axes.plot(*_columns(layers.remembering), "o-", ms=3.5, color=INK, label="rules with memory")
+        axes.plot(*_columns(layers.single), "o", ms=2.5, color=GREY, label="single tuned rules")
+    axes.plot(*_columns(layers.plain), "o--", ms=3.5, color=RULES.colour, label="rules without memory")
+    axes.plot(*_columns(layers.remembering), "o-", ms=3.5, color=RULES_MEMORY.colour, label="rules with memory")
     if layers.rollout:
         label = "these, improved once by simulation"
-        axes.plot(*_columns(layers.rollout), "D", ms=5, mfc="none", color="#1f6fb2", label=label)
+        axes.plot(*_columns(layers.rollout), "D", ms=5, mfc="none", color=ROLLOUT.colour, label=label)
     if layers.bound:
         rate, lower = _columns(layers.bound)
-        axes.plot(rate, lower, color="#2a8c4a", lw=1.2, label="proven: no policy lies below")
-        axes.fill_between(rate, 0.0, lower, color="#2a8c4a", alpha=0.08, lw=0)
+        axes.plot(rate, lower, color=BOUND.colour, lw=1.2, label="proven: no policy lies below")
+        axes.fill_between(rate, 0.0, lower, color=BOUND.colour, alpha=0.08, lw=0)
     spread = [
         [error.mean - error.low for error in errors],
         [error.high - error.mean for error in errors],
     ]
     axes.errorbar(
-        rates, [error.mean for error in errors], yerr=spread, fmt="*-", ms=11, lw=1.2,
-        elinewidth=0.9, capsize=2, color=AGENT, label="the agent, at seven prices", zorder=4,
+        rates, [error.mean for error in errors], yerr=spread, fmt="^-", ms=7, lw=1.2,
+        elinewidth=0.9, capsize=2, color=AGENTS_MEMORY.colour, label="the agent, at seven prices", zorder=4,
     )  # fmt: skip
     axes.set_xlim(0.0, right)
     least = min([mse for _, mse in layers.bound] or [error.low for error in errors])

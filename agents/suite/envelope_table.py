@@ -6,21 +6,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from fusion_gym.core.system import Knowledge, covers
-from fusion_gym.evaluation.envelope import EnvelopePoint, height, lower_hull
+from fusion_gym.evaluation.envelope import EnvelopePoint, height
 from fusion_gym.validation import ConfigurationError
 
 from .committed import FOLDER, read_envelopes
-from .reports import Baselines, Shape, Verdict, read
+from .reports import Shape, read
 
 SHARES = (0.05, 0.1, 0.2, 0.4)  # of the rate that transmitting always gets
 HEADLINE = 0.2
-# With which rules the agents of results/SETTING/baselines.json were compared.
-BEFORE: dict[str, Knowledge] = {
-    "sensors": "coordinator_memory",
-    "centre": "centre",
-    "local": "own_memory",
-}
 
 
 class Measured(Shape):
@@ -75,19 +68,18 @@ def text_of(results: Path, command: str) -> str:
         "Who decides: `centre` by what it knows before anything is sent, `sensors` is a "
         "coordinator that sees all new measurements, `local` is every sensor by itself, which "
         "hears nothing (`none`), the centre's `estimate`, or every delivered packet (`packets`). "
+        "Where packets hold the coordinator's estimate, the class says so. "
         "Mean squared error at some rates, 5, 10, 20 and 40 % of that of always transmitting: of "
-        "the rules tuned before (with which the agents in this folder were compared), of those "
-        "that remember nothing, of those that do, of one improvement on the value of "
+        "the rules that remember nothing, of those that do, of one improvement on the value of "
         "information by simulation (rollout; in brackets the number of episodes, so few that "
         "chance moves it by 5 to 15 %), and a lower bound; – where there is none.",
         "",
-        "| setting | class | rate | envelope before | envelope now | with memory | rollout "
-        "| bound |",
-        "|---|---|---|---|---|---|---|---|",
+        "| setting | class | rate | without memory | with memory | rollout | bound |",
+        "|---|---|---|---|---|---|---|",
     ]
     for envelopes in found:
         lines += rows_of(envelopes, results)
-    lines += ["", *agents_table(found, results), "", "## The strongest rules", ""]
+    lines += ["", "## The strongest rules", ""]
     for envelopes in found:
         lines += vertices_of(envelopes)
     return "\n".join(lines) + "\n"
@@ -96,94 +88,48 @@ def text_of(results: Path, command: str) -> str:
 def headline_table(results: Path) -> list[str]:
     """One row a setting, at a fifth of the rate of always transmitting: the front page's table."""
     lines = [
-        "| setting | rate | before | now | with memory | bound | alone | alone, with memory |",
-        "|---|---|---|---|---|---|---|---|",
+        "| setting | rate | coordinator | with memory | bound | alone | alone, with memory |",
+        "|---|---|---|---|---|---|---|",
     ]
     for path in sorted((results / FOLDER).glob("*.json")):
         envelopes = read_envelopes(path)
         name, rate = envelopes["setting"], round(HEADLINE * envelopes["always"], 4)
-        baselines, classes = results / name / "baselines.json", envelopes["classes"]
-        before = read(Baselines, baselines, "results") if baselines.exists() else None
+        classes = envelopes["classes"]
         bound = bound_of(results / "bounds" / f"{name}.json")
         heard = envelopes["inputs"]["broadcasts"][0]
-        hulls = [
-            hull_of(classes[key]) if key in classes else []
+        cells = [
+            cell(hull_of(classes[key]) if key in classes else [], rate)
             for key in ("sensors", "sensors_memory", f"local_{heard}", f"local_{heard}_memory")
         ]
-        cells = [cell(old_hull(before, "sensors") if before else [], rate)]
-        cells += [cell(hull, rate) for hull in hulls[:2]]
-        cells.append("–" if bound is None else f"{at_least(bound, rate):.4g}")
-        cells += [cell(hull, rate) for hull in hulls[2:]]
+        cells.insert(2, "–" if bound is None else f"{at_least(bound, rate):.4g}")
         title = envelopes["title"].split(",")[0]
         lines.append(f"| {title} | {rate:.4g} | {' | '.join(cells)} |")
     return lines
 
 
-def agents_table(found: list[dict[str, Any]], results: Path) -> list[str]:
-    """The agents of ``verdict.json`` beside the classes of now, price by price."""
-    lines = [
-        "## The agents in this folder",
-        "",
-        "Mean squared error of the agents, which remember nothing, relative to the envelope at "
-        "their own rate: of the rules of now that remember nothing, and of those that do. From "
-        "their lowest price to their highest; – left of an envelope.",
-        "",
-        "| setting | agent | against rules without memory | with memory |",
-        "|---|---|---|---|",
-    ]
-    for envelopes in found:
-        name, classes = envelopes["setting"], envelopes["classes"]
-        path = results / name / "verdict.json"
-        fronts = read(Verdict, path, "results")["modes"] if path.exists() else {}
-        for mode, front in fronts.items():
-            heard = envelopes["inputs"]["broadcasts"][0]
-            key = f"local_{heard}" if mode == "local" else mode
-            cells = [
-                " ".join(_relative(hull_of(classes[one]), point) for point in front["points"])
-                if one in classes
-                else "–"
-                for one in (key, f"{key}_memory")
-            ]
-            lines.append(f"| {name} | {mode} | {' | '.join(cells)} |")
-    return lines
-
-
-def _relative(hull: list[EnvelopePoint], point: dict[str, Any]) -> str:
-    below = height(hull, point["rate"])
-    return f"{point['mse'] / below - 1.0:+.1%}" if below else "–"
-
-
 def rows_of(envelopes: dict[str, Any], results: Path) -> Iterator[str]:
-    """A setting's rows."""
-    name, classes = envelopes["setting"], envelopes["classes"]
+    """A setting's rows; what is proven or simulated is so of packets that hold a measurement."""
+    name = envelopes["setting"]
     rates = [round(share * envelopes["always"], 4) for share in SHARES]
     rollout, episodes = measured(results / "rollout" / f"{name}.json", name)
     bound = bound_of(results / "bounds" / f"{name}.json")
-    baselines = results / name / "baselines.json"
-    before = read(Baselines, baselines, "results") if baselines.exists() else None
-    pairs = {(content["mode"], content["broadcast"]) for content in classes.values()}
-    for mode, broadcast in sorted(pairs, key=str):
-        plain, remembering = (
-            next(
-                (
-                    hull_of(content)
-                    for content in classes.values()
-                    if (content["mode"], content["broadcast"], content["memory"])
-                    == (mode, broadcast, memory)
-                ),
-                [],
-            )
-            for memory in (False, True)
-        )
-        default = mode != "local" or broadcast == envelopes["inputs"]["broadcasts"][0]
-        old = old_hull(before, mode) if before and default else []
-        own = rollout if mode == "sensors" else []
-        label = mode if broadcast is None else f"{mode}, {broadcast}"
+    grouped: dict[str, dict[bool, list[EnvelopePoint]]] = {}
+    for content in envelopes["classes"].values():
+        grouped.setdefault(_label(content), {})[content["memory"]] = hull_of(content)
+    for label, hulls in sorted(grouped.items()):
         for rate in rates:
-            cells = [cell(hull, rate) for hull in (old, plain, remembering, own)]
+            cells = [cell(hulls.get(memory, []), rate) for memory in (False, True)]
+            cells.append(cell(rollout if label == "sensors" else [], rate))
             cells[-1] += f" ({episodes})" if cells[-1] != "–" else ""
-            cells.append("–" if bound is None else f"{at_least(bound, rate):.4g}")
+            proven = "packets that" not in label
+            cells.append(f"{at_least(bound, rate):.4g}" if bound and proven else "–")
             yield f"| {name} | {label} | {rate:.4g} | {' | '.join(cells)} |"
+
+
+def _label(content: dict[str, Any]) -> str:
+    """A class without its memory."""
+    held = "packets that hold the estimate" * (content["options"].get("packet") == "estimate")
+    return ", ".join(part for part in (content["mode"], content["broadcast"], held) if part)
 
 
 def hull_of(content: dict[str, Any]) -> list[EnvelopePoint]:
@@ -193,18 +139,6 @@ def hull_of(content: dict[str, Any]) -> list[EnvelopePoint]:
         for v in content["vertices"]
     ]
     return sorted(points, key=lambda point: (point.rate, point.mse))
-
-
-def old_hull(baselines: dict[str, Any], mode: str) -> list[EnvelopePoint]:
-    """The envelope with which agents were compared before there were committed ones."""
-    points = []
-    for curve in baselines["curves"].values():
-        if covers(BEFORE[mode], curve["knows"]):
-            for name in curve["policies"]:
-                policy = baselines["policies"][name]
-                rate = sum(policy["rate"]) / len(policy["rate"])
-                points.append(EnvelopePoint(name, rate, policy["mse"]["mean"]))
-    return lower_hull(points) if points else []
 
 
 def measured(path: Path, setting: str) -> tuple[list[EnvelopePoint], int]:

@@ -6,12 +6,12 @@ The files hold more than this; nothing is converted.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pydantic
 from pydantic import FiniteFloat, NonNegativeInt
 
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.core.system import Knowledge
 
 from ..input.files import checked
 from ..output.files import read_json
@@ -36,6 +36,9 @@ class Interval(Mean):
 
     low: float
     high: float
+
+
+NOTHING = Interval(mean=0.0, low=0.0, high=0.0)  # of a field that may be left out
 
 
 class Policy(Shape):
@@ -83,27 +86,44 @@ class Point(Shape):
     envelope: float = 0.0
     reference: float = 0.0
     hindsight: float = 0.0
-    difference: Interval = Interval(mean=0.0, low=0.0, high=0.0)
+    difference: Interval = NOTHING
 
 
-class Named(Shape):
+class Place(Shape):
     """A policy on the envelope."""
 
     name: str
+    rate: FiniteFloat
+    mse: FiniteFloat = pydantic.Field(ge=0.0)
+
+
+class Beside(Shape):
+    """Rules and agents of a class at one rate, as far as they reach it."""
+
+    rate: FiniteFloat
+    rules: Interval = NOTHING
+    agents: Interval = NOTHING
+    difference: Interval = NOTHING
 
 
 class Front(Shape):
-    """An agent's points in one mode."""
+    """A class of knowledge: its agents' points beside the envelope of its rules."""
 
-    seeds: int
+    seeds: NonNegativeInt
     prices: NonNegativeInt = 0
     rates: list[FiniteFloat] = pydantic.Field(default_factory=list)
     points: list[Point] = pydantic.Field(min_length=1)
-    envelope: list[Named]
-    room: float = 0.0
-    closed: float = 0.0
-    hindsight_room: float = 0.0
-    middle: Interval = Interval(mean=0.0, low=0.0, high=0.0)
+    envelope: list[Place]
+    room: FiniteFloat = 0.0
+    closed: FiniteFloat = 0.0
+    hindsight_room: FiniteFloat = 0.0
+    middle: Interval = NOTHING
+    at: list[Beside]
+    mode: Literal["centre", "local", "sensors"]
+    memory: bool
+    broadcast: str | None
+    packet: str
+    knows: Knowledge
 
     @pydantic.model_validator(mode="after")
     def _closed(self) -> Front:
@@ -112,11 +132,23 @@ class Front(Shape):
         return self
 
 
+class Worth(Shape):
+    """What knowing more is worth: the relative difference of the error, of rules and of agents."""
+
+    kind: str
+    knows: str
+    less: str
+    rules: Interval = NOTHING
+    agents: Interval = NOTHING
+
+
 class Verdict(Shape):
-    """A setting's ``verdict.json``."""
+    """A setting's ``verdict.json``; without classes before any agent is trained."""
 
     title: str
-    modes: dict[str, Front] = pydantic.Field(min_length=1)
+    always: FiniteFloat = pydantic.Field(gt=0.0)
+    classes: dict[str, Front]
+    worth: list[Worth]
 
 
 class Best(Shape):
@@ -126,10 +158,12 @@ class Best(Shape):
 
 
 class Agent(Shape):
-    """One training seed's ``agent_MODE_SEED.json``."""
+    """One training seed's ``agent_CLASS_SEED.json``."""
 
     setting: str = pydantic.Field(pattern=NAME)
     mode: str = pydantic.Field(pattern=NAME)
+    name: str = pydantic.Field(pattern=NAME, alias="class")
+    class_options: dict[str, Any]
     training_seed: NonNegativeInt
     best_validation: Best
     training: dict[str, Any]
@@ -182,28 +216,3 @@ def read(shape: type[Shape], path: Path, option: str) -> dict[str, Any]:
     content = read_json(path, option)
     checked(shape, content, f"{option} = {str(path)!r}")
     return content
-
-
-def read_setting(folder: Path) -> dict[str, Any]:
-    """Verdict, baselines and informed references of one setting.
-
-    Raises:
-        ConfigurationError: as :func:`read`, or the files do not fit together.
-    """
-    informed = folder / "informed.json"
-    found = {
-        "verdict": read(Verdict, folder / "verdict.json", "results"),
-        "baselines": read(Baselines, folder / "baselines.json", "results"),
-        "informed": read(Tested, informed, "results")["policies"] if informed.exists() else {},
-    }
-    baselines = found["baselines"]
-    named = [name for curve in baselines["curves"].values() for name in curve["policies"]]
-    for front in found["verdict"]["modes"].values():
-        named += [point["name"] for point in front["envelope"]]
-    for name in named:
-        if name not in baselines["policies"]:
-            raise ConfigurationError(
-                f"results = {str(folder)!r} do not fit together: baselines.json has no policy "
-                f"{name!r}, of which it or verdict.json speaks"
-            )
-    return found

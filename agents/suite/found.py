@@ -1,0 +1,146 @@
+"""What the results folder holds of a setting, read and checked before anything is made of it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fusion_gym.evaluation.envelope import EnvelopePoint, height
+from fusion_gym.validation import ConfigurationError
+
+from .committed import path_of, read_envelopes
+from .envelope_table import bound_of, hull_of, measured
+from .reports import Agent, Baselines, Tested, Verdict, read
+
+Points = list[tuple[float, float]]  # rate and error
+
+
+@dataclass(frozen=True)
+class Found:
+    """A setting's results.
+
+    ``seeds[class]`` has a training seed's points, by price; ``ahead`` are the coordinator's
+    references and ``known`` those of the centre, as (name, rate, error); ``envelopes`` is the file
+    of committed envelopes. What is not there is empty.
+    """
+
+    name: str
+    verdict: dict[str, Any]
+    baselines: dict[str, Any]
+    ahead: list[EnvelopePoint]
+    known: list[EnvelopePoint]
+    seeds: Mapping[str, Sequence[Points]]
+    envelopes: dict[str, Any]
+    rollout: list[EnvelopePoint]
+    rollout_episodes: int
+    bound: dict[str, Any] | None
+
+    @property
+    def label(self) -> str:
+        """The setting's name for readers."""
+        return str(self.name.replace("_", "-"))
+
+    @property
+    def classes(self) -> dict[str, Any]:
+        """The classes that have agents."""
+        found: dict[str, Any] = self.verdict["classes"]
+        return found
+
+    @property
+    def optimal(self) -> bool:
+        """Whether the coordinator's reference is the optimum."""
+        names = [point.name for point in self.ahead]
+        return bool(names) and all(name.startswith("optimal:") for name in names)
+
+    def hull(self, name: str) -> list[EnvelopePoint]:
+        """The envelope of a class on the test seeds; empty without one."""
+        if name in self.classes:
+            places = self.classes[name]["envelope"]
+            return [EnvelopePoint(p["name"], p["rate"], p["mse"]) for p in places]
+        committed = self.envelopes.get("classes", {})
+        return hull_of(committed[name]) if name in committed else []
+
+    def rules_at(self, name: str, rate: float) -> float | None:
+        """The error of a class's rules at a rate."""
+        hull = self.hull(name)
+        return height(hull, rate) if hull else None
+
+
+def read_results(results: Path) -> dict[str, Found]:
+    """Every setting that is judged, by name.
+
+    Raises:
+        ConfigurationError: there are none, or a file that is no such JSON.
+    """
+    found = {
+        path.parent.name: read_setting(path.parent)
+        for path in sorted(results.glob("*/verdict.json"))
+    }
+    if not found:
+        raise ConfigurationError(
+            f"results = {str(results)!r} is not allowed: it must hold results of the benchmark"
+        )
+    return found
+
+
+def read_setting(folder: Path) -> Found:
+    """One setting's results.
+
+    Raises:
+        ConfigurationError: a file that cannot be read or is of another shape, or files that do not
+            fit together.
+    """
+    name, results = folder.name, folder.parent
+    verdict = read(Verdict, folder / "verdict.json", "results")
+    baselines = read(Baselines, folder / "baselines.json", "results")
+    named = [one for curve in baselines["curves"].values() for one in curve["policies"]]
+    named += [place["name"] for of in verdict["classes"].values() for place in of["envelope"]]
+    for one in named:
+        if one not in baselines["policies"]:
+            raise ConfigurationError(
+                f"results = {str(folder)!r} do not fit together: baselines.json has no policy "
+                f"{one!r}, of which it or verdict.json speaks"
+            )
+    committed = path_of(results, name)
+    rollout, episodes = measured(results / "rollout" / f"{name}.json", name)
+    return Found(
+        name,
+        verdict,
+        baselines,
+        _places(folder / "informed.json"),
+        _places(folder / "references.json"),
+        _seeds(folder, verdict["classes"]),
+        read_envelopes(committed) if committed.exists() else {},
+        rollout,
+        episodes,
+        bound_of(results / "bounds" / f"{name}.json"),
+    )
+
+
+def _places(path: Path) -> list[EnvelopePoint]:
+    """The policies of a file, if it is there, by rising rate."""
+    policies = read(Tested, path, "results")["policies"] if path.exists() else {}
+    found = [EnvelopePoint(name, rate_of(p), p["mse"]["mean"]) for name, p in policies.items()]
+    return sorted(found, key=lambda point: (point.rate, point.mse))
+
+
+def _seeds(folder: Path, classes: Mapping[str, Any]) -> dict[str, list[Points]]:
+    """Each training seed's points, of the classes that are judged and at as many prices."""
+    found: dict[str, list[Points]] = {}
+    for path in sorted(folder.glob("agent_*.json")):
+        # The class is in the file's name; what else lies there is none of these agents.
+        named = re.fullmatch(r"agent_(\w+)_\d+", path.stem)
+        if named and named[1] in classes:
+            points = read(Agent, path, "results")["points"]
+            if len(points) == len(classes[named[1]]["points"]):
+                column = [(rate_of(point), point["mse"]["mean"]) for point in points]
+                found.setdefault(named[1], []).append(column)
+    return found
+
+
+def rate_of(policy: Mapping[str, Any]) -> float:
+    """A tested policy's mean rate per sensor and step."""
+    return float(sum(policy["rate"]) / len(policy["rate"]))
