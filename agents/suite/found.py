@@ -23,8 +23,8 @@ class Found:
     """A setting's results.
 
     ``seeds[class]`` has a training seed's points, by price; ``ahead`` are the coordinator's
-    references and ``known`` those of the centre, as (name, rate, error); ``envelopes`` is the file
-    of committed envelopes. What is not there is empty.
+    references and ``known`` those of the centre, as (name, rate, error); ``validation`` says on which
+    episodes the agents were validated, and ``envelopes`` is the file of committed envelopes. What is not there is empty.
     """
 
     name: str
@@ -33,6 +33,7 @@ class Found:
     ahead: list[EnvelopePoint]
     known: list[EnvelopePoint]
     seeds: Mapping[str, Sequence[Points]]
+    validation: dict[str, Any]
     envelopes: dict[str, Any]
     rollout: list[EnvelopePoint]
     rollout_episodes: int
@@ -104,7 +105,8 @@ def read_setting(folder: Path) -> Found:
                 f"results = {str(folder)!r} do not fit together: baselines.json has no policy "
                 f"{one!r}, of which it or verdict.json speaks"
             )
-    committed = path_of(results, name)
+    classes, committed = verdict["classes"], path_of(results, name)
+    agents = _agents(folder, classes)
     rollout, episodes = measured(results / "rollout" / f"{name}.json", name)
     return Found(
         name,
@@ -112,7 +114,8 @@ def read_setting(folder: Path) -> Found:
         baselines,
         _places(folder / "informed.json"),
         _places(folder / "references.json"),
-        _seeds(folder, verdict["classes"]),
+        {name: _columns(own, len(classes[name]["points"])) for name, own in agents.items()},
+        next((a["training"]["validation"] for own in agents.values() for a in own), {}),
         read_envelopes(committed) if committed.exists() else {},
         rollout,
         episodes,
@@ -127,18 +130,24 @@ def _places(path: Path) -> list[EnvelopePoint]:
     return sorted(found, key=lambda point: (point.rate, point.mse))
 
 
-def _seeds(folder: Path, classes: Mapping[str, Any]) -> dict[str, list[Points]]:
-    """Each training seed's points, of the classes that are judged and at as many prices."""
-    found: dict[str, list[Points]] = {}
+def _agents(folder: Path, classes: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """The agents of the classes that are judged, by training seed."""
+    found: dict[str, list[dict[str, Any]]] = {}
     for path in sorted(folder.glob("agent_*.json")):
         # The class is in the file's name; what else lies there is none of these agents.
         named = re.fullmatch(r"agent_(\w+)_\d+", path.stem)
         if named and named[1] in classes:
-            points = read(Agent, path, "results")["points"]
-            if len(points) == len(classes[named[1]]["points"]):
-                column = [(rate_of(point), point["mse"]["mean"]) for point in points]
-                found.setdefault(named[1], []).append(column)
+            found.setdefault(named[1], []).append(read(Agent, path, "results"))
     return found
+
+
+def _columns(agents: Sequence[Mapping[str, Any]], prices: int) -> list[Points]:
+    """Each training seed's points, of those at as many prices."""
+    return [
+        [(rate_of(point), point["mse"]["mean"]) for point in agent["points"]]
+        for agent in agents
+        if len(agent["points"]) == prices
+    ]
 
 
 def rate_of(policy: Mapping[str, Any]) -> float:

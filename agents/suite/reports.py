@@ -157,6 +157,19 @@ class Best(Shape):
     value: FiniteFloat = pydantic.Field(alias="return")
 
 
+class Validation(Shape):
+    """On which episodes a training was validated."""
+
+    episodes: int
+    seed: int
+
+
+class Training(Shape):
+    """What a report needs of a training."""
+
+    validation: Validation
+
+
 class Agent(Shape):
     """One training seed's ``agent_CLASS_SEED.json``."""
 
@@ -166,7 +179,7 @@ class Agent(Shape):
     class_options: dict[str, Any]
     training_seed: NonNegativeInt
     best_validation: Best
-    training: dict[str, Any]
+    training: Training
     env: str
     options: dict[str, Any]
     episodes: int

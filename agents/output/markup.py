@@ -1,0 +1,70 @@
+"""Text of the reports: Markdown in which nothing is a mark that was not meant, and one HTML page."""
+
+from __future__ import annotations
+
+import base64
+import html
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from urllib.parse import quote
+
+import markdown
+
+NONE = "–"
+
+
+def plain(text: str) -> str:
+    """Free text in one line, no part of which Markdown or HTML takes for a mark."""
+    escaped = html.escape(" ".join(text.split()), quote=False)
+    return re.sub(r"[\\`*\[\]|]|(?<!\w)_|_(?!\w)", lambda mark: f"\\{mark[0]}", escaped)
+
+
+def code(text: str) -> str:
+    """Text as a span of code, also in a table."""
+    line = " ".join(text.split()).replace("|", "\\|")
+    fence = "`" * (1 + max(map(len, re.findall("`+", line)), default=0))
+    return f"{fence}{line}{fence}" if len(fence) == 1 else f"{fence} {line} {fence}"
+
+
+def share(interval: Mapping[str, float] | None) -> str:
+    """A relative difference with its interval, in per cent."""
+    if interval is None:
+        return NONE
+    return f"{interval['mean']:+.1%} [{interval['low']:+.1%}, {interval['high']:+.1%}]"
+
+
+def number(interval: Mapping[str, float] | None) -> str:
+    """A quantity with its interval."""
+    if interval is None:
+        return NONE
+    return f"{interval['mean']:.4g} [{interval['low']:.3g}, {interval['high']:.3g}]"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """A table and the empty line behind it; nothing without rows."""
+    if not rows:
+        return []
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    return [*lines, *(f"| {' | '.join(row)} |" for row in rows), ""]
+
+
+def page_of(text: str, folder: Path, title: str) -> str:
+    """The Markdown as one HTML page with the folder's figures inside; HTML in it is shown as text."""
+    renderer = markdown.Markdown(extensions=["tables", "toc"])
+    renderer.preprocessors.deregister("html_block")
+    renderer.inlinePatterns.deregister("html")
+    body = renderer.convert(text)
+    for path in (*folder.glob("*.png"), *folder.glob("*/pareto.png")):
+        place = "/".join(quote(part) for part in path.relative_to(folder).parts)
+        data = base64.b64encode(path.read_bytes()).decode()
+        body = body.replace(f'src="{place}"', f'src="data:image/png;base64,{data}"')
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f"<title>{html.escape(title)}</title><style>"
+        "body{font:16px/1.5 sans-serif;max-width:72rem;margin:2rem auto;padding:0 1rem;"
+        "color:#30343b}img{max-width:100%}table{border-collapse:collapse;margin:1rem 0}"
+        "td,th{border:1px solid #ccd;padding:.2rem .6rem;text-align:right}"
+        "td:first-child,th:first-child{text-align:left}code{background:#f3f4f6}"
+        f"</style></head><body>\n{body}\n</body></html>\n"
+    )
