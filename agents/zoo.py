@@ -1,34 +1,44 @@
 """Put the benchmark's best agents into the model zoo, with their cards.
 
-    python -m agents.zoo [--results results] [--work runs/benchmark/full]
+    python -m agents.zoo [--envs NAME …] [--classes NAME …] [--results results]
+                         [--work runs/benchmark/full]
 
-For each setting and mode the training seed with the best validation return goes into
-``fusion_gym/zoo``; validation has seeds of its own, so the test numbers stay honest.
+For each setting and chosen class the training seed with the best validation return goes into
+``fusion_gym/zoo``; validation has seeds of its own, so the test numbers stay honest. Agents that are
+there and are not chosen are removed. A model is kept as Stable-Baselines3 saved it, without what its
+optimiser remembers of gradients.
 """
 
 from __future__ import annotations
 
 import hashlib
-import shutil
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 from fusion_gym import zoo
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, choice
 
 from .command_line import Command, spelled, start
 from .input.options import InputFolder, OutputFolder
-from .output.files import replacing, write
+from .output.files import read_json, replacing, write
+from .output.small_model import small_model
+from .suite.classes import HEARD, KNOWS
 from .suite.reports import Agent, read
 
 LARGEST = 300_000  # bytes of a model
+MOST = 4_000_000  # bytes of all of them
 
 
 @dataclass(frozen=True)
 class Zoo(Command):
     """Put the benchmark's best agents into the model zoo, with their cards."""
 
+    envs: tuple[str, ...] = ()
+    """Settings by name; none stands for all."""
+    classes: tuple[str, ...] = ()
+    """Classes by name, as sensors_memory; none stands for five of each setting at most."""
     results: Annotated[Path, InputFolder()] = Path("results")
     """Folder of the benchmark's JSON."""
     work: Annotated[Path, InputFolder()] = Path("runs/benchmark/full")
@@ -37,58 +47,108 @@ class Zoo(Command):
     """Folder of the model zoo."""
 
     def run(self) -> None:
-        """Copy the best training seed of each setting and mode."""
+        """Copy the best training seed of each setting and class, and remove the other agents."""
         found = best_agents(self.results)
         if not found:
             raise ConfigurationError(
                 f"results = {str(self.results)!r} is not allowed: it holds no agents"
             )
-        models = {name: model_of(report, self.work) for name, report in found.items()}
-        for name, report in found.items():
+        every = chosen(found, self.envs, self.classes)
+        models = {name: model_of(report, self.work) for name, report in every.items()}
+        size = sum(map(len, models.values()))
+        if size > MOST:
+            raise ConfigurationError(
+                f"{len(models)} agents have {size:,} bytes: all together must have at most "
+                f"{MOST:,}; name fewer --envs or --classes"
+            )
+        for name, report in every.items():
             add(name, report, models[name], self.zoo)
             print(f"zoo:{name}")
+        for name in remove_others(self.zoo, every):
+            print(f"zoo:{name} is removed")
 
 
-def best_agents(results: Path) -> dict[str, dict[str, Any]]:
-    """The report of the best training seed, by ``SETTING_MODE``."""
-    found: dict[str, dict[str, Any]] = {}
+def best_agents(results: Path) -> dict[tuple[str, str], dict[str, Any]]:
+    """The report of the best training seed, by setting and class."""
+    found: dict[tuple[str, str], dict[str, Any]] = {}
     for path in sorted(results.glob("*/agent_*.json")):
         report = read(Agent, path, "results")
-        name = f"{report['setting']}_{report['mode']}"
+        place = (report["setting"], report["class"])
         value = report["best_validation"]["return"]
-        if name not in found or value > found[name]["best_validation"]["return"]:
-            found[name] = report
+        if place not in found or value > found[place]["best_validation"]["return"]:
+            found[place] = report
     return found
 
 
-def model_of(report: dict[str, Any], work: Path) -> Path:
-    """The model that a report speaks of.
+def chosen(
+    found: Mapping[tuple[str, str], dict[str, Any]], envs: Iterable[str], classes: Iterable[str]
+) -> dict[str, dict[str, Any]]:
+    """The agents of these settings and classes, as ``SETTING_CLASS``.
+
+    Raises:
+        ConfigurationError: a setting or class without agents; names the option and what there is.
+    """
+    settings = list(dict.fromkeys(setting for setting, _ in found))
+    known = list(dict.fromkeys(name for _, name in found))
+    for name in envs:
+        choice("envs", name, settings)
+    for name in classes:
+        choice("classes", name, known)
+    wanted = {}
+    for setting in envs or settings:
+        there = [name for one, name in found if one == setting]
+        for name in classes or typical(there):
+            if name in there:
+                wanted[f"{setting}_{name}"] = found[setting, name]
+    return wanted
+
+
+def typical(classes: Iterable[str]) -> list[str]:
+    """The centre, the coordinators of one measurement, and sensors that hear least and most.
+
+    Those by themselves with memory, and those that hear the least without, where there is none.
+    """
+    there = set(classes)
+    heard = [one for one in HEARD if {f"local_{one}", f"local_{one}_memory"} & there]
+    wanted = ["centre", "sensors", "sensors_memory"]
+    if heard:
+        least = f"local_{heard[0]}"
+        wanted.append(f"{least}_memory" if f"{least}_memory" in there else least)
+    wanted.append("local_packets_memory")
+    return [name for name in dict.fromkeys(wanted) if name in there]
+
+
+def model_of(report: dict[str, Any], work: Path) -> bytes:
+    """The model that a report speaks of, without its optimiser's memory.
 
     Raises:
         ConfigurationError: there is no such model, or it is too large.
     """
-    seed = f"{report['mode']}_{report['training_seed']}"
-    model = work / report["setting"] / seed / "best_model.zip"
-    if not model.exists():
-        raise ConfigurationError(f"work = {str(work)!r} is not allowed: {model} is missing")
-    if model.stat().st_size > LARGEST:
+    seed = f"{report['class']}_{report['training_seed']}"
+    path = work / report["setting"] / seed / "best_model.zip"
+    if not path.exists():
+        raise ConfigurationError(f"work = {str(work)!r} is not allowed: {path} is missing")
+    model = small_model(path)
+    if len(model) > LARGEST:
         raise ConfigurationError(
-            f"{model} has {model.stat().st_size} bytes: it must have at most {LARGEST}"
+            f"{path} has {len(model):,} bytes: it must have at most {LARGEST:,}"
         )
     return model
 
 
-def add(name: str, report: dict[str, Any], model: Path, folder: Path) -> None:
-    """Write a model's card, then copy it: a model that is there has a card."""
-    training = report["training"] | {"output": f"runs/{name}"}
+def add(name: str, report: dict[str, Any], model: bytes, folder: Path) -> None:
+    """Write a model's card, then the model: a model that is there has a card."""
+    options = report["options"] | report["class_options"]
     card = {
-        "sha256": hashlib.sha256(model.read_bytes()).hexdigest(),
+        "sha256": hashlib.sha256(model).hexdigest(),
         "env": report["env"],
-        "options": report["options"],
+        "options": options,
+        "class": report["class"],
         "mode": report["mode"],
-        "training": training,
-        "command": f"{spelled('benchmark')} --envs {report['setting']} --modes "
-        f"{report['mode']}, training seed {report['training_seed']}",
+        "knows": KNOWS[report["mode"], bool(options.get("memory", False))],
+        "training": report["training"] | {"output": f"runs/{name}"},
+        "command": f"{spelled('benchmark')} --envs {report['setting']} --classes "
+        f"{report['class']}, training seed {report['training_seed']}",
         "test": {
             "episodes": report["episodes"],
             "seed": report["seed"],
@@ -98,7 +158,19 @@ def add(name: str, report: dict[str, Any], model: Path, folder: Path) -> None:
     }
     write(folder / f"{name}.json", card)
     with replacing(folder / f"{name}.zip") as partial:
-        shutil.copyfile(model, partial)
+        partial.write_bytes(model)
+
+
+def remove_others(folder: Path, kept: Iterable[str]) -> list[str]:
+    """Remove the agents, each a model beside its card, that are not kept; returns their names."""
+    removed = []
+    for model in sorted(folder.glob("*.zip")):
+        card = model.with_suffix(".json")
+        if model.stem not in kept and card.exists() and "sha256" in read_json(card, "zoo"):
+            model.unlink()
+            card.unlink()
+            removed.append(model.stem)
+    return removed
 
 
 def main() -> None:
