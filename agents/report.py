@@ -3,7 +3,7 @@
     python -m agents.report [--results results]
 
 Reads the JSON in the results folder and writes ``README.md``, figures of all settings together and
-of each, and ``report.html`` with the figures inside. What the JSON says is text there, never markup.
+of each, and ``report.html`` with the figures inside. What the JSON says is text there, no markup.
 """
 
 from __future__ import annotations
@@ -47,9 +47,7 @@ class Report(Command):
         print(f"wrote {readme} and {page}")
 
 
-def text_of(
-    found: dict[str, Found], command: str, second: str = "python -m agents.report"
-) -> str:
+def text_of(found: dict[str, Found], command: str, second: str = "python -m agents.report") -> str:
     """The report in Markdown, made by these two commands."""
     lines = [
         f"# {TITLE}",

@@ -4,9 +4,9 @@
                          [--work runs/benchmark/full]
 
 For each setting and chosen class the training seed with the best validation return goes into
-``fusion_gym/zoo``; validation has seeds of its own, so the test numbers stay honest. Agents that are
-there and are not chosen are removed. A model is kept as Stable-Baselines3 saved it, without what its
-optimiser remembers of gradients.
+``fusion_gym/zoo``; validation has seeds of its own, so the test numbers stay honest. Agents that
+are there and are not chosen are removed. A model is kept as Stable-Baselines3 saved it, without
+what its optimiser remembers of gradients.
 """
 
 from __future__ import annotations

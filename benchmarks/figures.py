@@ -123,13 +123,19 @@ def zoo_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
 
 
 def envelope_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
-    """Every setting's rules that no other rule beats, in the stored results."""
+    """Every setting's rules that no other rule beats, in the worlds that they were tuned in."""
     for path in sorted(Path("results").glob("*/verdict.json")):
-        stored = read(path.with_name("baselines.json"))
-        modes = read(path)["modes"].values()
-        names = dict.fromkeys(point["name"] for mode in modes for point in mode["envelope"])
-        work = partial(evaluate, stored["env"], stored["options"], list(names), episodes)
-        yield f"envelopes {path.parent.name}, {episodes} episodes", work
+        stored = read(path.parent.parent / "envelopes" / f"{path.parent.name}.json")
+        worlds: dict[str, dict[str, Any]] = {}
+        for name in read(path)["classes"]:
+            for vertex in stored["classes"][name]["vertices"]:
+                key = ", ".join(f"{k}={v}" for k, v in vertex["options"].items()) or "as it is"
+                world = worlds.setdefault(key, {"options": vertex["options"], "policies": {}})
+                world["policies"][vertex["policy"]] = None
+        for key, world in worlds.items():
+            options = stored["options"] | world["options"]
+            work = partial(evaluate, stored["env"], options, list(world["policies"]), episodes)
+            yield f"envelopes {path.parent.name}, {key}, {episodes} episodes", work
 
 
 def reproduce_pieces(episodes: int) -> Iterator[tuple[str, Work]]:

@@ -7,10 +7,9 @@ import shutil
 from pathlib import Path
 
 import yaml
+from small_results import ENV, SETTING, small_model, small_results
 
 ROOT = Path(__file__).parent.parent
-ENV = "fusion_gym/RemoteEstimation-v0"
-SETTING = "remote_estimation"
 
 TRAINING = {
     "environment": {"id": ENV, "options": {"horizon": 4}},
@@ -76,21 +75,16 @@ def scratch(folder: Path) -> None:
         ("robust", ROBUST),
     ):  # fmt: skip
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(content))
+    whole = small_results(folder / "results", classes=["sensors"], seeds=1)
     for name, raw in BROKEN.items():
         for suffix in ("", ".yaml", ".json"):
             (folder / f"{name}{suffix}").write_bytes(raw)
         broken = folder / "bad_results" / name / SETTING
         broken.mkdir(parents=True)
-        shutil.copy(ROOT / "results" / SETTING / "baselines.json", broken)
+        shutil.copy(whole / "baselines.json", broken)
         (broken / "verdict.json").write_bytes(raw)
         (broken / "agent_sensors_0.json").write_bytes(raw)
-    made = folder / "results" / SETTING
-    made.mkdir(parents=True)
-    for name in ("verdict", "baselines", "agent_sensors_0"):
-        shutil.copy(ROOT / "results" / SETTING / f"{name}.json", made)
-    model = folder / "work" / SETTING / "sensors_0"
-    model.mkdir(parents=True)
-    (model / "best_model.zip").write_bytes(b"a model")
+    small_model(folder / "work" / SETTING / "sensors_0" / "best_model.zip")
     (folder / "folder").mkdir()
     (folder / "folder" / "file").write_text("kept")
     (folder / "locked").mkdir()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree
@@ -15,19 +14,22 @@ import numpy as np
 import optuna
 import pytest
 import yaml
+from small_results import small_results
 from small_suite import ENV, SMALL, small_suite
 
 import fusion_gym
 from agents import benchmark, report, solved, tune, zoo
 from agents.output.files import load_results, save_results
+from agents.output.markup import code, page_of
 from agents.suite import jobs
 from agents.suite.classes import classes_of, trained
+from agents.suite.committed import read_envelopes
 from agents.suite.config import load_suite
-from agents.suite.envelope_table import BEFORE
 from agents.suite.envelopes import searches_of
+from agents.suite.found import read_results
 from agents.training.checked import load
 from agents.training.config import Experiment
-from fusion_gym.core.system import covers, least_covering
+from fusion_gym.core.system import covers
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.periodic_optimum import Schedule
 from fusion_gym.policies.registry import make_policy
@@ -100,10 +102,13 @@ def test_from_tuning_to_report_and_zoo(
 
     run_main(monkeypatch, report, "--results", str(results))
     text = (results / "README.md").read_text()
-    assert "| [small](#small) | local | 2 |" in text
+    assert "| local_packets_memory | 2 |" in text
+    assert "Agents of a class: 2 training seeds." in text
     page = (results / "report.html").read_text()
-    assert "data:image/png;base64," in page
-    assert 'src="small' not in page
+    assert page.count('src="data:image/png;base64,') == 2
+    for figure in ("overview", "small/pareto"):
+        assert f'src="{figure}' not in page
+        xml.etree.ElementTree.parse(results / f"{figure}.svg")
 
     run_main(
         monkeypatch, zoo, "--results", str(results), "--work", str(work), "--zoo",
@@ -114,7 +119,17 @@ def test_from_tuning_to_report_and_zoo(
     content = (tmp_path / "zoo" / "small_sensors.zip").read_bytes()
     assert card["sha256"] == hashlib.sha256(content).hexdigest()
     assert (tmp_path / "zoo" / "small_sensors.zip").stat().st_size < 300_000
-    assert "zoo:small_local" in capsys.readouterr().out
+    assert card["command"].endswith("benchmark --envs small --classes sensors, training seed " + (
+        str(card["training"]["training"]["seed"])
+    ))  # fmt: skip
+    told = json.loads((tmp_path / "zoo" / "small_local_packets_memory.json").read_text())
+    task = fusion_gym.make_task(ENV, **told["options"])
+    smaller = f"model:{tmp_path / 'zoo' / 'small_local_packets_memory.zip'},price=0.01"
+    seed = told["training"]["training"]["seed"]
+    whole = f"model:{work / 'small' / f'local_packets_memory_{seed}' / 'best_model.zip'},price=0.01"
+    first, second = (run_episodes(task, make_policy(p, task), 4, seed=0) for p in (smaller, whole))
+    np.testing.assert_array_equal(first.mse, second.mse)
+    assert "zoo:small_local_estimate" in capsys.readouterr().out
 
 
 def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,16 +156,16 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(
-    "path", sorted((ROOT / "results").glob("*/baselines.json")), ids=lambda path: path.parent.name
+    "path", sorted((ROOT / "results" / "envelopes").glob("*.json")), ids=lambda path: path.stem
 )
-def test_agents_were_compared_with_the_rules_that_know_no_more(path: Path) -> None:
-    """What the stored results say of a rule's knowledge decides as the rule's own word does."""
-    stored = json.loads(path.read_text())
-    task = fusion_gym.make_task(stored["env"], **stored["options"])
-    for curve in stored["curves"].values():
-        known = least_covering(make_policy(name, task).knowledge for name in curve["policies"])
-        for limit in BEFORE.values():
-            assert covers(limit, curve["knows"]) == covers(limit, known)
+def test_envelopes_hold_rules_that_know_no_more_than_their_class(path: Path) -> None:
+    """What the committed envelopes say of a rule's knowledge is the rule's own word."""
+    stored = read_envelopes(path)
+    for content in stored["classes"].values():
+        for vertex in content["vertices"]:
+            task = fusion_gym.make_task(stored["env"], **(stored["options"] | vertex["options"]))
+            assert make_policy(vertex["policy"], task).knowledge == vertex["knows"]
+            assert covers(content["knows"], vertex["knows"])
 
 
 def test_trainings_of_the_committed_suite(tmp_path: Path) -> None:
@@ -250,11 +265,7 @@ def test_the_benchmark_refuses_with_one_line(
 
 def test_the_report_shows_what_it_is_told_as_text(tmp_path: Path) -> None:
     """Titles, policies and folders in HTML, Markdown and with a table's bars stay what they are."""
-    committed = Path(__file__).parent.parent / "results" / "tobit_oscillator"
-    folder = tmp_path / "a<b>_[c](javascript:d)"
-    folder.mkdir()
-    for source in committed.glob("*.json"):
-        shutil.copyfile(source, folder / source.name)
+    folder = small_results(tmp_path, "a<b>_[c](javascript:d)")
     title = 'x <script>alert(1)</script> | *y* [z](javascript:alert(2)) `<img src=x onerror="e">`'
     verdict = json.loads((folder / "verdict.json").read_text())
     baselines = json.loads((folder / "baselines.json").read_text())
@@ -267,27 +278,33 @@ def test_the_report_shows_what_it_is_told_as_text(tmp_path: Path) -> None:
     for name, content in (("verdict", verdict), ("baselines", baselines)):
         (folder / f"{name}.json").write_text(json.dumps(content))
     (folder / "pareto.png").write_bytes(b"image")
-    text = report.text_of(report.read(tmp_path), "one", "two")
-    page = report.page_of(text + "\n\n<script>alert(5)</script> <b onclick='f'>g</b>\n", tmp_path)
+    verdict["worth"][0]["kind"] = "*a* <b>b</b> | `c`"
+    (folder / "verdict.json").write_text(json.dumps(verdict))
+    (tmp_path / "overview.png").write_bytes(b"image")
+    text = report.text_of(read_results(tmp_path), "one", "two")
+    text += "\n\n<script>alert(5)</script> <b onclick='f'>g</b>\n"
+    page = page_of(text, tmp_path, "<script>alert(6)</script>")
+    assert "<title>&lt;script&gt;alert(6)&lt;/script&gt;</title>" in page
     inside = page[page.index("<body>") :].partition("</html")[0]
     body = xml.etree.ElementTree.fromstring(inside)
     tags = {element.tag for element in body.iter()}
-    plain = {"body", "h1", "h2", "p", "ul", "li", "strong", "a", "code", "img"}
+    plain = {"body", "h1", "h2", "p", "ul", "li", "strong", "em", "code", "img"}
     assert tags <= plain | {"table", "thead", "tbody", "tr", "th", "td"}
-    links = [element.get("href", "") for element in body.iter("a")]
-    assert links
-    assert all(link.startswith("#") for link in links)
+    assert {element.text for element in body.iter("em")} <= {
+        "envelope", "middle", "in hindsight", "Above:", "Below", "Strips:",
+    }  # fmt: skip
     images = [element.get("src", "") for element in body.iter("img")]
-    assert len(images) == 1
-    assert images[0].startswith("data:image/png;base64,")
+    assert len(images) == 2
+    assert all(image.startswith("data:image/png;base64,") for image in images)
     said = "".join(body.itertext())
     assert " ".join(verdict["title"].split()) in said
     assert "a`<script>alert(4)</script>" in said
     assert "<script>alert(5)</script>" in said
+    assert "*a* <b>b</b> | `c`" in said
     rows = [len(row) for table in body.iter("table") for row in table.iter("tr")]
     widths = {len(table.find("thead/tr") or ()) for table in body.iter("table")}
     assert set(rows) == widths
-    assert report.code("a|b``c") == "``` a\\|b``c ```"  # a bar would end the cell on other pages
+    assert code("a|b``c") == "``` a\\|b``c ```"  # a bar would end the cell on other pages
 
 
 def test_the_zoo_answers_by_name() -> None:
@@ -300,9 +317,8 @@ def test_the_zoo_answers_by_name() -> None:
 def test_agents_of_the_zoo_reach_their_numbers(name: str) -> None:
     """The card's first 60 episodes at its middle price, to what their mean allows."""
     card = fusion_gym.zoo.card(name)
-    task = fusion_gym.make_task(card["env"], **card["options"])
-    if card["mode"] == "centre":
-        task = fusion_gym.make_task(card["env"], information="centre", **card["options"])
+    centre = {"information": "centre"} if card["mode"] == "centre" else {}
+    task = fusion_gym.make_task(card["env"], **(card["options"] | centre))
     place = len(card["test"]["prices"]) // 2
     policy = make_policy(f"zoo:{name},price={card['test']['prices'][place]!r}", task)
     found = run_episodes(task, policy, 60, card["test"]["seed"])

@@ -10,10 +10,12 @@ import typing
 from pathlib import Path
 
 import pytest
+from small_results import small_results
 
 from agents import __main__ as everything
 from agents import command_line, report
 from agents.benchmark import Benchmark
+from agents.suite.found import read_results
 from agents.training.algorithms import TABLE
 from agents.training.checked import config_path, load, parse
 from agents.training.config import Experiment
@@ -157,6 +159,6 @@ def test_every_algorithm_can_be_loaded_by_its_name() -> None:
         assert parse(Experiment, experiment.model_dump(), "test") == experiment
 
 
-def test_a_report_names_the_commands_that_made_it() -> None:
-    found = report.read(ROOT / "results")
+def test_a_report_names_the_commands_that_made_it(tmp_path: Path) -> None:
+    found = read_results(small_results(tmp_path).parent)
     assert "Made by `a b` and `c d` from" in report.text_of(found, "a b", "c d")

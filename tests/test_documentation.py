@@ -20,7 +20,8 @@ import pytest
 import fusion_gym
 from agents import report
 from agents.output.files import read_json
-from agents.suite import envelope_table, learning_table
+from agents.suite import envelope_table, learning_table, overview
+from agents.suite.found import read_results
 from agents.suite.learning import load_learning
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.options import Scenario
@@ -96,11 +97,11 @@ def test_every_policy_is_in_the_readme() -> None:
 
 
 def test_the_committed_report_says_what_the_results_say() -> None:
-    found = report.read(ROOT / "results")
+    found = read_results(ROOT / "results")
     written = (ROOT / "results" / "README.md").read_text()
     assert written == report.text_of(found, "python -m agents.benchmark")
-    assert report.headline_count(found) in " ".join(README.split())
-    missing = [line for line in report.headline_table(found) if line not in README]
+    assert overview.headline_count(found) in " ".join(README.split())
+    missing = [line for line in overview.headline_table(found) if line not in README]
     assert missing == []
 
 

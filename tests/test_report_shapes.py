@@ -10,18 +10,20 @@ from typing import Any
 
 import pytest
 from command_runs import call
-from hostile_folder import ENV, ROOT, contents
+from hostile_folder import contents
+from small_results import CLASSES, ENV, SETTING, small_model, small_results
 
-from agents.output import figures
+from agents.output import pareto_figure
+from agents.output.palette import AGENTS, RULES
+from agents.output.pareto_figure import Differences, Limits, Panel, Series
 from agents.suite.comparison import comparison_table
-from agents.suite.reports import read_setting
+from agents.suite.found import read_setting
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import Comparison
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.intervals import Interval
 from fusion_gym.policies.registry import make_policy
 
-SETTING = "tobit_oscillator"
 ABSENT = object()
 
 
@@ -42,10 +44,7 @@ def changed(content: dict[str, Any], place: str, value: Any) -> dict[str, Any]:
 @pytest.fixture
 def setting(tmp_path: Path) -> Path:
     """A folder with one setting's results."""
-    folder = tmp_path / "results" / SETTING
-    folder.mkdir(parents=True)
-    for name in ("verdict", "baselines", "informed", "agent_sensors_0", "agent_sensors_1"):
-        shutil.copy(ROOT / "results" / SETTING / f"{name}.json", folder)
+    folder = small_results(tmp_path / "results")
     read_setting(folder)
     return folder
 
@@ -54,16 +53,25 @@ def setting(tmp_path: Path) -> Path:
     ("name", "place", "value", "message"),
     [
         ("verdict", "title", ABSENT, "title is not allowed: Field required"),
-        ("verdict", "modes", {}, "modes = {} is not allowed"),
-        ("verdict", "modes/sensors", [1], "modes.sensors = [1]"),
-        ("verdict", "modes/sensors/points", [], "modes.sensors.points = []"),
-        ("verdict", "modes/sensors/points/0/mse", None, "modes.sensors.points.0.mse = None"),
-        ("verdict", "modes/sensors/points/0/mse", float("nan"), "points.0.mse = nan"),
-        ("verdict", "modes/sensors/points/0/mse", -1.0, "points.0.mse = -1.0"),
-        ("verdict", "modes/sensors/points/0/rate", "0.5", "points.0.rate = '0.5'"),
-        ("verdict", "modes/sensors/points/0/difference", None, "points.0.difference = None"),
-        ("verdict", "modes/sensors/closed", ABSENT, "room stands without closed"),
-        ("verdict", "modes/sensors/envelope/0/name", "ghost", "no policy 'ghost'"),
+        ("verdict", "always", 0.0, "always = 0.0 is not allowed"),
+        ("verdict", "classes", [], "classes = [] is not allowed"),
+        ("verdict", "classes/sensors", [1], "classes.sensors = [1]"),
+        ("verdict", "classes/sensors/mode", "nobody", "classes.sensors.mode = 'nobody'"),
+        ("verdict", "classes/sensors/at/0/rate", None, "classes.sensors.at.0.rate = None"),
+        ("verdict", "classes/sensors/at", ABSENT, "classes.sensors.at is not allowed"),
+        ("verdict", "worth", ABSENT, "worth is not allowed: Field required"),
+        ("verdict", "worth/0/rules/low", "x", "worth.0.rules.low = 'x'"),
+        ("agent_sensors_1", "points/0/mse", 3, "points.0.mse = 3"),
+        ("agent_sensors_1", "class", ABSENT, "class is not allowed: Field required"),
+        ("agent_sensors_1", "training/validation", 1, "training.validation = 1"),
+        ("verdict", "classes/sensors/points", [], "classes.sensors.points = []"),
+        ("verdict", "classes/sensors/points/0/mse", None, "classes.sensors.points.0.mse = None"),
+        ("verdict", "classes/sensors/points/0/mse", float("nan"), "points.0.mse = nan"),
+        ("verdict", "classes/sensors/points/0/mse", -1.0, "points.0.mse = -1.0"),
+        ("verdict", "classes/sensors/points/0/rate", "0.5", "points.0.rate = '0.5'"),
+        ("verdict", "classes/sensors/points/0/difference", None, "points.0.difference = None"),
+        ("verdict", "classes/sensors/closed", ABSENT, "room stands without closed"),
+        ("verdict", "classes/sensors/envelope/0/name", "ghost", "no policy 'ghost'"),
         ("baselines", "curves/always/policies", ["ghost"], "no policy 'ghost'"),
         ("baselines", "curves", {}, "curves = {}"),
         ("baselines", "policies/always/mse", 3, "policies.always.mse = 3"),
@@ -85,19 +93,15 @@ def test_results_of_another_shape(
     assert len(ended.err.splitlines()) == 1
 
 
-def test_the_zoo_takes_all_agents_or_none(setting: Path, tmp_path: Path) -> None:
+def test_the_zoo_takes_all_agents_or_none(tmp_path: Path) -> None:
     """The second of two has no model; a setting's name is no path; then both are there."""
-    second = setting.parent / "zz"  # behind the other, in the order in which they are copied
-    shutil.copytree(setting, second)
-    file = second / "agent_sensors_0.json"
+    results, work = tmp_path / "results", tmp_path / "work"
+    for name in (SETTING, "zz"):  # the other stands first, in the order in which they are copied
+        small_results(results, name, classes=["sensors"], seeds=1)
+    file = results / "zz" / "agent_sensors_0.json"
     agent = json.loads(file.read_text(encoding="utf-8"))
-    model = tmp_path / "work" / SETTING / "sensors_0" / "best_model.zip"
-    model.parent.mkdir(parents=True)
-    model.write_bytes(b"a model")
-    for folder in (setting, second):
-        (folder / "agent_sensors_1.json").unlink()
-    words = ["--results", str(setting.parent), "--work", str(tmp_path / "work")]
-    words += ["--zoo", str(tmp_path / "zoo")]
+    small_model(work / SETTING / "sensors_0" / "best_model.zip")
+    words = ["--results", str(results), "--work", str(work), "--zoo", str(tmp_path / "zoo")]
     for value, message in (("second", "best_model.zip is missing"), ("../../x", "setting = ")):
         file.write_text(json.dumps(agent | {"setting": value}), encoding="utf-8")
         ended = call("zoo", words)
@@ -105,9 +109,52 @@ def test_the_zoo_takes_all_agents_or_none(setting: Path, tmp_path: Path) -> None
         assert message in ended.err
         assert not (tmp_path / "zoo").exists()
     file.write_text(json.dumps(agent | {"setting": "second"}), encoding="utf-8")
-    shutil.copytree(model.parent.parent, tmp_path / "work" / "second")
+    shutil.copytree(work / SETTING, work / "second")
     assert call("zoo", words).status == 0
     assert len(list((tmp_path / "zoo").iterdir())) == 4
+
+
+def test_the_zoo_takes_a_choice_and_removes_what_is_not_in_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results, work, folder = (tmp_path / name for name in ("results", "work", "zoo"))
+    small_results(results)
+    for name in CLASSES:
+        small_model(work / SETTING / f"{name}_0" / "best_model.zip")
+    words = ["--results", str(results), "--work", str(work), "--zoo", str(folder)]
+    folder.mkdir()
+    (folder / "notes.json").write_text("{}")
+    assert call("zoo", words).status == 0
+    assert {path.stem for path in folder.glob("*.zip")} == {f"{SETTING}_{name}" for name in CLASSES}
+    card = json.loads((folder / f"{SETTING}_local_packets_memory.json").read_text())
+    assert card["class"] == "local_packets_memory"
+    assert card["knows"] == "own_memory"
+    assert card["options"] == {"horizon": 4, "memory": True, "broadcast": "packets"}
+    line = f"benchmark --envs {SETTING} --classes local_packets_memory, training seed 0"
+    assert card["command"].endswith(line)
+    assert call("zoo", [*words, "--classes", "centre", "sensors"]).status == 0
+    left = {f"{SETTING}_{name}.{end}" for name in ("centre", "sensors") for end in ("zip", "json")}
+    assert {path.name for path in folder.iterdir()} == left | {"notes.json"}
+    for wrong, message in ((["--classes", "sensor"], "sensors"), (["--envs", "x"], "envs = 'x'")):
+        ended = call("zoo", [*words, *wrong])
+        assert (ended.status, ended.trace) == (1, "")
+        assert message in ended.err
+    monkeypatch.setattr("agents.zoo.MOST", 200)
+    ended = call("zoo", words)
+    assert (ended.status, ended.trace) == (1, "")
+    assert "all together must have at most 200; name fewer" in ended.err
+    assert {path.name for path in folder.iterdir()} == left | {"notes.json"}
+
+
+def test_what_is_not_there_yet_is_said(tmp_path: Path) -> None:
+    """No agents, no references, no envelopes: a report all the same, which says so."""
+    folder = small_results(tmp_path, classes=[])
+    (folder / "informed.json").unlink()
+    assert call("report", ["--results", str(tmp_path)]).status == 0
+    text = (tmp_path / "README.md").read_text()
+    assert "Agents of a class: none so far." in text
+    assert "nothing to remember" in text
+    assert "no agent has a price in the middle of the front so far" in text
 
 
 def test_an_evaluation_goes_on_with_whole_policies_alone(tmp_path: Path) -> None:
@@ -132,10 +179,15 @@ def test_an_evaluation_goes_on_with_whole_policies_alone(tmp_path: Path) -> None
 @pytest.mark.filterwarnings("error")
 def test_no_error_at_all_can_be_drawn_and_compared(tmp_path: Path) -> None:
     """Over a perfect channel whoever always transmits has none: no axis and no share of it."""
-    point = [(1.0, 0.0)]
-    curves = {"always": point, "never": [(0.0, 1.0)]}
-    figures.fronts(tmp_path / "x.png", "perfect", curves, [], {"sensors": point}, None)
-    assert (tmp_path / "x.png").stat().st_size > 10_000
+    panel = Panel(
+        "perfect",
+        [Series(RULES, [(0.0, 1.0), (1.0, 0.0)]), Series(AGENTS, [], [(1.0, 0.0)])],
+        differences=[Differences(AGENTS, [])],
+    )
+    limits = Limits((0.04, 1.0), (0.5, 2.0))
+    paths = [tmp_path / "x.png", tmp_path / "x.svg"]
+    pareto_figure.draw(paths, "a title", panel, [panel], limits)
+    assert all(path.stat().st_size > 10_000 for path in paths)
     task = make_task(ENV, horizon=3)
     found = run_episodes(task, make_policy("always", task), 2, 0)
     table = comparison_table(Comparison(Interval(0.0, 0.0, 0.0), 0.0, ("always",)), found)

@@ -42,11 +42,21 @@ def front(path: Path, title: str, caption: str, layers: Layers) -> None:
     right = 1.12 * max(rates.max(), 0.02)
     if layers.single:
         axes.plot(*_columns(layers.single), "o", ms=2.5, color=GREY, label="single tuned rules")
-    axes.plot(*_columns(layers.plain), "o--", ms=3.5, color=RULES.colour, label="rules without memory")
-    axes.plot(*_columns(layers.remembering), "o-", ms=3.5, color=RULES_MEMORY.colour, label="rules with memory")
+    axes.plot(
+        *_columns(layers.plain), "o--", ms=3.5, color=RULES.colour, label="rules without memory"
+    )
+    axes.plot(
+        *_columns(layers.remembering),
+        "o-",
+        ms=3.5,
+        color=RULES_MEMORY.colour,
+        label="rules with memory",
+    )
     if layers.rollout:
         label = "these, improved once by simulation"
-        axes.plot(*_columns(layers.rollout), "D", ms=5, mfc="none", color=ROLLOUT.colour, label=label)
+        axes.plot(
+            *_columns(layers.rollout), "D", ms=5, mfc="none", color=ROLLOUT.colour, label=label
+        )
     if layers.bound:
         rate, lower = _columns(layers.bound)
         axes.plot(rate, lower, color=BOUND.colour, lw=1.2, label="proven: no policy lies below")
@@ -57,7 +67,8 @@ def front(path: Path, title: str, caption: str, layers: Layers) -> None:
     ]
     axes.errorbar(
         rates, [error.mean for error in errors], yerr=spread, fmt="^-", ms=7, lw=1.2,
-        elinewidth=0.9, capsize=2, color=AGENTS_MEMORY.colour, label="the agent, at seven prices", zorder=4,
+        elinewidth=0.9, capsize=2, color=AGENTS_MEMORY.colour, label="the agent, at seven prices",
+        zorder=4,
     )  # fmt: skip
     axes.set_xlim(0.0, right)
     least = min([mse for _, mse in layers.bound] or [error.low for error in errors])

@@ -1,4 +1,4 @@
-"""Text of the reports: Markdown in which nothing is a mark that was not meant, and one HTML page."""
+"""Text of the reports: Markdown in which no mark is there by chance, and one HTML page."""
 
 from __future__ import annotations
 
@@ -41,6 +41,12 @@ def number(interval: Mapping[str, float] | None) -> str:
     return f"{interval['mean']:.4g} [{interval['low']:.3g}, {interval['high']:.3g}]"
 
 
+def ranged(values: Sequence[int]) -> str:
+    """One number, or the least and the greatest."""
+    low, high = min(values), max(values)
+    return f"{low:,}" if low == high else f"{low:,} to {high:,}"
+
+
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """A table and the empty line behind it; nothing without rows."""
     if not rows:
@@ -50,7 +56,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def page_of(text: str, folder: Path, title: str) -> str:
-    """The Markdown as one HTML page with the folder's figures inside; HTML in it is shown as text."""
+    """The Markdown as one HTML page with the folder's figures inside; HTML in it is text."""
     renderer = markdown.Markdown(extensions=["tables", "toc"])
     renderer.preprocessors.deregister("html_block")
     renderer.inlinePatterns.deregister("html")

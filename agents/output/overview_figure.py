@@ -6,6 +6,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import matplotlib.pyplot as plt
 import matplotlib.ticker
@@ -16,7 +17,7 @@ from .figures import save
 from .palette import INK, KINDS, LARGE
 
 # Who is meant, the mark, whether it is filled.
-MARKS = {
+MARKS: dict[str, tuple[str, Literal["full", "none"]]] = {
     "rules": ("o", "none"),
     "agents": ("^", "full"),
     "coordinator": ("s", "full"),

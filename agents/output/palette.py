@@ -7,6 +7,7 @@ blue, agents orange, lighter without memory; what stands still is grey or black.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import matplotlib
 
@@ -32,7 +33,12 @@ plt.rcParams.update(
         "svg.hashsalt": "fusion-gym",
     }
 )
-LARGE = {"font.size": 15, "axes.titlesize": 15, "legend.fontsize": 14, "figure.dpi": 100}  # at half width still read
+LARGE: Any = {
+    "font.size": 15,
+    "axes.titlesize": 15,
+    "legend.fontsize": 14,
+    "figure.dpi": 100,
+}  # at half width still read
 
 
 @dataclass(frozen=True)

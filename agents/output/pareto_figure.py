@@ -7,6 +7,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import matplotlib.ticker
@@ -122,8 +123,8 @@ def _panel(axes: Axes, panel: Panel, limits: Limits) -> None:
     for place, series in enumerate(panel.series):
         style, order = series.style, 3 + place
         if series.band:
-            rates, low, high = zip(*series.band, strict=True)
-            axes.fill_between(rates, low, high, color=style.colour, alpha=0.25, lw=0, zorder=order)
+            places, low, high = zip(*series.band, strict=True)
+            axes.fill_between(places, low, high, color=style.colour, alpha=0.25, lw=0, zorder=order)
         if style.line:
             line = _columns(series.line)
             axes.plot(*line, style.line, color=style.colour, lw=1.9, zorder=order)
@@ -160,9 +161,9 @@ def _strip(axes: Axes, panel: Panel, limits: Limits) -> None:
     )
 
 
-def _mark(style: Style) -> dict[str, object]:
+def _mark(style: Style) -> dict[str, Any]:
     """Agents are filled and edged, so that they stand out of what they lie on."""
-    edge = {} if style.marker in ("", "x", "o") else {"mec": "white", "mew": 0.7}
+    edge: dict[str, Any] = {} if style.marker in ("", "x", "o") else {"mec": "white", "mew": 0.7}
     return {"marker": style.marker or None, "ms": style.size, **edge}
 
 
@@ -192,7 +193,7 @@ def _write(axis: Axis, places: Sequence[float]) -> None:
 
 
 def ticks(low: float, high: float, least: int) -> list[float]:
-    """At least so many round numbers between two positive ones, if there are; no more than needed."""
+    """At least so many round numbers between two positive ones, if there are, and few more."""
     found: list[float] = []
     for steps in _STEPS:
         decades = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)

@@ -23,8 +23,9 @@ class Found:
     """A setting's results.
 
     ``seeds[class]`` has a training seed's points, by price; ``ahead`` are the coordinator's
-    references and ``known`` those of the centre, as (name, rate, error); ``validation`` says on which
-    episodes the agents were validated, and ``envelopes`` is the file of committed envelopes. What is not there is empty.
+    references and ``known`` those of the centre; ``validation`` says on which episodes the agents
+    were validated, and ``envelopes`` is the file of committed envelopes. What is not there is
+    empty.
     """
 
     name: str
@@ -42,7 +43,7 @@ class Found:
     @property
     def label(self) -> str:
         """The setting's name for readers."""
-        return str(self.name.replace("_", "-"))
+        return self.name.replace("_", "-")
 
     @property
     def classes(self) -> dict[str, Any]:

@@ -161,8 +161,13 @@ def above_of(front: dict[str, Any]) -> tuple[list[dict[str, Any]], int]:
 def above_rows(found: Mapping[str, Found]) -> list[list[str]]:
     """Each such point."""
     return [
-        [plain(one.label), plain(name), f"{p['price']:.3g}", f"{p['rate']:.4f}"]
-        + [share(p["difference"])]
+        [
+            plain(one.label),
+            plain(name),
+            f"{p['price']:.3g}",
+            f"{p['rate']:.4f}",
+            share(p["difference"]),
+        ]
         for one in found.values()
         for name, front in one.classes.items()
         for p in above_of(front)[0]

@@ -5,86 +5,68 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ..output.markup import ranged
 from .committed import FOLDER
 from .found import Found
 from .verdict import RATES
+
+TEXT = """\
+## How to read this
+
+**Compared** are tuned rules and learned agents: who has the smaller mean squared error at the same
+rate of transmissions per sensor and step. An agent is one policy that sees the price of a token and
+is asked at several. The rules of a class are its *envelope*: the line, mixtures of two included,
+through those chosen on tuning seeds among all that know no more than the class, committed with a
+hash (`{folder}/`) before any agent was trained. Then all ran on the test seeds.
+
+**Who knew what.** A class says who decides, what a sensor hears, and whether there is memory:
+
+- `centre` decides by what it knows before anything is sent, and sees no new measurement.
+- `local_none`, `local_estimate`, `local_packets`: each sensor by itself, by one shared policy; it
+  hears nothing, the centre's estimate, or every packet that is delivered.
+- `sensors`: a coordinator that sees all new measurements and decides for all sensors.
+- `…_memory`: what was measured and not sent is remembered besides.
+- **A packet** holds one sensor's newest measurement (in Markov jump tracking the node's estimate),
+  in `sensors_estimates_memory` the coordinator's estimate.
+
+**Seeds.** {seeds}
+
+**Intervals** are 95 % bootstrap intervals: of errors over episodes, of agents against rules over
+training seeds, paired episodes, rates and tuning seeds at once. The *middle* is the mean over
+{rates} rates, evenly spaced in the logarithm from 5 % to 50 % of that of always transmitting, as
+far as agents reach, of the interquartile mean over training seeds; a worth is a mean over such
+rates.
+
+**Proven** are the bounds (`bounds/`: no policy lies below) and, in remote estimation, the optimum
+by dynamic programming. All else was measured: a lookahead with the model, the best schedules of a
+period and rules improved by simulation are policies and no floors, and *in hindsight* is what a
+clairvoyant reaches by beam search on a few episodes, which no policy can.
+"""
 
 
 def how_to_read(found: Mapping[str, Found]) -> list[str]:
     """The report's first section."""
     first = next(iter(found.values())).baselines
     last = first["seed"] + first["episodes"] - 1
-    seeds = [front["seeds"] for one in found.values() for front in one.classes.values()]
-    tunings = [one.envelopes["inputs"]["tuning"] for one in found.values() if one.envelopes]
-    trained = f"{ranged(seeds)} training seeds" if seeds else "no agents so far"
-    return [
-        "## How to read this",
-        "",
-        "**Compared** are, in each setting, tuned rules and learned agents: who has the smaller mean "
-        "squared error at the same rate of transmissions per sensor and step. An agent is one policy "
-        "that sees the price of a token and is asked at several prices. The rules of a class are its "
-        "*envelope*: the line through those chosen among all tuned rules that know no more than the "
-        "class, with mixtures of two. It was chosen on tuning seeds and committed with a hash "
-        f"(`{FOLDER}/`) before any agent was trained; then rules and agents were run on the test "
-        "seeds.",
-        "",
-        "**Who knew what.** A class is who decides, what it hears and whether it remembers:",
-        "",
-        "- `centre`: whoever fuses, by what it knows before anything is sent; it sees no new signal.",
-        "- `local_none`, `local_estimate`, `local_packets`: each sensor by itself, by one shared "
-        "policy; it hears nothing, the centre's estimate, or every packet that is delivered.",
-        "- `sensors`: a coordinator that sees all new measurements and decides for all sensors.",
-        "- `…_memory`: besides, what was measured and not sent is remembered; without it, a decision "
-        "looks at new measurements and at what the centre knows.",
-        "- `sensors_estimates_memory`: **a packet** holds the coordinator's estimate. In all other "
-        "classes it holds one sensor's newest measurement (in Markov jump the node's estimate).",
-        "",
-        f"**Seeds.** Test: {first['episodes']:,} episodes a policy, seeds {first['seed']:,} to "
-        f"{last:,}, the same noise for all. {_tuning(tunings)}{_validation(found)}Agents: {trained}.",
-        "",
-        "**Intervals** are 95 % bootstrap intervals. That of an error resamples episodes. That of a "
-        "difference between agents and rules resamples training seeds, paired episodes, rates and "
-        "tuning seeds at once; its mean is the interquartile mean over training seeds at each price, "
-        f"and then the plain mean over a grid of {RATES} rates, evenly spaced in the logarithm from "
-        "5 % to 50 % of the rate of always transmitting, as far as the agents reach (the *middle* of "
-        "the front). What more knowledge is worth is such a mean over the rates that both classes "
-        "reach, at least half of the grid. No interval knows of another training method or other "
-        "rules.",
-        "",
-        "**Proven** are the bounds (no policy lies below, whatever it remembers; `bounds/`), and the "
-        "optimum of two sources seen exactly, by dynamic programming. **Not proven**: a lookahead "
-        "with the model, the best periodic schedules (the best of all schedules of their period, where "
-        "covariances do not depend on data), and rules improved by simulation are policies, no floors; "
-        "*in hindsight* is what a clairvoyant that knows all noise reaches by beam search on a few "
-        "episodes, no goal for any policy. The genie states what it assumes.",
-        "",
-    ]  # fmt: skip
+    agents = [front["seeds"] for one in found.values() for front in one.classes.values()]
+    tuned = [one.envelopes["inputs"]["tuning"] for one in found.values() if one.envelopes]
+    validated = [one.validation for one in found.values() if one.validation]
+    seeds = [f"Test: {first['seed']:,} to {last:,}, the same noise for all."]
+    if tuned:
+        seeds.append(
+            f"Tuning: {_of(tuned, 'seeds')} searches of {_of(tuned, 'episodes')} episodes each, "
+            f"from {_of(tuned, 'seed')} on."
+        )
+    if validated:
+        seeds.append(
+            f"Validation, which chooses the moment of a training that is kept: "
+            f"{_of(validated, 'episodes')} episodes from {_of(validated, 'seed')} on."
+        )
+    number = f"{ranged(agents)} training seeds" if agents else "none so far"
+    seeds.append(f"Agents of a class: {number}.")
+    text = TEXT.format(folder=FOLDER, seeds=" ".join(seeds), rates=RATES)
+    return text.split("\n")
 
 
-def _tuning(tunings: Sequence[Mapping[str, Any]]) -> str:
-    """The seeds on which rules were tuned."""
-    if not tunings:
-        return ""
-    starts = ranged([one["seed"] for one in tunings])
-    return (
-        f"Tuning of rules: {ranged([one['seeds'] for one in tunings])} searches a setting, each on "
-        f"{ranged([one['episodes'] for one in tunings])} episodes of its own from seed {starts} on. "
-    )
-
-
-def _validation(found: Mapping[str, Found]) -> str:
-    """The seeds on which the best moment of a training was chosen."""
-    chosen = [one.validation for one in found.values() if one.validation]
-    if not chosen:
-        return ""
-    return (
-        f"Validation, which chooses the moment of a training that is kept: "
-        f"{ranged([one['episodes'] for one in chosen])} episodes from seed "
-        f"{ranged([one['seed'] for one in chosen])} on. "
-    )
-
-
-def ranged(values: Sequence[int]) -> str:
-    """One number, or the least and the greatest."""
-    low, high = min(values), max(values)
-    return f"{low:,}" if low == high else f"{low:,} to {high:,}"
+def _of(every: Sequence[Mapping[str, Any]], key: str) -> str:
+    return ranged([one[key] for one in every])

@@ -48,7 +48,9 @@ def panels_of(found: Found) -> tuple[Panel, list[Panel]]:
     series = list(_series(found, coordinator, found.ahead))
     if found.rollout:
         points = [(point.rate, point.mse) for point in found.rollout]
-        style = replace(ROLLOUT, label=f"improved by simulation\n({found.rollout_episodes} episodes)")
+        style = replace(
+            ROLLOUT, label=f"improved by simulation\n({found.rollout_episodes} episodes)"
+        )
         series.append(Series(style, [], points))
     genie = found.baselines.get("genie")
     level = ("everything arrives", float(genie["mse"]["mean"])) if genie and not bound else None
@@ -74,7 +76,7 @@ def panels_of(found: Found) -> tuple[Panel, list[Panel]]:
 
 
 def limits_of(found: Found, panels: Sequence[Panel]) -> Limits:
-    """From 4 % of what always transmitting gets on, and from the least error that is drawn there."""
+    """From 4 % of what always transmitting gets, and from the least error that is drawn there."""
     always = found.verdict["always"]
     left, right = LEFT * always, 1.12 * always
     every = [
@@ -176,14 +178,9 @@ def _band(
     """The least and the greatest error of training seeds at each price."""
     columns = found.seeds.get(name, ())
     if len(columns) > 1:
-        band = [
-            (rate, min(errors), max(errors))
-            for (rate, _), *errors in (
-                (mark, *(column[place][1] for column in columns))
-                for place, mark in enumerate(marks)
-            )
-        ]
-        yield from sorted(band)
+        for place, (rate, _) in sorted(enumerate(marks), key=lambda one: one[1]):
+            errors = [column[place][1] for column in columns]
+            yield rate, min(errors), max(errors)
 
 
 def _along(hull: Sequence[EnvelopePoint], rates: Sequence[float]) -> Iterator[tuple[float, float]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..output.markup import share
+from ..output.markup import ranged, share
 from .envelope_table import HEADLINE, at_least
 from .found import Found
 from .overview import above_of, reason, worth_of
@@ -91,7 +91,9 @@ def floors(found: Found) -> str:
         text = f"at the rate {rate:.3g} no policy has an error below {least:.3g}"
         best = found.rules_at("sensors_memory", rate) or found.rules_at("sensors", rate)
         if best is not None:
-            text += f"; a coordinator's strongest rules have {best:.3g}, {best / least:.1f} times it"
+            text += (
+                f"; a coordinator's strongest rules have {best:.3g}, {best / least:.1f} times it"
+            )
         parts.append(f"{text}. This is proven, but no policy is known that reaches it")
     if not parts:
         return "**Floor**: no bound, optimum or reference is known at these rates."
@@ -100,7 +102,8 @@ def floors(found: Found) -> str:
 
 def _referred(found: Found) -> list[str]:
     """The classes with a reference of which something is said."""
-    wanted = ["sensors", "sensors_memory", "centre"]
+    coordinator = "sensors" if "sensors" in found.classes else "sensors_memory"
+    wanted = [coordinator, "centre"]
     return [name for name in wanted if name in found.classes and gap(found, name)]
 
 
@@ -132,7 +135,7 @@ def _beside(found: Found, name: str) -> str:
     what = reference_of(found, front)
     text = (
         f"relative to {what}, the strongest rules of the {named(front)} have {rules:+.1%} error "
-        f"and its agents {agents:+.1%} (sums over the prices in the middle, without an interval)"
+        f"and its agents {agents:+.1%} (summed over the prices in the middle; no interval)"
     )
     if what == "the optimum":
         if rules <= EQUAL:
@@ -143,12 +146,12 @@ def _beside(found: Found, name: str) -> str:
 
 def caption(found: Found, drawn: Sequence[str]) -> str:
     """What the figure of a setting shows, and what to see in it; ``drawn`` are its small panels."""
-    seeds = sorted({len(columns) for columns in found.seeds.values()})
-    band = f", with a band from the least to the greatest of {_range(seeds)} training seeds"
+    seeds = [len(columns) for columns in found.seeds.values() if len(columns) > 1]
+    band = "" if not seeds else f", with a band from the least to the greatest of {ranged(seeds)}"
     parts = [
         "*Above:* error against rate of the coordinator, both axes logarithmic. Blue: the lower "
         "envelope of the tuned rules; orange: agents at their prices"
-        + (band if seeds and seeds[-1] > 1 else "")
+        + (f"{band} training seeds" if band else "")
         + "; light without memory, dark with it; grey: each rule by itself, on tuning seeds."
     ]
     if found.rollout:
@@ -162,7 +165,7 @@ def caption(found: Found, drawn: Sequence[str]) -> str:
         genie = found.baselines["genie"]["mse"]["mean"]
         parts.append(f"If everything arrives the error is {genie:.3g}.")
     if drawn:
-        parts.append(f"*Below*, on the same axes: {', '.join(drawn)}.")
+        parts.append(f"*Below*, on the same axes: {'; '.join(drawn)}.")
     parts.append(
         "*Strips:* the agents' error relative to the rules that know as much (the line at 0), with "
         f"95 % intervals. {_see(found)}"
@@ -182,7 +185,3 @@ def _see(found: Found) -> str:
     if found.optimal:
         return "See how close rules and agents lie to the optimum."
     return "See how close the lines of agents and rules lie together, panel by panel."
-
-
-def _range(values: Sequence[int]) -> str:
-    return f"{values[0]}" if values[0] == values[-1] else f"{values[0]} to {values[-1]}"
