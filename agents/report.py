@@ -99,7 +99,7 @@ def above_section(found: dict[str, Found]) -> list[str]:
 
 def setting_section(found: Found) -> list[str]:
     """A setting's figure, what was found, and its tables."""
-    title = f"{plain(found.verdict['title'])} ({code(found.baselines['env'])})."
+    title = f"{plain(found.verdict['title'])}: {code(found.baselines['env'])}, {code(found.name)}."
     panels = [" ".join(p.title.split()) for p in report_layers.panels_of(found)[1]]
     lines = [f"## {plain(found.label)}", "", title, ""]
     lines += [f"- {sentence}" for sentence in sentences(found)]

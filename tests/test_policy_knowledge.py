@@ -68,6 +68,7 @@ REMEMBERING: dict[str, tuple[str, Values]] = {
 # Policies that look at what is believed are tried where that differs.
 BELIEVING = (
     "estimate_difference", "kullback_leibler", "lookahead", "rollout", "value_of_information",
+    "zoo",
 )  # fmt: skip
 BELIEVED = (*REMEMBERING, "tobit", "tobit, centre", "correlated", "remote, one link")
 POLICIES: dict[str, list[str]] = {
@@ -105,7 +106,7 @@ POLICIES: dict[str, list[str]] = {
     ],
     "variance_threshold": ["threshold=0.2", "threshold=0.4,at_most=none"],
     "whittle": ["", "at_most=1"],
-    "zoo": [f"tobit_oscillator_{mode}" for mode in ("sensors", "local", "centre")],
+    "zoo": [name for name in zoo.names() if name.startswith("tobit_oscillator_")],
 }
 
 

@@ -43,21 +43,22 @@ LARGE: Any = {
 
 @dataclass(frozen=True)
 class Style:
-    """How one kind of policy is drawn."""
+    """How one kind of policy is drawn; legends list them by ``order``."""
 
     label: str
     colour: str
     marker: str
     line: str = "-"
     size: float = 6.0
+    order: int = 0
 
 
-RULES = Style("rules", SKY, "o", "--", 5.0)
-RULES_MEMORY = Style("rules, memory", BLUE, "o", "-", 5.0)
-AGENTS = Style("agents", ORANGE, "s", "--", 7.5)
-AGENTS_MEMORY = Style("agents, memory", VERMILLION, "^", "-", 8.5)
-ROLLOUT = Style("rule improved by simulation", PURPLE, "D", "", 8.0)
-REFERENCE = Style("reference", BLACK, "x", ":", 7.0)
+RULES = Style("rules", SKY, "o", "--", 5.0, 0)
+RULES_MEMORY = Style("rules, memory", BLUE, "o", "-", 5.0, 1)
+AGENTS = Style("agents", ORANGE, "s", "--", 7.5, 2)
+AGENTS_MEMORY = Style("agents, memory", VERMILLION, "^", "-", 8.5, 3)
+ROLLOUT = Style("rule improved by simulation", PURPLE, "D", "", 8.0, 4)
+REFERENCE = Style("reference", BLACK, "x", ":", 7.0, 5)
 BOUND = Style("proven: none lies below", GREEN, "", "-")
 
 # What the worths of the overview are drawn in.

@@ -169,13 +169,10 @@ def _mark(style: Style) -> dict[str, Any]:
 
 def _handles(main: Panel, small: Sequence[Panel]) -> Iterator[tuple[str, Line2D]]:
     """What the legend shows, by its label: each kind once."""
-    for panel in (main, *small):
-        for series in panel.series:
-            style = series.style
-            yield (
-                style.label,
-                Line2D([], [], color=style.colour, ls=style.line or "none", lw=1.9, **_mark(style)),
-            )  # fmt: skip
+    styles = [series.style for panel in (main, *small) for series in panel.series]
+    for style in sorted(styles, key=lambda style: style.order):
+        line = Line2D([], [], color=style.colour, ls=style.line or "none", lw=1.9, **_mark(style))
+        yield style.label, line
     if any(panel.single for panel in (main, *small)):
         yield "single tuned rules", Line2D([], [], color=GREY, lw=1.2)
     if main.bound:

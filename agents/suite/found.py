@@ -42,8 +42,8 @@ class Found:
 
     @property
     def label(self) -> str:
-        """The setting's name for readers."""
-        return self.name.replace("_", "-")
+        """The setting's name for readers: its title up to the first comma."""
+        return str(self.verdict["title"].split(",")[0])
 
     @property
     def classes(self) -> dict[str, Any]:

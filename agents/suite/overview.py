@@ -104,7 +104,7 @@ def learning_rows(found: Mapping[str, Found]) -> list[list[str]]:
     rows = []
     for one in found.values():
         cells = [_middle(one, column) for column in learned_columns(one)]
-        rows.append([plain(one.verdict["title"].split(",")[0]), *cells])
+        rows.append([plain(one.label), *cells])
     return rows
 
 
@@ -177,7 +177,7 @@ def above_rows(found: Mapping[str, Found]) -> list[list[str]]:
 def draw(results: Path, found: Mapping[str, Found]) -> None:
     """The overview's figure, into the folder, as PNG and as SVG."""
     paths = [results / f"overview.{suffix}" for suffix in ("png", "svg")]
-    names = {one.name: one.verdict["title"].split(",")[0] for one in found.values()}
+    names = {one.name: one.label for one in found.values()}
     columns = {HEADS[kind]: (kind, _knowing(found, kind)) for kind in KNOWING}
     columns["learning"] = ("learning", list(_learning(found)))
     overview_figure.draw(paths, list(names.values()), columns)

@@ -192,18 +192,32 @@ def _along(hull: Sequence[EnvelopePoint], rates: Sequence[float]) -> Iterator[tu
 
 
 def _single(found: Found, names: Sequence[str]) -> list[list[tuple[float, float]]]:
-    """Each family's tuned rules, on the tuning seeds, in the classes of a panel."""
+    """Each family's tuned rules, on the tuning seeds, in the classes of a panel.
+
+    They are drawn down to the envelope on the test seeds: what was best on the seeds that it was
+    tuned on lies lower there, by luck.
+    """
+    hulls = [found.hull(name) for name in names]
     classes = found.envelopes.get("classes", {})
     own = [classes[name] for name in names if name in classes]
     families = {family for content in own for family in content["families"]}
     options = [{}, *(content["options"] for content in own)]
     return [
-        [(point["rate"], point["mse"]) for point in curve["points"]]
+        [
+            (point["rate"], max(point["mse"], _least(hulls, point["rate"])))
+            for point in curve["points"]
+        ]
         for curve in found.envelopes.get("curves", ())
         if curve["family"] in families - {MIXED}
         and curve["options"] in options
         and len(curve["points"]) > 1
     ]
+
+
+def _least(hulls: Sequence[Sequence[EnvelopePoint]], rate: float) -> float:
+    """The least error of these envelopes at a rate; zero left of them."""
+    heights = [height(hull, rate) for hull in hulls if hull]
+    return min([one for one in heights if one is not None], default=0.0)
 
 
 def _fine(found: Found) -> list[float]:

@@ -138,7 +138,9 @@ def _beside(found: Found, name: str) -> str:
         f"and its agents {agents:+.1%} (summed over the prices in the middle; no interval)"
     )
     if what == "the optimum":
-        if rules <= EQUAL:
+        if rules < -EQUAL:
+            text += ". Below it lies only what chance and mixtures of its prices allow"
+        elif rules <= EQUAL:
             text += ". So a rule is as good as the optimum, to within 1 %: that is a result"
         return text
     return f"{text}; that reference is neither an optimum of this class nor a bound"
@@ -152,7 +154,8 @@ def caption(found: Found, drawn: Sequence[str]) -> str:
         "*Above:* error against rate of the coordinator, both axes logarithmic. Blue: the lower "
         "envelope of the tuned rules; orange: agents at their prices"
         + (f"{band} training seeds" if band else "")
-        + "; light without memory, dark with it; grey: each rule by itself, on tuning seeds."
+        + "; light without memory, dark with it; grey: each tuned rule by itself, on tuning seeds, "
+        "down to the envelope."
     ]
     if found.rollout:
         parts.append(
