@@ -60,7 +60,7 @@ class Benchmark(Command):
     backend: BackendName = "loky"
     """Who works: loky's processes of this machine, or a dask or ray cluster."""
     address: str | None = None
-    """Where dask's scheduler or ray's head is; without it a cluster of --workers begins here."""
+    """Where dask's scheduler or ray's head is; without it a cluster of this machine begins."""
     seeds: Annotated[int | None, Whole(1, 10_000)] = None
     """Number of training seeds, instead of the config's."""
     timesteps: Steps = None

@@ -14,7 +14,7 @@ from small_suite import ENV, small_suite
 import fusion_gym
 from agents import envelope
 from agents.suite.classes import Class, classes_of
-from agents.suite.committed import read_envelopes
+from agents.suite.committed import merged_curves, read_envelopes
 from agents.suite.config import Choices, Family, Range, Tuning, load_suite
 from agents.suite.envelope_table import cell
 from agents.suite.tuning import Trial, first_values, near_hull, policy_text, search
@@ -225,3 +225,13 @@ def test_cells_of_the_table() -> None:
     computed = [EnvelopePoint("a", 0.1, 2.0), EnvelopePoint("b", 0.2, 1.0)]
     assert [cell(computed, rate) for rate in (0.05, 0.15, 0.3)] == ["–", "1.5", "–"]
     assert cell([], 0.1) == "–"
+
+
+def test_classes_that_are_added_take_no_curves_away() -> None:
+    first = [{"family": "a", "options": {}, "trials": 1}, {"family": "b", "options": {}}]
+    new = [
+        {"family": "a", "options": {}, "trials": 2},
+        {"family": "b", "options": {"memory": True}},
+    ]
+    found = merged_curves(first, new)
+    assert found == [new[0], first[1], new[1]]
