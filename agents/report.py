@@ -71,9 +71,12 @@ def overview_section(found: dict[str, Found]) -> list[str]:
         "![What knowing and learning are worth, setting by setting](overview.png)",
         "",
         "Each mark is a relative difference of the mean squared error at equal rate, with its 95 % "
-        "interval: left of the line at 0 is better. Four columns compare a class of knowledge with "
-        "one that knows less, for its rules (circles) and for its agents (triangles); the last one "
-        "compares agents with rules that know as much.",
+        "interval; left of the line at 0 is better. Four columns compare a class with one that "
+        "knows less, for its rules (circles) and its agents (triangles), with memory where there "
+        "is: a coordinator with memory and without; sensors alone that hear every packet, and that "
+        "hear what the environment tells by default; a coordinator, who sees what all measured, "
+        "and sensors alone that hear every packet; packets with the coordinator's estimate, and "
+        "with a measurement. The last column compares agents with rules that know as much.",
         "",
         "What knowing is worth:",
         "",

@@ -114,8 +114,10 @@ def test_classes_contain_what_knows_less() -> None:
         assert packets.contains(Class("local", False, "estimate"))
         assert not packets.contains(Class("local", True, "estimate"))
         assert not Class("local", True, "estimate").contains(packets)
-        assert classes[-1].name == "sensors_memory"
-        assert all(classes[-1].contains(c) for c in classes)
+        measured = [c for c in classes if c.packet == "measurement"]
+        assert measured[-1].name == "sensors_memory"
+        assert all(measured[-1].contains(c) for c in measured)
+        assert all(c.packet == "estimate" for c in classes if not measured[-1].contains(c))
 
 
 def test_chosen_policies_all_count() -> None:
