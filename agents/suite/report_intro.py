@@ -37,8 +37,8 @@ training seeds, paired episodes, rates and tuning seeds at once. The *middle* is
 far as agents reach, of the interquartile mean over training seeds; a worth is a mean over such
 rates.
 
-**Proven** are the bounds (`bounds/`: no policy lies below) and, in remote estimation, the optimum
-by dynamic programming. All else was measured: a lookahead with the model, the best schedules of a
+**Proven** are the bounds (`bounds/`: no policy lies below, whatever its packets hold) and, in
+remote estimation, the optimum by dynamic programming. All else was measured: a lookahead with the model, the best schedules of a
 period and rules improved by simulation are policies and no floors, and *in hindsight* is what a
 clairvoyant reaches by beam search on a few episodes, which no policy can.
 """

@@ -67,7 +67,7 @@ def panels_of(found: Found) -> tuple[Panel, list[Panel]]:
             _title(*key),
             list(_series(found, names, found.known if key[0] == "centre" else [])),
             _single(found, names),
-            [] if key[2] == "estimate" else bound,
+            bound,
             differences=list(_differences(found, names)),
         )
         for key, names in grouped.items()

@@ -34,7 +34,6 @@ def rates_table(found: Found) -> list[str]:
             simulated = name == "sensors_memory" or (
                 name == "sensors" and "sensors_memory" not in shown(found)
             )
-            proven = found.bound is not None and content.get("packet") != "estimate"
             rows.append(
                 [
                     plain(name),
@@ -43,7 +42,7 @@ def rates_table(found: Found) -> list[str]:
                     number(row.get("agents")),
                     share(row.get("difference")),
                     cell(found.rollout, row["rate"]) if simulated else NONE,
-                    f"{at_least(found.bound, row['rate']):.4g}" if found.bound and proven else NONE,
+                    f"{at_least(found.bound, row['rate']):.4g}" if found.bound else NONE,
                 ]
             )
     return table(head, rows)
