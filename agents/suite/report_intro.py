@@ -38,9 +38,10 @@ far as agents reach, of the interquartile mean over training seeds; a worth is a
 rates.
 
 **Proven** are the bounds (`bounds/`: no policy lies below, whatever its packets hold) and, in
-remote estimation, the optimum by dynamic programming. All else was measured: a lookahead with the model, the best schedules of a
-period and rules improved by simulation are policies and no floors, and *in hindsight* is what a
-clairvoyant reaches by beam search on a few episodes, which no policy can.
+remote estimation, the optimum by dynamic programming. All else was measured: a lookahead with the
+model, the best schedules of a period and rules improved by simulation are policies and no floors,
+and *in hindsight* is what a clairvoyant reaches by beam search on a few episodes, which no policy
+can.
 """
 
 
