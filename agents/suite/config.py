@@ -188,9 +188,10 @@ class Suite(Strict):
 QUICK: dict[str, Any] = {
     "episodes": 200,
     "training_seeds": 1,
-    "timesteps": 600_000,
+    "timesteps": 200_000,
     "prices": 5,
     "hindsight_episodes": 10,
+    "classes": ["local_estimate", "local_estimate_memory", "sensors", "sensors_memory"],
     "tuning": {"trials": 4, "prices": 4, "refined": 1, "episodes": 32, "seeds": 2},
 }
 
