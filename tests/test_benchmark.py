@@ -94,7 +94,8 @@ def test_from_tuning_to_report_and_zoo(
     assert agent["training"]["environment"]["local"]
     assert len(agent["points"]) == 3
     # The written numbers are those that the saved model reaches on the test seeds.
-    task = fusion_gym.make_task(ENV, filter="tobit", horizon=10)
+    shown = ["difference", "value"]  # as rules without memory look at it
+    task = fusion_gym.make_task(ENV, filter="tobit", horizon=10, belief_features=shown)
     path = work / "small" / "local_estimate_1" / "best_model.zip"
     model = f"model:{path},price={agent['prices'][1]!r}"
     again = run_episodes(task, make_policy(model, task), 12, seed=0)
@@ -266,6 +267,8 @@ def test_the_benchmark_refuses_with_one_line(
 def test_the_report_shows_what_it_is_told_as_text(tmp_path: Path) -> None:
     """Titles, policies and folders in HTML, Markdown and with a table's bars stay what they are."""
     folder = small_results(tmp_path, "a<b>_[c](javascript:d)")
+    for path in folder.glob("agent_*.json"):  # where no such name is allowed
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"setting": "strange"}))
     title = 'x <script>alert(1)</script> | *y* [z](javascript:alert(2)) `<img src=x onerror="e">`'
     verdict = json.loads((folder / "verdict.json").read_text())
     baselines = json.loads((folder / "baselines.json").read_text())
