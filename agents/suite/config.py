@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import pydantic
 
@@ -15,6 +15,7 @@ Mode = Literal["sensors", "centre", "local"]
 Broadcast = Literal["none", "estimate", "packets"]
 Packet = Literal["measurement", "estimate"]
 Error = Literal["squared", "excess", "mismatch"]
+Longer = Annotated[float, pydantic.Field(gt=0)]
 
 
 class Range(Strict):
@@ -98,7 +99,7 @@ class Setting(Strict):
 
     ``agents`` are the classes in which agents are trained, by name (all by default), and
     ``agent_options`` tell them what rules know anyway. ``longer`` multiplies the length of their
-    trainings, ``price_exponent``, ``num_envs``, ``error`` and ``tuning`` replace the suite's;
+    trainings, ``lengths`` those of one mode; ``price_exponent``, ``num_envs``, ``error`` and ``tuning`` replace the suite's;
     ``algorithm`` changes entries of the suite's, ``algorithms`` those of one mode; ``pace`` is
     about how many steps a second they train, for the time that is told to remain.
     """
@@ -112,7 +113,8 @@ class Setting(Strict):
     known: tuple[str, ...] = ()
     informed: tuple[str, ...] = ()
     references: tuple[str, ...] = ()
-    longer: float = pydantic.Field(default=1.0, gt=0)
+    longer: Longer = 1.0
+    lengths: dict[Mode, Longer] = pydantic.Field(default_factory=dict)
     price_exponent: Share | None = None
     num_envs: Positive | None = None
     error: Error | None = None
@@ -155,6 +157,10 @@ class Suite(Strict):
         """
         of_mode = self.algorithms.get(mode, {}) | setting.algorithms.get(mode, {})
         return settings(self.algorithm.model_dump() | setting.algorithm | of_mode)
+
+    def timesteps_of(self, setting: Setting, mode: Mode) -> int:
+        """Steps of a training, where sensors decide by themselves of each of their rows."""
+        return round(self.timesteps * setting.longer * setting.lengths.get(mode, 1.0))
 
     def tuning_of(self, setting: Setting) -> Tuning:
         """The setting's budget of tuning, checked again.

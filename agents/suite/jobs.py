@@ -112,7 +112,7 @@ def jobs(
         for setting in settings:
             for of in wanted[setting.name]:
                 if of.name in classes:
-                    weight = 10.0 + suite.timesteps * setting.longer / setting.pace
+                    weight = 10.0 + suite.timesteps_of(setting, of.mode) / setting.pace
                     kept = ((of.name, hashes[setting.name][of.name]),)
                     yield Job(setting, "agent", of, seed, weight, kept)
 
@@ -212,7 +212,7 @@ def experiment_of(suite: Suite, setting: Setting, of: Class, seed: int, work: Pa
         "cost_weight": "random",
         "price_range": list(setting.price_range),
     }
-    timesteps = round(suite.timesteps * setting.longer)
+    timesteps = suite.timesteps_of(setting, of.mode)
     own = setting.price_exponent
     return Experiment(
         environment=EnvironmentConfig(
