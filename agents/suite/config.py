@@ -99,9 +99,10 @@ class Setting(Strict):
 
     ``agents`` are the classes in which agents are trained, by name (all by default), and
     ``agent_options`` tell them what rules know anyway. ``longer`` multiplies the length of their
-    trainings, ``lengths`` those of one mode; ``price_exponent``, ``num_envs``, ``error`` and ``tuning`` replace the suite's;
-    ``algorithm`` changes entries of the suite's, ``algorithms`` those of one mode; ``pace`` is
-    about how many steps a second they train, for the time that is told to remain.
+    trainings, ``lengths`` those of one mode; ``price_exponent``, ``num_envs``, ``error`` and
+    ``tuning`` replace the suite's; ``algorithm`` changes entries of the suite's, ``algorithms``
+    those of one mode; ``pace`` is about how many steps a second they train, for the time that is
+    told to remain.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
