@@ -1,6 +1,6 @@
 """Tables and figures of the benchmark's results, as Markdown and as one self-contained page.
 
-    python -m agents.report [--results results]
+    python -m agents.report [--results results] [--pages README.md docs/biased.md …]
 
 Reads the JSON in the results folder and writes ``README.md``, figures of all settings together and
 of each, and ``report.html`` with the figures inside. What the JSON says is text there, no markup.
@@ -14,12 +14,14 @@ from typing import Annotated
 from urllib.parse import quote
 
 from .command_line import Command, spelled, start
+from .input.files import read_text
 from .input.options import OutputFolder
 from .output.files import write_text
 from .output.markup import code, page_of, plain, table
 from .suite import overview, report_layers
 from .suite.found import Found, read_results
 from .suite.report_intro import how_to_read
+from .suite.report_pages import documented
 from .suite.report_tables import classes_table, rates_table, worth_table
 from .suite.report_words import caption, sentences
 
@@ -32,10 +34,14 @@ class Report(Command):
 
     results: Annotated[Path, OutputFolder()] = Path("results")
     """Folder of the benchmark's JSON, and for what is made of it."""
+    pages: tuple[Path, ...] = ()
+    """Other pages, as README.md, whose parts between <!-- results: … --> and <!-- end --> are made
+    anew."""
 
     def run(self) -> None:
         """Draw the figures, write README.md and report.html."""
         found = read_results(self.results)
+        pages = {path: documented(read_text("pages", path), found) for path in self.pages}
         quick = " --quick" if self.results.name == "quick" else ""
         text = text_of(found, f"{spelled('benchmark')}{quick}", spelled("report"))
         overview.draw(self.results, found)
@@ -44,7 +50,9 @@ class Report(Command):
         page, readme = self.results / "report.html", self.results / "README.md"
         write_text(readme, text)
         write_text(page, page_of(text, self.results, TITLE))
-        print(f"wrote {readme} and {page}")
+        for path, content in pages.items():
+            write_text(path, content)
+        print(f"wrote {', '.join(map(str, (readme, page, *pages)))}")
 
 
 def text_of(found: dict[str, Found], command: str, second: str = "python -m agents.report") -> str:

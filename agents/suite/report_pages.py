@@ -1,0 +1,47 @@
+"""The parts of README and docs that say who wins: made of the results, between two marks."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+from fusion_gym.validation import choice
+
+from .found import Found
+from .overview import headline_count, headline_table
+from .report_words import sentences
+
+HEADLINE = "headline"
+_MARKED = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def documented(text: str, found: Mapping[str, Found]) -> str:
+    """The text with all its marked parts made anew.
+
+    ``<!-- results: SETTING -->`` to ``<!-- end -->`` holds what was found in a setting, ``headline``
+    in its place the table of all settings and how many points lie above the envelopes.
+
+    Raises:
+        ConfigurationError: a setting of which there are no results.
+    """
+
+    def part(match: re.Match[str]) -> str:
+        return match[1] + "\n".join(["", *lines_of(match[2], found), ""]) + match[3]
+
+    return _MARKED.sub(part, text)
+
+
+def lines_of(name: str, found: Mapping[str, Found]) -> list[str]:
+    """The lines of a marked part.
+
+    Raises:
+        ConfigurationError: as :func:`documented`.
+    """
+    choice("results", name, [HEADLINE, *found])
+    if name != HEADLINE:
+        return [*(f"- {sentence}" for sentence in sentences(found[name])), ""]
+    seeds = [front["seeds"] for one in found.values() for front in one.classes.values()]
+    trained = f"{min(seeds)} to {max(seeds)}" if min(seeds) < max(seeds) else f"{seeds[0]}"
+    count = headline_count(found)
+    said = f"{count[0].upper()}{count[1:]}; training seeds of a class: {trained}."
+    return [*headline_table(found), "", said, ""]
