@@ -18,8 +18,8 @@ _MARKED = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 def documented(text: str, found: Mapping[str, Found]) -> str:
     """The text with all its marked parts made anew.
 
-    ``<!-- results: SETTING -->`` to ``<!-- end -->`` holds what was found in a setting, ``headline``
-    in its place the table of all settings and how many points lie above the envelopes.
+    ``<!-- results: SETTING -->`` to ``<!-- end -->`` holds what was found in a setting, and with
+    ``headline`` in its place the table of all settings and how many points lie above envelopes.
 
     Raises:
         ConfigurationError: a setting of which there are no results.
