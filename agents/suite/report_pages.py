@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from fusion_gym.validation import choice
 
+from .config import load_suite
 from .found import Found
 from .overview import headline_count, headline_table
 from .report_words import sentences
@@ -22,7 +23,7 @@ def documented(text: str, found: Mapping[str, Found]) -> str:
     ``headline`` in its place the table of all settings and how many points lie above envelopes.
 
     Raises:
-        ConfigurationError: a setting of which there are no results.
+        ConfigurationError: a setting that neither the results nor the benchmark has.
     """
 
     def part(match: re.Match[str]) -> str:
@@ -37,7 +38,10 @@ def lines_of(name: str, found: Mapping[str, Found]) -> list[str]:
     Raises:
         ConfigurationError: as :func:`documented`.
     """
-    choice("results", name, [HEADLINE, *found])
+    settings = [setting.name for setting in load_suite("benchmark").settings]
+    choice("results", name, dict.fromkeys([HEADLINE, *found, *settings]))
+    if name not in (HEADLINE, *found):
+        return ["- No agents have been trained here so far.", ""]
     if name != HEADLINE:
         return [*(f"- {sentence}" for sentence in sentences(found[name])), ""]
     seeds = [front["seeds"] for one in found.values() for front in one.classes.values()]

@@ -1,0 +1,70 @@
+"""The parts of pages that say who wins: made of results, and only where a page asks for them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from small_results import SETTING, small_results
+
+from agents import report
+from agents.suite.found import read_results
+from agents.suite.overview import headline_count
+from agents.suite.report_pages import documented
+from agents.suite.report_words import sentences
+from fusion_gym.validation import ConfigurationError
+
+PAGE = """# A page
+
+<!-- results: {name} -->
+what was said before
+<!-- end -->
+
+The rest stays. <!-- end -->
+"""
+
+
+def test_a_setting_is_said_in_its_sentences(tmp_path: Path) -> None:
+    small_results(tmp_path)
+    found = read_results(tmp_path)
+    text = documented(PAGE.format(name=SETTING), found)
+    assert "what was said before" not in text
+    assert text.endswith("\nThe rest stays. <!-- end -->\n")
+    for sentence in sentences(found[SETTING]):
+        assert f"\n- {sentence}\n" in text
+    assert documented(text, found) == text, "made anew it is the same"
+
+
+def test_the_headline_counts_points_and_seeds(tmp_path: Path) -> None:
+    small_results(tmp_path, seeds=3)
+    found = read_results(tmp_path)
+    text = documented(PAGE.format(name="headline"), found)
+    count = headline_count(found)
+    assert f"{count[0].upper()}{count[1:]}; training seeds of a class: 3." in text
+    assert "| setting |" in text
+
+
+def test_settings_without_results(tmp_path: Path) -> None:
+    """One of the benchmark has none so far; what nobody knows is refused."""
+    small_results(tmp_path)
+    found = read_results(tmp_path)
+    assert "No agents" in documented(PAGE.format(name="markov_jump"), found)
+    with pytest.raises(ConfigurationError, match=r"results = 'tobit_osc' .*'tobit_oscillator'"):
+        documented(PAGE.format(name="tobit_osc"), found)
+
+
+def test_the_command_writes_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    results, page = tmp_path / "results", tmp_path / "page.md"
+    small_results(results)
+    page.write_text(PAGE.format(name="headline"))
+    words = ["report", "--results", str(results), "--pages", str(page)]
+    monkeypatch.setattr(sys, "argv", words)
+    report.main()
+    assert page.read_text() == documented(PAGE.format(name="headline"), read_results(results))
+    page.write_text(PAGE.format(name="nobody"))
+    with pytest.raises(SystemExit, match="results = 'nobody'"):
+        report.main()
+    monkeypatch.setattr(sys, "argv", [*words[:-1], str(tmp_path / "absent.md")])
+    with pytest.raises(SystemExit, match="pages"):
+        report.main()
