@@ -188,7 +188,7 @@ def test_a_table_marks_what_only_other_options_have() -> None:
     starred = [name for name, row in rows.items() if "` *" in row]
     assert starred[0] == "error[sensor]"
     for name in starred[1:]:
-        assert "only with `memory=True`" in rows[name]
+        assert "only with `memory=True` or `belief_features`" in rows[name]
         assert ("| its own" in rows[name]) == name.startswith("own_")
     assert len(starred) == 5
 

@@ -91,7 +91,7 @@ _NETWORK = {
 # What is believed, in the observation of the coordinator and in a sensor's own.
 _BELIEFS: dict[Owner, str] = {
     "coordinator": "only with `memory=True` or `belief_features`",
-    "own": "the same, for a sensor that decides by itself",
+    "own": "only with `memory=True` or `belief_features`, for a sensor by itself",
 }
 _SEES = {"own": "its own", "told": "all", "hidden": "none"}
 _MARKED = re.compile(r"(<!-- observation: (.*?) -->\n).*?(<!-- end -->)", re.DOTALL)
