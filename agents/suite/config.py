@@ -100,9 +100,9 @@ class Setting(Strict):
     ``agents`` are the classes in which agents are trained, by name (all by default), and
     ``agent_options`` tell them what rules know anyway. ``longer`` multiplies the length of their
     trainings, ``lengths`` those of one mode; ``price_exponent``, ``num_envs``, ``error`` and
-    ``tuning`` replace the suite's; ``algorithm`` changes entries of the suite's, ``algorithms``
-    those of one mode; ``pace`` is about how many steps a second they train, for the time that is
-    told to remain.
+    ``tuning`` replace the suite's, ``envs`` the number of environments of one mode; ``algorithm``
+    changes entries of the suite's, ``algorithms`` those of one mode; ``pace`` is about how many
+    steps a second they train, for the time that is told to remain.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
@@ -118,6 +118,7 @@ class Setting(Strict):
     lengths: dict[Mode, Longer] = pydantic.Field(default_factory=dict)
     price_exponent: Share | None = None
     num_envs: Positive | None = None
+    envs: dict[Mode, Positive] = pydantic.Field(default_factory=dict)
     error: Error | None = None
     agents: tuple[str, ...] | None = None
     agent_options: dict[str, Any] = pydantic.Field(default_factory=dict)
@@ -158,6 +159,10 @@ class Suite(Strict):
         """
         of_mode = self.algorithms.get(mode, {}) | setting.algorithms.get(mode, {})
         return settings(self.algorithm.model_dump() | setting.algorithm | of_mode)
+
+    def num_envs_of(self, setting: Setting, mode: Mode) -> int:
+        """Environments side by side in a training."""
+        return setting.envs.get(mode) or setting.num_envs or self.num_envs
 
     def timesteps_of(self, setting: Setting, mode: Mode) -> int:
         """Steps of a training, where sensors decide by themselves of each of their rows."""

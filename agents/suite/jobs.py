@@ -221,7 +221,7 @@ def experiment_of(suite: Suite, setting: Setting, of: Class, seed: int, work: Pa
         algorithm=suite.algorithm_of(setting, of.mode),
         training=TrainingConfig(
             timesteps=timesteps,
-            num_envs=setting.num_envs or suite.num_envs,
+            num_envs=suite.num_envs_of(setting, of.mode),
             seed=seed,
             price_exponent=suite.price_exponent if own is None else own,
             error=setting.error or suite.error,
