@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import pydantic
-import yaml
 
 from fusion_gym import validation
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.yaml_text import parsed
 
 from ..input.files import checked, read_text
 
@@ -44,33 +42,6 @@ class Strict(pydantic.BaseModel):
             key: tuple(value) if isinstance(value, list) else value
             for key, value in content.items()
         }
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML whose keys are given once, and whose ``1e-3`` is a number, as in YAML 1.2."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """A mapping.
-
-        Raises:
-            ConstructorError: a key that is given twice.
-        """
-        seen = set()
-        for key_node, _ in node.value:
-            if key_node.tag == "tag:yaml.org,2002:merge":
-                continue
-            key = self.construct_object(key_node, deep=True)
-            if isinstance(key, Hashable) and key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} is given twice", key_node.start_mark
-                )
-            seen.add(key)
-        return super().construct_mapping(node, deep)
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), "-+.0123456789"
-)
 
 
 def config_path(name: str | Path, option: str = "config") -> Path:
@@ -114,12 +85,7 @@ def read_yaml(name: str | Path, option: str = "config") -> Any:
         ConfigurationError: no such file, or no YAML.
     """
     text = read_text(option, config_path(name, option), str(name))
-    try:
-        return yaml.load(text, _Loader)  # a safe loader
-    # PyYAML lets through what its types raise: a date of 31 February, tags without a value.
-    except (yaml.YAMLError, ValueError, AttributeError, TypeError, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise ConfigurationError(f"{option} {str(name)!r} is no YAML: {reason}") from None
+    return parsed(text, f"{option} {str(name)!r}")
 
 
 def parse(kind: type[Model], content: Any, source: str, option: str = "config") -> Model:

@@ -17,6 +17,12 @@ from fusion_gym.envs.single import FusionEnv
 from fusion_gym.envs.vector import FusionVectorEnv
 
 
+# What every environment takes beside its options: the path of a file that holds some of them.
+_SYSTEM = inspect.Parameter(
+    "system", inspect.Parameter.KEYWORD_ONLY, default=None, annotation="str | None"
+)
+
+
 class _Page:
     """A docstring that is written when it is first asked for; an object's tells of its own task."""
 
@@ -65,6 +71,8 @@ def _made(env_id: str, base: type, init: Any) -> type:
     own = list(inspect.signature(init).parameters.values())[:-1]
     options = inspect.signature(options_of(env_id)).parameters.values()
     named = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
+    if "system" not in [option.name for option in named]:
+        named.append(_SYSTEM)
     init.__signature__ = inspect.Signature([*own, *named])
     body = {"__init__": init, "__module__": __name__, "__doc__": _Page(env_id)}
     return type(base.__name__, (base,), body)

@@ -17,6 +17,7 @@ from fusion_gym import validation
 from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.rehearsal import rehearse
 from fusion_gym.core.task import Task
+from fusion_gym.envs.option_file import read_options
 from fusion_gym.validation import ConfigurationError
 
 Build = Callable[[Any], Scenario]
@@ -28,6 +29,7 @@ ENVIRONMENTS: dict[str, str | Build] = {
     "fusion_gym/UnknownInput-v0": "fusion_gym.systems.unknown_input.environment:build",
     "fusion_gym/BiasedOscillator-v0": "fusion_gym.systems.tobit.biased:build_oscillator",
     "fusion_gym/BiasedTracking-v0": "fusion_gym.systems.tobit.biased:build_tracking",
+    "fusion_gym/LinearFusion-v0": "fusion_gym.systems.tobit.linear:build",
     "fusion_gym/RemoteEstimation-v0": "fusion_gym.systems.remote.environment:build",
 }
 
@@ -107,9 +109,10 @@ def options_of(env_id: str) -> type[CommonOptions]:
 def make_task(env: str | CommonOptions, **options: Any) -> Task:
     """The task of a registered environment, everything checked before anything runs.
 
-    ``env`` is an id, to which ``options`` and ``max_episode_steps`` (which every environment
-    takes) are added, or an options object such as
-    :class:`~fusion_gym.systems.tobit.oscillator.TobitOscillatorOptions`.
+    ``env`` is an id, to which ``options`` and what every environment takes are added, or an options
+    object such as :class:`~fusion_gym.systems.tobit.oscillator.TobitOscillatorOptions`. Every
+    environment takes ``max_episode_steps``, and ``system``, the path of a YAML file of options,
+    which those beside it replace.
 
     Raises:
         ConfigurationError: an id that is not registered, an unknown option, or a value that is
@@ -128,7 +131,10 @@ def make_task(env: str | CommonOptions, **options: Any) -> Task:
             )
         return _checked(build_of(env_id), env, limit)
     kind = options_of(env)
-    validation.arguments(env, options, [field.name for field in fields(kind)])
+    known = [field.name for field in fields(kind)]
+    if "system" in options and "system" not in known:
+        options = read_options(options.pop("system")) | options
+    validation.arguments(env, options, known)
     return _checked(build_of(env), kind(**options), limit)
 
 

@@ -25,9 +25,11 @@ _LARGEST = 1e26  # what a delivery leaves of a larger variance would drown in it
 class CensoredSensors:
     """y = clip(C x + v, τ, υ) by component, v ~ N(0, diag(R)), for several sensors of equal size.
 
-    ``deviation`` is √R, ``uncensored`` marks lower thresholds of minus infinity, which
-    ``finite_threshold`` replaces by zero; ``two_sided`` says whether any upper threshold is
-    finite, and ``finite_upper`` replaces those that are not by zero.
+    A component that a sensor does not have is always zero: its row of C is, it is not censored, and
+    ``noise_deviation``, elsewhere √R, is zero there. ``deviation`` is √R, ``uncensored`` marks
+    lower thresholds of minus infinity, which ``finite_threshold`` replaces by zero; ``two_sided``
+    says whether any upper threshold is finite, and ``finite_upper`` replaces those that are not by
+    zero.
 
     Shapes: ``measurement_matrix`` C (sensors, m, n, 1), ``variance`` R (sensors, m, 1),
     ``threshold`` τ and ``upper`` υ (sensors, m, 1), in the unit of the measurement, minus and plus
@@ -41,6 +43,7 @@ class CensoredSensors:
     threshold: Array
     upper: Array
     deviation: Array
+    noise_deviation: Array
     uncensored: NDArray[np.bool_]
     finite_threshold: Array
     finite_upper: Array
@@ -54,8 +57,11 @@ class CensoredSensors:
         threshold: ArrayLike,
         states: int,
         upper: ArrayLike = np.inf,
+        present: NDArray[np.bool_] | None = None,
     ) -> CensoredSensors:
         """Check plain arrays: C (sensors, m, states); R, τ and υ broadcast to (sensors, m).
+
+        ``present`` (sensors, m) are the components that the sensors have, by default all.
 
         Raises:
             ConfigurationError: a wrong shape, a variance <= 0, a lower threshold that is not below
@@ -72,12 +78,14 @@ class CensoredSensors:
             )
         uncensored = np.isneginf(low)
         noise = validation.positive("measurement_variance", variance, shape)[..., None]
+        here = np.ones(shape) if present is None else np.where(present, 1.0, 0.0)
         return cls(
             measurement_matrix=matrix[..., None],
             variance=noise,
             threshold=low[..., None],
             upper=high[..., None],
             deviation=np.sqrt(noise),
+            noise_deviation=np.sqrt(noise) * here[..., None],
             uncensored=uncensored[..., None],
             finite_threshold=np.where(uncensored, 0.0, low)[..., None],
             finite_upper=np.where(np.isposinf(high), 0.0, high)[..., None],
@@ -106,7 +114,7 @@ class CensoredSensors:
         """
         shape = (self.count, self.size, noise.shape[-1])
         latent = linalg.matvec(self.measurement_matrix, state)
-        latent += self.deviation * noise.reshape(shape)
+        latent += self.noise_deviation * noise.reshape(shape)
         np.maximum(latent, true_limits(departure, self.threshold), out=latent)
         if not self.two_sided:
             return latent

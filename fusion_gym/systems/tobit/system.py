@@ -51,6 +51,7 @@ class CensoredState:
     departure: Array | None = None
 
 
+_OF_CENSORING = ("censored", "uncensored_probability")
 _COMPONENTS = "(sensors, m, N)"
 SIGNALS = (
     Signal("measurement", "own", _COMPONENTS, "the new censored measurement"),
@@ -134,7 +135,7 @@ class CensoredSystem:
 
     @property
     def observation(self) -> tuple[Block, ...]:
-        """Blocks of the observation."""
+        """Blocks of the observation, without those of censoring where nothing is censored."""
         sensors, nodes = self.centre.sensors, numbered(self.sensor_count)
         own = partial(Block, labels=(nodes, numbered(sensors.size)), node="own")
         new = partial(own, knowledge="own", limit=_RANGE)
@@ -143,7 +144,7 @@ class CensoredSystem:
         uncensored = "predicted probability that the component is not censored"
         moved = "new minus last delivered measurement, over two noise deviations"
         variance = "logarithm of the predicted variance over its open-loop mean"
-        return (
+        blocks = [
             new("whitened_innovation", "innovation over its predicted deviation", _whitened),
             new("censored", at_threshold, lambda s: sensors.censored(s.measurement), limit=None),
             new(
@@ -163,7 +164,10 @@ class CensoredSystem:
                 "prediction over the state's root mean square",
                 lambda s: s.prior_mean / self.scale[:, None],
             ),
-        )
+        ]
+        if sensors.unlimited:  # these two would say nothing
+            blocks = [one for one in blocks if one.name not in _OF_CENSORING]
+        return tuple(blocks)
 
     def start(self, noise: Array) -> CensoredState:
         """Time 0: the state is drawn and every first measurement is known, free of charge."""

@@ -1,0 +1,34 @@
+"""Options of an environment from a file."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from fusion_gym.errors import refusal
+from fusion_gym.validation import ConfigurationError
+
+
+def read_options(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The options that a YAML file holds, by name.
+
+    Raises:
+        ConfigurationError: the file cannot be read, is no YAML or no mapping, or PyYAML is absent.
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        raise refusal("system", path, "the path of a YAML file")
+    source = f"system = {os.fspath(path)!r}"
+    try:
+        from fusion_gym.yaml_text import parsed
+    except ModuleNotFoundError:
+        raise ConfigurationError(f"{source} needs PyYAML: pip install pyyaml") from None
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigurationError(f"{source} cannot be read: {reason}") from None
+    content = parsed(text, source)
+    if not (isinstance(content, dict) and all(isinstance(key, str) for key in content)):
+        raise ConfigurationError(f"{source} is not allowed: it must hold a mapping of options")
+    return content

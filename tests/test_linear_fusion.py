@@ -1,0 +1,194 @@
+"""A linear system of one's own, against plain matrices of an independent filter."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from numpy.typing import NDArray
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError
+
+Array = NDArray[np.float64]
+LINEAR = "fusion_gym/LinearFusion-v0"
+
+
+def system(seed: int, states: int, sizes: list[int]) -> dict[str, Any]:
+    """A stable plant of any coupling; sensors of these sizes with full covariances."""
+    generator = np.random.default_rng(seed)
+    rotation, _ = np.linalg.qr(generator.normal(size=(states, states)))
+    factor = generator.normal(size=(states, 2))
+    covariances = []
+    for size in sizes:
+        root = generator.normal(size=(size, size + 1))
+        covariances.append(0.5 * root @ root.T + 0.1 * np.eye(size))
+    return {
+        "transition": 0.97 * rotation,
+        "process_covariance": 0.1 * factor @ factor.T,
+        "initial_mean": generator.normal(size=states),
+        "initial_covariance": 0.5 * np.eye(states),
+        "measurement_matrices": [generator.normal(size=(size, states)) for size in sizes],
+        "measurement_covariances": covariances,
+    }
+
+
+def reference(options: dict[str, Any], granted: list[int], prior: Array) -> Array:
+    """The posterior covariance of a centralised filter that takes the granted in full."""
+    covariance = prior
+    for place in granted:
+        matrix, noise = (
+            options[f"measurement_{name}"][place] for name in ("matrices", "covariances")
+        )
+        gain = covariance @ matrix.T @ np.linalg.inv(matrix @ covariance @ matrix.T + noise)
+        covariance = covariance - gain @ matrix @ covariance
+    return covariance
+
+
+@pytest.mark.parametrize(("states", "sizes"), [(2, [1, 1]), (3, [2, 1, 3]), (12, [1, 2] * 20)])
+def test_the_centre_is_the_optimal_filter(states: int, sizes: list[int]) -> None:
+    """Covariances step by step; the squared errors of many runs against their trace."""
+    options = system(7, states, sizes)
+    task = fusion_gym.make_task(LINEAR, tokens="unlimited", **options)
+    batch = EpisodeBatch.seeded(task, 400, 0)
+    generator = np.random.default_rng(1)
+    covariance = options["initial_covariance"]
+    normalised = []
+    for _ in range(25):
+        requests = generator.random(len(sizes)) < 0.3
+        moved = options["transition"] @ covariance @ options["transition"].T
+        prior = moved + options["process_covariance"]
+        covariance = reference(options, np.flatnonzero(requests).tolist(), prior)
+        outcome = batch.step(np.repeat(requests[:, None], 400, axis=1))
+        _, fused = task.system.fused(batch.delivered)
+        np.testing.assert_allclose(fused[..., 0], covariance, atol=1e-8)
+        error = outcome.error
+        weighted = np.linalg.solve(covariance, error)
+        normalised.append((error * weighted).sum(0))
+    # Chi-squared with n degrees of freedom; successive errors of a run are correlated.
+    mean = np.mean(normalised)
+    spread = np.mean(normalised, axis=0).std() / np.sqrt(400)
+    assert abs(mean - states) < 5.0 * spread
+
+
+def test_estimates_are_those_of_filterpy() -> None:
+    """A sensor with a diagonal covariance reports its channels as they are."""
+    options = system(3, 3, [2, 1]) | {"measurement_covariances": [[[0.3, 0.0], [0.0, 0.2]], 0.5]}
+    task = fusion_gym.make_task(LINEAR, tokens="unlimited", **options)
+    batch = EpisodeBatch.seeded(task, 1, 5)
+    matrix = np.vstack(options["measurement_matrices"])
+    beside = KalmanFilter(dim_x=3, dim_z=3)
+    beside.x, beside.P = options["initial_mean"].copy(), options["initial_covariance"].copy()
+    beside.F, beside.Q = options["transition"], options["process_covariance"]
+    beside.H, beside.R = matrix, np.diag([0.3, 0.2, 0.5])
+    for _ in range(30):
+        measured = batch.signals["measurement"][..., 0]
+        assert measured[1, 1] == 0.0  # the second sensor has one channel
+        beside.predict()
+        beside.update(np.concatenate([measured[0], measured[1, :1]]))
+        batch.step(np.ones((2, 1), dtype=np.bool_))
+        mean, _ = task.system.fused(batch.delivered)
+        np.testing.assert_allclose(mean[:, 0], beside.x, atol=1e-9)
+
+
+def test_censored_sensors_get_a_filter_that_knows_it() -> None:
+    common = {"measurement_matrices": [[1, 0], [[0, 1], [1, 1]]], "horizon": 50}
+    limited = fusion_gym.make_task(LINEAR, censoring_threshold=[0.0, [-np.inf, 1.0]], **common)
+    assert limited.settings["filter"] == "tobit"
+    assert fusion_gym.make_task(LINEAR, **common).settings["filter"] == "kalman"
+    batch = EpisodeBatch.seeded(limited, 2000, 0)
+    measured = batch.signals["measurement"]
+    assert measured[0, 0].min() == 0.0
+    assert measured[1, 0].min() < 0.0
+    assert measured[1, 1].min() == 1.0
+    assert not measured[0, 1].any()
+    names = EpisodeBatch(limited, 1).layout.names
+    assert "censored[0,0]" in names
+    assert "censored[0,0]" not in EpisodeBatch(fusion_gym.make_task(LINEAR), 1).layout.names
+
+
+def test_every_rule_and_the_best_schedule_run() -> None:
+    task = fusion_gym.make_task(LINEAR, token_rate=1.5, horizon=40)
+    clock, schedule = "periodic:period=4", "periodic_optimum:period=4,packets=2"
+    names = ("always", "innovation_threshold:threshold=1", "information_gain:threshold=0.05",
+             "value_of_information:threshold=0.02,at_most=1", "lookahead:price=0.02", clock,
+             schedule)  # fmt: skip
+    found = {name: run_episodes(task, make_policy(name, task), 300, 0) for name in names}
+    errors = {name: one.mse.mean() for name, one in found.items()}
+    assert found[clock].rate.mean() == pytest.approx(found[schedule].rate.mean(), rel=0.05)
+    assert errors[schedule] <= errors[clock] * 1.01
+    assert errors["always"] == min(errors.values())
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"measurement_matrices": []}, "measurement_matrices = []"),
+        ({"measurement_matrices": 3}, "a list with a matrix for each sensor"),
+        ({"measurement_matrices": [[1, 0], [[1, 0, 0]]]}, "measurement_matrices[1]"),
+        ({"measurement_covariances": [1.0]}, "each of the 2 sensors"),
+        ({"measurement_covariances": -1.0}, "measurement_covariances = -1"),
+        ({"measurement_covariances": [1.0, [[1, 2], [2, 1]]]}, "measurement_covariances[1]"),
+        ({"censoring_threshold": [0.0, [1.0, 2.0]]}, "censoring_threshold[1]"),
+        ({"censoring_threshold": 1.0, "censoring_upper": 0.0}, "censoring_threshold"),
+        ({"transition": [[2.0, 0.0], [0.0, 1.5]]}, "transition"),
+        (
+            {
+                "measurement_matrices": [[[1, 0], [0, 1]]],
+                "measurement_covariances": [[[1, 0.5], [0.5, 1]]],
+                "censoring_threshold": 0.0,
+            },
+            "diagonal",
+        ),
+    ],
+)
+def test_bad_systems_are_told_in_one_error(options: dict[str, Any], told: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        fusion_gym.make_task(LINEAR, **options)
+    assert told in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+FILE = """\
+transition: [[0.99, 0.1], [0.0, 0.95]]
+process_covariance: [[0.001, 0.0], [0.0, 0.05]]
+measurement_matrices: [[1, 0], [[0, 1], [1, 1]]]
+measurement_covariances: [0.2, [[0.1, 0.02], [0.02, 0.3]]]
+token_rate: 2
+"""
+
+
+def test_a_system_from_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(FILE)
+    env = gym.make(LINEAR, system=str(path), token_rate=1.5)
+    task = env.unwrapped.task  # type: ignore[attr-defined]
+    assert task.settings["token_rate"] == 1.5
+    assert task.settings["measurement_covariances"] == [0.2, [[0.1, 0.02], [0.02, 0.3]]]
+    assert fusion_gym.make_task(LINEAR, system=str(path)).settings["token_rate"] == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("transitions: [[1]]", "transitions"),
+        ("- 1", "a mapping"),
+        ("transition: [[1", "plant.yaml"),
+        ("token_rate: 1\ntoken_rate: 2", "token_rate"),
+        ("transition: [[1, 2]]", "transition"),
+    ],
+)
+def test_a_bad_file_is_told_by_name(tmp_path: Path, text: str, told: str) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigurationError, match=told):
+        fusion_gym.make_task(LINEAR, system=str(path))
+    with pytest.raises(ConfigurationError, match=r"absent\.yaml"):
+        fusion_gym.make_task(LINEAR, system=str(tmp_path / "absent.yaml"))
