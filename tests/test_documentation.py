@@ -88,7 +88,7 @@ def test_configs_that_the_texts_name_exist() -> None:
 
 def test_the_readme_stays_short() -> None:
     assert len(README.splitlines()) < 150
-    assert len(PAGES) == 6
+    assert len(PAGES) == 7
 
 
 def test_files_and_names_of_the_library_that_the_texts_name_exist() -> None:

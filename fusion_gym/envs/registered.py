@@ -16,7 +16,6 @@ from fusion_gym.envs.registration import ENVIRONMENTS, class_name, make_task, op
 from fusion_gym.envs.single import FusionEnv
 from fusion_gym.envs.vector import FusionVectorEnv
 
-
 # What every environment takes beside its options: the path of a file that holds some of them.
 _SYSTEM = inspect.Parameter(
     "system", inspect.Parameter.KEYWORD_ONLY, default=None, annotation="str | None"

@@ -23,6 +23,7 @@ JUMP = "fusion_gym/MarkovJumpTracking-v0"
 INPUT = "fusion_gym/UnknownInput-v0"
 BIASED = "fusion_gym/BiasedOscillator-v0"
 TRACKING = "fusion_gym/BiasedTracking-v0"
+LINEAR = "fusion_gym/LinearFusion-v0"
 REMOTE = "fusion_gym/RemoteEstimation-v0"
 IDS = [name for name in ENVIRONMENTS if name != OWN_ID] + [OWN_ID]
 
@@ -107,6 +108,17 @@ VARIANTS: dict[str, list[Options]] = {
         {"filter": "stochastic", "stochastic_weight": 1.0, "access": "any", "fusion": "ici"},
         {"filter": "adf", "access": "round_robin", "error": "trace"},
         REMEMBERING | {"access": "round_robin"} | DRAWN,
+    ],
+    LINEAR: [
+        {
+            "measurement_matrices": [[1, 0], [[0, 1], [1, 1]], [1, -1]],
+            "measurement_covariances": [0.3, [[0.2, 0.05], [0.05, 0.1]], 1.0],
+            "fusion": "ci",
+        }
+        | REMEMBERING
+        | DRAWN,
+        {"censoring_threshold": (0.0, -1.0), "access": "round_robin", "information": "centre"},
+        ESTIMATES | NOISY | {"filter": "adf", "action": "discrete"},
     ],
     REMOTE: [
         LOSSY | {"access": "single", "initial_deviation": 1.0} | DRAWN,
