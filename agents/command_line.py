@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
+import os
 import re
 import sys
 from abc import ABC, abstractmethod
@@ -79,6 +80,8 @@ def start(kind: type[Command]) -> None:
         SystemExit: as :func:`told`.
     """
     command: Command | None = None
+    if os.getcwd() not in sys.path:  # where modules of one's own lie: an installed script lacks it
+        sys.path.append(os.getcwd())
     with told(lambda: command.interrupted() if command else "interrupted"):
         command = read(kind)
         check_options(command)

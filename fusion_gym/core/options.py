@@ -14,6 +14,7 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import System
 from fusion_gym.errors import ConfigurationError, refusal
+from fusion_gym.importing import name_of
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class CommonOptions:
     information: str = "sensors"
     own_number: bool = True
     action: str = "binary"
-    error: str = "squared"
+    error: str | Callable[[Array, Array], Any] = "squared"
     error_weight: float = 1.0
     cost_weight: float | str = 0.01
     price_range: ArrayLike | None = None
@@ -224,4 +225,6 @@ def plain(value: Any) -> Any:
         return {key: plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(entry) for entry in value]
+    if callable(value):
+        return name_of(value)
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value

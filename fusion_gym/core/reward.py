@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,9 +12,11 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.importing import name_of, named
 from fusion_gym.validation import ConfigurationError
 
-ERROR_KINDS = ("squared", "trace")
+Cost = Callable[[Array, Array], Any]  # of errors (n, N) and covariances (n, n, N)
+ERROR_KINDS = ("squared", "trace", "maximum")
 TRAINING_ERRORS = ("squared", "excess", "mismatch")
 _LARGEST = 1e32  # of squares on average: rewards are also handed on as float32
 
@@ -52,16 +55,31 @@ def _at_rest(open_loop: Array) -> ConfigurationError:
     )
 
 
+def _cost(error: str | Cost) -> str | Cost:
+    """A kind as it is, or the function that ``error`` is or names.
+
+    Raises:
+        ConfigurationError: neither, or a function that cannot be imported.
+    """
+    own = named("error", error) if isinstance(error, str) and ":" in error else error
+    if own not in ERROR_KINDS and (isinstance(own, str) or not callable(own)):
+        listed = ", ".join(repr(kind) for kind in ERROR_KINDS)
+        allowed = f"one of {listed}, a function of error and covariance, or its 'module:name'"
+        raise validation.refusal("error", own, allowed)
+    return own
+
+
 @dataclass(frozen=True)
 class Reward:
-    """reward = -(error_weight · Σᵢ wᵢ error_i + price · tokens spent).
+    """reward = -(error_weight · D + price · tokens spent), D what an error costs.
 
-    ``error="squared"`` takes the squared error of the fused estimate, ``"trace"`` the diagonal of
-    its covariance as the filter claims it (which a policy can game, see the documentation).
-    ``state_weights`` w has shape (n, 1).
+    ``error="squared"`` takes D = Σᵢ wᵢ eᵢ² of the error e of the fused estimate, ``"maximum"``
+    D = maxᵢ wᵢ eᵢ², ``"trace"`` D = Σᵢ wᵢ Pᵢᵢ of the covariance P as the filter claims it (which a
+    policy can game, see the documentation). A function takes e (n, N) = truth - estimate and
+    P (n, n, N), and returns D (N,) >= 0; the weights w, of shape (n, 1), are not in it.
     """
 
-    error: str
+    error: str | Cost
     error_weight: float
     price: Price
     state_weights: Array
@@ -69,7 +87,7 @@ class Reward:
     @classmethod
     def create(
         cls,
-        error: str,
+        error: str | Cost,
         error_weight: float,
         price: Price,
         state_weights: ArrayLike | None,
@@ -77,11 +95,13 @@ class Reward:
     ) -> Reward:
         """Check the weights; ``None`` weighs all states alike so that open loop costs 1.
 
-        ``open_loop`` (n,) is the mean error variance of each state without any transmission.
+        ``error`` is a kind, a function, or ``module:name`` of one. ``open_loop`` (n,) is the mean
+        error variance of each state without any transmission.
 
         Raises:
-            ConfigurationError: an unknown kind, a negative weight, a wrong shape, or weights that
-                make of the error without transmissions more than can be worked with.
+            ConfigurationError: an unknown kind, a function that cannot be imported, a negative
+                weight, a wrong shape, or weights that make of the error without transmissions more
+                than can be worked with.
         """
         if state_weights is None and not open_loop.sum() > 0.0:
             raise _at_rest(open_loop)
@@ -98,22 +118,46 @@ class Reward:
                 f"{_LARGEST:g} a step, not {weight * (weights @ open_loop):g}"
             )
         return cls(
-            error=validation.choice("error", error, ERROR_KINDS),
+            error=_cost(error),
             error_weight=weight,
             price=price,
             state_weights=weights[:, None],
         )
 
+    @property
+    def error_kind(self) -> str:
+        """The kind of the error's term, or the name of its function."""
+        return self.error if isinstance(self.error, str) else name_of(self.error)
+
     def terms(
-        self, squared_error: Array, covariance: Array, spent: Array, price: Array
+        self, error: Array, covariance: Array, spent: Array, price: Array
     ) -> tuple[Array, Array]:
         """The two terms of the reward (N,), both <= 0: error and cost.
 
-        From squared errors (n, N), the fused covariance (n, n, N), tokens spent (N,) and the
-        price of a token (N,).
+        From errors (n, N), the fused covariance (n, n, N), tokens spent (N,) and the price of a
+        token (N,).
+
+        Raises:
+            ConfigurationError: a function of one's own returns no numbers >= 0 of shape (N,).
         """
-        error = squared_error if self.error == "squared" else linalg.diagonal(covariance)
-        return -self.error_weight * (self.state_weights * error).sum(0), -price * spent
+        return -self.error_weight * self._error_cost(error, covariance), -price * spent
+
+    def _error_cost(self, error: Array, covariance: Array) -> Array:
+        if self.error == "squared":
+            return np.asarray((self.state_weights * (error * error)).sum(0))
+        if self.error == "trace":
+            return np.asarray((self.state_weights * linalg.diagonal(covariance)).sum(0))
+        if self.error == "maximum":
+            return np.asarray((self.state_weights * (error * error)).max(0))
+        assert not isinstance(self.error, str)
+        found = np.asarray(self.error(error, covariance), dtype=np.float64)
+        if found.shape != error.shape[1:] or not np.all(found >= 0.0):
+            raise ConfigurationError(
+                f"error = {name_of(self.error)!r} is not allowed: of errors {error.shape} it must "
+                f"return numbers >= 0 of shape {error.shape[1:]}, and returned "
+                f"{validation.shown(found)} of shape {found.shape}"
+            )
+        return found
 
     def training_error(self, kind: str, error: Array, reference_error: Array) -> Array:
         """The error's term of the reward (…,) to train with, of errors (n, …): truth - estimate.

@@ -97,9 +97,7 @@ class Runs:
         mean, covariance = system.fused(state)
         error = system.truth(state) - mean
         squared_error = error * error
-        reward_error, reward_communication = task.reward.terms(
-            squared_error, covariance, spent, self.price
-        )
+        reward_error, reward_communication = task.reward.terms(error, covariance, spent, self.price)
         if self.shadows is not None:
             self.shadows = self.memory.deliver(self.beliefs(), granted)
         self.delivered, self.tokens, self.steps = state, tokens, self.steps + 1

@@ -18,6 +18,7 @@ from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.rehearsal import rehearse
 from fusion_gym.core.task import Task
 from fusion_gym.envs.option_file import read_options
+from fusion_gym.importing import imported
 from fusion_gym.validation import ConfigurationError
 
 Build = Callable[[Any], Scenario]
@@ -74,11 +75,15 @@ def register(env_id: str | None = None, build: str | Build | None = None) -> Non
 
 
 def build_of(env_id: str) -> Build:
-    """The ``build`` function of an id.
+    """The ``build`` function of an id; ``module:id`` imports a module first, which registers it.
 
     Raises:
-        ConfigurationError: an unknown id.
+        ConfigurationError: an unknown id, or a module that cannot be imported.
     """
+    module, colon, own = env_id.rpartition(":")
+    if colon:
+        imported("env", env_id, module)
+        env_id = own
     validation.keys("environment", [env_id], ENVIRONMENTS)
     entry = ENVIRONMENTS[env_id]
     if not isinstance(entry, str):
@@ -109,10 +114,11 @@ def options_of(env_id: str) -> type[CommonOptions]:
 def make_task(env: str | CommonOptions, **options: Any) -> Task:
     """The task of a registered environment, everything checked before anything runs.
 
-    ``env`` is an id, to which ``options`` and what every environment takes are added, or an options
-    object such as :class:`~fusion_gym.systems.tobit.oscillator.TobitOscillatorOptions`. Every
-    environment takes ``max_episode_steps``, and ``system``, the path of a YAML file of options,
-    which those beside it replace.
+    ``env`` is an id, or ``module:id`` of one that a module registers, to which ``options`` and what
+    every environment takes are added, or an options object such as
+    :class:`~fusion_gym.systems.tobit.oscillator.TobitOscillatorOptions`. Every environment takes
+    ``max_episode_steps``, and ``system``, the path of a YAML file of options, which those beside it
+    replace.
 
     Raises:
         ConfigurationError: an id that is not registered, an unknown option, or a value that is

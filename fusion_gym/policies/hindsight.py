@@ -66,8 +66,8 @@ def find_schedules(task: Task, price: float, width: int, episodes: int, seed: in
     validation.integer("seed", seed, at_least=0)
     if task.reward.error != "squared":
         raise ConfigurationError(
-            f"error = {task.reward.error!r} is not allowed with a hindsight schedule: it must be "
-            "'squared', for the error that the noise makes is what a clairvoyant knows"
+            f"error = {task.reward.error_kind!r} is not allowed with a hindsight schedule: it must "
+            "be 'squared', for the error that the noise makes is what a clairvoyant knows"
         )
     block = max(1, _CANDIDATES // width)
     parts = [

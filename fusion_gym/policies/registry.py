@@ -1,7 +1,8 @@
 """Every policy by its name: rules, references that know the model, saved agents.
 
 A policy is asked for as ``NAME`` or ``NAME:key=value,key=value``, a saved agent as ``model:PATH``
-or ``zoo:NAME`` with settings behind a comma.
+or ``zoo:NAME`` with settings behind a comma, one of your own as ``package.module:Class`` or
+``package.module:Class:key=value``.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import KNOWLEDGE
 from fusion_gym.core.task import Task
+from fusion_gym.importing import named
 from fusion_gym.policies.base import Policy, owner_of
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError, boolean, choice, keys
@@ -125,7 +127,7 @@ def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
     """
     context: Context = {"task": task, "trust": boolean("trust", trust)}
     policy = _make(spec, task.policy_defaults, context)
-    if _ROWS[spec.partition(":")[0]].kind != "agent":  # loading it has checked all that it sees
+    if _asked(spec)[1].kind != "agent":  # loading it has checked all that it sees
         _try_out(spec, policy, task)
     return policy
 
@@ -138,22 +140,21 @@ def make_rule(spec: str, defaults: dict[str, dict[str, Any]] | None = None) -> P
     Raises:
         ConfigurationError: an unknown rule or parameter, or a value that is not allowed.
     """
-    name = spec.partition(":")[0]
-    if name in _ROWS and _ROWS[name].kind != "rule":
+    if _asked(spec)[1].kind != "rule":
         raise ConfigurationError(f"policy {spec!r} is no rule: make_policy makes it for a task")
     return _make(spec, defaults or {}, {"task": None, "trust": False})
 
 
 def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> Policy:
-    name, _, text = spec.partition(":")
-    maker = _maker(name)
+    name, row, text = _asked(spec)
+    maker = _maker(row)
     known = _parameters(name, maker)
     given: dict[str, Any] = {}
-    if _ROWS[name].kind == "agent":
+    if row.kind == "agent":
         key, (value, *entries) = next(iter(known)), text.split(",")
         given[key] = value.removeprefix(f"{key}=")
     else:
-        text, given = _split_rest(text, _ROWS[name].rest)
+        text, given = _split_rest(text, row.rest)
         entries = text.split(",") if text else []
     settings = parse_settings(f"parameter of policy {name!r}", entries)
     keys(f"parameter of policy {name!r}", settings, known.keys() - given.keys())
@@ -184,9 +185,31 @@ def _split_rest(text: str, rest: str | None) -> tuple[str, dict[str, Any]]:
     return text, {}
 
 
-def _maker(name: str) -> Maker:
-    keys("policy", [name], _ROWS)
-    maker = _ROWS[name].maker
+def _asked(spec: str) -> tuple[str, Row, str]:
+    """The name of a policy, its row, and the text behind its name.
+
+    Raises:
+        ConfigurationError: an unknown name, or a class that cannot be imported or is no policy.
+    """
+    name, _, text = spec.partition(":")
+    own, _, behind = text.partition(":")
+    if name in _ROWS or not own.isidentifier():
+        keys("policy", [name], _ROWS)
+        return name, _ROWS[name], text
+    name = f"{name}:{own}"
+    found = named("policy", name)
+    lacks = [part for part in ("knowledge", "reset", "__call__") if not hasattr(found, part)]
+    if not isinstance(found, type) or lacks:
+        raise ConfigurationError(
+            f"policy = {name!r} is not allowed: it must be a class with knowledge, reset and "
+            "__call__, as one derived from fusion_gym.policies.base.Rule"
+        )
+    kind: Kind = "reference" if "task" in inspect.signature(found).parameters else "rule"
+    return name, Row(kind, found), behind
+
+
+def _maker(row: Row) -> Maker:
+    maker = row.maker
     if isinstance(maker, str):
         module, _, attribute = maker.partition(":")
         found: Maker = getattr(importlib.import_module(module), attribute)

@@ -58,7 +58,7 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
     system, reward = _system(task), task.reward
     if reward.error != "squared":
         raise ConfigurationError(
-            f"error = {reward.error!r} is not allowed for the optimum: it must be 'squared'"
+            f"error = {reward.error_kind!r} is not allowed for the optimum: it must be 'squared'"
         )
     if reward.price.fixed is None:
         raise ConfigurationError(

@@ -1,0 +1,182 @@
+"""Environments, policies and rewards of one's own, by their names in a module."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.registry import make_policy, make_rule
+from fusion_gym.validation import ConfigurationError
+
+TOBIT = "fusion_gym/TobitOscillator-v0"
+MODULE = '''
+from dataclasses import dataclass
+
+import numpy as np
+
+import fusion_gym
+from fusion_gym.core.options import Scenario
+from fusion_gym.policies.base import Rule
+from fusion_gym.systems.tobit.linear import LinearFusionOptions
+from fusion_gym.systems.tobit.linear import build as build_linear
+
+
+@dataclass(frozen=True)
+class CartOptions(LinearFusionOptions):
+    """A cart."""
+
+    token_rate: float = 2.0
+
+
+def build(chosen: CartOptions) -> Scenario:
+    return build_linear(chosen)
+
+
+fusion_gym.register("me/OwnCart-v0", build)
+
+
+@dataclass
+class Oldest(Rule):
+    """Whoever was silent for longer than some steps."""
+
+    knowledge = "centre"
+    steps: float = 3.0
+
+    def __call__(self, signals):
+        return signals["age"] > self.steps
+
+
+@dataclass
+class Tasked(Rule):
+    """One that is given the task."""
+
+    knowledge = "centre"
+    task: object = None
+
+    def __call__(self, signals):
+        return np.ones((self.task.sensors, len(signals["tokens"])), dtype=bool)
+
+
+def worst(error, covariance):
+    return np.abs(error).max(0)
+
+
+def wrong(error, covariance):
+    return error
+
+
+def below(error, covariance):
+    return -np.abs(error).max(0)
+
+
+NUMBER = 3
+'''
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the module ``own_names``, on Python's path."""
+    (tmp_path / "own_names.py").write_text(MODULE)
+    (tmp_path / "broken_names.py").write_text("1 / 0")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_an_environment_by_module_and_id(own: Path) -> None:
+    name = "own_names:me/OwnCart-v0"
+    task = fusion_gym.make_task(name, horizon=20)
+    assert task.settings["token_rate"] == 2.0
+    env: Any = gym.make(name, horizon=20)
+    env.reset(seed=0)
+    assert env.unwrapped.task.settings == task.settings
+    vector = fusion_gym.make_sb3_vec_env(name, num_envs=2, horizon=20)
+    assert vector.reset().shape[0] == 2
+
+
+def test_a_policy_by_module_and_class(own: Path) -> None:
+    task = fusion_gym.make_task(TOBIT, filter="tobit")
+    policy = make_policy("own_names:Oldest:steps=5", task)
+    rate = run_episodes(task, policy, 4, 0).rate.mean()
+    assert rate == pytest.approx(
+        run_episodes(task, make_policy("periodic:period=6", task), 4, 0).rate.mean(), abs=0.02
+    )
+    assert make_rule("own_names:Oldest").knowledge == "centre"  # type: ignore[comparison-overlap]
+    assert run_episodes(task, make_policy("own_names:Tasked", task), 2, 0).requests.mean() == 1.0
+
+
+def test_an_error_of_ones_own(own: Path) -> None:
+    """A function, its name in a module, and the named kinds, on one episode's errors."""
+
+    def total(error: Any, covariance: Any) -> Any:
+        return np.trace(covariance)
+
+    for error, expected in (
+        ("own_names:worst", lambda e, p, w: np.abs(e).max(0)),
+        (total, lambda e, p, w: np.trace(p)),
+        ("maximum", lambda e, p, w: (w * e**2).max(0)),
+        ("squared", lambda e, p, w: (w * e**2).sum(0)),
+        ("trace", lambda e, p, w: (w * np.diagonal(p).T).sum(0)),
+    ):
+        weights = np.array([[2.0], [0.5]])
+        task = fusion_gym.make_task(
+            TOBIT, filter="tobit", error=error, error_weight=3.0, state_weights=weights[:, 0]
+        )
+        batch = EpisodeBatch.seeded(task, 5, 0)
+        outcome = batch.step(np.ones((3, 5), dtype=np.bool_))
+        covariance = task.system.fused(batch.delivered)[1]
+        np.testing.assert_allclose(
+            -outcome.reward_error, 3.0 * expected(outcome.error, covariance, weights), rtol=1e-12
+        )
+        json.dumps(task.settings)
+    assert fusion_gym.make_task(TOBIT, error=total).settings["error"].endswith("total")
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda task: fusion_gym.make_task("own_names:me/Other-v0"), "me/Other-v0"),
+        (lambda task: fusion_gym.make_task("absent_names:me/OwnCart-v0"), "'absent_names' cannot"),
+        (lambda task: fusion_gym.make_task("broken_names:me/OwnCart-v0"), "ZeroDivisionError"),
+        (lambda task: make_policy("own_names:Absent", task), "has no 'Absent'"),
+        (lambda task: make_policy("own_names:worst", task), "a class with knowledge"),
+        (lambda task: make_policy("subprocess:Popen:args=true", task), "a class with knowledge"),
+        (lambda task: make_policy("own_names:Oldest:step=5", task), "did you mean 'steps'"),
+        (lambda task: make_policy("broken_names:Oldest", task), "ZeroDivisionError"),
+        (lambda task: fusion_gym.make_task(TOBIT, error="own_names:absent"), "has no 'absent'"),
+        (lambda task: fusion_gym.make_task(TOBIT, error="own_names:NUMBER"), "error = 3"),
+        (lambda task: fusion_gym.make_task(TOBIT, error="own_names:wrong"), "of shape"),
+        (lambda task: fusion_gym.make_task(TOBIT, error="own_names:below"), ">= 0"),
+        (lambda task: fusion_gym.make_task(TOBIT, error="squarred"), "'squared'"),
+    ],
+)
+def test_what_cannot_be_had_is_told_in_one_line(own: Path, make: Any, told: str) -> None:
+    task = fusion_gym.make_task(TOBIT, filter="tobit")
+    with pytest.raises(ConfigurationError) as caught:
+        make(task)
+    assert told in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_command_finds_the_module_beside_it(own: Path) -> None:
+    words = ["--env", "own_names:me/OwnCart-v0", "--set", "error=own_names:worst", "horizon=10"]
+    policies = ["--policies", "own_names:Oldest:steps=2", "always", "--episodes", "8"]
+    line = [sys.executable, "-c", "import agents.__main__ as m; m.main()", "evaluate"]
+    root = Path(__file__).parent.parent
+    done = subprocess.run(
+        [*line, *words, *policies, "--json", "found.json"],
+        cwd=own, env={"PYTHONPATH": str(root), "PATH": "/usr/bin:/bin", "HOME": str(own)},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "own_names:Oldest" in (own / "found.json").read_text()
