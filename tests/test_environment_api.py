@@ -99,11 +99,12 @@ def test_infos_and_the_terms_of_the_reward(sharing: str, error: str) -> None:
         token_rate=2.0,
     )
     _, info = env.reset(seed=11)
-    keys = {"cost", "cost_tokens", "rewards", "granted", "denied", "squared_error", "diverged"}
+    keys = {"cost", "cost_tokens", "reward_error", "reward_cost", "granted", "denied",
+            "squared_error", "diverged"}  # fmt: skip
     assert info.keys() == keys
     assert not info["diverged"]
     assert info["cost"] == info["cost_tokens"] == 0.0
-    assert info["rewards"] == {"error": 0.0, "communication": 0.0}
+    assert info["reward_error"] == info["reward_cost"] == 0.0
     assert not info["granted"].any()
     assert not info["denied"].any()
     assert not info["squared_error"].any()
@@ -123,9 +124,9 @@ def test_infos_and_the_terms_of_the_reward(sharing: str, error: str) -> None:
         squared = (system.truth(delivered) - mean)[:, 0] ** 2
         np.testing.assert_allclose(info["squared_error"], squared, rtol=1e-12)
         size = squared if error == "squared" else np.diagonal(covariance[..., 0])
-        assert info["rewards"]["error"] == pytest.approx(-2.0 * weights @ size)
-        assert info["rewards"]["communication"] == pytest.approx(-0.3 * info["cost"])
-        assert reward == pytest.approx(sum(info["rewards"].values()), rel=1e-14)
+        assert info["reward_error"] == pytest.approx(-2.0 * weights @ size)
+        assert info["reward_cost"] == pytest.approx(-0.3 * info["cost"])
+        assert reward == pytest.approx(info["reward_error"] + info["reward_cost"], rel=1e-14)
         denied += info["denied"].sum()
     assert denied > 0
 

@@ -42,6 +42,7 @@ class CommonOptions:
     information: str = "sensors"
     own_number: bool = True
     action: str = "binary"
+    reward: str = "scalar"
     error: str | Callable[[Array, Array], Any] = "squared"
     error_weight: float = 1.0
     cost_weight: float | str = 0.01

@@ -20,6 +20,7 @@ from fusion_gym.core.token_bucket import TokenBucket
 # What a policy of each information mode may know.
 INFORMATION_MODES: dict[str, Knowledge] = {"sensors": "coordinator", "centre": "centre"}
 ACTION_KINDS = ("binary", "discrete")
+REWARDS = ("scalar", "vector")  # the sum of its two terms, or both
 MOST_SENSORS = 1000  # the network serves them in a loop
 # Signals beside the system's own that only who sees the sensors may have.
 SENSORS_ONLY = (
@@ -43,6 +44,7 @@ class Task:
     estimate back. With ``clock`` the observation shows what is left of the episode, whose end then
     belongs to the problem: a termination, no truncation. Without ``own_number`` a sensor that
     decides by itself does not see which one it is, so that sensors of one kind learn together.
+    With ``vector_reward`` the environments pay the two terms of the reward one by one.
     ``settings`` is what a user chose, for reports; ``policy_defaults`` the scenario's own
     parameters of named policies.
 
@@ -65,6 +67,7 @@ class Task:
     feedback: bool = False
     clock: bool = False
     own_number: bool = True
+    vector_reward: bool = False
     settings: dict[str, Any] = field(default_factory=dict)
     policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
 
@@ -135,6 +138,7 @@ class Task:
             feedback=scenario.feedback,
             clock=chosen.clock,
             own_number=chosen.own_number,
+            vector_reward=validation.choice("reward", chosen.reward, REWARDS) == "vector",
             settings=plain(asdict(chosen)),
             policy_defaults=scenario.policy_defaults,
         )

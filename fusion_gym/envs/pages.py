@@ -32,7 +32,6 @@ from fusion_gym.core.reward import Price
 from fusion_gym.core.system import Block, covers, numbered
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task, options_of
-from fusion_gym.envs.vector import reset_infos
 from fusion_gym.envs.views import heard, make_view
 
 LEGEND = """\
@@ -69,9 +68,9 @@ Truncation after `horizon` steps, here {horizon}; with `clock=True`, which shows
 left, it is a termination. `max_episode_steps` ends episodes earlier without changing any scale.
 
 ## Info
-`cost` = `cost_tokens` (tokens spent, never negative), `rewards` (its terms
-{terms}), `granted` and `denied` (one flag a sensor), `squared_error` (one
-number a state), `diverged` (a squared error above 100 times its open-loop mean, or not finite).
+`cost` = `cost_tokens` (tokens spent, never negative), `reward_error` and `reward_cost` (the two
+terms of the reward), `granted` and `denied` (one flag a sensor), `squared_error` (one number a
+state), `diverged` (a squared error above 100 times its open-loop mean, or not finite).
 
 ## Arguments
 The fields of `{options}`, of which `fusion_gym.make_task` also takes an object.
@@ -123,7 +122,6 @@ def page(env_id: str, task: Task | None = None) -> str:
         weights=_short(weights),
         open_loop=f"{float(weights @ system.open_loop(task.horizon)):.3g}",
         horizon=task.horizon,
-        terms=" and ".join(f"`{term}`" for term in reset_infos(task, 1)["rewards"]),
         options=kind.__name__,
         arguments=_arguments(kind),
         history="\n".join(f"- {text}" for text in ["v0: first version.", *versions]),

@@ -15,6 +15,7 @@ from pettingzoo import ParallelEnv
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
+from fusion_gym.envs.vector import refuse_vector_reward
 from fusion_gym.envs.views import SensorView
 from fusion_gym.errors import shown
 
@@ -34,6 +35,7 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
     metadata = {"render_modes": [], "name": "fusion_gym_v0", "is_parallelizable": True}  # noqa: RUF012
 
     def __init__(self, task: Task) -> None:
+        refuse_vector_reward(task, "with PettingZoo")
         self.task = task
         self.view = SensorView(task)
         self.batch = EpisodeBatch(task, 1, self.view.owner)

@@ -17,6 +17,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
+from fusion_gym.envs.vector import refuse_vector_reward
 from fusion_gym.envs.views import make_view
 
 
@@ -56,6 +57,7 @@ class FusionSB3VecEnv(VecEnv):
         local: bool = False,
         price_exponent: float = 0.0,
     ) -> None:
+        refuse_vector_reward(task, "with Stable-Baselines3")
         self.runs = validation.runs(num_envs)
         self.task = task
         self.view = make_view(task, validation.boolean("local", local))

@@ -11,14 +11,23 @@ from numpy.typing import NDArray
 from fusion_gym import validation
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
-from fusion_gym.envs.vector import Infos, refuse_rendering, reset_infos, step_infos
+from fusion_gym.envs.vector import (
+    Infos,
+    Specified,
+    refuse_rendering,
+    reset_infos,
+    reward_space,
+    rewards_of,
+    step_infos,
+)
 from fusion_gym.envs.views import CoordinatorView
 
 
-class FusionEnv(gymnasium.Env[Any, Any]):
+class FusionEnv(Specified, gymnasium.Env[Any, Any]):
     """One run of a task behind Gymnasium's interface.
 
-    An episode ends by truncation at the task's horizon, never by termination.
+    An episode ends at the task's horizon, by truncation or with ``clock=True`` by termination. With
+    ``reward="vector"`` a reward is an array (2,), what the error and what the tokens cost.
 
     Attributes:
         observation_names: a name for each entry of the observation.
@@ -34,6 +43,8 @@ class FusionEnv(gymnasium.Env[Any, Any]):
         self.observation_names = self.view.names
         self.observation_space = self.view.space
         self.action_space = self.view.actions
+        if task.vector_reward:
+            self.reward_space = reward_space()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -49,7 +60,7 @@ class FusionEnv(gymnasium.Env[Any, Any]):
         self.batch.reset()
         return self.batch.observe()[0], _first(reset_infos(self.task, 1))
 
-    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, Infos]:
+    def step(self, action: Any) -> tuple[NDArray[np.float32], Any, bool, bool, Infos]:
         """One step; see the environment's documentation for the info.
 
         Raises:
@@ -62,7 +73,9 @@ class FusionEnv(gymnasium.Env[Any, Any]):
         observation = self.batch.observe()[0]
         infos = _first(step_infos(outcome))
         ended, clock = bool(outcome.ended[0]), self.task.clock
-        reward = float(outcome.reward[0])
+        reward = rewards_of(self.task, outcome)[0]
+        if not self.task.vector_reward:
+            reward = float(reward)
         return observation, reward, ended and clock, ended and not clock, infos
 
     def action_masks(self) -> NDArray[np.bool_]:

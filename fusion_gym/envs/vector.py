@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -20,10 +23,33 @@ from fusion_gym.envs.views import CoordinatorView
 Infos = dict[str, Any]
 
 
-class FusionVectorEnv(VectorEnv[Any, Any, Any]):
+class Specified:
+    """An environment whose specification knows the length of its episodes.
+
+    ``horizon`` decides on it, and no wrapper of Gymnasium's: what asks the specification for
+    ``max_episode_steps`` (``TimeAwareObservation``, other libraries) is told the same.
+    """
+
+    task: Task
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium knows of the environment; ``None`` of one that it has not made."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, given: EnvSpec | None) -> None:
+        self._spec = copy.copy(given)
+        if self._spec is not None:
+            self._spec.max_episode_steps = self.task.horizon
+
+
+class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
     """N runs of a task behind Gymnasium's vector interface.
 
-    Episodes end by truncation at the task's horizon, never by termination. ``autoreset_mode`` is
+    Episodes end at the task's horizon, by truncation or with ``clock=True`` by termination; rewards
+    are (N,), with ``reward="vector"`` (N, 2). ``autoreset_mode`` is
     any of Gymnasium's: ``NEXT_STEP`` (the default), ``SAME_STEP`` (with ``final_obs`` and
     ``final_info``) or ``DISABLED`` (reset with ``options={"reset_mask": mask}``).
 
@@ -55,6 +81,8 @@ class FusionVectorEnv(VectorEnv[Any, Any, Any]):
         self.single_action_space = self.view.actions
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
+        if task.vector_reward:
+            self.reward_space = reward_space()
         self._everyone = np.ones(self.num_envs, dtype=np.bool_)
         self._started = np.zeros(self.num_envs, dtype=np.bool_)
 
@@ -132,11 +160,11 @@ class FusionVectorEnv(VectorEnv[Any, Any, Any]):
                 "options={'reset_mask': mask} before the next step"
             )
         outcome = batch.step(requests)
-        reward, ended = outcome.reward, outcome.ended
+        reward, ended = rewards_of(self.task, outcome), outcome.ended
         infos = step_infos(outcome)
         if self.autoreset_mode == AutoresetMode.NEXT_STEP and finished.any():
             batch.reset(np.flatnonzero(finished))
-            reward = np.where(finished, 0.0, reward)
+            reward = np.where(finished.reshape(-1, *[1] * (reward.ndim - 1)), 0.0, reward)
             ended = ended & ~finished
             infos = _cleared(infos, finished)
         final: Infos = {}
@@ -162,12 +190,37 @@ def refuse_rendering(owner: str, render_mode: Any) -> None:
         )
 
 
+def rewards_of(task: Task, outcome: Outcome) -> NDArray[np.float64]:
+    """The rewards (N,) of a step, or (N, 2): what the error and what the tokens cost."""
+    if not task.vector_reward:
+        return outcome.reward
+    return np.stack([outcome.reward_error, outcome.reward_communication], axis=-1)
+
+
+def refuse_vector_reward(task: Task, where: str) -> None:
+    """Some faces take one number alone.
+
+    Raises:
+        ConfigurationError: the task's reward has two.
+    """
+    if task.vector_reward:
+        raise validation.ConfigurationError(
+            f"reward = 'vector' is not allowed {where}: it must be 'scalar'"
+        )
+
+
+def reward_space() -> Box:
+    """The space of a vector of rewards, as MO-Gymnasium asks for it."""
+    return Box(-np.inf, 0.0, (2,), np.float64)
+
+
 def step_infos(outcome: Outcome) -> Infos:
     """The info of a step as arrays with the batch axis first, without masks."""
     return {
         "cost": outcome.cost,
         "cost_tokens": outcome.cost,
-        "rewards": {"error": outcome.reward_error, "communication": outcome.reward_communication},
+        "reward_error": outcome.reward_error,
+        "reward_cost": outcome.reward_communication,
         "granted": outcome.granted.T,
         "denied": (outcome.requested & ~outcome.granted).T,
         "squared_error": outcome.squared_error.T,
@@ -181,7 +234,8 @@ def reset_infos(task: Task, num_envs: int) -> Infos:
     return {
         "cost": np.zeros(num_envs),
         "cost_tokens": np.zeros(num_envs),
-        "rewards": {"error": np.zeros(num_envs), "communication": np.zeros(num_envs)},
+        "reward_error": np.zeros(num_envs),
+        "reward_cost": np.zeros(num_envs),
         "granted": np.zeros((num_envs, sensors), dtype=np.bool_),
         "denied": np.zeros((num_envs, sensors), dtype=np.bool_),
         "squared_error": np.zeros((num_envs, states)),
