@@ -1,0 +1,181 @@
+"""The base of a system of one's own, and the example that uses it."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
+
+import fusion_gym
+from fusion_gym import linalg
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.envs.registration import ENVIRONMENTS
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.nonlinear import NonlinearSystem
+from fusion_gym.validation import ConfigurationError
+
+EXAMPLE = Path(__file__).parent.parent / "examples" / "pendulum_ekf.py"
+Array = NDArray[np.float64]
+A, W = np.array([[0.9, 0.2], [-0.1, 0.95]]), np.diag([0.04, 0.09])
+C, DEVIATION = np.array([[1.0, 0.0], [1.0, 1.0]]), np.array([0.5, 0.3])
+MEAN, START = np.array([1.0, -1.0]), np.array([[0.5, 0.1], [0.1, 0.4]])
+
+
+class Linear(NonlinearSystem):
+    """A linear case, whose optimal filter is known."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            ("a", "b"), sensors=2, process_channels=2, initial_mean=MEAN, initial_covariance=START
+        )
+
+    def move(self, state: Array, noise: Array) -> Array:
+        return A @ state + np.sqrt(W) @ noise
+
+    def measure(self, state: Array, noise: Array) -> Array:
+        return (C @ state)[:, None] + DEVIATION[:, None, None] * noise
+
+    def predict(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
+        return A @ mean, linalg.congruence(A[..., None], covariance) + W[..., None]
+
+    def update(
+        self, mean: Array, covariance: Array, sensor: int, measurement: Array
+    ) -> tuple[Array, Array]:
+        row = C[sensor][:, None]
+        cross = linalg.matvec(covariance, np.broadcast_to(row, mean.shape))
+        gain = cross / (linalg.dot(row, cross) + DEVIATION[sensor] ** 2)
+        changed = covariance - linalg.outer(gain, cross)
+        return mean + gain * (measurement[0] - linalg.dot(row, mean)), changed
+
+
+@pytest.fixture
+def linear(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.setitem(ENVIRONMENTS, "me/Linear-v0", build)
+    return fusion_gym.make_task("me/Linear-v0", tokens="unlimited")
+
+
+def build(chosen: CommonOptions) -> Scenario:
+    return Scenario(chosen, Linear())
+
+
+@pytest.fixture(scope="module")
+def pendulum() -> Iterator[ModuleType]:
+    specification = importlib.util.spec_from_file_location("pendulum_ekf", EXAMPLE)
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    sys.modules["pendulum_ekf"] = module
+    specification.loader.exec_module(module)
+    yield module
+    del ENVIRONMENTS["examples/Pendulum-v0"], gym.registry["examples/Pendulum-v0"]
+    del sys.modules["pendulum_ekf"]
+
+
+def test_a_linear_case_is_filterpys(linear: Any) -> None:
+    batch = EpisodeBatch.seeded(linear, 1, 3)
+    beside = KalmanFilter(dim_x=2, dim_z=1)
+    beside.x, beside.P, beside.F, beside.Q = MEAN.copy(), START.copy(), A, W
+    generator = np.random.default_rng(0)
+    for _ in range(40):
+        signals = batch.signals()
+        beside.predict()
+        np.testing.assert_allclose(signals["prior_covariance"][..., 0], beside.P, atol=1e-12)
+        deviation = np.sqrt(np.diag(C @ beside.P @ C.T) + DEVIATION**2)
+        np.testing.assert_allclose(signals["innovation_deviation"][:, 0, 0], deviation, rtol=1e-9)
+        reduction = signals["variance_reduction"][:, 0]
+        requests = generator.random((2, 1)) < 0.4
+        for sensor in range(2):
+            kept = beside.P.copy(), beside.x.copy()
+            prior = np.trace(beside.P)
+            measured = signals["measurement"][sensor, :, 0]
+            beside.update(measured, R=DEVIATION[sensor] ** 2, H=C[sensor][None])
+            if sensor == 0:
+                assert reduction[0] == pytest.approx(prior - np.trace(beside.P))
+            if not requests[sensor, 0]:
+                beside.P, beside.x = kept
+        batch.step(requests)
+        mean, covariance = linear.system.fused(batch.delivered)
+        np.testing.assert_allclose(mean[:, 0], beside.x, atol=1e-10)
+        np.testing.assert_allclose(covariance[..., 0], beside.P, atol=1e-12)
+
+
+def test_open_loop_by_simulation(linear: Any) -> None:
+    plant = LinearPlant.create(A, W, MEAN, START)
+    # A mean of squares over 1,000 correlated runs: about 1/√500 of it.
+    np.testing.assert_allclose(linear.system.open_loop(30), plant.open_loop(30), rtol=0.12)
+    assert linear.system.open_loop(30).tolist() == Linear().open_loop(30).tolist()
+
+
+def test_the_example_runs_by_itself() -> None:
+    root = EXAMPLE.parent.parent
+    done = subprocess.run([sys.executable, EXAMPLE], cwd=root, capture_output=True, text=True,
+                          env={"PYTHONPATH": str(root), "PATH": ""}, check=True)  # fmt: skip
+    assert done.stdout.count("NEES") == 4
+
+
+def test_the_pendulums_filter_is_consistent(pendulum: ModuleType) -> None:
+    task = fusion_gym.make_task("examples/Pendulum-v0")
+    for name in ("always", "periodic:period=6"):
+        results = run_episodes(task, make_policy(name, task), 400, 0)
+        assert results.nees.mean() == pytest.approx(1.0, abs=0.1)
+        assert not results.diverged.any()
+    watchful = make_policy("value_of_information:threshold=0.02,at_most=1", task)
+    periodic = run_episodes(task, make_policy("periodic:period=6", task), 400, 0)
+    found = run_episodes(task, watchful, 400, 0)
+    assert found.mse.mean() < periodic.mse.mean()
+    assert found.rate.mean() < 1.1 * periodic.rate.mean()
+
+
+def test_the_pendulum_has_every_face(pendulum: ModuleType) -> None:
+    name = "examples/Pendulum-v0"
+    check_env(gym.make(name, memory=True, horizon=20).unwrapped, skip_render_check=True)
+    rows = fusion_gym.make_sb3_vec_env(name, num_envs=3, local=True, memory=True, horizon=20)
+    assert np.isfinite(rows.reset()).all()
+    envs = gym.make_vec(name, num_envs=4, horizon=5, packet="estimate", memory=True)
+    envs.reset(seed=0)
+    for _ in range(11):
+        observation, reward, *_ = envs.step(envs.action_space.sample())
+        assert np.isfinite(observation).all()
+        assert np.isfinite(reward).all()
+    task = fusion_gym.make_task(name, horizon=30)
+    for policy in ("lookahead:price=0.01", "rollout:samples=4,price=0.01,base=periodic:period=5"):
+        assert np.isfinite(run_episodes(task, make_policy(policy, task), 4, 0).mse).all()
+
+
+def test_what_does_not_fit_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigurationError, match="initial_covariance"):
+        Shaped(initial_covariance=-np.eye(2))
+    with pytest.raises(ConfigurationError, match="sensors = 0"):
+        Shaped(sensors=0)
+    monkeypatch.setitem(ENVIRONMENTS, "me/Flat-v0", build_flat)
+    with pytest.raises(ValueError, match="measure of shape"):
+        fusion_gym.make_task("me/Flat-v0")
+
+
+class Shaped(Linear):
+    """Other arguments, and measurements without an axis for the channels."""
+
+    def __init__(self, **changes: Any) -> None:
+        given = {"sensors": 2, "initial_covariance": START} | changes
+        NonlinearSystem.__init__(self, ("a", "b"), process_channels=2, initial_mean=MEAN, **given)
+
+    def measure(self, state: Array, noise: Array) -> Array:
+        return C @ state
+
+
+def build_flat(chosen: CommonOptions) -> Scenario:
+    return Scenario(chosen, Shaped())
