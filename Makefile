@@ -10,7 +10,7 @@ QUICK  := tests/conformance/test_faces.py tests/test_bad_input.py tests/test_env
 	tests/test_agents.py::test_training_writes_its_results_and_resumes \
 	tests/test_benchmark.py::test_from_tuning_to_report_and_zoo
 
-.PHONY: help demo test test-all test-lowest wheel-test lint format bench clean
+.PHONY: help demo test test-all test-lowest wheel-test wheel lint format bench clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 13
@@ -49,6 +49,9 @@ test-lowest: $(LOWEST)/.installed  ## quick tests with the lowest versions that 
 
 wheel-test: $(STAMP)  ## build the package and try it in an empty folder, outside the repository
 	$(BIN)/python tests/wheel_smoke.py
+
+wheel: $(STAMP)  ## build the wheel into dist/
+	$(BIN)/python -m build --wheel
 
 lint: $(STAMP)  ## ruff and mypy
 	$(BIN)/ruff check .

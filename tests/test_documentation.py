@@ -252,3 +252,12 @@ def test_a_page_without_a_text_and_one_with_a_history(monkeypatch: pytest.Monkey
     text = pages.page("test/Later-v1")
     assert text.startswith("A title.\n\nSome text of `Later` and `Later`.\n\n## Action")
     assert "- v0: first version.\n- v1: it changed.\n" in text
+
+
+def test_the_citation_is_of_this_version() -> None:
+    citation = (ROOT / "CITATION.cff").read_text()
+    project = (ROOT / "pyproject.toml").read_text()
+    for text in (citation, project):
+        assert re.search(r'^version(?:: | = ")([\d.]+)', text, re.MULTILINE)[1] == (  # type: ignore[index]
+            fusion_gym.__version__
+        )

@@ -22,6 +22,7 @@ import tarfile
 import tempfile
 import time
 import venv
+import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -167,11 +168,17 @@ def use(programs: Path, folder: Path) -> None:
 
 def main() -> None:
     """Build, install, use; then look for every file, and run tests, in the source distribution."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
         source, built = copy(folder / "source"), folder / "built"
         call(sys.executable, "-m", "build", "--outdir", built, source, cwd=folder)
         (wheel,), (archive,) = built.glob("*.whl"), built.glob("*.tar.gz")
+        with zipfile.ZipFile(wheel) as packed_wheel:
+            (name,) = (one for one in packed_wheel.namelist() if one.endswith("/METADATA"))
+            said = packed_wheel.read(name).decode()
+        assert "Description-Content-Type: text/markdown" in said
+        assert "](https://github.com/" in said
+        assert "](docs/" not in said
         programs = install(wheel, folder / "environment")
         use(programs, folder / "empty")
         with tarfile.open(archive) as packed:
