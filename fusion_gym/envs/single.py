@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 from fusion_gym import validation
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
+from fusion_gym.envs.drawing import Film, Frame, Window
 from fusion_gym.envs.vector import (
+    FRAMES_PER_SECOND,
+    RENDER_MODES,
     Infos,
     Specified,
-    refuse_rendering,
+    checked_mode,
     reset_infos,
     reward_space,
     rewards_of,
@@ -33,11 +36,17 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
         observation_names: a name for each entry of the observation.
     """
 
+    metadata = {  # noqa: RUF012
+        "render_modes": list(RENDER_MODES),
+        "render_fps": FRAMES_PER_SECOND,
+    }
+
     def __init__(self, task: Task, render_mode: str | None = None) -> None:
-        refuse_rendering(type(self).__name__, render_mode)
-        self.metadata = {"render_modes": []}
-        self.render_mode = None
+        self.render_mode = checked_mode(type(self).__name__, render_mode)
         self.task = task
+        self._film = None if self.render_mode is None else Film(task, 1)
+        shown = self.render_mode == "human"
+        self._window = Window(type(self).__name__, FRAMES_PER_SECOND) if shown else None
         self.batch = EpisodeBatch(task, 1)
         self.view = CoordinatorView(task)
         self.observation_names = self.view.names
@@ -58,6 +67,9 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
         super().reset(seed=seed)
         self.batch.use_generator(0, self.np_random)
         self.batch.reset()
+        if self._film is not None:
+            self._film.begin()
+            self._show()
         return self.batch.observe()[0], _first(reset_infos(self.task, 1))
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], Any, bool, bool, Infos]:
@@ -70,6 +82,9 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
         if self.batch.finished[0]:
             raise gymnasium.error.ResetNeeded("the episode is over or never began: call reset")
         outcome = self.batch.step(self.view.requests(action, None))
+        if self._film is not None:
+            self._film.record(self.batch, outcome)
+            self._show()
         observation = self.batch.observe()[0]
         infos = _first(step_infos(outcome))
         ended, clock = bool(outcome.ended[0]), self.task.clock
@@ -77,6 +92,21 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
         if not self.task.vector_reward:
             reward = float(reward)
         return observation, reward, ended and clock, ended and not clock, infos
+
+    def render(self) -> Frame | None:
+        """The picture (height, width, 3) of the present step; a window shows ``"human"``."""
+        if self._film is None or self._window is not None:
+            return None
+        return self._film.frame()
+
+    def close(self) -> None:
+        """The window, if there is one, is gone."""
+        if self._window is not None:
+            self._window.close()
+
+    def _show(self) -> None:
+        if self._window is not None and self._film is not None:
+            self._window.show(self._film.frame())
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Open choices (choices,), for sb3-contrib's MaskablePPO."""

@@ -18,9 +18,12 @@ from fusion_gym import validation
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
+from fusion_gym.envs.drawing import Film, Frame
 from fusion_gym.envs.views import CoordinatorView
 
 Infos = dict[str, Any]
+RENDER_MODES = ("rgb_array", "human")
+FRAMES_PER_SECOND = 10
 
 
 class Specified:
@@ -67,12 +70,16 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
     ) -> None:
-        refuse_rendering(type(self).__name__, render_mode)
+        self.render_mode = checked_mode(type(self).__name__, render_mode, ("rgb_array",))
         self.num_envs = validation.runs(num_envs)
         modes = [mode.value for mode in AutoresetMode]
         given = getattr(autoreset_mode, "value", autoreset_mode)
         self.autoreset_mode = AutoresetMode(validation.choice("autoreset_mode", given, modes))
-        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
+        self.metadata = {
+            "render_modes": ["rgb_array"],
+            "render_fps": FRAMES_PER_SECOND,
+            "autoreset_mode": self.autoreset_mode,
+        }
         self.task = task
         self.batch = EpisodeBatch(task, self.num_envs)
         self.view = CoordinatorView(task)
@@ -83,6 +90,7 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         if task.vector_reward:
             self.reward_space = reward_space()
+        self._film = None if self.render_mode is None else Film(task, self.num_envs)
         self._everyone = np.ones(self.num_envs, dtype=np.bool_)
         self._started = np.zeros(self.num_envs, dtype=np.bool_)
 
@@ -119,7 +127,21 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
         self.batch.seed(runs, [seeds[run] for run in runs])
         self.batch.reset(None if mask.all() else runs)
         self._started |= mask
+        if self._film is not None:
+            self._film.begin(runs)
         return self.batch.observe(), _with_mask(reset_infos(self.task, self.num_envs), mask)
+
+    def render(self) -> tuple[Frame, ...] | None:  # type: ignore[override]
+        """A picture (height, width, 3) of every run; nothing without a render mode."""
+        if self._film is None:
+            return None
+        return tuple(self._film.frame(run) for run in range(self.num_envs))
+
+    def _renew(self, runs: NDArray[np.bool_]) -> None:
+        """New episodes in these runs."""
+        self.batch.reset(np.flatnonzero(runs))
+        if self._film is not None:
+            self._film.begin(np.flatnonzero(runs))
 
     def _reset_mask(self, options: dict[str, Any]) -> NDArray[np.bool_]:
         validation.keys("reset option", options, ["reset_mask"])
@@ -160,17 +182,19 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
                 "options={'reset_mask': mask} before the next step"
             )
         outcome = batch.step(requests)
+        if self._film is not None:
+            self._film.record(batch, outcome)
         reward, ended = rewards_of(self.task, outcome), outcome.ended
         infos = step_infos(outcome)
         if self.autoreset_mode == AutoresetMode.NEXT_STEP and finished.any():
-            batch.reset(np.flatnonzero(finished))
+            self._renew(finished)
             reward = np.where(finished.reshape(-1, *[1] * (reward.ndim - 1)), 0.0, reward)
             ended = ended & ~finished
             infos = _cleared(infos, finished)
         final: Infos = {}
         if self.autoreset_mode == AutoresetMode.SAME_STEP and ended.any():
             final = _final_infos(infos, ended, batch.observe())
-            batch.reset(np.flatnonzero(ended))
+            self._renew(ended)
             infos = _cleared(infos, ended)
         never = np.zeros_like(ended)
         terminated, truncated = (ended, never) if self.task.clock else (never, ended)
@@ -178,16 +202,20 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
         return batch.observe(), reward, terminated, truncated, infos
 
 
-def refuse_rendering(owner: str, render_mode: Any) -> None:
-    """Nothing is drawn step by step; ``fusion_gym.evaluation`` draws whole episodes.
+def checked_mode(owner: str, render_mode: Any, modes: Sequence[str] = RENDER_MODES) -> str | None:
+    """The render mode, or none.
 
     Raises:
-        UnexpectedArgumentError: a render mode.
+        UnexpectedArgumentError: another one than ``modes``.
     """
-    if render_mode is not None:
+    if render_mode is not None and render_mode not in modes:
+        listed = ", ".join(map(repr, modes))
         raise validation.UnexpectedArgumentError.of(
-            owner, "render_mode", f"render_mode = {render_mode!r} is not allowed: it must be None"
+            owner,
+            "render_mode",
+            f"render_mode = {render_mode!r} is not allowed: it must be None or one of {listed}",
         )
+    return None if render_mode is None else str(render_mode)
 
 
 def rewards_of(task: Task, outcome: Outcome) -> NDArray[np.float64]:

@@ -169,6 +169,25 @@ class CensoredSystem:
             blocks = [one for one in blocks if one.name not in _OF_CENSORING]
         return tuple(blocks)
 
+    @property
+    def censored_beyond(self) -> dict[int, tuple[float, float]]:
+        """Where states are censored, for pictures: lowest and highest value that is seen.
+
+        Of states that some sensors measure alone, by their number; the widest where they differ.
+        """
+        found: dict[int, tuple[float, float]] = {}
+        sensors = self.centre.sensors
+        rows = sensors.measurement_matrix[..., 0].reshape(-1, self.plant.size)
+        limits = zip(sensors.threshold.ravel(), sensors.upper.ravel(), strict=True)
+        for row, (low, high) in zip(rows, limits, strict=True):
+            (states,) = np.nonzero(row)
+            if len(states) == 1:
+                state = int(states[0])
+                ends = sorted((low / row[state], high / row[state]))
+                before = found.get(state, (np.inf, -np.inf))
+                found[state] = (min(before[0], ends[0]), max(before[1], ends[1]))
+        return found
+
     def start(self, noise: Array) -> CensoredState:
         """Time 0: the state is drawn and every first measurement is known, free of charge."""
         n, sensors = self.plant.size, self.centre.sensors

@@ -1,0 +1,209 @@
+"""The live episode as a picture: states and estimates, requests and their answers, tokens."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections import deque
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.runs import Outcome
+from fusion_gym.core.task import Task
+from fusion_gym.errors import ConfigurationError
+
+Frame = NDArray[np.uint8]  # (height, width, 3)
+WINDOW = 60  # steps that are shown
+_MOST_STATES = 4
+# Okabe and Ito's colours, which people who are colour-blind tell apart.
+_TRUTH, _ESTIMATE, _GRANTED, _DENIED, _TOKENS = "black", "#D55E00", "#0072B2", "0.55", "#009E73"
+_CENSORED = "#CC79A7"
+_WIDTH, _STATE, _STRIP, _TOP, _BOTTOM = 640, 120, 70, 48, 44  # pixels
+
+
+class _Step(NamedTuple):
+    """What is kept of one step of all runs: no copies, for nothing of it changes in place."""
+
+    state: Any
+    outcome: Outcome
+    tokens: Array
+
+
+class Film:
+    """The last steps of N runs of a task, and a picture of each.
+
+    Above, up to four states with the fused estimate and two deviations that the filter claims,
+    and shaded where a sensor of that state alone is censored; then a row a sensor of requests,
+    granted or denied; then the tokens.
+
+    Raises:
+        ConfigurationError: matplotlib is absent.
+    """
+
+    def __init__(self, task: Task, runs: int) -> None:
+        _require("matplotlib")
+        self.task = task
+        self._steps: deque[_Step] = deque(maxlen=WINDOW)
+        self._ages = np.zeros(runs, dtype=np.int64)  # steps of each run's episode
+        self._shown = task.system.state_names[:_MOST_STATES]
+        self._figure: Any = None  # made when it is first looked at
+
+    def begin(self, runs: NDArray[np.int64] | None = None) -> None:
+        """These runs (all by default) begin a new episode."""
+        self._ages[slice(None) if runs is None else runs] = 0
+
+    def record(self, batch: EpisodeBatch, outcome: Outcome) -> None:
+        """A step of all runs, before any of them is reset."""
+        self._steps.append(_Step(batch.delivered, outcome, batch.tokens))
+        self._ages += 1
+
+    def frame(self, run: int = 0, title: str | None = None) -> Frame:
+        """The picture of a run, of which no more is shown than its own episode."""
+        if self._figure is None:
+            self._draw_frame()
+        age = int(self._ages[run])
+        steps = list(self._steps)[-min(age, WINDOW) :] if age else []
+        times = np.arange(age - len(steps) + 1, age + 1)
+        first = max(age - WINDOW, 0)
+        self._title.set_text(f"step {age} of {self.task.horizon}" if title is None else title)
+        self._draw_states(times, steps, run)
+        granted, denied = [], []
+        for time, step in zip(times, steps, strict=True):
+            for sensor in np.flatnonzero(step.outcome.requested[:, run]):
+                answer = granted if step.outcome.granted[sensor, run] else denied
+                answer.append((time, sensor))
+        for mark, points in zip(self._marks, (granted, denied), strict=True):
+            mark.set_data(*(np.array(points).T if points else ([], [])))
+        self._level.set_data(times, [step.tokens[run] for step in steps])
+        self._axes[-1].set_xlim(first, first + WINDOW + 1)
+        self._canvas.draw()
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+    def _draw_states(self, times: NDArray[np.int64], steps: list[_Step], run: int) -> None:
+        system, shown = self.task.system, len(self._shown)
+        fused = [system.fused(step.state) for step in steps]
+        truth = np.array([system.truth(step.state)[:shown, run] for step in steps])
+        mean = np.array([found[0][:shown, run] for found in fused])
+        variance = np.array([linalg.diagonal(found[1])[:shown, run] for found in fused])
+        truth, mean, variance = (part.reshape(-1, shown) for part in (truth, mean, variance))
+        deviation = 2.0 * np.sqrt(np.maximum(variance, 0.0))
+        for place, lines in enumerate(self._curves):
+            axis, own, centre, wide = (
+                self._axes[place], truth[:, place], mean[:, place], deviation[:, place]
+            )  # fmt: skip
+            lines[0].set_data(times, own)
+            lines[1].set_data(times, centre)
+            lines[2].remove()
+            lines[2] = axis.fill_between(
+                times, centre - wide, centre + wide, color=_ESTIMATE, alpha=0.18, lw=0
+            )
+            if steps:
+                low, high = min(own.min(), centre.min()), max(own.max(), centre.max())
+                room = 0.15 * (high - low) + 1e-6 + 0.5 * float(np.median(wide))
+                axis.set_ylim(low - room, high + room)
+
+    def _draw_frame(self) -> None:
+        """All that does not move."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        height = _TOP + _BOTTOM + _STATE * len(self._shown) + 2 * _STRIP
+        self._figure = Figure(figsize=(_WIDTH / 100, height / 100), dpi=100)
+        self._canvas = FigureCanvasAgg(self._figure)
+        ratios = [_STATE] * len(self._shown) + [_STRIP, _STRIP]
+        self._axes: list[Any] = list(
+            self._figure.subplots(
+                len(ratios), 1, sharex=True,
+                gridspec_kw={"height_ratios": ratios, "hspace": 0.12, "left": 0.1, "right": 0.98,
+                             "bottom": _BOTTOM / height, "top": 1.0 - _TOP / height},
+            )
+        )  # fmt: skip
+        self._curves: list[list[Any]] = []
+        limits = getattr(self.task.system, "censored_beyond", {})
+        for place, (name, axis) in enumerate(zip(self._shown, self._axes, strict=False)):
+            (truth,) = axis.plot([], [], color=_TRUTH, lw=1.4, label="state")
+            (mean,) = axis.plot([], [], color=_ESTIMATE, lw=1.4, label="fused estimate")
+            band = axis.fill_between(
+                [], [], [], color=_ESTIMATE, alpha=0.18, lw=0, label="± 2 claimed deviations"
+            )
+            low, high = limits.get(place, (-np.inf, np.inf))
+            if np.isfinite(low):
+                axis.axhspan(-1e9, low, color=_CENSORED, alpha=0.15, lw=0, label="censored")
+            if np.isfinite(high):
+                label = None if np.isfinite(low) else "censored"
+                axis.axhspan(high, 1e9, color=_CENSORED, alpha=0.15, lw=0, label=label)
+            axis.set_ylabel(name)
+            self._curves.append([truth, mean, band])
+        sensors, bucket = self.task.sensors, self.task.bucket
+        requests, level = self._axes[-2:]
+        (granted,) = requests.plot([], [], "|", color=_GRANTED, ms=9, mew=2, label="granted")
+        (denied,) = requests.plot([], [], "x", color=_DENIED, ms=5, label="denied")
+        self._marks = (granted, denied)
+        requests.set_ylim(sensors - 0.4, -0.6)
+        requests.set_yticks(range(sensors) if sensors <= 6 else [0, sensors - 1])
+        requests.set_ylabel("sensor")
+        (self._level,) = level.plot([], [], color=_TOKENS, lw=1.6)
+        top = float(bucket.capacity) if np.isfinite(bucket.capacity) else 1.0
+        level.set_ylim(0.0, 1.08 * top)
+        level.set_ylabel("tokens")
+        level.set_xlabel("step")
+        for axis in self._axes:
+            axis.tick_params(labelsize=8)
+            axis.grid(alpha=0.25)
+            axis.spines[["top", "right"]].set_visible(False)
+        handles = {}
+        for axis in self._axes:
+            for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+                handles.setdefault(label, handle)
+        self._figure.legend(
+            list(handles.values()), list(handles), loc="upper left", ncols=len(handles),
+            bbox_to_anchor=(0.09, 1.0 - 20 / height), fontsize=7, frameon=False, borderaxespad=0.0,
+            borderpad=0.2, columnspacing=1.2, handlelength=1.4,
+        )  # fmt: skip
+        self._title = self._figure.text(0.1, 1.0 - 4 / height, "", va="top", fontsize=9)
+        self._figure.align_ylabels(self._axes)
+
+
+class Window:
+    """A window that shows frames as they come, ``fps`` a second.
+
+    Raises:
+        ConfigurationError: pygame is absent.
+    """
+
+    def __init__(self, title: str, fps: int) -> None:
+        _require("pygame")
+        self._title, self._fps, self._screen = title, fps, None
+
+    def show(self, frame: Frame) -> None:
+        """One frame, for its time."""
+        import pygame
+
+        if self._screen is None:
+            pygame.init()
+            self._screen = pygame.display.set_mode(frame.shape[1::-1])
+            pygame.display.set_caption(self._title)
+            self._clock = pygame.time.Clock()
+        pygame.event.pump()
+        self._screen.blit(pygame.surfarray.make_surface(frame.swapaxes(0, 1)), (0, 0))
+        pygame.display.flip()
+        self._clock.tick(self._fps)
+
+    def close(self) -> None:
+        """The window is gone."""
+        if self._screen is not None:
+            import pygame
+
+            pygame.quit()
+            self._screen = None
+
+
+def _require(package: str) -> None:
+    if importlib.util.find_spec(package) is None:
+        raise ConfigurationError(
+            f"render_mode needs {package}, which is absent: pip install 'fusion-gym[render]'"
+        )
