@@ -182,7 +182,7 @@ def test_options_elsewhere(name: str, options: dict[str, Any], parts: tuple[str,
     assert len(message) < 1000
 
 
-@pytest.mark.parametrize("render_mode", ["human", "rgb_array"])
+@pytest.mark.parametrize("render_mode", ["ansi", "rgb"])
 @pytest.mark.filterwarnings("ignore:.*render_mode")
 def test_render_mode(render_mode: str) -> None:
     for make in (lambda **o: gymnasium.make(ENV_ID, **o), make_vector):

@@ -101,10 +101,11 @@ class Film:
             lines[2] = axis.fill_between(
                 times, centre - wide, centre + wide, color=_ESTIMATE, alpha=0.18, lw=0
             )
+            low, high, room = -1.0, 1.0, 0.0
             if steps:
                 low, high = min(own.min(), centre.min()), max(own.max(), centre.max())
                 room = 0.15 * (high - low) + 1e-6 + 0.5 * float(np.median(wide))
-                axis.set_ylim(low - room, high + room)
+            axis.set_ylim(low - room, high + room)
 
     def _draw_frame(self) -> None:
         """All that does not move."""

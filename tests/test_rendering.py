@@ -1,0 +1,135 @@
+"""Pictures of the live episode, and the recorders that take them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import HumanRendering, RecordVideo
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecVideoRecorder
+
+import fusion_gym
+from fusion_gym.envs.registration import ENVIRONMENTS
+from fusion_gym.validation import ConfigurationError
+
+TOBIT = "fusion_gym/TobitOscillator-v0"
+PICTURE = "fusion_gym/BiasedOscillator-v0"
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_every_environment_draws_its_episode(env_id: str) -> None:
+    env: Any = gym.make(env_id, render_mode="rgb_array", horizon=5)
+    env.reset(seed=0)
+    empty = env.render()
+    assert empty.dtype == np.uint8
+    assert empty.shape[1:] == (640, 3)
+    assert empty.shape[0] % 2 == 0  # as video codecs want it
+    env.step(np.ones_like(env.action_space.sample()))
+    one = env.render()
+    env.step(np.ones_like(env.action_space.sample()))
+    two = env.render()
+    assert (one != empty).any()
+    assert (two != one).any()
+    np.testing.assert_array_equal(two, env.render())
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.render(), empty)
+
+
+def test_gymnasiums_check_with_rendering() -> None:
+    check_env(gym.make(TOBIT, render_mode="rgb_array", horizon=4).unwrapped)
+
+
+def test_a_picture_shows_what_happened() -> None:
+    """Ticks of requests that were granted and denied, in their colours; the censored region."""
+    env: Any = gym.make(
+        TOBIT, render_mode="rgb_array", initial_tokens=3.0, token_rate=0.0, sharing="rotating"
+    )
+
+    def has(colour: tuple[int, int, int]) -> bool:
+        return bool((np.abs(env.render().astype(int) - colour).max(-1) <= 3).any())
+
+    granted, denied, censored = (0, 114, 178), (140, 140, 140), (247, 235, 241)
+    env.reset(seed=0)
+    marks = [has(granted), has(denied)]  # the legend
+    assert marks == [True, True]
+    counts = [_count(env.render(), colour) for colour in (granted, denied)]
+    env.step(np.array([1, 0, 0], dtype=np.int8))
+    first = [_count(env.render(), colour) for colour in (granted, denied)]
+    assert first[0] > counts[0]
+    assert first[1] == counts[1]
+    env.step(np.array([0, 1, 0], dtype=np.int8))
+    second = [_count(env.render(), colour) for colour in (granted, denied)]
+    assert second[1] > first[1]
+    assert has(censored)
+
+
+def _count(frame: Any, colour: tuple[int, int, int]) -> int:
+    return int((np.abs(frame.astype(int) - colour).max(-1) <= 3).sum())
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_a_vector_environment_draws_every_run(mode: str) -> None:
+    envs: Any = gym.make_vec(
+        TOBIT, num_envs=2, horizon=3, render_mode="rgb_array", autoreset_mode=mode
+    )
+    single: Any = gym.make(TOBIT, horizon=3, render_mode="rgb_array")
+    envs.reset(seed=0)
+    single.reset(seed=1)
+    for _ in range(2):
+        envs.step(np.ones((2, 3), dtype=np.int8))
+        single.step(np.ones(3, dtype=np.int8))
+    frames = envs.render()
+    assert len(frames) == 2
+    np.testing.assert_array_equal(frames[1], single.render())
+    for _ in range(2):
+        envs.step(np.ones((2, 3), dtype=np.int8))
+    assert len(envs.render()) == 2
+    assert gym.make_vec(TOBIT, num_envs=2).render() is None
+
+
+def test_recorders_write_films(tmp_path: Path) -> None:
+    env: Any = RecordVideo(
+        gym.make(PICTURE, render_mode="rgb_array", horizon=4), str(tmp_path / "gym"),
+        disable_logger=True,
+    )  # fmt: skip
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step(env.action_space.sample())
+    env.close()
+    assert list((tmp_path / "gym").glob("*.mp4"))
+    rows = make_vec_env(TOBIT, n_envs=2, env_kwargs={"horizon": 5})
+    film = VecVideoRecorder(rows, str(tmp_path / "sb3"), lambda step: step == 0, video_length=3)
+    film.reset()
+    for _ in range(4):
+        film.step(np.ones((2, 3), dtype=np.int8))
+    film.close()
+    assert list((tmp_path / "sb3").glob("*.mp4"))
+
+
+def test_a_window_shows_the_episode() -> None:
+    env: Any = gym.make(TOBIT, render_mode="human", horizon=3)
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(env.action_space.sample())
+        assert env.render() is None
+    env.close()
+    wrapped: Any = HumanRendering(gym.make(TOBIT, render_mode="rgb_array", horizon=3))
+    wrapped.reset(seed=0)
+    wrapped.step(wrapped.action_space.sample())
+    wrapped.close()
+
+
+def test_other_modes_are_refused() -> None:
+    for kind in (ConfigurationError, TypeError):
+        with pytest.raises(kind, match="render_mode = 'ansi'"):
+            gym.make(TOBIT, render_mode="ansi")
+    with pytest.raises(ConfigurationError, match="render_mode = 'human'"):
+        gym.make_vec(TOBIT, num_envs=2, render_mode="human")
+    assert fusion_gym.make_task(TOBIT)
