@@ -66,7 +66,7 @@ def test_a_picture_shows_what_happened() -> None:
     env.step(np.array([0, 1, 0], dtype=np.int8))
     second = [_count(env.render(), colour) for colour in (granted, denied)]
     assert second[0] == first[0]
-    assert second[1] > first[1] + 10  # digits have a little grey too
+    assert second[1] > first[1]
     assert has(censored)
 
 
