@@ -128,8 +128,8 @@ class Benchmark(Command):
                 team,
                 "benchmark",
             )
-            for setting in chosen:
-                conclude(suite, setting, folders, shelf)
+            judged = [Work(30.0, conclude, (suite, one, folders, shelf)) for one in chosen]
+            side_by_side(judged, team, "verdicts")
         report = f"{spelled('report')} --results {folders.results}"
         print(f"results in {folders.results}: {report}")
 

@@ -35,8 +35,7 @@ class Report(Command):
     results: Annotated[Path, OutputFolder()] = Path("results")
     """Folder of the benchmark's JSON, and for what is made of it."""
     pages: tuple[Path, ...] = ()
-    """Other pages, as README.md, whose parts between <!-- results: … --> and <!-- end --> are made
-    anew."""
+    """Other pages, as README.md, whose marked parts are made anew."""
 
     def run(self) -> None:
         """Draw the figures, write README.md and report.html."""

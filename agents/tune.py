@@ -22,6 +22,7 @@ import functools
 import shlex
 import sqlite3
 import sys
+import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +33,7 @@ import optuna
 import yaml
 from optuna.exceptions import ExperimentalWarning, StorageInternalError
 from optuna.trial import TrialState
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.exc import IntegrityError, OperationalError, SQLAlchemyError
 from tqdm import tqdm
 
 from fusion_gym.validation import ConfigurationError
@@ -56,6 +57,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "hidden": ("64,64", "128,128"),
 }
 _HEARTBEAT = 60  # seconds between two signs of life of who makes a trial in a shared study
+_OPENINGS, _PAUSE = 4, 0.3  # tries to open a storage, and seconds between them
 FACTORS = (0.25, 0.5, 1, 2)  # of the config's steps between two updates
 
 
@@ -144,9 +146,10 @@ def tune(
         )
     check(experiment)
     try:
+        shared = None if storage is None else shared_study(experiment, storage)
         with alone_in(folder, "output"):
-            if storage is not None:
-                return together(shared_study(experiment, storage), experiment, trials, folder)
+            if shared is not None:
+                return together(shared, experiment, trials, folder)
             study = open_study(experiment, folder)
             search(study, experiment, trials, folder)
             return study
@@ -222,11 +225,7 @@ def shared_study(experiment: Experiment, storage: str) -> optuna.Study:
     """
     inputs = inputs_of(experiment)
     try:
-        with warnings.catch_warnings():  # signs of life are an experiment of Optuna's
-            warnings.simplefilter("ignore", ExperimentalWarning)
-            found = optuna.storages.RDBStorage(
-                storage, heartbeat_interval=_HEARTBEAT, grace_period=3 * _HEARTBEAT
-            )
+        found = _opened(storage)
     except (SQLAlchemyError, ImportError) as error:
         reason = str(error).splitlines()[0]
         raise ConfigurationError(
@@ -242,6 +241,27 @@ def shared_study(experiment: Experiment, storage: str) -> optuna.Study:
     )
     study.set_user_attr("inputs", inputs)
     return study
+
+
+def _opened(storage: str) -> optuna.storages.RDBStorage:
+    """The storage; another process that makes its tables at the same moment is waited for.
+
+    Raises:
+        SQLAlchemyError: it cannot be opened, or read.
+        ImportError: the database's driver is absent.
+    """
+    for left in range(_OPENINGS - 1, -1, -1):
+        try:
+            with warnings.catch_warnings():  # signs of life are an experiment of Optuna's
+                warnings.simplefilter("ignore", ExperimentalWarning)
+                return optuna.storages.RDBStorage(
+                    storage, heartbeat_interval=_HEARTBEAT, grace_period=3 * _HEARTBEAT
+                )
+        except (IntegrityError, OperationalError):
+            if not left:
+                raise
+            time.sleep(_PAUSE)
+    raise AssertionError
 
 
 def together(

@@ -188,7 +188,9 @@ def test_trainings_of_the_committed_suite(tmp_path: Path) -> None:
             if of.mode == "local":
                 assert task.broadcast == of.broadcast
             assert training.seed == 3
-            assert training.num_envs == (setting.num_envs or suite.num_envs)
+            assert training.num_envs == (
+                setting.envs.get(of.mode) or setting.num_envs or suite.num_envs
+            )
             assert training.error == (setting.error or suite.error)
             wanted = setting.price_exponent
             assert training.price_exponent == (suite.price_exponent if wanted is None else wanted)

@@ -28,6 +28,7 @@ from agents.suite.learning import load_learning
 from agents.suite.learning_table import row, text_of
 from agents.suite.lessons import beyond, run_lesson
 from agents.suite.study import Lesson, Study
+from agents.suite.team import Team
 from agents.training.checked import load
 from agents.training.config import Experiment
 from agents.training.run import train
@@ -171,7 +172,7 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
     suite = small_suite(folder, settings=[*SMALL["settings"], source], families=gain)
     chosen = load_suite(suite)
     classes = ["sensors", "sensors_memory"]
-    complete(chosen, chosen.settings[:1], classes, folder / "results", folder / "tuning", 1)
+    complete(chosen, chosen.settings[:1], classes, folder / "results", folder / "tuning", Team(1))
     options = {
         "small": {"filter": "tobit", "horizon": 10, "memory": True},
         "centre": {"filter": "tobit", "horizon": 10, "information": "centre"},
@@ -206,7 +207,14 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "prices": 3,
         "every": 64,
         "episodes": 4,
-        "plain": {"every": 128, "seeds": 1, "budget": 1000.0},
+        "plain": {
+            "every": 128,
+            "seeds": 1,
+            "budget": 1000.0,
+            "timesteps": 256,
+            "num_envs": 4,
+            "algorithm": {"name": "ppo", "n_steps": 16, "batch_size": 32},
+        },
         "settings": [course],
     }
     (folder / "learning.yaml").write_text(yaml.safe_dump(content))

@@ -183,11 +183,9 @@ def test_agents_of_the_zoo_decide_as_stable_baselines_loads_them(
     name: str, request: pytest.FixtureRequest
 ) -> None:
     told = fusion_gym.zoo.card(name)
-    options = told["options"] | ({"information": "centre"} if told["mode"] == "centre" else {})
-    task = fusion_gym.make_task(told["env"], **options)
-    loaded = ALGORITHMS[told["training"]["algorithm"]["name"]].load(
-        fusion_gym.zoo.model_path(name), device="cpu"
-    )
+    task = fusion_gym.make_task(told["env"], **told["options"])
+    algorithm = told["training"]["algorithm"]["name"].removeprefix("counterfactual_")
+    loaded = ALGORITHMS[algorithm].load(fusion_gym.zoo.model_path(name), device="cpu")
     request.getfixturevalue("no_unpickling")
     policy: Any = make_policy(f"zoo:{name}", task)
     loaded.observation_space.seed(0)
@@ -440,12 +438,13 @@ def test_a_damaged_file_is_refused_or_harmless(
 def test_a_file_of_the_zoo_is_the_one_that_its_card_describes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    name = "biased_oscillator_local"
+    name = "biased_oscillator_local_packets_memory"
     for suffix in ("zip", "json"):
         source = Path(fusion_gym.zoo.__file__).with_name(f"{name}.{suffix}")
         shutil.copyfile(source, tmp_path / source.name)
     monkeypatch.setattr(fusion_gym.zoo, "_folder", lambda: tmp_path)
-    task = fusion_gym.make_task(fusion_gym.zoo.card(name)["env"])
+    card = fusion_gym.zoo.card(name)
+    task = fusion_gym.make_task(card["env"], **card["options"])
     make_policy(f"zoo:{name}", task)
     content = bytearray((tmp_path / f"{name}.zip").read_bytes())
     content[-1] ^= 1

@@ -59,6 +59,7 @@ AGENTS = Style("agents", ORANGE, "s", "--", 7.5, 2)
 AGENTS_MEMORY = Style("agents, memory", VERMILLION, "^", "-", 8.5, 3)
 ROLLOUT = Style("rule improved by simulation", PURPLE, "D", "", 8.0, 4)
 REFERENCE = Style("reference", BLACK, "x", ":", 7.0, 5)
+SCHEDULES = Style("best periodic schedules", BLACK, "+", "-.", 8.0, 6)
 BOUND = Style("proven: none lies below", GREEN, "", "-")
 
 # What the worths of the overview are drawn in.

@@ -163,7 +163,8 @@ def _strip(axes: Axes, panel: Panel, limits: Limits) -> None:
 
 def _mark(style: Style) -> dict[str, Any]:
     """Agents are filled and edged, so that they stand out of what they lie on."""
-    edge: dict[str, Any] = {} if style.marker in ("", "x", "o") else {"mec": "white", "mew": 0.7}
+    plain = style.marker in ("", "x", "+", "o")
+    edge: dict[str, Any] = {} if plain else {"mec": "white", "mew": 0.7}
     return {"marker": style.marker or None, "ms": style.size, **edge}
 
 

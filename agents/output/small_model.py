@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,13 @@ from fusion_gym.validation import ConfigurationError
 from .files import DAMAGED
 
 OPTIMISER = "policy.optimizer.pth"
+_OF_RUNS = ("_last_obs", "_last_episode_starts", "_last_original_obs", "ep_info_buffer")
 _BEGINNING = (1980, 1, 1, 0, 0, 0)  # of an archive's time: equal content gives equal bytes
 
 
 def small_model(path: Path) -> bytes:
-    """The archive with its parts compressed and its optimiser as before the first step.
+    """The archive with its parts compressed, without its runs, its optimiser as before the first
+    step.
 
     Stable-Baselines3 loads it, and would train it on from there.
 
@@ -30,12 +33,22 @@ def small_model(path: Path) -> bytes:
                 content = old.read(part)
                 if part == OPTIMISER:
                     content = _unused(content)
+                if part == "data":
+                    content = _without_runs(content)
                 info = zipfile.ZipInfo(part, _BEGINNING)
                 info.compress_type = zipfile.ZIP_DEFLATED
                 new.writestr(info, content)
     except DAMAGED as error:
         raise ConfigurationError(f"model = {str(path)!r} cannot be read: {error}") from None
     return packed.getvalue()
+
+
+def _without_runs(content: bytes) -> bytes:
+    """The settings alone: what the training's runs last saw is as large as the network."""
+    found: dict[str, Any] = json.loads(content)
+    return json.dumps(
+        {key: None if key in _OF_RUNS else one for key, one in found.items()}
+    ).encode()
 
 
 def _unused(content: bytes) -> bytes:

@@ -12,7 +12,16 @@ import numpy as np
 from fusion_gym.evaluation.envelope import EnvelopePoint, height, lower_hull
 
 from ..output import pareto_figure
-from ..output.palette import AGENTS, AGENTS_MEMORY, REFERENCE, ROLLOUT, RULES, RULES_MEMORY
+from ..output.palette import (
+    AGENTS,
+    AGENTS_MEMORY,
+    REFERENCE,
+    ROLLOUT,
+    RULES,
+    RULES_MEMORY,
+    SCHEDULES,
+    Style,
+)
 from ..output.pareto_figure import Differences, Limits, Panel, Series
 from .envelope_table import at_least
 from .found import Found
@@ -140,7 +149,7 @@ def _series(
     if reference:
         hull = lower_hull(reference)
         yield Series(
-            replace(REFERENCE, label=reference_label(found, reference)),
+            _reference_style(found, reference),
             list(_along(hull, [r for r in _fine(found) if r <= hull[-1].rate])),
             [(point.rate, point.mse) for point in hull],
         )
@@ -163,6 +172,11 @@ def _differences(found: Found, names: Sequence[str]) -> Iterator[Differences]:
                 if "difference" in point
             ]
             yield Differences(AGENTS_MEMORY if content["memory"] else AGENTS, sorted(points))
+
+
+def _reference_style(found: Found, reference: Sequence[EnvelopePoint]) -> Style:
+    style = SCHEDULES if reference is found.known else REFERENCE
+    return replace(style, label=reference_label(found, reference))
 
 
 def reference_label(found: Found, reference: Sequence[EnvelopePoint]) -> str:

@@ -64,7 +64,9 @@ def _cost(error: str | Cost) -> str | Cost:
     own = named("error", error) if isinstance(error, str) and ":" in error else error
     if own not in ERROR_KINDS and (isinstance(own, str) or not callable(own)):
         listed = ", ".join(repr(kind) for kind in ERROR_KINDS)
-        allowed = f"one of {listed}, a function of error and covariance, or its 'module:name'"
+        near = validation.nearest(own, ERROR_KINDS) if isinstance(own, str) else None
+        hint = f" (did you mean {near!r}?)" if near else ""
+        allowed = f"one of {listed}, a function, or 'module:name' of one{hint}"
         raise validation.refusal("error", own, allowed)
     return own
 

@@ -71,11 +71,12 @@ class Film:
         first = max(age - WINDOW, 0)
         self._title.set_text(f"step {age} of {self.task.horizon}" if title is None else title)
         self._draw_states(times, steps, run)
-        granted, denied = [], []
+        granted: list[tuple[int, int]] = []
+        denied: list[tuple[int, int]] = []
         for time, step in zip(times, steps, strict=True):
             for sensor in np.flatnonzero(step.outcome.requested[:, run]):
                 answer = granted if step.outcome.granted[sensor, run] else denied
-                answer.append((time, sensor))
+                answer.append((int(time), int(sensor)))
         for mark, points in zip(self._marks, (granted, denied), strict=True):
             mark.set_data(*(np.array(points).T if points else ([], [])))
         self._level.set_data(times, [step.tokens[run] for step in steps])
@@ -156,7 +157,7 @@ class Film:
             axis.tick_params(labelsize=8)
             axis.grid(alpha=0.25)
             axis.spines[["top", "right"]].set_visible(False)
-        handles = {}
+        handles: dict[str, Any] = {}
         for axis in self._axes:
             for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
                 handles.setdefault(label, handle)
@@ -178,7 +179,8 @@ class Window:
 
     def __init__(self, title: str, fps: int) -> None:
         _require("pygame")
-        self._title, self._fps, self._screen = title, fps, None
+        self._title, self._fps = title, fps
+        self._screen: Any = None
 
     def show(self, frame: Frame) -> None:
         """One frame, for its time."""

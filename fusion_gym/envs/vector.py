@@ -131,7 +131,7 @@ class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
             self._film.begin(runs)
         return self.batch.observe(), _with_mask(reset_infos(self.task, self.num_envs), mask)
 
-    def render(self) -> tuple[Frame, ...] | None:  # type: ignore[override]
+    def render(self) -> tuple[Frame, ...] | None:
         """A picture (height, width, 3) of every run; nothing without a render mode."""
         if self._film is None:
             return None

@@ -117,7 +117,7 @@ VARIANTS: dict[str, list[Options]] = {
         }
         | REMEMBERING
         | DRAWN,
-        {"censoring_threshold": (0.0, -1.0), "access": "round_robin", "information": "centre"},
+        {"censoring_threshold": (-2.0, -2.0), "access": "round_robin", "information": "centre"},
         ESTIMATES | NOISY | {"filter": "adf", "action": "discrete"},
     ],
     REMOTE: [

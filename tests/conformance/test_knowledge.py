@@ -104,6 +104,7 @@ def test_whoever_is_shown_something_can_know_it(case: Case) -> None:
     system, view = task.system, None if case.not_local else SensorView(task)
     batch = case.batch([3], owner=None if view is None else view.owner)
     told = any(block.node == "told" for block in system.observation)
+    told |= task.broadcast != "none" and bool(task.memory or task.belief_features)
     noticed = np.zeros(task.sensors, dtype=np.bool_)
     before = Moment.start(batch, np.random.default_rng(0))
     draw, channels = np.random.default_rng(1), system.noise_channels
