@@ -88,7 +88,7 @@ POLICIES: dict[str, list[str]] = {
     "kullback_leibler": ["threshold=0.3,at_most=1", "threshold=0.3,own=true"],
     "local_variance": ["", "m=0.3"],
     "lookahead": ["price=0.02,steps=1"],
-    "model": [f"{zoo.model_path('tobit_oscillator_sensors')}"],
+    "model": [f"{zoo.model_path('tobit_oscillator_centre')}"],
     "never": [""],
     "optimal": ["", "criterion=average"],
     "paced": ["rate=0.3"],

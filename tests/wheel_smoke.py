@@ -141,8 +141,8 @@ def use(programs: Path, folder: Path) -> None:
     assert lacking.strip() == "error: tyro is missing: pip install 'fusion-gym[agents]'", lacking
     call(python, "-c", HELP, cwd=folder)
     call(
-        program, "evaluate", "--config", "tobit_oscillator_ppo", "--episodes", "5", "--policies",
-        "always", "zoo:tobit_oscillator_sensors", "--json", "evaluation.json", cwd=folder,
+        program, "evaluate", "--config", "tobit_oscillator_ppo", "--set", "belief_features=true",
+        "--episodes", "5", "--policies", "always", "zoo:tobit_oscillator_sensors", "--json", "evaluation.json", cwd=folder,
     )  # fmt: skip
     assert len(json.loads((folder / "evaluation.json").read_text())["policies"]) == 2
     call(

@@ -97,9 +97,11 @@ def _features(value: Any, remembers: bool) -> tuple[str, ...]:
     """What the observation shows of what is believed: with memory all of it by default."""
     if value is None:
         return FEATURES if remembers else ()
+    if value is True:
+        return FEATURES
     given = (value,) if isinstance(value, str) else value
     if not isinstance(given, Sequence):
-        raise validation.refusal("belief_features", value, f"a list of some of {FEATURES}")
+        raise validation.refusal("belief_features", value, f"a list of some of {FEATURES}, or true")
     for name in given:
         validation.choice("belief_features", name, FEATURES)
     return tuple(name for name in FEATURES if name in given)

@@ -36,7 +36,7 @@ class CommonOptions:
     broadcast: str | None = None
     memory: bool = False
     memory_filter: str | None = None
-    belief_features: Sequence[str] | None = None
+    belief_features: Sequence[str] | bool | None = None
     horizon: int = 100
     clock: bool = False
     information: str = "sensors"
