@@ -101,7 +101,7 @@ def test_estimates_are_those_of_filterpy() -> None:
 def test_censored_sensors_get_a_filter_that_knows_it() -> None:
     common = {"measurement_matrices": [[1, 0], [[0, 1], [1, 1]]], "horizon": 50}
     limited = fusion_gym.make_task(LINEAR, censoring_threshold=[0.0, [-np.inf, 1.0]], **common)
-    assert limited.settings["filter"] == "tobit"
+    assert limited.settings["filter"] == "adf"
     assert fusion_gym.make_task(LINEAR, **common).settings["filter"] == "kalman"
     batch = EpisodeBatch.seeded(limited, 2000, 0)
     measured = batch.signals()["measurement"]
@@ -112,6 +112,21 @@ def test_censored_sensors_get_a_filter_that_knows_it() -> None:
     names = EpisodeBatch(limited, 1).layout.names
     assert "censored[0,0]" in names
     assert "censored[0,0]" not in EpisodeBatch(fusion_gym.make_task(LINEAR), 1).layout.names
+
+
+def test_states_have_the_names_that_they_are_given() -> None:
+    task = fusion_gym.make_task(LINEAR, state_names=["angle", "rate"])
+    assert task.system.state_names == ("angle", "rate")
+    assert "estimate[rate]" in EpisodeBatch(task, 1).layout.names
+
+
+def test_a_plant_that_no_noise_moves() -> None:
+    """What is unknown at the start is all that there is: measured often enough, it is known."""
+    still = {"transition": [[1, 0.1], [0, 1]], "process_covariance": np.zeros((2, 2))}
+    task = fusion_gym.make_task(LINEAR, tokens="unlimited", horizon=200, **still)
+    found = run_episodes(task, make_policy("always", task), 200, 0)
+    assert found.squared_error[-1].sum() < 0.05 * found.squared_error[0].sum()
+    assert found.nees.mean() == pytest.approx(1.0, abs=0.2)
 
 
 def test_every_rule_and_the_best_schedule_run() -> None:
@@ -133,6 +148,11 @@ def test_every_rule_and_the_best_schedule_run() -> None:
     ("options", "told"),
     [
         ({"measurement_matrices": []}, "measurement_matrices = []"),
+        ({"state_names": "ab"}, "state_names = 'ab'"),
+        ({"state_names": ["a"]}, "2 different words"),
+        ({"state_names": ["a", "a"]}, "2 different words"),
+        ({"state_names": ["a", "b", "a"]}, "2 different words"),
+        ({"state_names": ["a", "b,c"]}, "2 different words"),
         ({"measurement_matrices": 3}, "a list with a matrix for each sensor"),
         ({"measurement_matrices": [[1, 0], [[1, 0, 0]]]}, "measurement_matrices[1]"),
         ({"measurement_covariances": [1.0]}, "each of the 2 sensors"),

@@ -88,6 +88,8 @@ class LinearPlant:
         With a ``departure`` (4, N) the plant moves by I + c (A - I) in the place of A.
         """
         moved = true_motion(departure, state, linalg.matvec(self.transition, state))
+        if not self.noise_channels:
+            return moved
         return moved + linalg.matvec(self.process_factor, noise)
 
     def true_radius(self, factor: float) -> float:

@@ -158,6 +158,7 @@ class NonlinearSystem(ABC):
                 (self.state_names,),
                 node="told",
                 limit=_RANGE,
+                constants={"open-loop mean": self._typical[1]},
             ),
             Block(
                 "estimate",
@@ -166,6 +167,7 @@ class NonlinearSystem(ABC):
                 (self.state_names,),
                 node="told",
                 limit=_RANGE,
+                constants={"root mean square": self._typical[0]},
             ),
         )
 

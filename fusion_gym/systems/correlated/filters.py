@@ -39,6 +39,9 @@ class RobustKalmanFilter:
     bound of the actual one (Theorem 1), whatever is delivered, as long as what is delivered does
     not depend on the noise.
 
+    Assumes: a linear plant, variances below their bounds, all in one proportion, and
+    transmissions that are not chosen by the noise.
+
     Source: adaptive_innovation, equation (12), with R_ii and S_i of :class:`CorrelatedSensors`.
     """
 

@@ -134,6 +134,7 @@ class CorrelatedTrackingSystem:
         components = (nodes, numbered(self.filter.sensors.size))
         innovation = "innovation of the node over its predicted deviation"
         deviation = "logarithm of the node's predicted over the open-loop deviation"
+        open_loop = {"open-loop deviation": np.sqrt(self.reference)}
         return (
             block("whitened_innovation", innovation, self._whitened, components, "own", "own"),
             block(
@@ -150,18 +151,21 @@ class CorrelatedTrackingSystem:
                 lambda s: self._log_deviation(s.prior_covariance[1:]),
                 (nodes, states),
                 node="own",
+                constants=open_loop,
             ),
             block(
                 "log_deviation",
                 "the same of the fused prediction",
                 lambda s: self._log_deviation(s.prior_covariance[0]),
                 (states,),
+                constants=open_loop,
             ),
             block(
                 "estimate",
                 "fused prediction over the state's root mean square",
                 lambda s: s.prior_mean[0] / self.magnitude[:, None],
                 (states,),
+                constants={"root mean square": self.magnitude},
             ),
         )
 

@@ -186,6 +186,7 @@ class MarkovJumpCentralSystem:
         deviation = (
             "logarithm of the innovation's deviation over the measurement's root mean square"
         )
+        measured = {"root mean square": self.scale}
         probability = Block(
             "mode_probability",
             "probability of the mode",
@@ -201,6 +202,7 @@ class MarkovJumpCentralSystem:
                 (nodes,),
                 "own",
                 "own",
+                constants=measured,
             ),
             *sampling_blocks(self.sensors),
             age_block(nodes),
@@ -209,18 +211,21 @@ class MarkovJumpCentralSystem:
                 deviation,
                 lambda s: np.log(self._deviation(_sensed(s)) / scale),
                 (nodes,),
+                constants=measured,
             ),
             block(
                 "log_deviation",
                 "logarithm of the predicted over the open-loop deviation",
                 self._log_deviation,
                 (self.state_names,),
+                constants={"open-loop deviation": np.sqrt(self.reference)},
             ),
             block(
                 "estimate",
                 "prediction over the state's root mean square",
                 lambda s: _sensed(s).mean[:n] / self.magnitude[:, None],
                 (self.state_names,),
+                constants={"root mean square": self.magnitude},
             ),
             *((probability,) if isinstance(self.estimator, InteractingModels) else ()),
         )

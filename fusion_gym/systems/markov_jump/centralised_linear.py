@@ -125,6 +125,9 @@ class CentralisedLinearFilter:
     (a, a, T) · ``variance`` of the own noises σ_i² C_i P(k) C_iᵀ + R_i (l, T). Tables end when they
     have settled.
 
+    Assumes: a Markov jump system whose mode nobody sees, and transmissions that are not chosen
+    by the noise; the estimate is the best linear one, not the best.
+
     Source: markov_jump, equations (5)-(22), with the measurements of all sensors in one vector.
     """
 

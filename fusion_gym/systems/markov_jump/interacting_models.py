@@ -40,6 +40,12 @@ class InteractingModels:
 
     Shapes, s = n + r: ``maps`` (M, n + l, s, 1) from z to col(x, y), ``motion`` [Φ_j Γ_j]
     (M, n, s, 1), ``unfaded`` H (M, l, n, 1).
+
+    Assumes: one Gaussian a mode after every step, and fading that acts as Gaussian noise.
+
+    Source: H. A. P. Blom and Y. Bar-Shalom, "The interacting multiple model algorithm for
+    systems with Markovian switching coefficients", IEEE Trans. Automatic Control 33, 1988; the
+    system is that of markov_jump.
     """
 
     plant: MarkovJumpPlant

@@ -162,6 +162,9 @@ class LocalFilters:
     ``predicted_cross`` E ε_i L_j(k+1|k) (l, l, a, T). ``period`` is the number of steps after
     which the sensors' sampling repeats, at most T.
 
+    Assumes: a Markov jump system whose mode nobody sees; the estimate is the best linear one,
+    not the best.
+
     Source: markov_jump, equations (12)-(22).
     """
 

@@ -122,22 +122,37 @@ class MarkovJumpSystem:
         innovation = "node's innovation over its deviation, 0 without a sample"
         local = "logarithm of the root of the node's trace over the open-loop trace"
         copies = "logarithm of the copy's predicted over the open-loop deviation"
+        open_loop = {"open-loop deviation": np.sqrt(self.reference)}
         return (
             own("whitened_difference", difference, self._difference, nodes + states, "own"),
             own("whitened_innovation", innovation, self._whitened_innovation, nodes, "own"),
             *sampling_blocks(self.sensors),
             age_block(*nodes),
-            own("local_log_deviation", local, self._local_log_deviation, nodes),
-            own("copy_log_deviation", copies, self._copy_log_deviation, nodes + states),
+            own(
+                "local_log_deviation",
+                local,
+                self._local_log_deviation,
+                nodes,
+                constants={"open-loop trace": self.reference.sum()},
+            ),
+            own(
+                "copy_log_deviation",
+                copies,
+                self._copy_log_deviation,
+                nodes + states,
+                constants=open_loop,
+            ),
             fused(
                 "log_deviation",
                 "the same of the fused estimate if nobody transmits",
                 lambda s: self._log_deviation(s.prior_covariance),
+                constants=open_loop,
             ),
             fused(
                 "estimate",
                 "that estimate over the state's root mean square",
                 lambda s: s.prior_mean / self.magnitude[:, None],
+                constants={"root mean square": self.magnitude},
             ),
         )
 

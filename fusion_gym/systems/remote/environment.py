@@ -17,7 +17,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.access import ACCESS_RULES
 from fusion_gym.core.channel import CHANNELS, INITIAL_STATES, Channel
 from fusion_gym.core.options import CommonOptions, Nature, Scenario
-from fusion_gym.core.task import MOST_SENSORS, make_bucket
+from fusion_gym.core.task import make_bucket
 from fusion_gym.systems.remote.system import RemoteEstimationSystem
 from fusion_gym.validation import ConfigurationError
 
@@ -74,7 +74,8 @@ def build(chosen: RemoteEstimationOptions) -> Scenario:
     Raises:
         ConfigurationError: a value that is not allowed.
     """
-    sensors = validation.integer("sensors", chosen.sensors, at_least=1, at_most=MOST_SENSORS)
+    most = validation.MOST_SENSORS
+    sensors = validation.integer("sensors", chosen.sensors, at_least=1, at_most=most)
     weights = (
         np.ones(sensors)
         if chosen.state_weights is None

@@ -126,6 +126,7 @@ class RemoteEstimationSystem:
             "own",
             "own",
             _RANGE,
+            {"error_scale": self.error_scale},
         )
         channel = Block(
             "channel",
@@ -255,6 +256,10 @@ class RemoteEstimationSystem:
         After a delivery the error is zero; its variance is given as 1e-12 σ².
         """
         return state.estimate, _diagonal(state.variance)
+
+    def fused_mean(self, state: RemoteEstimationState) -> Array:
+        """The centre's mean (n, N)."""
+        return state.estimate
 
     def local_means(self, state: RemoteEstimationState) -> Array:
         """The nodes' means (sensors, n, N): each knows its source, and x̂ of the others."""

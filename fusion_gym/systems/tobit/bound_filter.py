@@ -122,6 +122,11 @@ class BoundTobitFilter:
 
     ``event_error`` (or None) is the κ₆ Ξ term of a delivery; ``hold`` says what happens without
     one: True updates with the held value as the paper does, False predicts.
+
+    Assumes: the paper's dynamic event trigger, for Ξ; and that censoring is independent of the
+    noise, which it is not, so that the bound is not proven.
+
+    Source: tobit_token_bucket, equations (20)-(37), Theorems 1 and 2.
     """
 
     sensors: CensoredSensors

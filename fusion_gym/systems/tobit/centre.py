@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.fusion.rules import FusionRule
+from fusion_gym.fusion.rules import Fused, FusionRule, InformationFusion
 from fusion_gym.systems.tobit.filters import (
     Expectation,
+    KalmanFilter,
     NodeFilter,
     Outcomes,
 )
@@ -50,6 +51,11 @@ class Centre(Protocol):
         """The sensors."""
         ...
 
+    @property
+    def predictable(self) -> bool:
+        """Whether its covariances follow from the deliveries alone, whatever is measured."""
+        ...
+
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> Prediction:
         """Expectations under the centre's prediction (n, N), (n, n, N)."""
         ...
@@ -63,6 +69,15 @@ class Centre(Protocol):
         granted: NDArray[np.bool_],
     ) -> Posterior:
         """The posterior after the granted (sensors, N) of the measurements (sensors, m, N)."""
+        ...
+
+    def alone(
+        self, mean: Array, covariance: Array, prediction: Prediction, measurement: Array
+    ) -> tuple[Array, Array] | None:
+        """Posterior means (sensors, n, N) and covariances (sensors, n, n, N), one sensor granted.
+
+        Those of as many calls of :meth:`update`; ``None`` where all together cost no less.
+        """
         ...
 
     def variances(
@@ -122,7 +137,10 @@ class Feedback:
         means = np.broadcast_to(mean, (self.sensors, *mean.shape))
         if self.share is None:
             return means, np.broadcast_to(covariance, (self.sensors, *covariance.shape))
-        return means, covariance / self.share[:, None, None]
+        share = self.share[:, None, None]
+        if (self.share == self.share[0]).all():
+            return means, np.broadcast_to(covariance / share[0], (self.sensors, *covariance.shape))
+        return means, covariance / share
 
 
 @dataclass(frozen=True)
@@ -141,6 +159,11 @@ class FeedbackCentre:
     def sensors(self) -> CensoredSensors:
         """The sensors."""
         return self.filter.sensors
+
+    @property
+    def predictable(self) -> bool:
+        """See :class:`Centre`: with Kalman filters, where nothing is censored."""
+        return isinstance(self.filter, KalmanFilter) and self.sensors.unlimited
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> Prediction:
         """See :class:`Centre`."""
@@ -165,13 +188,32 @@ class FeedbackCentre:
     ) -> Posterior:
         """Each node takes the planned outcome of the network's answer; the centre fuses."""
         outcomes = _outcomes(prediction)
-        innovation = measurement - prediction.expectation.value
-        update = linalg.matvec(linalg.transpose(outcomes.correction), innovation)
-        grant = granted[:, None]
-        local_mean = np.where(grant, mean + update, outcomes.silent_mean)
-        local = np.where(grant[:, None], outcomes.delivered_covariance, outcomes.silent_covariance)
-        fused = self.fusion.fuse(local_mean, local)
+        delivered = mean + _correction(outcomes, prediction, measurement)
+        local_mean = np.where(granted[:, None], delivered, outcomes.silent_mean)
+        fused = self._fused(local_mean, outcomes, granted)
         return Posterior(fused.mean, fused.covariance, local_mean)
+
+    def _fused(self, means: Array, outcomes: Outcomes, granted: NDArray[np.bool_]) -> Fused:
+        """The nodes' estimates joined; bitwise the same by informations where that is cheaper."""
+        if isinstance(self.fusion, InformationFusion) and outcomes.informed:
+            return self.fusion.fuse_information(means, outcomes.information(granted))
+        grant = granted[:, None, None]
+        local = np.where(grant, outcomes.delivered_covariance, outcomes.silent_covariance)
+        return self.fusion.fuse(means, local)
+
+    def alone(
+        self, mean: Array, covariance: Array, prediction: Prediction, measurement: Array
+    ) -> tuple[Array, Array] | None:
+        """See :class:`Centre`: informations of all nodes but one stay what they are in silence."""
+        if not isinstance(self.fusion, InformationFusion):
+            return None
+        outcomes = _outcomes(prediction)
+        return self.fusion.fuse_each(
+            outcomes.silent_mean,
+            outcomes.silent_information,
+            mean + _correction(outcomes, prediction, measurement),
+            outcomes.delivered_information,
+        )
 
     def variances(
         self, mean: Array, covariance: Array, prediction: Prediction, weights: Array
@@ -194,6 +236,11 @@ class SequentialCentre:
         """The sensors."""
         return self.filter.sensors
 
+    @property
+    def predictable(self) -> bool:
+        """See :class:`Centre`: what is censored changes the covariance."""
+        return False
+
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> Prediction:
         """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
         expectation = self.filter.expect(mean, covariance)
@@ -213,6 +260,12 @@ class SequentialCentre:
         local = np.broadcast_to(mean, (self.sensors.count, *mean.shape))
         return Posterior(mean, covariance, local)
 
+    def alone(
+        self, mean: Array, covariance: Array, prediction: Prediction, measurement: Array
+    ) -> tuple[Array, Array] | None:
+        """See :class:`Centre`."""
+        return None
+
     def variances(
         self, mean: Array, covariance: Array, prediction: Prediction, weights: Array
     ) -> tuple[Array, Array]:
@@ -220,6 +273,12 @@ class SequentialCentre:
         silent = linalg.weighted_trace(covariance, weights)
         expected = self.filter.expected_covariance(mean, covariance)
         return silent, silent - linalg.weighted_trace(expected, weights)
+
+
+def _correction(outcomes: Outcomes, prediction: Prediction, measurement: Array) -> Array:
+    """What a delivery would add to each node's mean (sensors, n, N)."""
+    innovation = measurement - prediction.expectation.value
+    return linalg.matvec(linalg.transpose(outcomes.correction), innovation)
 
 
 def _outcomes(prediction: Prediction) -> Outcomes:

@@ -8,6 +8,7 @@ current measurement, so a policy may look at both without looking at the measure
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.fusion.rules import alike, inverses
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.validation import ConfigurationError
 
@@ -37,7 +39,11 @@ class Expectation(NamedTuple):
     truncated_variance: Array
 
 
-class Outcomes(NamedTuple):
+_MANY, _LARGE = 6, 3  # sensors and states
+
+
+@dataclass(frozen=True)
+class Outcomes:
     """Both outcomes at every node.
 
     ``correction`` (sensors, m, n, N): the transposed gain of a delivery, so that the delivered
@@ -49,6 +55,44 @@ class Outcomes(NamedTuple):
     delivered_covariance: Array
     silent_mean: Array
     silent_covariance: Array
+
+    @functools.cached_property
+    def silent_information(self) -> Array:
+        """The inverse (sensors, n, n, N) of the silent covariance."""
+        return inverses(self.silent_covariance)
+
+    @property
+    def informed(self) -> bool:
+        """Whether both informations are known already, or that of silence is cheap to have.
+
+        It is where many nodes have one and the same covariance, too large for a closed form.
+        """
+        if {"silent_information", "delivered_information"} <= vars(self).keys():
+            return True
+        sensors, states = self.silent_covariance.shape[:2]
+        return alike(self.silent_covariance) and sensors >= _MANY and states >= _LARGE
+
+    @functools.cached_property
+    def delivered_information(self) -> Array:
+        """The inverse (sensors, n, n, N) of the delivered covariance."""
+        return linalg.inverse(self.delivered_covariance)
+
+    def information(self, granted: NDArray[np.bool_]) -> Array:
+        """The nodes' informations (sensors, n, n, N) after the answer ``granted`` (sensors, N).
+
+        Only what was granted is inverted anew: bitwise the inverse of the covariances that result.
+        """
+        if not granted.any():
+            return self.silent_information
+        if granted.all() or "delivered_information" in vars(self):
+            grant = granted[:, None, None]
+            return np.where(grant, self.delivered_information, self.silent_information)
+        result = np.ascontiguousarray(self.silent_information).copy()
+        sensor, run = np.nonzero(granted)
+        delivered = np.moveaxis(self.delivered_covariance[sensor, :, :, run], 0, -1)
+        found = linalg.inverse(np.ascontiguousarray(delivered))
+        result[sensor, :, :, run] = np.moveaxis(found, -1, 0)
+        return result
 
 
 class NodeFilter(Protocol):
@@ -130,6 +174,12 @@ class KalmanFilter:
 
     S = C P Cᵀ + R, K = P Cᵀ S⁻¹. Biased wherever measurements are censored: it stands beside the
     Tobit filters to show what they are worth.
+
+    Assumes: a linear plant, Gaussian noises independent of one another, uncensored
+    measurements, and transmissions that are not chosen by the noise.
+
+    Source: R. E. Kalman, "A new approach to linear filtering and prediction problems", Journal
+    of Basic Engineering 82, 1960.
     """
 
     sensors: CensoredSensors
@@ -176,6 +226,9 @@ class StochasticEventFilter:
 
     ``weight`` has shape (sensors, 1), in the inverse squared unit of the measurement, >= 0; with
     weight 0 silence says nothing. Build one with :meth:`create`.
+
+    Assumes: a linear plant, Gaussian noises, uncensored sensors, the policy
+    ``stochastic_event`` with the same weight, and that every request is granted.
 
     Source: D. Han, Y. Mo, J. Wu, S. Weerakkody, B. Sinopoli and L. Shi, "Stochastic
     event-triggered sensor schedule for remote state estimation", IEEE Trans. Automatic Control

@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.arrays import Array
-from fusion_gym.core.options import Scenario
+from fusion_gym.core.options import Scenario, plain
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
+from fusion_gym.systems.tobit.joint import joint_centre
+from fusion_gym.systems.tobit.linear_sensors import linear_sensors
 from fusion_gym.systems.tobit.options import (
     FILTERS,
     FeedbackOptions,
+    Filter,
     at_the_nodes,
     make_centre,
     remembering_system,
@@ -31,6 +33,7 @@ _FILTERS = {
     "tobit": at_the_nodes(TobitKalmanFilter),
     "adf": FILTERS["adf"],
     "stochastic": FILTERS["stochastic"],
+    "joint": Filter(joint_centre, nodes=False),
 }
 _STEP = 0.1  # seconds between two samples of the default target
 # Observed variances are relative to those after so many silent steps: a target that nobody sees
@@ -42,9 +45,9 @@ _REFERENCE_HORIZON = 10
 class LinearFusionOptions(FeedbackOptions):
     """Any linear plant, x' = A x + w, and any sensors of it, y = C x + v, each with its own size.
 
-    Every sensor has a Kalman filter (a Tobit Kalman filter where it is censored); the centre fuses
-    them and feeds the result back. At every step the policy requests transmissions, and the token
-    bucket grants or denies them.
+    Every sensor has a Kalman filter; the centre fuses them and feeds the result back. Where some
+    sensor is censored, the centre takes what arrives in an assumed-density filter of its own. At
+    every step the policy requests transmissions, and the token bucket grants or denies them.
 
     ``measurement_matrices`` has a matrix (channels, states) for each sensor, or a row of as many
     numbers as states for a sensor of one channel. ``measurement_covariances`` has a covariance for
@@ -52,6 +55,13 @@ class LinearFusionOptions(FeedbackOptions):
     covariance is not diagonal reports R^(-1/2) y, which holds the same. ``censoring_threshold``
     and ``censoring_upper`` have a number for all channels, one for each sensor, or a list of one
     for each channel of each sensor.
+
+    Noises of different sensors are independent, unless ``joint_measurement_covariance`` stands in
+    the place of ``measurement_covariances``: the covariance of all channels of all sensors, one
+    sensor after another. The centre then takes what arrives in one filter (``"joint"``), or the
+    nodes' estimates are joined by covariance intersection.
+
+    ``state_names`` are words for tables and figures.
 
     Starting state: x₀ ~ N(``initial_mean``, ``initial_covariance``), by default zero and the
     identity. The first measurement is known to the centre free of charge.
@@ -68,9 +78,11 @@ class LinearFusionOptions(FeedbackOptions):
     )
     initial_mean: ArrayLike | None = None
     initial_covariance: ArrayLike | None = None
+    state_names: Sequence[str] | None = None
     # Sensors: y = clip(C x + v, τ, υ), v ~ N(0, R)
     measurement_matrices: Sequence[ArrayLike] = ((1.0, 0.0), (0.0, 1.0))
     measurement_covariances: ArrayLike | Sequence[ArrayLike] = 0.25
+    joint_measurement_covariance: ArrayLike | None = None
     censoring_threshold: ArrayLike | Sequence[ArrayLike] = -np.inf
     censoring_upper: ArrayLike | Sequence[ArrayLike] = np.inf
     # Network
@@ -90,14 +102,18 @@ def build(chosen: LinearFusionOptions) -> Scenario:
     horizon = validation.horizon(chosen.horizon)
     plant = _plant(chosen)
     sensors = _sensors(chosen, plant.size)
+    correlated = sensors.noise_correlation is not None
     if chosen.filter is None:
-        chosen = replace(chosen, filter="kalman" if sensors.unlimited else "tobit")
+        default = "joint" if correlated else "kalman"
+        chosen = replace(chosen, filter=default if sensors.unlimited else "adf")
+    if correlated:
+        _check_rules(chosen)
     system = CensoredSystem(
         plant=plant,
         model=plant,
         centre=make_centre(str(chosen.filter), _FILTERS, chosen, sensors),
         random_start=False,
-        state_names=tuple(f"x{i + 1}" for i in range(plant.size)),
+        state_names=_names(chosen.state_names, plant.size),
         scale=typical_magnitude(plant, horizon, random_start=False),
         reference=plant.open_loop(min(horizon, _REFERENCE_HORIZON)),
         nature=true_nature(chosen, plant, sensors, horizon),
@@ -120,81 +136,49 @@ def _plant(chosen: LinearFusionOptions) -> LinearPlant:
 
 
 def _sensors(chosen: LinearFusionOptions, states: int) -> CensoredSensors:
-    """All sensors with as many channels as the largest has; the others' last ones are absent."""
-    matrices = _matrices(chosen.measurement_matrices, states)
-    sizes = [len(matrix) for matrix in matrices]
-    shape = (len(sizes), max(sizes))
-    low = _limits("censoring_threshold", chosen.censoring_threshold, sizes, -np.inf)
-    high = _limits("censoring_upper", chosen.censoring_upper, sizes, np.inf)
-    present = np.arange(shape[1]) < np.array(sizes)[:, None]
-    matrix, variance = np.zeros((*shape, states)), np.ones(shape)
-    for place, covariance in enumerate(_covariances(chosen.measurement_covariances, sizes)):
-        own, size = matrices[place], sizes[place]
-        if np.count_nonzero(covariance - np.diag(np.diagonal(covariance))):
-            if np.isfinite(low[place]).any() or np.isfinite(high[place]).any():
-                raise validation.refusal(
-                    f"measurement_covariances[{place}]",
-                    covariance,
-                    "diagonal, for this sensor is censored, channel by channel",
-                )
-            own = np.linalg.solve(np.linalg.cholesky(covariance), own)
-            covariance = np.eye(size)
-        matrix[place, :size], variance[place, :size] = own, np.diagonal(covariance)
-    return CensoredSensors.create(matrix, variance, low, states, high, present)
+    joint, own = chosen.joint_measurement_covariance, chosen.measurement_covariances
+    default = LinearFusionOptions.measurement_covariances
+    if joint is not None and plain(own) != default:
+        raise validation.refusal(
+            "measurement_covariances", own, "left out beside joint_measurement_covariance"
+        )
+    return linear_sensors(
+        states,
+        chosen.measurement_matrices,
+        own,
+        joint,
+        chosen.censoring_threshold,
+        chosen.censoring_upper,
+    )
 
 
-def _matrices(given: Any, states: int) -> list[Array]:
-    found = []
-    for place, one in enumerate(_each("measurement_matrices", given, "a matrix")):
-        name = f"measurement_matrices[{place}]"
-        row = _dimensions(one) == 1
-        matrix = validation.array(name, one, (states,) if row else (None, states))
-        found.append(matrix[None] if row else matrix)
-    return found
-
-
-def _covariances(given: Any, sizes: Sequence[int]) -> list[Array]:
-    name, count = "measurement_covariances", len(sizes)
-    one = _dimensions(given) == 0
-    each = [given] * count if one else _each(name, given, "a covariance or a variance", count)
-    found = []
-    for place, (size, value) in enumerate(zip(sizes, each, strict=True)):
-        full = name if one else f"{name}[{place}]"
-        if _dimensions(value) == 0:
-            value = validation.number(full, value, above=0.0) * np.eye(size)
-        found.append(validation.covariance(full, value, size, definite=True))
-    return found
-
-
-def _limits(name: str, given: Any, sizes: Sequence[int], none: float) -> Array:
-    """Limits (sensors, m); ``none`` stands for no limit, as of channels that are absent."""
-    one = _dimensions(given) == 0
-    each = [given] * len(sizes) if one else _each(name, given, "a number or a list", len(sizes))
-    found = np.full((len(sizes), max(sizes)), none)
-    for place, (size, value) in enumerate(zip(sizes, each, strict=True)):
-        full = name if one else f"{name}[{place}]"
-        found[place, :size] = validation.spread(full, value, (size,), infinity=int(np.sign(none)))
-    return found
-
-
-def _each(name: str, given: Any, kind: str, count: int | None = None) -> list[Any]:
-    """What is given for each sensor.
+def _names(given: Any, states: int) -> tuple[str, ...]:
+    """The states' names, by default x1, x2, …
 
     Raises:
-        ConfigurationError: no list, an empty one, or another number of sensors.
+        ConfigurationError: another number of them, or some that are no different words.
     """
-    listed = isinstance(given, (list, tuple)) or (isinstance(given, np.ndarray) and given.ndim > 0)
-    if not listed or not len(given) or (count is not None and len(given) != count):
-        many = "each sensor" if count is None else f"each of the {count} sensors"
-        raise validation.refusal(name, given, f"a list with {kind} for {many}")
-    return list(given)
+    if given is None:
+        return tuple(f"x{i + 1}" for i in range(states))
+    listed = isinstance(given, (list, tuple)) and len(given) == len(set(map(repr, given))) == states
+    if not listed or not all(isinstance(name, str) and name.isidentifier() for name in given):
+        words = f"a list of {states} different words of letters, digits and '_'"
+        raise validation.refusal("state_names", given, words)
+    return tuple(given)
 
 
-def _dimensions(value: Any) -> int:
-    """How deep a value is nested, by its first entries: ragged ones have no shape."""
-    if isinstance(value, np.ndarray):
-        return value.ndim
-    depth = 0
-    while isinstance(value, (list, tuple)):
-        depth, value = depth + 1, value[0] if value else 0.0
-    return depth + (value.ndim if isinstance(value, np.ndarray) else 0)
+def _check_rules(chosen: LinearFusionOptions) -> None:
+    """Whether filter and fusion stay right where sensors share noise.
+
+    Raises:
+        ConfigurationError: they would count what the sensors share several times.
+    """
+    why = "for the sensors' noises are correlated"
+    for name in ("filter", "memory_filter"):
+        kind = getattr(chosen, name)
+        if kind not in (None, "joint", "kalman"):
+            raise validation.refusal(name, kind, f"'joint' or 'kalman', {why}")
+        if kind == "kalman" and chosen.fusion not in ("ci", "sci"):
+            raise validation.refusal(
+                "fusion", chosen.fusion, f"'ci' or 'sci' with {name}='kalman', {why}"
+            )

@@ -147,13 +147,18 @@ def assumed_density_centre(chosen: FeedbackOptions, sensors: CensoredSensors) ->
     Raises:
         ConfigurationError: an option of the nodes' fusion, for there are no nodes.
     """
-    _refuse(
-        chosen,
-        _OF_FUSION,
-        "filter='adf'",
-        "a filter with nodes (here the centre takes the measurements itself)",
-    )
+    refuse_fusion(chosen, "adf")
     return SequentialCentre(AssumedDensityFilter(sensors))
+
+
+def refuse_fusion(chosen: FeedbackOptions, kind: str) -> None:
+    """Whether a filter of this name at the centre is asked to join nodes.
+
+    Raises:
+        ConfigurationError: an option of the nodes' fusion, for there are no nodes.
+    """
+    belongs = "a filter with nodes (here the centre takes the measurements itself)"
+    _refuse(chosen, _OF_FUSION, f"filter={kind!r}", belongs)
 
 
 # What every environment of the family offers; each adds its paper's own.

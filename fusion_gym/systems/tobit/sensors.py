@@ -29,11 +29,13 @@ class CensoredSensors:
     ``noise_deviation``, elsewhere √R, is zero there. ``deviation`` is √R, ``uncensored`` marks
     lower thresholds of minus infinity, which ``finite_threshold`` replaces by zero; ``two_sided``
     says whether any upper threshold is finite, and ``finite_upper`` replaces those that are not by
-    zero.
+    zero. ``noise_correlation`` is a factor L of the noises' correlations L Lᵀ, over the channels of
+    all sensors one after another, ``None`` where all are independent.
 
     Shapes: ``measurement_matrix`` C (sensors, m, n, 1), ``variance`` R (sensors, m, 1),
     ``threshold`` τ and ``upper`` υ (sensors, m, 1), in the unit of the measurement, minus and plus
-    infinity where a component is not censored on that side. Build one with :meth:`create`.
+    infinity where a component is not censored on that side; ``noise_correlation`` L
+    (sensors·m, sensors·m, 1). Build one with :meth:`create`.
 
     Source: tobit_token_bucket, equations (1) and (2); round_robin_tobit, equations (2) and (6).
     """
@@ -48,6 +50,7 @@ class CensoredSensors:
     finite_threshold: Array
     finite_upper: Array
     two_sided: bool
+    noise_correlation: Array | None = None
 
     @classmethod
     def create(
@@ -67,7 +70,9 @@ class CensoredSensors:
             ConfigurationError: a wrong shape, a variance <= 0, a lower threshold that is not below
                 the upper one, or an entry that is not finite (but for infinite thresholds).
         """
-        matrix = validation.array("measurement_matrices", measurement_matrix, (None, None, states))
+        name, most = "measurement_matrices", validation.MOST_SENSORS
+        matrix = validation.array(name, measurement_matrix, (None, None, states), most)
+        validation.array(f"{name}[0]", matrix[0], (None, states))  # channels are gone through
         shape = matrix.shape[:2]
         low = validation.spread("censoring_threshold", threshold, shape, infinity=-1)
         high = validation.spread("censoring_upper", upper, shape, infinity=1)
@@ -113,12 +118,35 @@ class CensoredSensors:
         A ``departure`` (4, N) moves the thresholds that the sensors have.
         """
         shape = (self.count, self.size, noise.shape[-1])
+        if self.noise_correlation is not None:
+            noise = linalg.matvec(self.noise_correlation, noise)
         latent = linalg.matvec(self.measurement_matrix, state)
         latent += self.noise_deviation * noise.reshape(shape)
         np.maximum(latent, true_limits(departure, self.threshold), out=latent)
         if not self.two_sided:
             return latent
         return np.minimum(latent, true_limits(departure, self.upper), out=latent)
+
+    @property
+    def stacked_matrix(self) -> Array:
+        """C (sensors·m, n, 1) of all sensors, one after another."""
+        return self.measurement_matrix.reshape(-1, *self.measurement_matrix.shape[2:])
+
+    @functools.cached_property
+    def noise_factor(self) -> Array:
+        """F (sensors·m, sensors·m, 1) with F Fᵀ the covariance of all noises, as filters have it.
+
+        That of a component that a sensor does not have counts as 1, of its own.
+        """
+        deviation = self.deviation.reshape(-1, 1, 1)
+        factor = self.noise_correlation
+        return deviation * (linalg.identity(len(deviation)) if factor is None else factor)
+
+    @functools.cached_property
+    def noise_covariance(self) -> Array:
+        """R (sensors·m, sensors·m, 1) of all noises, as filters have it."""
+        factor = self.noise_factor
+        return linalg.symmetrise(linalg.matmul(factor, linalg.transpose(factor)))
 
     @property
     def unlimited(self) -> bool:

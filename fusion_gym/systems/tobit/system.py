@@ -19,8 +19,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.options import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.tobit.centre import Centre, FeedbackCentre, Prediction
-from fusion_gym.systems.tobit.filters import KalmanFilter
+from fusion_gym.systems.tobit.centre import Centre, Prediction
 
 _RANGE = 5.0  # whitened quantities and logarithms of variance ratios are clipped here
 
@@ -121,12 +120,10 @@ class CensoredSystem:
     def covariance_cycle(self) -> int | None:
         """1 where covariances follow from the deliveries: Kalman filters, and nothing censored.
 
-        With federated fusion they are then the actual ones, if ``model`` is the plant; with
-        covariance intersection they are bounds.
+        With federated fusion, or one filter at the centre, they are then the actual ones, if
+        ``model`` is the plant; with covariance intersection they are bounds.
         """
-        sensors, centre = self.centre.sensors, self.centre
-        linear = isinstance(centre, FeedbackCentre) and isinstance(centre.filter, KalmanFilter)
-        return 1 if linear and sensors.unlimited else None
+        return 1 if self.centre.predictable else None
 
     @property
     def signals(self) -> tuple[Signal, ...]:
@@ -151,6 +148,7 @@ class CensoredSystem:
                 "held_difference",
                 moved,
                 lambda s: (s.measurement - s.held) / (2.0 * sensors.deviation),
+                constants={"two noise deviations": 2.0 * sensors.deviation[..., 0]},
             ),
             own(
                 "uncensored_probability",
@@ -158,11 +156,17 @@ class CensoredSystem:
                 lambda s: _prediction(s).expectation.uncensored_probability,
             ),
             age_block(nodes),
-            told("log_variance", variance, self._log_variance),
+            told(
+                "log_variance",
+                variance,
+                self._log_variance,
+                constants={"open-loop mean": self.reference},
+            ),
             told(
                 "estimate",
                 "prediction over the state's root mean square",
                 lambda s: s.prior_mean / self.scale[:, None],
+                constants={"root mean square": self.scale},
             ),
         ]
         if sensors.unlimited:  # these two would say nothing
@@ -252,6 +256,12 @@ class CensoredSystem:
             local_mean=posterior.local_mean,
             mean=posterior.mean,
             covariance=posterior.covariance,
+        )
+
+    def fused_alone(self, state: CensoredState) -> tuple[Array, Array] | None:
+        """See :class:`~fusion_gym.core.system.TryingSystem`."""
+        return self.centre.alone(
+            state.prior_mean, state.prior_covariance, _prediction(state), state.measurement
         )
 
     def read(self, state: CensoredState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:

@@ -82,6 +82,10 @@ class TobitKalmanFilter:
     """Tobit Kalman filter; when nothing arrives the prior is the posterior.
 
     S = q C P Cᵀ q + R v, K = P Cᵀ q S⁻¹ with q, v of :func:`expect_censored`.
+
+    Assumes: a linear plant and Gaussian noises; q and v are those at the predicted state, as if
+    it were exact, and transmissions are not chosen by the noise.
+
     Source: Allik et al., "The Tobit Kalman filter" (IEEE Trans. Control Syst. Technol. 24, 2016);
     tobit_token_bucket, equations (21)-(23) with κ₁ = 1 and S = diag(R v).
     """
@@ -113,6 +117,12 @@ class AssumedDensityFilter:
     P Cᵀ C P h (h - t)/S, with the hazard h = φ(t)/(1 - Φ(t)); at the upper threshold the signs
     are mirrored. These are the exact posterior mean and covariance of a Gaussian prior given
     that event; the posterior is then taken to be Gaussian again.
+
+    Assumes: a linear plant, Gaussian noises, and a posterior that is nearly Gaussian;
+    transmissions are not chosen by the noise.
+
+    Source: P. S. Maybeck, "Stochastic models, estimation, and control", volume 2, 1982, chapter
+    12, for assumed densities; the moments are those of a truncated normal variable.
     """
 
     sensors: CensoredSensors

@@ -35,6 +35,9 @@ class BoundTables:
     The bound holds under a trigger that sends whenever |σ|² > ρ̄ and whose requests are granted.
     For a policy without that guarantee, and after a request that was denied, it is void.
 
+    Assumes: |σ|² <= ρ̄ wherever nothing was sent, and rank C ℬ = number of inputs; nothing of
+    the input.
+
     Source: unknown_input, equations (17)-(20); the factor (1 - 2δ) there, which makes the noise
     negative when nothing is sent, is left out, and the missing factor of process noise and σ put
     in.

@@ -20,6 +20,9 @@ class ExactInputStateFilter:
     predicts with the :class:`InputModel`; from then on its covariance is a claim that is as good
     as the model.
 
+    Assumes: rank C ℬ = number of inputs; nothing of the input while everything arrives, and its
+    model where nothing does.
+
     Source: S. Gillijns and B. De Moor, "Unbiased minimum-variance input and state estimation for
     linear discrete-time systems", Automatica 43, 2007; unknown_input, equations (8)-(16) with
     every measurement sent.
@@ -47,6 +50,9 @@ class RandomWalkInputFilter:
     Unlike the unbiased filters it uses what it knew of the input before, and it is optimal if the
     input does follow the model. The actual input does not, so its covariance is a claim, not a
     bound; how good a claim depends on the model's numbers.
+
+    Assumes: an input that follows its model, and transmissions that are not chosen by the
+    noise.
 
     Source: B. Friedland, "Treatment of bias in recursive filtering", IEEE Trans. Automatic
     Control 14, 1969, for the augmented state.

@@ -140,20 +140,34 @@ class UnknownInputSystem:
         fused = partial(Block, labels=states, limit=_RANGE)
         innovation = "innovation of the node over its predicted deviation"
         deviation = "logarithm of the node's predicted over the open-loop deviation"
+        open_loop = {"open-loop deviation": np.sqrt(self.reference)}
         return (
             new("whitened_innovation", innovation, self._whitened),
             new(
                 "held_difference",
                 "new minus held measurement over √2 noise deviations",
                 lambda s: (s.measurement - s.held) / self._noise_deviation,
+                constants={"√2 noise deviations": self._noise_deviation[..., 0]},
             ),
             age_block(*nodes),
-            own("local_log_deviation", deviation, self._local_log_deviation, nodes + states),
-            fused("log_deviation", "the same of the last fused estimate", self._log_deviation),
+            own(
+                "local_log_deviation",
+                deviation,
+                self._local_log_deviation,
+                nodes + states,
+                constants=open_loop,
+            ),
+            fused(
+                "log_deviation",
+                "the same of the last fused estimate",
+                self._log_deviation,
+                constants=open_loop,
+            ),
             fused(
                 "estimate",
                 "fused prediction over the root mean square",
                 lambda s: _sensed(s).fused_mean / self.magnitude[:, None],
+                constants={"root mean square": self.magnitude},
             ),
         )
 

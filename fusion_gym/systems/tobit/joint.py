@@ -1,0 +1,128 @@
+"""The Kalman filter of all delivered measurements together, whose noises may be correlated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.systems.tobit.centre import Posterior, Prediction
+from fusion_gym.systems.tobit.filters import (
+    Expectation,
+    KalmanFilter,
+    Outcomes,
+    in_lanes,
+    joseph_form,
+)
+from fusion_gym.systems.tobit.options import FeedbackOptions, refuse_fusion
+from fusion_gym.systems.tobit.sensors import CensoredSensors
+from fusion_gym.validation import ConfigurationError
+
+_MOST_CHANNELS = 100  # whose joint covariance is solved in every step
+
+
+@dataclass(frozen=True)
+class JointCentre:
+    """The centre takes all measurements that arrive in a step at once; there are no nodes.
+
+    With C and y the rows of what has arrived and R the covariance of their noises, correlations
+    between sensors included: S = C P Cᵀ + R, K = P Cᵀ S⁻¹, x̂ = x⁻ + K (y - C x⁻), P = P⁻ - K C P⁻.
+    Optimal for uncensored sensors; censoring is ignored.
+
+    Assumes: a linear plant, Gaussian noises whose joint covariance is known, uncensored sensors,
+    and transmissions that are not chosen by the noise.
+
+    Source: B. D. O. Anderson and J. B. Moore, "Optimal Filtering", 1979, chapter 3.
+    """
+
+    sensors: CensoredSensors
+
+    @property
+    def predictable(self) -> bool:
+        """See :class:`Centre`."""
+        return self.sensors.unlimited
+
+    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> Prediction:
+        """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
+        expectation = KalmanFilter(self.sensors).expect(mean)
+        matrix, variance = self.sensors.measurement_matrix, self.sensors.variance
+        spread = (matrix * linalg.matmul(matrix, covariance)).sum(-2)
+        return Prediction(expectation, np.sqrt(spread + (1.0 + 1e-3) * variance), None)
+
+    def update(
+        self,
+        mean: Array,
+        covariance: Array,
+        prediction: Prediction,
+        measurement: Array,
+        granted: NDArray[np.bool_],
+    ) -> Posterior:
+        """See :class:`Centre`."""
+        sensors, runs = self.sensors, granted.shape[-1]
+        taken = np.repeat(granted, sensors.size, axis=0).astype(np.float64)  # (channels, N)
+        innovation = (measurement - prediction.expectation.value).reshape(-1, runs)
+        matrix = taken[:, None] * sensors.stacked_matrix
+        cross = linalg.matmul(matrix, covariance)
+        spread = linalg.matmul(cross, linalg.transpose(matrix))
+        # A channel that has not arrived stands for nothing, with a variance of 1.
+        spread = spread + taken[:, None] * taken * sensors.noise_covariance
+        spread = linalg.add_diagonal(linalg.symmetrise(spread), 1.0 - taken)
+        correction = linalg.solve(spread, cross)
+        mean = mean + linalg.matvec(linalg.transpose(correction), innovation)
+        posterior = covariance - linalg.matmul(linalg.transpose(cross), correction)
+        posterior = linalg.symmetrise(posterior)
+        lanes = sensors.starved(covariance)
+        if lanes.size:
+            gain = linalg.transpose(in_lanes(correction, lanes))
+            noise = [linalg.matmul(gain, sensors.noise_factor)]
+            prior, rows = covariance[..., lanes], in_lanes(matrix, lanes)
+            posterior[..., lanes] = joseph_form(sensors, prior, rows, gain, noise)
+        local = np.broadcast_to(mean, (sensors.count, *mean.shape))
+        return Posterior(mean, posterior, local)
+
+    def alone(
+        self, mean: Array, covariance: Array, prediction: Prediction, measurement: Array
+    ) -> tuple[Array, Array] | None:
+        """See :class:`Centre`: by the sensor's own channels, up to rounding."""
+        outcomes = self._each(mean, covariance, prediction)
+        innovation = measurement - prediction.expectation.value
+        correction = linalg.matvec(linalg.transpose(outcomes.correction), innovation)
+        return mean + correction, outcomes.delivered_covariance
+
+    def variances(
+        self, mean: Array, covariance: Array, prediction: Prediction, weights: Array
+    ) -> tuple[Array, Array]:
+        """See :class:`Centre`."""
+        silent = linalg.weighted_trace(covariance, weights)
+        alone = self._each(mean, covariance, prediction)
+        return silent, silent - linalg.weighted_trace(alone.delivered_covariance, weights)
+
+    def _each(self, mean: Array, covariance: Array, prediction: Prediction) -> Outcomes:
+        """What each sensor alone makes of the centre's own prediction."""
+        priors = np.broadcast_to(covariance, (self.sensors.count, *covariance.shape))
+        means = np.broadcast_to(mean, (self.sensors.count, *mean.shape))
+        expectation: Expectation = prediction.expectation
+        return KalmanFilter(self.sensors).outcomes(
+            means, priors, expectation, expectation.value, mean[0]
+        )
+
+
+def joint_centre(chosen: FeedbackOptions, sensors: CensoredSensors) -> JointCentre:
+    """The centre of ``filter="joint"``.
+
+    Raises:
+        ConfigurationError: an option of the nodes' fusion, for there are no nodes, or more than
+            100 channels.
+    """
+    refuse_fusion(chosen, "joint")
+    channels = sensors.noise_channels
+    if channels > _MOST_CHANNELS:
+        raise ConfigurationError(
+            f"filter = 'joint' is not allowed with {sensors.count} sensors of {sensors.size} "
+            f"channels: together they may have at most {_MOST_CHANNELS}, for a step costs their "
+            "cube; where noises of different sensors are independent, 'kalman' is the same filter"
+        )
+    return JointCentre(sensors)

@@ -1,0 +1,127 @@
+"""The sensors of a linear system of one's own, from plain lists: each has a size of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from fusion_gym import linalg, validation
+from fusion_gym.arrays import Array
+from fusion_gym.systems.tobit.sensors import CensoredSensors
+
+_JOINT = "joint_measurement_covariance"
+
+
+def linear_sensors(
+    states: int, matrices: Any, covariances: Any, joint: Any, threshold: Any, upper: Any
+) -> CensoredSensors:
+    """All sensors with as many channels as the largest has; the others' last ones are absent.
+
+    ``joint`` is the covariance of all channels of all sensors, or ``None``: then ``covariances``
+    are theirs, and noises of different sensors are independent. A sensor whose own covariance R is
+    not diagonal reports F⁻¹ y with F Fᵀ = R.
+
+    Raises:
+        ConfigurationError: a value that is not allowed, or censoring where noises are correlated.
+    """
+    rows = _matrices(matrices, states)
+    sizes = [len(one) for one in rows]
+    shape = (len(sizes), max(sizes))
+    low = _limits("censoring_threshold", threshold, sizes, -np.inf)
+    high = _limits("censoring_upper", upper, sizes, np.inf)
+    present = np.arange(shape[1]) < np.array(sizes)[:, None]
+    whole = None
+    if joint is None:
+        own = _covariances(covariances, sizes)
+    else:
+        whole = validation.covariance(_JOINT, joint, sum(sizes), definite=True)
+        ends = np.cumsum(sizes)
+        own = [whole[end - n : end, end - n : end] for n, end in zip(sizes, ends, strict=True)]
+    limited = [bool(np.isfinite(ends).any()) for ends in np.concatenate([low, high], axis=1)]
+    matrix, variance, factors = np.zeros((*shape, states)), np.ones(shape), []
+    for place, (size, covariance) in enumerate(zip(sizes, own, strict=True)):
+        factor: Array = np.eye(size)
+        variances = np.diagonal(covariance)
+        if np.count_nonzero(covariance - np.diag(variances)):
+            if limited[place]:
+                raise validation.refusal(
+                    f"measurement_covariances[{place}]" if whole is None else _JOINT,
+                    covariance,
+                    f"diagonal for sensor {place}, which is censored, channel by channel",
+                )
+            factor, variances = linalg.cholesky(covariance[..., None])[..., 0], np.ones(size)
+        matrix[place, :size] = np.linalg.solve(factor, rows[place])
+        variance[place, :size] = variances
+        factors.append(factor)
+    sensors = CensoredSensors.create(matrix, variance, low, states, high, present)
+    if whole is None or not np.count_nonzero(whole - block_diag(*own)):
+        return sensors
+    if any(limited):
+        raise validation.refusal(
+            _JOINT, joint, "without correlations between sensors, for some of them are censored"
+        )
+    scale = block_diag(*factors) * np.sqrt(variance[present])
+    factor, places = np.eye(present.size), np.flatnonzero(present)
+    factor[np.ix_(places, places)] = np.linalg.solve(scale, np.linalg.cholesky(whole))
+    return replace(sensors, noise_correlation=factor[..., None])
+
+
+def _matrices(given: Any, states: int) -> list[Array]:
+    found = []
+    for place, one in enumerate(_each("measurement_matrices", given, "a matrix")):
+        name = f"measurement_matrices[{place}]"
+        row = _dimensions(one) == 1
+        matrix = validation.array(name, one, (states,) if row else (None, states))
+        found.append(matrix[None] if row else matrix)
+    return found
+
+
+def _covariances(given: Any, sizes: Sequence[int]) -> list[Array]:
+    name, count = "measurement_covariances", len(sizes)
+    one = _dimensions(given) == 0
+    each = [given] * count if one else _each(name, given, "a covariance or a variance", count)
+    found = []
+    for place, (size, value) in enumerate(zip(sizes, each, strict=True)):
+        full = name if one else f"{name}[{place}]"
+        if _dimensions(value) == 0:
+            value = validation.number(full, value, above=0.0) * np.eye(size)
+        found.append(validation.covariance(full, value, size, definite=True))
+    return found
+
+
+def _limits(name: str, given: Any, sizes: Sequence[int], none: float) -> Array:
+    """Limits (sensors, m); ``none`` stands for no limit, as of channels that are absent."""
+    one = _dimensions(given) == 0
+    each = [given] * len(sizes) if one else _each(name, given, "a number or a list", len(sizes))
+    found = np.full((len(sizes), max(sizes)), none)
+    for place, (size, value) in enumerate(zip(sizes, each, strict=True)):
+        full = name if one else f"{name}[{place}]"
+        found[place, :size] = validation.spread(full, value, (size,), infinity=int(np.sign(none)))
+    return found
+
+
+def _each(name: str, given: Any, kind: str, count: int | None = None) -> list[Any]:
+    """What is given for each sensor.
+
+    Raises:
+        ConfigurationError: no list, an empty one, or another number of sensors.
+    """
+    listed = isinstance(given, (list, tuple)) or (isinstance(given, np.ndarray) and given.ndim > 0)
+    if not listed or not len(given) or (count is not None and len(given) != count):
+        many = "each sensor" if count is None else f"each of the {count} sensors"
+        raise validation.refusal(name, given, f"a list with {kind} for {many}")
+    return list(given)
+
+
+def _dimensions(value: Any) -> int:
+    """How deep a value is nested, by its first entries: ragged ones have no shape."""
+    if isinstance(value, np.ndarray):
+        return value.ndim
+    depth = 0
+    while isinstance(value, (list, tuple)):
+        depth, value = depth + 1, value[0] if value else 0.0
+    return depth + (value.ndim if isinstance(value, np.ndarray) else 0)

@@ -1,0 +1,189 @@
+"""LinearFusion with noises that sensors share, against plain matrices and Monte Carlo."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.fusion.rules import InformationFusion
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.solvers.silence.model import silence_model
+from fusion_gym.systems.tobit.centre import Feedback, FeedbackCentre
+from fusion_gym.systems.tobit.filters import KalmanFilter
+from fusion_gym.validation import ConfigurationError
+
+Array = NDArray[np.float64]
+LINEAR = "fusion_gym/LinearFusion-v0"
+SIZES = (1, 2, 1)
+A = np.array([[0.98, 0.2], [-0.1, 0.95]])
+W = np.array([[0.05, 0.02], [0.02, 0.1]])
+ROWS = [[1.0, 0.0], [[0.0, 1.0], [1.0, 1.0]], [1.0, 0.5]]
+C = np.vstack([np.atleast_2d(rows) for rows in ROWS])
+
+
+def shared() -> Array:
+    """The covariance of four channels that all have one common noise, and each its own."""
+    common = np.array([[0.6, 0.5, 0.4, 0.7]])
+    return common.T @ common + np.diag([0.1, 0.2, 0.15, 0.1])
+
+
+def task_of(**options: Any) -> Task:
+    given = {
+        "transition": A,
+        "process_covariance": W,
+        "measurement_matrices": ROWS,
+        "joint_measurement_covariance": shared(),
+        "tokens": "unlimited",
+    }
+    return fusion_gym.make_task(LINEAR, **(given | options))
+
+
+def optimal(granted: NDArray[np.bool_], prior: Array) -> Array:
+    """Posterior covariance of all granted channels at once, in information form."""
+    kept = np.repeat(granted, SIZES)
+    if not kept.any():
+        return prior
+    noise = shared()[np.ix_(kept, kept)]
+    return np.linalg.inv(np.linalg.inv(prior) + C[kept].T @ np.linalg.inv(noise) @ C[kept])
+
+
+def test_the_joint_filter_is_the_optimal_one() -> None:
+    """Its covariances in closed form, and its errors' spread in 2,000 runs."""
+    task = task_of()
+    assert task.settings["filter"] == "joint"
+    batch = EpisodeBatch.seeded(task, 2000, 0)
+    generator = np.random.default_rng(1)
+    covariance, normalised = np.eye(2), []
+    for _ in range(30):
+        granted = generator.random(3) < 0.6
+        covariance = optimal(granted, A @ covariance @ A.T + W)
+        outcome = batch.step(np.repeat(granted[:, None], 2000, axis=1))
+        _, claimed = task.system.fused(batch.delivered)
+        np.testing.assert_allclose(claimed[..., 0], covariance, atol=1e-10)
+        normalised.append((outcome.error * np.linalg.solve(covariance, outcome.error)).sum(0))
+    spread = np.mean(normalised, axis=0).std() / np.sqrt(2000)
+    assert abs(np.mean(normalised) - 2.0) < 4.0 * spread
+
+
+def test_the_noise_has_the_covariance_that_was_given() -> None:
+    """Of a plant that stands still at zero the measurements are the noise."""
+    still = {"transition": np.eye(2), "process_covariance": np.zeros((2, 2)),
+             "initial_covariance": 1e-12 * np.eye(2)}  # fmt: skip
+    batch = EpisodeBatch.seeded(task_of(horizon=1, **still), 20_000, 3)
+    measured = batch.signals()["measurement"]
+    own = np.linalg.cholesky(shared()[1:3, 1:3])  # the second sensor reports F⁻¹ y
+    second = own @ measured[1]
+    found = np.cov(np.vstack([measured[0, :1], second, measured[2, :1]]))
+    np.testing.assert_allclose(found, shared(), atol=0.03)
+    assert not measured[0, 1].any()  # a channel that the sensor does not have
+
+
+def test_without_shared_noise_it_is_federated_fusion() -> None:
+    separate = np.zeros((4, 4))
+    for rows in (slice(0, 1), slice(1, 3), slice(3, 4)):
+        separate[rows, rows] = shared()[rows, rows]
+    together = task_of(joint_measurement_covariance=separate, filter="joint")
+    nodes = task_of(joint_measurement_covariance=separate)
+    assert nodes.settings["filter"] == "kalman"
+    for name in ("periodic:period=3", "innovation_threshold", "information_gain",
+                 "value_of_information"):  # fmt: skip
+        first, second = (run_episodes(t, make_policy(name, t), 20, 0) for t in (together, nodes))
+        np.testing.assert_allclose(first.returns, second.returns, rtol=1e-9)
+
+
+@pytest.mark.parametrize("fusion", ["ci", "sci"])
+def test_covariance_intersection_keeps_its_bound(fusion: str) -> None:
+    """Two sensors of one state each, whose noise is nearly the same."""
+    pair = {
+        "measurement_matrices": [[1.0, 0.0], [0.6, 0.8]],
+        "joint_measurement_covariance": [[0.5, 0.45], [0.45, 0.5]],
+    }
+    joint, nodes = task_of(**pair), task_of(**pair, filter="kalman", fusion=fusion)
+    best, found = (run_episodes(t, make_policy("always", t), 500, 0) for t in (joint, nodes))
+    assert found.mse.mean() < 0.97 * found.bound_trace.mean()
+    assert best.mse.mean() < 0.9 * found.mse.mean()
+
+
+def test_informations_that_are_simply_added_would_claim_too_much() -> None:
+    task = task_of()
+    best = run_episodes(task, make_policy("always", task), 500, 0)
+    assert best.nees.mean() == pytest.approx(1.0, abs=0.03)
+    system: Any = task.system
+    naive = FeedbackCentre(
+        KalmanFilter(system.centre.sensors), InformationFusion(), Feedback.in_shares(None, 3)
+    )
+    wrong = replace(task, system=replace(system, centre=naive))
+    found = run_episodes(wrong, make_policy("always", wrong), 500, 0)
+    assert found.nees.mean() > 1.2
+    assert found.mse.mean() > 1.1 * best.mse.mean()
+
+
+def test_a_large_prior_keeps_its_digits() -> None:
+    """A prior a trillion times as large as the noise: the posterior is that of the information."""
+    task = task_of(initial_covariance=1e12 * np.eye(2))
+    batch = EpisodeBatch.seeded(task, 1, 0)
+    batch.step(np.ones((3, 1), dtype=np.bool_))
+    _, claimed = task.system.fused(batch.delivered)
+    expected = np.linalg.inv(C.T @ np.linalg.inv(shared()) @ C)
+    np.testing.assert_allclose(claimed[..., 0], expected, rtol=1e-3)
+
+
+def test_references_and_memory_run_and_what_is_believed_is_the_best() -> None:
+    task = task_of(memory=True, tokens="limited", horizon=40)
+    names = ("value_of_information:threshold=0.05,at_most=1", "lookahead:price=0.02",
+             "periodic_optimum:period=4,packets=2")  # fmt: skip
+    for name in names:
+        results = run_episodes(task, make_policy(name, task), 200, 0)
+        assert results.mse.mean() < 1.1 * results.bound_trace.mean()
+    assert results.nees.mean() == pytest.approx(1.0, abs=0.1)  # silence of a clock says nothing
+    remembering = EpisodeBatch.seeded(task, 5, 0)
+    everything = EpisodeBatch.seeded(task_of(horizon=40), 5, 0)
+    for _ in range(5):
+        remembering.step(np.zeros((3, 5), dtype=np.bool_))
+        everything.step(np.ones((3, 5), dtype=np.bool_))
+    best = remembering.signals()["beliefs"].remembered  # type: ignore[attr-defined]
+    everything.step(np.ones((3, 5), dtype=np.bool_))
+    np.testing.assert_allclose(task.system.fused(best)[0], everything.delivered.mean, atol=1e-9)
+
+
+def test_the_bounds_floor_counts_what_is_shared() -> None:
+    """The floor under the error is the optimal filter's error with all measurements."""
+    model = silence_model(task_of())
+    covariance, total = optimal(np.ones(3, dtype=np.bool_), np.eye(2)), 0.0
+    for _ in range(100):
+        covariance = optimal(np.ones(3, dtype=np.bool_), A @ covariance @ A.T + W)
+        total += np.trace(covariance) / 100
+    assert model.floor == pytest.approx(total, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"joint_measurement_covariance": np.eye(3)}, "shape (4, 4)"),
+        ({"joint_measurement_covariance": np.ones((4, 4))}, "positive definite"),
+        ({"measurement_covariances": [1.0, 1.0, 1.0]}, "measurement_covariances"),
+        ({"filter": "kalman"}, "fusion = None"),
+        ({"filter": "kalman", "fusion": "federated"}, "'ci' or 'sci'"),
+        ({"filter": "kalman", "fusion": "sici"}, "'ci' or 'sci'"),
+        ({"filter": "adf"}, "'joint' or 'kalman'"),
+        ({"filter": "stochastic", "stochastic_weight": 1.0}, "'joint' or 'kalman'"),
+        ({"memory": True, "memory_filter": "adf"}, "memory_filter"),
+        ({"memory": True, "memory_filter": "kalman"}, "fusion = None"),
+        ({"filter": "joint", "fusion": "ci"}, "a filter with nodes"),
+        ({"censoring_threshold": [0.0, -np.inf, -np.inf]}, "for some of them are censored"),
+        ({"censoring_upper": [5.0, [4.0, np.inf], np.inf]}, "sensor 1, which is censored"),
+    ],
+)
+def test_what_would_not_stay_right_is_refused(options: dict[str, Any], told: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        task_of(**options)
+    assert told in str(caught.value)
+    assert "\n" not in str(caught.value)
