@@ -17,9 +17,10 @@ Automatic Control 67, 2022, for its value.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,11 +47,27 @@ class Shadows:
     alone: Any = None
 
 
-class Estimate(NamedTuple):
-    """``mean`` (k, n, N) and ``covariance`` (k, n, n, N): k = 1 for all, or one a sensor."""
+@dataclass(frozen=True)
+class Estimate:
+    """``mean`` (k, n, N) and ``covariance`` (k, n, n, N): k = 1 for all, or one a sensor.
+
+    Covariances may be ``given`` as a function, for they are large where there are many states.
+    """
 
     mean: Array
-    covariance: Array
+    given: Array | Callable[[], Array]
+
+    @cached_property
+    def covariance(self) -> Array:
+        """The covariance, computed when first looked at."""
+        return self.given() if callable(self.given) else self.given
+
+    def __iter__(self) -> Iterator[Array]:
+        return iter((self.mean, self.covariance))
+
+    def __reduce__(self) -> tuple[type[Estimate], tuple[Array, Array]]:
+        """Pickled with the covariance, for a function cannot be."""
+        return Estimate, (self.mean, self.covariance)
 
 
 class Beliefs(ABC):
@@ -138,10 +155,12 @@ class CoordinatorBeliefs(Beliefs):
         """See :class:`Beliefs`; with ``packet="estimate"`` every packet carries x*."""
         if self.task.packet == "estimate":
             return Estimate(*(np.repeat(part, self.task.sensors, axis=0) for part in self.best))
+        if (together := _together(self.task.system, self._state)) is not None:
+            return together
         each = [_of(self.task.system, delivered) for delivered in self._sent]
         return Estimate(
             np.concatenate([one.mean for one in each]),
-            np.concatenate([one.covariance for one in each]),
+            lambda: np.concatenate([one.covariance for one in each]),
         )
 
     @cached_property
@@ -210,7 +229,8 @@ class OwnBeliefs(Beliefs):
             return self._each(system, system.deliver(self.shadows.alone, nobody))
         told = _of(system, system.deliver(self._state, self._nobody(self._runs)))
         return Estimate(
-            np.repeat(told.mean, sensors, axis=0), np.repeat(told.covariance, sensors, axis=0)
+            np.repeat(told.mean, sensors, axis=0),
+            lambda: np.repeat(told.covariance, sensors, axis=0),
         )
 
     @cached_property
@@ -218,6 +238,8 @@ class OwnBeliefs(Beliefs):
         """See :class:`Beliefs`."""
         system, itself = self.task.system, self._itself
         if self.shadows.alone is None:
+            if (together := _together(system, self._state)) is not None:
+                return together
             every = np.tile(np.arange(self._runs), self.task.sensors)
             return self._each(system, arrived(system, take_runs(self._state, every), itself))
         own = self._each(system, arrived(system, self.shadows.alone, itself))
@@ -246,12 +268,12 @@ class OwnBeliefs(Beliefs):
 
     def _each(self, system: System[Any], delivered: Any) -> Estimate:
         """From sensors · N runs to an estimate a sensor."""
-        mean, covariance = system.fused(delivered)
-        shape = (self.task.sensors, self._runs)
-        return Estimate(
-            np.moveaxis(mean.reshape(*mean.shape[:-1], *shape), -2, 0),
-            np.moveaxis(covariance.reshape(*covariance.shape[:-1], *shape), -2, 0),
-        )
+        shape, whole = (self.task.sensors, self._runs), _of(system, delivered)
+
+        def apart(values: Array) -> Array:
+            return np.moveaxis(values.reshape(*values.shape[:-1], *shape), -2, 0)
+
+        return Estimate(apart(whole.mean[0]), lambda: apart(whole.covariance[0]))
 
 
 def _one(steps: int) -> None:
@@ -290,12 +312,23 @@ def silent_path(system: System[Any], delivered: Any, steps: int) -> Array:
     return np.stack(means)
 
 
+def _together(system: System[Any], state: Any) -> Estimate | None:
+    """The estimates after each sensor's packet alone, where the system has them all at once."""
+    tried = getattr(system, "fused_alone", None)
+    found = None if tried is None else tried(state)
+    return None if found is None else Estimate(*found)
+
+
 def arrived(system: System[Any], state: Any, packets: Packets) -> Any:
     """The state after the arrival of these packets and no others."""
     return system.deliver(arriving(system, state, packets), packets)
 
 
 def _of(system: System[Any], delivered: Any) -> Estimate:
+    if hasattr(system, "fused_mean"):
+        return Estimate(
+            system.fused_mean(delivered)[None], lambda: system.fused(delivered)[1][None]
+        )
     mean, covariance = system.fused(delivered)
     return Estimate(mean[None], covariance[None])
 

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.beliefs import Beliefs
@@ -50,7 +50,11 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
     """What the network adds to a system's own blocks; their values are made of a `Network`."""
     capacity, price = task.bucket.capacity, task.reward.price
     tokens = Block(
-        "tokens", "tokens over the capacity", lambda net: net.tokens / capacity, node="told"
+        "tokens",
+        "tokens over the capacity",
+        lambda net: net.tokens / capacity,
+        node="told",
+        constants={"capacity": capacity},
     )
     admitted = Block(
         "admitted",
@@ -64,9 +68,16 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
         "steps left of the episode over the horizon",
         lambda net: net.left / task.horizon,
         node="told",
+        constants={"horizon": task.horizon},
     )
     place = "place of a token's price in its range, in the logarithm"
-    shown = Block("price", place, lambda net: price.encode(net.price), node="told")
+    shown = Block(
+        "price",
+        place,
+        lambda net: price.encode(net.price),
+        node="told",
+        constants={} if price.span is None else {"range": price.span},
+    )
     decides = task.access in ("round_robin", "random")
     return (
         tokens,
@@ -95,6 +106,11 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
         return _VALUE * np.sign(both) * np.sqrt(np.abs(both))
 
     states, nodes = task.system.state_names, numbered(task.sensors)
+    of_difference: dict[str, ArrayLike] = {"open-loop deviations": deviation[:, 0]}
+    of_value: dict[str, ArrayLike] = {
+        "open loop": whole,
+        "squared norm": task.relative_weights[:, 0],
+    }
     apart = (
         f"arsinh of {_DIFFERENCE:g} times what is believed beyond the centre's estimate, in "
         "open-loop deviations"
@@ -108,10 +124,20 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
         own = partial(Block, knowledge=known, node="own")
         found = {
             "difference": own(
-                "own_difference", apart, difference, (nodes, states), limit=_DIFFERENCE_LIMIT
+                "own_difference",
+                apart,
+                difference,
+                (nodes, states),
+                limit=_DIFFERENCE_LIMIT,
+                constants=of_difference,
             ),
             "value": own(
-                "own_value", worth, value, (nodes, ("nobody", "itself")), limit=_VALUE_LIMIT
+                "own_value",
+                worth,
+                value,
+                (nodes, ("nobody", "itself")),
+                limit=_VALUE_LIMIT,
+                constants=of_value,
             ),
         }
     else:
@@ -124,6 +150,7 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
                 lambda b: difference(b)[0],
                 (states,),
                 limit=_DIFFERENCE_LIMIT,
+                constants=of_difference,
             ),
             "value": every(
                 "transmission_value",
@@ -131,6 +158,7 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
                 lambda b: np.concatenate((value(b)[:1, 0], value(b)[:, 1])),
                 (("nobody", *nodes),),
                 limit=_VALUE_LIMIT,
+                constants=of_value,
             ),
         }
     return tuple(found[name] for name in task.belief_features)

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, TypeVar, get_args, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
@@ -88,7 +88,9 @@ class Block:
     ``labels`` has the labels of each axis: ``(("0", "1"), ("x1", "x2"))`` names the entries
     ``name[0,x1]``, ``name[0,x2]``, …, and no axes at all the one entry ``name``. ``value`` takes a
     state after sensing and returns the entries, scaled to order one, as an array of the labels'
-    shape and N runs; they are clipped to ±``limit``, or without a limit to 0..1.
+    shape and N runs; they are clipped to ±``limit``, or without a limit to 0..1. ``constants`` are
+    the numbers that ``meaning`` speaks of, by its own words, mostly one for each label of the last
+    axes.
 
     ``knowledge`` is the least class that knows the block before anything is sent; ``node`` is what
     a sensor sees of it by itself: its own row of the first axis (``"own"``), all of it, for the
@@ -102,6 +104,7 @@ class Block:
     knowledge: Knowledge = "centre"
     node: Literal["own", "told", "hidden"] = "hidden"
     limit: float | None = None
+    constants: Mapping[str, ArrayLike] = field(default_factory=dict)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -306,6 +309,28 @@ class AdoptingSystem(System[StateT], Protocol[StateT]):
         self, state: StateT, mean: Array, covariance: Array, runs: NDArray[np.bool_]
     ) -> StateT:
         """A delivered state with the centre's estimate (n, N), (n, n, N) replaced in ``runs``."""
+        ...
+
+
+@runtime_checkable
+class TryingSystem(System[StateT], Protocol[StateT]):
+    """A system that tells what each packet alone would make of the estimate. Optional."""
+
+    def fused_alone(self, state: StateT) -> tuple[Array, Array] | None:
+        """The centre's means (sensors, n, N) and covariances (sensors, n, n, N) after a delivery.
+
+        The i-th is :meth:`fused` of what :meth:`deliver` makes of the packet of sensor i alone;
+        ``None`` where one after another costs no more. Of a system that loses nothing.
+        """
+        ...
+
+
+@runtime_checkable
+class ManyStatesSystem(System[StateT], Protocol[StateT]):
+    """A system whose covariances are large, and are left alone where means will do. Optional."""
+
+    def fused_mean(self, state: StateT) -> Array:
+        """The mean (n, N) of :meth:`fused`, without its covariance."""
         ...
 
 

@@ -21,7 +21,6 @@ from fusion_gym.core.token_bucket import TokenBucket
 INFORMATION_MODES: dict[str, Knowledge] = {"sensors": "coordinator", "centre": "centre"}
 ACTION_KINDS = ("binary", "discrete")
 REWARDS = ("scalar", "vector")  # the sum of its two terms, or both
-MOST_SENSORS = 1000  # the network serves them in a loop
 # Signals beside the system's own that only who sees the sensors may have.
 SENSORS_ONLY = (
     "model", "beliefs", "belief_difference", "transmission_value", "own_beliefs",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ _MOST_STATES = 4
 # Okabe and Ito's colours, which people who are colour-blind tell apart.
 _TRUTH, _ESTIMATE, _GRANTED, _DENIED, _TOKENS = "black", "#D55E00", "#0072B2", "0.55", "#009E73"
 _CENSORED = "#CC79A7"
-_WIDTH, _STATE, _STRIP, _TOP, _BOTTOM = 640, 120, 70, 48, 44  # pixels
+_WIDTH, _STATE, _STRIP, _TOP, _BOTTOM = 640, 120, 70, 62, 44  # pixels
 
 
 class _Step(NamedTuple):
@@ -61,16 +62,32 @@ class Film:
         self._steps.append(_Step(batch.delivered, outcome, batch.tokens))
         self._ages += 1
 
-    def frame(self, run: int = 0, title: str | None = None) -> Frame:
-        """The picture of a run, of which no more is shown than its own episode."""
+    def limits(self, run: int = 0) -> list[tuple[float, float]]:
+        """How far the axis of each state that is shown has to reach, for films side by side."""
+        truth, mean, deviation = self._shown_of(self._steps_of(run), run)
+        if not len(truth):
+            return [(-1.0, 1.0)] * len(self._shown)
+        low, high = np.minimum(truth, mean).min(0), np.maximum(truth, mean).max(0)
+        room = 0.15 * (high - low) + 1e-6 + 0.5 * np.median(deviation, 0)
+        return list(zip((low - room).tolist(), (high + room).tolist(), strict=True))
+
+    def frame(
+        self,
+        run: int = 0,
+        title: str | None = None,
+        limits: Sequence[tuple[float, float]] | None = None,
+    ) -> Frame:
+        """The picture of a run, of which no more is shown than its own episode.
+
+        ``title`` instead of the step, ``limits`` instead of those of this run.
+        """
         if self._figure is None:
             self._draw_frame()
-        age = int(self._ages[run])
-        steps = list(self._steps)[-min(age, WINDOW) :] if age else []
+        age, steps = int(self._ages[run]), self._steps_of(run)
         times = np.arange(age - len(steps) + 1, age + 1)
         first = max(age - WINDOW, 0)
         self._title.set_text(f"step {age} of {self.task.horizon}" if title is None else title)
-        self._draw_states(times, steps, run)
+        self._draw_states(times, steps, run, self.limits(run) if limits is None else limits)
         granted: list[tuple[int, int]] = []
         denied: list[tuple[int, int]] = []
         for time, step in zip(times, steps, strict=True):
@@ -84,29 +101,38 @@ class Film:
         self._canvas.draw()
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def _draw_states(self, times: NDArray[np.int64], steps: list[_Step], run: int) -> None:
+    def _steps_of(self, run: int) -> list[_Step]:
+        """The steps of this run's episode that the window shows."""
+        age = int(self._ages[run])
+        return list(self._steps)[-min(age, WINDOW) :] if age else []
+
+    def _shown_of(self, steps: list[_Step], run: int) -> tuple[Array, Array, Array]:
+        """Truth, fused estimate and two deviations that it claims, each (steps, shown)."""
         system, shown = self.task.system, len(self._shown)
         fused = [system.fused(step.state) for step in steps]
         truth = np.array([system.truth(step.state)[:shown, run] for step in steps])
         mean = np.array([found[0][:shown, run] for found in fused])
         variance = np.array([linalg.diagonal(found[1])[:shown, run] for found in fused])
         truth, mean, variance = (part.reshape(-1, shown) for part in (truth, mean, variance))
-        deviation = 2.0 * np.sqrt(np.maximum(variance, 0.0))
-        for place, lines in enumerate(self._curves):
-            axis, own, centre, wide = (
-                self._axes[place], truth[:, place], mean[:, place], deviation[:, place]
-            )  # fmt: skip
-            lines[0].set_data(times, own)
+        return truth, mean, 2.0 * np.sqrt(np.maximum(variance, 0.0))
+
+    def _draw_states(
+        self,
+        times: NDArray[np.int64],
+        steps: list[_Step],
+        run: int,
+        limits: Sequence[tuple[float, float]],
+    ) -> None:
+        truth, mean, deviation = self._shown_of(steps, run)
+        for place, (lines, ends) in enumerate(zip(self._curves, limits, strict=True)):
+            axis, centre, wide = self._axes[place], mean[:, place], deviation[:, place]
+            lines[0].set_data(times, truth[:, place])
             lines[1].set_data(times, centre)
             lines[2].remove()
             lines[2] = axis.fill_between(
                 times, centre - wide, centre + wide, color=_ESTIMATE, alpha=0.18, lw=0
             )
-            low, high, room = -1.0, 1.0, 0.0
-            if steps:
-                low, high = min(own.min(), centre.min()), max(own.max(), centre.max())
-                room = 0.15 * (high - low) + 1e-6 + 0.5 * float(np.median(wide))
-            axis.set_ylim(low - room, high + room)
+            axis.set_ylim(*ends)
 
     def _draw_frame(self) -> None:
         """All that does not move."""
@@ -155,6 +181,7 @@ class Film:
         level.set_xlabel("step")
         for axis in self._axes:
             axis.tick_params(labelsize=8)
+            axis.yaxis.set_label_coords(-0.065, 0.5)  # a fixed place: quicker, and all in line
             axis.grid(alpha=0.25)
             axis.spines[["top", "right"]].set_visible(False)
         handles: dict[str, Any] = {}
@@ -163,11 +190,10 @@ class Film:
                 handles.setdefault(label, handle)
         self._figure.legend(
             list(handles.values()), list(handles), loc="upper left", ncols=len(handles),
-            bbox_to_anchor=(0.09, 1.0 - 20 / height), fontsize=7, frameon=False, borderaxespad=0.0,
+            bbox_to_anchor=(0.09, 1.0 - 37 / height), fontsize=7, frameon=False, borderaxespad=0.0,
             borderpad=0.2, columnspacing=1.2, handlelength=1.4,
         )  # fmt: skip
         self._title = self._figure.text(0.1, 1.0 - 4 / height, "", va="top", fontsize=9)
-        self._figure.align_ylabels(self._axes)
 
 
 class Window:

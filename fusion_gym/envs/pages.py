@@ -13,11 +13,9 @@ import re
 import shlex
 import sys
 from collections.abc import Iterable
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from fusion_gym.core.communication import FEATURES
 from fusion_gym.core.memory import Owner
@@ -27,10 +25,11 @@ from fusion_gym.core.observation import (
     block_entries,
     network_blocks,
 )
-from fusion_gym.core.options import CommonOptions, plain
+from fusion_gym.core.options import CommonOptions
 from fusion_gym.core.reward import Price
 from fusion_gym.core.system import Block, covers, numbered
 from fusion_gym.core.task import Task
+from fusion_gym.envs.option_text import listed, options_in, short
 from fusion_gym.envs.registration import make_task, options_of
 from fusion_gym.envs.views import heard, make_view
 
@@ -73,7 +72,8 @@ terms of the reward), `granted` and `denied` (one flag a sensor), `squared_error
 state), `diverged` (a squared error above 100 times its open-loop mean, or not finite).
 
 ## Arguments
-The fields of `{options}`, of which `fusion_gym.make_task` also takes an object.
+The fields of `{options}`, of which `fusion_gym.make_task` also takes an object, then what every
+environment takes: `system`, the path of a YAML file of options, where no field has that name.
 
 {arguments}
 
@@ -119,11 +119,11 @@ def page(env_id: str, task: Task | None = None) -> str:
         states=", ".join(system.state_names),
         legend=LEGEND,
         table=observation_table(task),
-        weights=_short(weights),
+        weights=short(weights),
         open_loop=f"{float(weights @ system.open_loop(task.horizon)):.3g}",
         horizon=task.horizon,
         options=kind.__name__,
-        arguments=_arguments(kind),
+        arguments="\n".join(f"    {line}" for line in listed(options_in(kind))),
         history="\n".join(f"- {text}" for text in ["v0: first version.", *versions]),
     )
 
@@ -215,24 +215,6 @@ def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
     widths = [max(len(line[column]) for line in lines) for column in range(len(head) - 1)]
     padded = ["| " + " | ".join(map(str.ljust, line, (*widths, 0))) + " |" for line in lines]
     return "\n".join((padded[0], "|---" * len(head) + "|", *padded[1:]))
-
-
-def _arguments(kind: type[CommonOptions]) -> str:
-    """The options with their defaults: the environment's own, then those that all have."""
-    chosen = kind()
-    common = {field.name for field in fields(CommonOptions)}
-    ordered = sorted(fields(kind), key=lambda field: field.name in common)
-    return "\n".join(
-        f"    {field.name} = {_short(getattr(chosen, field.name))}" for field in ordered
-    )
-
-
-def _short(value: Any) -> str:
-    """A default as it would be written, its numbers with four digits."""
-    value = plain(value)
-    if isinstance(value, list):
-        return f"({', '.join(map(_short, value))}{',' if len(value) == 1 else ''})"
-    return f"{value:.4g}" if isinstance(value, float) and np.isfinite(value) else repr(value)
 
 
 def _options(words: list[str]) -> dict[str, Any]:

@@ -30,6 +30,8 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
 
     Attributes:
         observation_names: a name for each entry of an agent's observation.
+        state_names: a name for each entry of :meth:`state`.
+        state_space: the Box of :meth:`state`, float32.
     """
 
     metadata = {"render_modes": [], "name": "fusion_gym_v0", "is_parallelizable": True}  # noqa: RUF012
@@ -40,6 +42,9 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         self.view = SensorView(task)
         self.batch = EpisodeBatch(task, 1, self.view.owner)
         self.observation_names = self.view.names
+        layout = self.batch.layout
+        self.state_names = layout.names
+        self.state_space = Box(layout.low, layout.high, dtype=np.float32)
         self.render_mode = None
         self.possible_agents = [f"sensor_{sensor}" for sensor in range(task.sensors)]
         self.agents: list[str] = []
@@ -57,13 +62,15 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
     def reset(self, seed: int | None = None, options: Dict | None = None) -> tuple[Dict, Dict]:
         """A new episode; without a seed the noise goes on where it stood.
 
+        The infos are those of a step in which nothing was sent.
         There are no options, and PettingZoo's interface test demands that any be taken.
         """
         if seed is not None:
             self.batch.use_generator(0, seeding.np_random(seed)[0])
         self.batch.reset()
         self.agents = list(self.possible_agents)
-        return self._observations(), {agent: {} for agent in self.agents}
+        infos = {agent: {"granted": False, "cost": 0.0} for agent in self.agents}
+        return self._observations(), infos
 
     def step(self, actions: Dict) -> tuple[Dict, Dict, Dict, Dict, Dict]:
         """One step with an action of every agent; an info has ``granted`` and ``cost``.
@@ -98,6 +105,19 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         if ended:
             self.agents = []
         return result
+
+    def state(self) -> NDArray[np.float32]:
+        """What all sensors and the centre know together (entries,), for a central critic.
+
+        It is a coordinator's observation, with what each sensor remembers by itself in a task with
+        memory: everything that an agent observes but its own number, and nothing of the truth.
+
+        Raises:
+            ResetNeeded: before the first reset.
+        """
+        if self.batch.state is None:
+            raise gymnasium.error.ResetNeeded("call reset before the first state")
+        return self.batch.observe()[0]
 
     def _observations(self) -> Dict:
         rows = self.view.rows(self.batch.observe())

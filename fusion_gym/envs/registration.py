@@ -2,26 +2,65 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import inspect
 import re
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from fusion_gym import validation
 from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.rehearsal import rehearse
 from fusion_gym.core.task import Task
 from fusion_gym.envs.option_file import read_options
+from fusion_gym.envs.option_text import Option, listed, options_in
 from fusion_gym.importing import imported
 from fusion_gym.validation import ConfigurationError
 
 Build = Callable[[Any], Scenario]
+
+
+class FusionSpec(EnvSpec):
+    """What Gymnasium knows of an environment, and every option with its type and default.
+
+    ``gymnasium.spec(id).pprint()`` lists them, ``env.unwrapped.spec.pprint()`` also what was given.
+    """
+
+    @classmethod
+    def of(cls, given: EnvSpec) -> EnvSpec:
+        """A copy of what Gymnasium knows, of this kind where the environment is registered."""
+        if given.id not in ENVIRONMENTS:
+            return copy.copy(given)
+        known = {field.name: getattr(given, field.name) for field in fields(given) if field.init}
+        return cls(**known)
+
+    @property
+    def options(self) -> dict[str, Option]:
+        """Type and default of every option, by its name."""
+        return options_in(options_of(self.id))
+
+    def pprint(
+        self,
+        disable_print: bool = False,
+        include_entry_points: bool = False,
+        print_all: bool = False,
+    ) -> str | None:
+        """See Gymnasium's; the options follow."""
+        lines = [f"    {option}" for option in listed(self.options, self.kwargs)]
+        text = super().pprint(True, include_entry_points, print_all)
+        text = "\n".join([f"{text}", "options:", *lines])
+        if disable_print:
+            return text
+        print(text)
+        return None
+
 
 ENVIRONMENTS: dict[str, str | Build] = {
     "fusion_gym/TobitOscillator-v0": "fusion_gym.systems.tobit.oscillator:build",
@@ -69,9 +108,9 @@ def register(env_id: str | None = None, build: str | Build | None = None) -> Non
     for name in ENVIRONMENTS:
         if name not in gymnasium.registry:
             prefix = f"fusion_gym.envs.registered:{class_name(name)}"
-            gymnasium.register(
-                name, entry_point=f"{prefix}Env", vector_entry_point=f"{prefix}VectorEnv"
-            )
+            single, vector = f"{prefix}Env", f"{prefix}VectorEnv"
+            gymnasium.register(name, entry_point=single, vector_entry_point=vector)
+            gymnasium.registry[name] = FusionSpec(name, single, vector_entry_point=vector)
 
 
 def build_of(env_id: str) -> Build:
@@ -136,12 +175,21 @@ def make_task(env: str | CommonOptions, **options: Any) -> Task:
                 "registered environments"
             )
         return _checked(build_of(env_id), env, limit)
-    kind = options_of(env)
-    known = [field.name for field in fields(kind)]
-    if "system" in options and "system" not in known:
-        options = read_options(options.pop("system")) | options
-    validation.arguments(env, options, known)
+    kind, options = options_of(env), opened(env, options)
+    validation.arguments(env, options, [field.name for field in fields(kind)])
     return _checked(build_of(env), kind(**options), limit)
+
+
+def opened(env_id: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of an environment with those of the file that ``system`` names, if it does.
+
+    Raises:
+        ConfigurationError: an id that is not registered, or a file that cannot be read.
+    """
+    if "system" not in options or "system" in {field.name for field in fields(options_of(env_id))}:
+        return dict(options)
+    beside = {name: value for name, value in options.items() if name != "system"}
+    return read_options(options["system"]) | beside
 
 
 def _checked(build: Build, chosen: CommonOptions, limit: int | None) -> Task:

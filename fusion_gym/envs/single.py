@@ -114,10 +114,12 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
 
 
 def _first(infos: Infos) -> Infos:
-    """The info of the only run: numbers and arrays without the batch axis."""
+    """The info of the only run: NumPy's numbers, and arrays without the batch axis.
+
+    Every value has a ``dtype``, which TorchRL asks for. A flag is an array without axes: of NumPy's
+    scalar flags Gymnasium's vector environments make arrays of objects.
+    """
     return {
-        key: _first(value)
-        if isinstance(value, dict)
-        else (value[0].item() if value.ndim == 1 else value[0].copy())
+        key: np.array(value[0]) if value.ndim > 1 or value.dtype == np.bool_ else value[0]
         for key, value in infos.items()
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,6 +18,8 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.envs.drawing import Film, Frame
+from fusion_gym.envs.members import Members
+from fusion_gym.envs.registration import FusionSpec
 from fusion_gym.envs.views import CoordinatorView
 
 Infos = dict[str, Any]
@@ -43,12 +44,12 @@ class Specified:
 
     @spec.setter
     def spec(self, given: EnvSpec | None) -> None:
-        self._spec = copy.copy(given)
+        self._spec = None if given is None else FusionSpec.of(given)
         if self._spec is not None:
             self._spec.max_episode_steps = self.task.horizon
 
 
-class FusionVectorEnv(Specified, VectorEnv[Any, Any, Any]):
+class FusionVectorEnv(Specified, Members, VectorEnv[Any, Any, Any]):
     """N runs of a task behind Gymnasium's vector interface.
 
     Episodes end at the task's horizon, by truncation or with ``clock=True`` by termination; rewards

@@ -119,6 +119,12 @@ VARIANTS: dict[str, list[Options]] = {
         | DRAWN,
         {"censoring_threshold": (-2.0, -2.0), "access": "round_robin", "information": "centre"},
         ESTIMATES | NOISY | {"filter": "adf", "action": "discrete"},
+        {
+            "measurement_matrices": [[1, 0], [[0, 1], [1, 1]]],
+            "joint_measurement_covariance": [[0.3, 0.2, 0.1], [0.2, 0.3, 0.1], [0.1, 0.1, 0.2]],
+        }
+        | REMEMBERING
+        | LIMITED,
     ],
     REMOTE: [
         LOSSY | {"access": "single", "initial_deviation": 1.0} | DRAWN,

@@ -1,0 +1,133 @@
+"""With the numbers that its meaning speaks of, an observation gives back what was measured."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fusion_gym
+from fusion_gym.arrays import Array
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.observation import ObservationLayout, block_entries
+from fusion_gym.core.system import Block, Signals
+from fusion_gym.envs.registration import ENVIRONMENTS
+
+COMMON = {"tokens": "limited", "clock": True, "cost_weight": "random", "price_range": (0.01, 1.0)}
+
+
+def batch_of(env_id: str, **options: Any) -> EpisodeBatch:
+    task = fusion_gym.make_task(env_id, **COMMON, belief_features=True, **options)
+    batch = EpisodeBatch.seeded(task, 40, 0)
+    for _ in range(7):
+        batch.step(batch.signals()["step"] % 3 == np.arange(task.sensors)[:, None])
+    return batch
+
+
+def shown(batch: EpisodeBatch) -> dict[str, tuple[Block, Array]]:
+    """Blocks by name with their entries, (…, N), nan where they are clipped."""
+    rows, place, found = batch.observe(), 0, {}
+    for block in batch.layout.blocks:
+        count = len(block_entries(block))
+        entries = rows[:, place : place + count].T.astype(np.float64)
+        low, high = block.bounds
+        entries[(entries == low) | (entries == high)] = np.nan
+        found[block.name] = block, entries.reshape(*block.shape, -1)
+        place += count
+    return found
+
+
+def diagonal(covariance: Array) -> Array:
+    return np.einsum("iin->in", covariance)
+
+
+# For each word of a constant and block what the entries stand for, from signals.
+PHYSICAL: dict[tuple[str, str], Any] = {
+    ("estimate", "root mean square"): lambda e, c, s: (e * c, s["prior_mean"]),
+    ("log_variance", "open-loop mean"): lambda e, c, s: (
+        np.exp(e) * c,
+        diagonal(s["prior_covariance"]),
+    ),
+    ("log_deviation", "open-loop deviation"): lambda e, c, s: (
+        np.exp(e) * c,
+        np.sqrt(diagonal(s["prior_covariance"])),
+    ),
+    ("held_difference", "two noise deviations"): lambda e, c, s: (
+        e * c,
+        s["measurement"] - s["held"],
+    ),
+    ("held_difference", "√2 noise deviations"): lambda e, c, s: (
+        e * c,
+        s["measurement"] - s["held"],
+    ),
+    ("error", "error_scale"): lambda e, c, s: (e * c, s["innovation"][:, 0]),
+    ("belief_difference", "open-loop deviations"): lambda e, c, s: (
+        np.sinh(e) / 4.0 * c,
+        s["belief_difference"],
+    ),
+    ("tokens", "capacity"): lambda e, c, s: (e * c, s["tokens"]),
+    ("transmission_value", "open loop"): lambda e, c, s: (
+        np.sign(e[1:]) * (e[1:] / 2.0) ** 2 * c,
+        s["transmission_value"],
+    ),
+}
+
+
+LAST = ("log_deviation", "UnknownInput-v0")
+
+
+def check(batch: EpisodeBatch, env_id: str) -> set[tuple[str, str]]:
+    signals: Signals = batch.signals()
+    done = set()
+    for name, (block, entries) in shown(batch).items():
+        for word, value in block.constants.items():
+            # In UnknownInput-v0 that is of the last estimate, which no signal has.
+            if (name, word) not in PHYSICAL or (name, env_id[11:]) == LAST:
+                continue
+            column = np.asarray(value)[..., None] if np.ndim(value) else value
+            ours, theirs = PHYSICAL[name, word](entries, column, signals)
+            size = min(len(ours), len(theirs))  # an input stands behind the states
+            ours, theirs = ours[:size], theirs[:size]
+            seen = np.isfinite(ours)
+            np.testing.assert_allclose(
+                ours[seen], np.broadcast_to(theirs, ours.shape)[seen], rtol=2e-5, atol=2e-5,
+                err_msg=f"{env_id}: {name}",
+            )  # fmt: skip
+            if seen.any():
+                done.add((name, word))
+    return done
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_entries_give_back_what_was_measured(env_id: str) -> None:
+    done = check(batch_of(env_id), env_id)
+    assert ("belief_difference", "open-loop deviations") in done
+    assert ("transmission_value", "open loop") in done
+    words = {word for _, word in done}
+    assert words & {"root mean square", "error_scale"}
+    assert len(done) >= (3 if "Remote" in env_id else 5)
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.parametrize("owner", ["coordinator", "own"])
+def test_constants_are_named_by_words_of_the_meaning(env_id: str, owner: Any) -> None:
+    task = fusion_gym.make_task(env_id, **COMMON, belief_features=True)
+    said = ""
+    for block in ObservationLayout(task, owner).blocks:
+        said = f"{said} {block.meaning}" if block.meaning.startswith("th") else block.meaning
+        for word, value in block.constants.items():
+            assert word in said, (block.name, word)
+            numbers = np.asarray(value, dtype=np.float64)
+            assert (numbers > 0.0).all(), (block.name, word)
+            assert np.isfinite(numbers).all(), (block.name, word)
+
+
+def test_the_clock_and_the_price_are_decoded() -> None:
+    batch = batch_of("fusion_gym/TobitOscillator-v0")
+    found = shown(batch)
+    block, left = found["time_left"]
+    np.testing.assert_allclose(left * block.constants["horizon"], 100 - 7, rtol=1e-6)
+    block, place = found["price"]
+    low, high = np.asarray(block.constants["range"])
+    np.testing.assert_allclose(low * (high / low) ** place, batch.price, rtol=1e-5)

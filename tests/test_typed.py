@@ -1,0 +1,131 @@
+"""Types and options as an editor, a type checker, ``help`` and the specification show them."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+import venv
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+
+import fusion_gym
+from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.envs import registered
+from fusion_gym.envs.option_text import FOR_ALL, short
+from fusion_gym.envs.registration import ENVIRONMENTS, FusionSpec, class_name, options_of
+from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions, build
+
+ROOT = Path(__file__).parent.parent
+USER = ROOT / "tests" / "typed_user.py"
+STRICT = "[mypy]\nstrict = True\n[mypy-torch.*]\nfollow_imports = skip\n"  # torch takes a minute
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The interpreter of an environment in which the package is a typed one of others'."""
+    folder = tmp_path_factory.mktemp("installed")
+    venv.create(folder / "environment", with_pip=False)
+    (packages,) = (folder / "environment").glob("lib/python3*/site-packages")
+    (packages / "fusion_gym").symlink_to(ROOT / "fusion_gym", target_is_directory=True)
+    others = [path for path in sys.path if path.endswith("site-packages")]
+    (packages / "others.pth").write_text("\n".join(others))
+    return folder / "environment" / "bin" / "python"
+
+
+def strictly(python: Path, file: Path, folder: Path) -> str:
+    """What ``mypy --strict`` says of a user's file, outside of the repository."""
+    (folder / "mypy.ini").write_text(STRICT)
+    line = [sys.executable, "-m", "mypy", "--config-file", "mypy.ini"]
+    line += [
+        "--python-executable",
+        str(python),
+        "--cache-dir",
+        str(ROOT / ".mypy_cache" / "strict"),
+    ]
+    line += [str(file)]
+    return subprocess.run(line, cwd=folder, capture_output=True, text=True).stdout
+
+
+def test_mypy_strict_accepts_what_a_user_writes(installed: Path, tmp_path: Path) -> None:
+    """It needs every ``type: ignore`` that stands there, so that no type is Any by chance."""
+    file = tmp_path / USER.name
+    file.write_text(USER.read_text())
+    said = strictly(installed, file, tmp_path)
+    assert said.startswith("Success"), said
+    text = USER.read_text()
+    file.write_text(text.replace("  # type: ignore[attr-defined]", ""))
+    said = strictly(installed, file, tmp_path)
+    assert said.count("[attr-defined]") == text.count("ignore[attr-defined]")
+
+
+def test_what_a_user_writes_runs() -> None:
+    done = subprocess.run([sys.executable, USER], cwd=ROOT, capture_output=True, text=True,
+                          env={"PYTHONPATH": str(ROOT), "PATH": ""}, check=True)  # fmt: skip
+    assert "Interval(mean=" in done.stdout
+
+
+def test_every_name_that_is_offered_is_there() -> None:
+    for name in fusion_gym.__all__:
+        assert getattr(fusion_gym, name) is not None
+        assert name in dir(fusion_gym)
+    with pytest.raises(AttributeError, match="make_taks"):
+        fusion_gym.make_taks  # type: ignore[attr-defined]  # noqa: B018
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_the_specification_lists_every_option(env_id: str) -> None:
+    specification = gym.spec(env_id)
+    assert isinstance(specification, FusionSpec)
+    kind = options_of(env_id)
+    own = [field.name for field in fields(kind)]
+    options = specification.options
+    assert set(options) == {*own, *FOR_ALL}
+    text = specification.pprint(disable_print=True)
+    assert text is not None
+    lines = [line.strip() for line in text.splitlines()]
+    assert lines[0] == f"id={env_id}"
+    for field in fields(kind):
+        assert options[field.name].type == field.type
+        assert f"{field.name}: {field.type} = {short(getattr(kind(), field.name))}" in lines
+    for ending in ("Env", "VectorEnv"):  # what an editor shows of the class, and help
+        shown = inspect.signature(getattr(registered, class_name(env_id) + ending)).parameters
+        for name in own:
+            assert shown[name].annotation == options[name].type
+            assert shown[name].default is not inspect.Parameter.empty
+        assert {"system", "render_mode"} <= set(shown)
+
+
+def test_a_specification_tells_what_was_given(capsys: pytest.CaptureFixture[str]) -> None:
+    env = gym.make("fusion_gym/TobitOscillator-v0", token_rate=2.5, horizon=7)
+    found: Any = env.unwrapped.spec
+    assert found.pprint() is None
+    said = capsys.readouterr().out
+    assert "max_episode_steps=7" in said
+    assert "    token_rate: float = 2.5  (default: 5)\n" in said
+    assert "    horizon: int = 7  (default: 100)\n" in said
+    assert "    token_capacity: float = 30\n" in said
+    again = gym.make(env.spec)  # type: ignore[arg-type]
+    assert again.unwrapped.task.settings["token_rate"] == 2.5  # type: ignore[attr-defined]
+    assert gym.make_vec("fusion_gym/TobitOscillator-v0", 2).spec.options  # type: ignore[union-attr]
+
+
+def test_options_of_ones_own_are_listed_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = dataclass(frozen=True)(
+        type("Own", (TobitOscillatorOptions,), {"__annotations__": {"depth": int}, "depth": 3})
+    )
+
+    def made(chosen: CommonOptions) -> Scenario:
+        return build(chosen)  # type: ignore[arg-type]
+
+    made.__annotations__["chosen"] = own
+    monkeypatch.setitem(ENVIRONMENTS, "typed/Own-v0", made)
+    fusion_gym.register("typed/Own-v0", made)
+    try:
+        assert "    depth: int = 3" in str(gym.spec("typed/Own-v0").pprint(disable_print=True))
+    finally:
+        del gym.registry["typed/Own-v0"]
