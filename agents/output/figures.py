@@ -30,13 +30,13 @@ def pareto(
     title: str,
     lines: Sequence[Line],
     points: Mapping[str, EpisodeResults],
-    agents: Mapping[str, EpisodeResults],
+    agent: Line,
     envelope: Sequence[EnvelopePoint],
 ) -> None:
     """MSE against transmission rate, with 95 % intervals over episodes.
 
-    ``lines`` are the swept baselines, ``points`` single policies, ``agents`` the learned ones,
-    ``envelope`` the lower convex hull of the baselines.
+    ``lines`` are the swept baselines, ``points`` single policies, ``agent`` the learned one at each
+    of its prices, ``envelope`` the lower convex hull of the baselines.
     """
     figure, axes = plt.subplots(figsize=(8.6, 5.6))
     colours = plt.get_cmap("tab20")
@@ -46,21 +46,30 @@ def pareto(
         _draw(axes, name, [found], INK, marker="sD^vPX"[place % 6], size=4.5)
     hull = [*envelope]
     right = axes.get_xlim()[1]
-    rates = [p.rate for p in hull] + [max(right, hull[-1].rate)]
-    errors = [p.mse for p in hull] + [hull[-1].mse]
+    known = [point.rate for point in hull]
+    rates = np.union1d(known, np.linspace(known[0], max(right, known[-1]), 400))
+    errors = np.interp(rates, known, [point.mse for point in hull])  # a mixture's, on any axis
     axes.plot(rates, errors, "--", color=INK, lw=1, label="lower envelope of the baselines")
-    for name, found in agents.items():
-        _draw(axes, name, [found], AGENT, marker="*", size=15)
+    size = 15.0 if len(agent.results) == 1 else 9.0
+    _draw(axes, agent.label, agent.results, AGENT, marker="*", size=size)
     axes.set_xlabel("transmissions per sensor and step")
     axes.set_ylabel("mean squared error of the fused estimate")
-    every = [r for line in lines for r in line.results] + [*points.values(), *agents.values()]
+    every = [r for line in lines for r in line.results] + [*points.values(), *agent.results]
     means = np.array([r.mse.mean() for r in every])
     if means.max() > 6 * means.min():
         axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(_plain_tick)
+        axes.yaxis.set_minor_formatter(_plain_tick)
     axes.set_xlim(left=-0.005)
     axes.set_title(title, loc="left", fontsize=10)
-    axes.legend(fontsize=7.5, ncols=2)
+    axes.legend(fontsize=7.5, loc="upper left", bbox_to_anchor=(1.01, 1.0))
     save(figure, path)
+
+
+def _plain_tick(value: float, place: float | None = None) -> str:
+    """The labels of a logarithmic axis: 0.1, 0.2, 0.3, 0.5, 1, …"""
+    text = f"{value:g}"
+    return text if f"{value:.0e}"[0] in "1235" else ""
 
 
 def _draw(

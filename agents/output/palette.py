@@ -70,3 +70,15 @@ KINDS = {
     "packets that hold the estimate": SKY,
     "learning": VERMILLION,
 }
+
+# Figures of pages: still read at half their width.
+READABLE: Any = {
+    "font.size": 11,
+    "axes.titlesize": 12,
+    "legend.fontsize": 10,
+    "figure.dpi": 130,
+    "savefig.dpi": 130,
+}
+# States, sensors and estimates in figures of papers, everywhere the same.
+TRUTH, MEASURED, FUSED, CENTRAL = BLACK, GREY, VERMILLION, GREEN
+SENSORS = (BLUE, ORANGE, PURPLE, SKY)

@@ -1,66 +1,223 @@
-"""The progress bars of all scripts."""
+"""Where long work is: one look on a terminal, plain lines elsewhere, nothing where it is quiet.
+
+    writing(("models and validations", folder))
+    with progress_bar(total, "training") as bar:
+        bar.update(steps)
+
+All of it goes to stderr. On a terminal every piece of work has a bar; a file or a pipe gets a line
+now and then, without control characters; a closed stderr gets nothing.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+import time
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from pathlib import Path
 
-from tqdm import tqdm
+from rich.console import Console
+from rich.progress import Progress, ProgressColumn, Task
+from rich.progress_bar import ProgressBar
+from rich.table import Column
+from rich.text import Text
+
+_QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
+_EVERY, _SHARE, _MOST = 20.0, 0.1, 600.0  # seconds between two lines; of the time so far; at most
 
 
-def progress_bar(total: int, description: str, initial: int = 0, quiet: bool = False) -> tqdm[Any]:
-    """A bar over environment steps; where nobody watches, a line now and then; quiet, nothing."""
-    closed = sys.stderr is None  # as the shell's 2>&- does
-    return tqdm(
-        disable=quiet or closed,
-        total=total,
-        initial=initial,
-        desc=description,
-        unit="step",
-        unit_scale=True,
-        mininterval=0.2 if not closed and sys.stderr.isatty() else 20.0,
-    )
+class Bar:
+    """How far a piece of work is: ``done`` of ``total`` in a ``unit``, given in the plural.
+
+    ``share`` of the work, from 0 to 1, tells the remaining time; ``note`` says what is going on.
+    """
+
+    def __init__(self, description: str, total: float, unit: str, initial: float = 0.0) -> None:
+        self.description, self.total, self.unit = description, total, unit
+        self.done, self.note, self.share = initial, "", initial / total if total else 1.0
+        self._began = self._reached = time.monotonic()
+        self._first, self._due = self.share, self._began + _EVERY
+        self._ended: float | None = None
+        self.plain = False  # whether lines are printed instead of a bar
+
+    def update(self, amount: float = 1.0) -> None:
+        """So much more is done."""
+        self.reach(self.done + amount)
+
+    def reach(self, done: float, share: float | None = None) -> None:
+        """So much is done in all; ``share`` where its parts take times of their own."""
+        self.done = min(max(done, self.done), self.total)
+        known = self.done / self.total if share is None and self.total else share or 0.0
+        if known > self.share:
+            self.share, self._reached = min(known, 1.0), time.monotonic()
+        now = time.monotonic()
+        if self.plain and now >= self._due:
+            self._due = now + min(max(_EVERY, _SHARE * self.seconds), _MOST)
+            remark(self.line())
+
+    def say(self, note: str) -> None:
+        """What is going on."""
+        self.note = note
+
+    @property
+    def begun(self) -> bool:
+        """Whether anything has been done."""
+        return self.share > self._first
+
+    @property
+    def seconds(self) -> float:
+        """Since the work was begun, or gone on with."""
+        return (self._ended or time.monotonic()) - self._began
+
+    @property
+    def left(self) -> float | None:
+        """Seconds that remain at the mean speed so far; unknown before anything is done."""
+        if not self.begun:
+            return 0.0 if self.share >= 1.0 else None
+        needed = (self._reached - self._began) * (1.0 - self.share) / (self.share - self._first)
+        return max(needed - (time.monotonic() - self._reached), 0.0)
+
+    def end(self) -> None:
+        """Nothing more will be done."""
+        self._ended, self.plain = time.monotonic(), False
+
+    def line(self) -> str:
+        """All of it in one line."""
+        told = [f"{self.description}: {int(100 * self.share)} %", _count(self), _clock(self)]
+        return ", ".join([*told, self.note] if self.note else told)
 
 
 @contextlib.contextmanager
-def progress_bars(
-    totals: Mapping[str, int],
-) -> Iterator[Callable[[str, Mapping[str, Any] | None], None]]:
-    """A bar a training, one below the other; where nobody watches, a line a validation.
+def progress_bar(
+    total: float, description: str, initial: float = 0.0, quiet: bool = False, unit: str = "steps"
+) -> Iterator[Bar]:
+    """A bar while this is entered, below others that are; ``initial`` was done before."""
+    bar = Bar(description, total, unit, initial)
+    if quiet or is_quiet():
+        yield bar
+    elif _SCREEN.progress is not None or _watched():
+        with _SCREEN.showing(bar):
+            try:
+                yield bar
+            finally:
+                bar.end()
+    else:
+        bar.plain = True
+        try:
+            yield bar
+        finally:
+            bar.end()
+            if bar.begun:
+                remark(bar.line())
 
-    What is yielded shows how far one of them is by its last validation (none: not so far yet).
-    """
-    watched = sys.stderr is not None and sys.stderr.isatty()
-    width = max(map(len, totals))
-    with contextlib.ExitStack() as stack:
-        bars = {
-            name: stack.enter_context(
-                tqdm(
-                    total=total,
-                    desc=f"training {name:<{width}}",
-                    unit="step",
-                    unit_scale=True,
-                    smoothing=0.0,
-                    position=place,
-                    disable=not watched,
-                )
-            )
-            for place, (name, total) in enumerate(totals.items())
-        }
-        shown = dict.fromkeys(totals, 0)
 
-        def show(name: str, record: Mapping[str, Any] | None) -> None:
-            bar, new = bars[name], record is not None and record["timesteps"] > shown[name]
-            if record is not None and new:
-                shown[name] = record["timesteps"]
-                result = f"MSE {record['mse']:.4f}, rate {record['rate']:.4f}"
-                bar.set_postfix_str(result, refresh=False)
-                bar.update(min(shown[name], totals[name]) - bar.n)
-                if not watched and sys.stderr is not None:
-                    reached = f"{shown[name]:,} of {totals[name]:,} steps"
-                    print(f"training {name}: {reached}, {result}", file=sys.stderr, flush=True)
-            bar.refresh()
+@contextlib.contextmanager
+def quietly(quiet: bool = True) -> Iterator[None]:
+    """Neither bars nor remarks while this is entered."""
+    token = _QUIET.set(quiet or _QUIET.get())
+    try:
+        yield
+    finally:
+        _QUIET.reset(token)
 
-        yield show
+
+def is_quiet() -> bool:
+    """Whether nothing is to be shown beside results and errors."""
+    return _QUIET.get() or sys.stderr is None  # as the shell's 2>&- leaves it
+
+
+def remark(text: str) -> None:
+    """A line to stderr, above the bars."""
+    if is_quiet():
+        return
+    if _SCREEN.progress is not None:
+        _SCREEN.progress.console.print(Text(text), soft_wrap=True)
+    else:
+        print(text, file=sys.stderr, flush=True)
+
+
+def writing(*goods: tuple[str, Path | str]) -> None:
+    """Say at the beginning of long work what is being written into which folder or file."""
+    remark("writing " + ", ".join(f"{what} into {place}" for what, place in goods))
+
+
+class _Screen:
+    """The bars of a terminal: those that are entered, one below the other."""
+
+    def __init__(self) -> None:
+        self.progress: Progress | None = None
+
+    @contextlib.contextmanager
+    def showing(self, bar: Bar) -> Iterator[None]:
+        if self.progress is not None:
+            self.progress.add_task("", bar=bar)
+            yield
+            return
+        watched = sys.stdout is not None and sys.stdout.isatty()  # else it goes on as it is
+        with Progress(*_columns(), console=Console(stderr=True), redirect_stdout=watched) as made:
+            self.progress = made
+            try:
+                made.add_task("", bar=bar)
+                yield
+            finally:
+                self.progress = None
+
+
+_SCREEN = _Screen()
+
+
+class _Part(ProgressColumn):
+    """A column that is read from a bar."""
+
+    def __init__(self, text: Callable[[Bar], str], style: str, whole: bool = True) -> None:
+        super().__init__(Column(no_wrap=whole))  # others give way first where room is scarce
+        self._text, self._style = text, style
+
+    def render(self, task: Task) -> Text:
+        text = self._text(task.fields["bar"])
+        return Text(text, self._style, no_wrap=True, overflow="ellipsis")
+
+
+class _Drawn(ProgressColumn):
+    """The bar itself."""
+
+    def __init__(self) -> None:
+        super().__init__(Column(min_width=8, max_width=20))
+
+    def render(self, task: Task) -> ProgressBar:
+        return ProgressBar(1.0, task.fields["bar"].share)
+
+
+def _columns() -> list[ProgressColumn]:
+    return [
+        _Part(lambda bar: bar.description, ""),
+        _Drawn(),
+        _Part(_count, "progress.download"),
+        _Part(_clock, "progress.remaining"),
+        _Part(lambda bar: bar.note, "", whole=False),
+    ]
+
+
+def _count(bar: Bar) -> str:
+    return f"{int(bar.done):,}/{int(bar.total):,} {bar.unit}"
+
+
+def _clock(bar: Bar) -> str:
+    """The time so far, and the one that remains."""
+    if bar.share >= 1.0:
+        return f"{_time(bar.seconds)}"
+    left = "?" if bar.left is None else _time(bar.left)
+    return f"{_time(bar.seconds)}, {left} left"
+
+
+def _time(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
+
+
+def _watched() -> bool:
+    """Whether somebody looks at a terminal that can draw."""
+    return sys.stderr.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")

@@ -1,0 +1,123 @@
+"""Policies side by side on the same noise: the pictures, the command and its films."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+
+import fusion_gym
+from agents import watch as command
+from agents.output.films import save_film
+from fusion_gym.evaluation.watching import watch
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError
+
+TOBIT = "fusion_gym/TobitOscillator-v0"
+
+
+def frames(*names: str, seed: int = 3, steps: int | None = None, **options: Any) -> list[Any]:
+    task = fusion_gym.make_task(TOBIT, **({"horizon": 4} | options))
+    return list(watch(task, {name: make_policy(name, task) for name in names}, seed, steps))
+
+
+def test_pictures_stand_side_by_side_one_a_step_and_one_before() -> None:
+    alone, both = frames("always"), frames("always", "never")
+    assert len(alone) == len(both) == 5
+    height, width, _ = alone[0].shape
+    assert all(frame.shape == (height, 2 * width, 3) for frame in both)
+    assert [len(frames("always", steps=steps)) for steps in (1, 2)] == [2, 3]
+
+
+def test_a_policy_alone_is_what_the_environment_draws() -> None:
+    """The same noise and the same pictures, but for the words above them and the axes."""
+    env: Any = gym.make(TOBIT, horizon=4, render_mode="rgb_array")
+    env.reset(seed=3)
+    for _ in range(4):
+        env.step(np.ones(3, dtype=np.int8))
+    drawn, watched = env.render(), frames("always")[-1]
+    assert drawn.shape == watched.shape
+    np.testing.assert_array_equal(drawn[45:], watched[45:])  # below the title
+
+
+def test_both_policies_meet_the_same_noise() -> None:
+    """The same rule under two names: both halves alike, below the names."""
+    task = fusion_gym.make_task(TOBIT, horizon=4)
+    rules = {name: make_policy("innovation_threshold:threshold=1", task) for name in ("a", "b")}
+    for frame in watch(task, rules, seed=5):
+        left, right = np.hsplit(frame, 2)
+        np.testing.assert_array_equal(left[45:], right[45:])
+
+
+def test_what_cannot_be_watched_is_refused_at_once() -> None:
+    task = fusion_gym.make_task(TOBIT, horizon=4)
+    rule = {"always": make_policy("always", task)}
+    with pytest.raises(ConfigurationError, match="steps = 5"):
+        watch(task, rule, steps=5)
+    with pytest.raises(ConfigurationError, match="seed = -1"):
+        watch(task, rule, seed=-1)
+    with pytest.raises(ConfigurationError, match="policies"):
+        watch(task, {})
+
+
+@pytest.mark.parametrize("name", ["film.gif", "film.mp4"])
+def test_the_command_writes_films(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = f"--env {TOBIT} --policy always --against never --set horizon=6 --save {name} --fps 5"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["watch", *words.split()])
+    command.main()
+    with imageio.get_reader(name) as reader:
+        film: Any = reader
+        shown = [np.asarray(frame)[..., :3] for frame in film]
+    assert len(shown) == 7
+    task = fusion_gym.make_task(TOBIT, horizon=6)
+    rules = {name: make_policy(name, task) for name in ("always", "never")}
+    for seen, drawn in zip(shown, watch(task, rules), strict=True):
+        assert seen.shape == drawn.shape
+        # 64 colours of a GIF, chroma of a video.
+        assert np.abs(seen.astype(int) - drawn).mean() < 3.0
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_film_that_fails_leaves_nothing(tmp_path: Path) -> None:
+    def broken() -> Any:
+        yield np.zeros((16, 16, 3), dtype=np.uint8)
+        raise KeyboardInterrupt
+
+    for name in ("film.gif", "film.mp4"):
+        with pytest.raises(KeyboardInterrupt):
+            save_film(broken(), tmp_path / name, 10)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_shows_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    words = ["--env", TOBIT, "--policy", "always", "--set", "horizon=3", "--fps", "50"]
+    monkeypatch.setattr(sys, "argv", ["watch", *words])
+    command.main()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--save", "film.avi"], "save = 'film.avi' is not allowed: it must end with .gif or .mp4"),
+        (["--against", "always"], "against = 'always' is not allowed: it is the policy itself"),
+        (["--steps", "1000", "--save", "film.gif"], "steps = 1000"),
+        (["--fps", "0"], "fps = 0"),
+    ],
+)
+def test_what_is_not_allowed_is_said_in_one_line(
+    words: list[str], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = ["--env", TOBIT, "--policy", "always", *words]
+    monkeypatch.setattr(sys, "argv", ["watch", *given])
+    with pytest.raises(SystemExit) as caught:
+        command.main()
+    assert str(caught.value.code).startswith(f"error: {message}")
