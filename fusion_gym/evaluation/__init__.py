@@ -5,6 +5,7 @@ from fusion_gym.evaluation.episodes import EpisodeResults, Trajectory, record_ep
 from fusion_gym.evaluation.hindsight import run_hindsight
 from fusion_gym.evaluation.intervals import Interval, mean_interval
 from fusion_gym.evaluation.metrics import paired_difference, robust_summary, summarise
+from fusion_gym.evaluation.watching import watch
 from fusion_gym.policies.hindsight import Schedules, find_schedules
 from fusion_gym.policies.registry import make_policy
 
@@ -25,4 +26,5 @@ __all__ = [
     "run_episodes",
     "run_hindsight",
     "summarise",
+    "watch",
 ]

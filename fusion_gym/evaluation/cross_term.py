@@ -12,7 +12,7 @@ is not, and a policy that is trained on the mismatch is drawn aside by it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,12 +60,14 @@ def cross_terms(
     episodes: int,
     seed: int,
     level: float = LEVEL,
+    progress: Callable[[int], Any] | None = None,
 ) -> dict[str, CrossTerm]:
     """The cross term under each policy, in episodes with the seeds ``seed``, ``seed + 1``, …
 
     ``reference`` is the system, on the same noise, whose filter takes in every measurement
     (:func:`~fusion_gym.envs.privileged.reference_system`). All intervals hold together with the
     probability ``level`` (Bonferroni): where some exclude zero, it is not for their number.
+    ``progress`` is called with the number of environment steps made since its last call.
 
     Raises:
         ConfigurationError: fewer than two episodes, which have no interval, or a negative seed.
@@ -77,7 +79,9 @@ def cross_terms(
     found = {}
     for name, policy in policies.items():
         sizes = [(first, min(BATCH, episodes - first)) for first in range(0, episodes, BATCH)]
-        parts = [_run(task, reference, policy, many, seed + first) for first, many in sizes]
+        parts = [
+            _run(task, reference, policy, many, seed + first, progress) for first, many in sizes
+        ]
         found[name] = _summary(np.concatenate(parts, axis=-1), each)
     return found
 
@@ -105,7 +109,10 @@ def usual_policies(task: Task, rates: Sequence[float] = RATES) -> list[str]:
     return names
 
 
-def _run(task: Task, system: System[Any], policy: Policy, episodes: int, seed: int) -> Array:
+def _run(
+    task: Task, system: System[Any], policy: Policy, episodes: int, seed: int,
+    progress: Callable[[int], Any] | None,
+) -> Array:  # fmt: skip
     """Rate, error, floor and mismatch (4, E) of episodes, each a mean over steps."""
     batch = EpisodeBatch(task, episodes, owner_of(policy), system)
     batch.seed(np.arange(episodes), [seed + place for place in range(episodes)])
@@ -117,6 +124,8 @@ def _run(task: Task, system: System[Any], policy: Policy, episodes: int, seed: i
         least = batch.reference_error
         squared = [error * error for error in (outcome.error, least, outcome.error - least)]
         sums += np.stack((outcome.granted.mean(0), *(weights @ part for part in squared)))
+        if progress is not None:
+            progress(episodes)
     return sums / task.horizon
 
 

@@ -18,6 +18,7 @@ from fusion_gym.policies.planning import Model, transmission_sets
 from fusion_gym.validation import ConfigurationError
 
 _MOST_TOGETHER = 8  # sensors whose sets are all weighed
+_MOST_GREEDY = 40  # of which one after another is added, each time the best of all that are left
 
 
 class Lookahead:
@@ -32,17 +33,23 @@ class Lookahead:
     arrive of the set: it knows the channel's probabilities and not what the channel is about to
     do.
 
-    Of up to 8 sensors every set is weighed. Above that it is ``greedy``, and warns of it: it adds
-    the transmission that lowers the cost most until none does, each by its own probability of
-    arrival as if those before it had arrived.
+    Of up to 8 sensors every set is weighed. Above that, up to 40, it is ``greedy``, and warns of
+    it: it adds the transmission that lowers the cost most until none does, each by its own
+    probability of arrival as if those before it had arrived.
 
     It uses the task's model through the system itself (:class:`Model`), so it works for every
     system; exact for linear systems, plausible for others. This is neither an optimum nor a bound,
     but a policy that knows the model.
 
+    Assumes: x* is the conditional mean given all measurements, a model that is true, and no
+    further transmission within the steps.
+
+    Source: none of one paper; receding-horizon control of the decisions, with the value of
+    :mod:`fusion_gym.core.beliefs`.
+
     Raises:
-        ConfigurationError: fewer than one step, a negative price, or information other than
-            "sensors".
+        ConfigurationError: fewer than one step, a negative price, information other than
+            "sensors", or more than 40 sensors, unless only one transmits at a time.
     """
 
     stateless: ClassVar[bool] = True
@@ -59,6 +66,12 @@ class Lookahead:
         self._task = task
         self.knowledge: Knowledge = knows(task, own=False)
         self.greedy = task.sensors > _MOST_TOGETHER and task.access != "single"
+        if self.greedy and task.sensors > _MOST_GREEDY:
+            raise ConfigurationError(
+                f"sensors = {task.sensors} is not allowed with policy 'lookahead': it must be at "
+                f"most {_MOST_GREEDY}, for a step may cost the cube of their number; "
+                "'value_of_information' weighs each sensor alone"
+            )
         if self.greedy:
             warnings.warn(
                 f"policy 'lookahead' adds one transmission after another for {task.sensors} "

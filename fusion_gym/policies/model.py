@@ -15,7 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from fusion_gym.core.reward import Price
 from fusion_gym.core.system import Knowledge, Signals, least_covering
 from fusion_gym.core.task import Task
-from fusion_gym.envs.views import make_view
+from fusion_gym.envs.views import Rows, make_view
 from fusion_gym.policies.base import Requests
 from fusion_gym.policies.card import ENTRY, card
 from fusion_gym.validation import ConfigurationError
@@ -64,16 +64,16 @@ class ModelPolicy:
         self.model = model
         self.deterministic = deterministic
         self._shown = task.reward.price.span is not None
-        self._task = priced(task, price_range)
-        self._view = make_view(self._task, local)
+        self.task = priced(task, price_range)
+        self.view = make_view(self.task, local)
         self._memory: Any = None  # of a recurrent policy
         self.stateless = deterministic and not isinstance(model, RecurrentPPO)
-        self.knowledge: Knowledge = self._view.knowledge
-        self.remember = self._view.owner
+        self.knowledge: Knowledge = self.view.knowledge
+        self.remember = self.view.owner
         if isinstance(model, RecurrentPPO) and self.knowledge != "centre":
             self.knowledge = least_covering((self.knowledge, "own_memory"))
-        span = self._task.reward.price.span
-        self._price: float | None = None  # as the model sees it, in place of the task's own
+        span = self.task.reward.price.span
+        self.price: float | None = None
         if price is None and span is not None and not self._shown:
             fixed = task.reward.price.fixed
             assert fixed is not None  # a drawn price is always shown
@@ -85,7 +85,7 @@ class ModelPolicy:
                     "price_range, for one price alone"
                 )
             chosen = Price.create(price, span)
-            self._price = float(chosen.encode(chosen.draw(np.zeros(1)))[0])
+            self.price = float(chosen.encode(chosen.draw(np.zeros(1)))[0])
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Forget the memory of a recurrent policy; draw from the stream of ``seed``."""
@@ -95,22 +95,26 @@ class ModelPolicy:
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
-        observation = signals["observation"]
-        if self._price is not None:
-            own = observation[:, :-1] if self._shown else observation  # the price comes last
-            column = np.full((len(own), 1), self._price, dtype=np.float32)
-            observation = np.concatenate((own, column), axis=1)
         masks = {}
         if isinstance(self.model, MaskablePPO):
-            masks["action_masks"] = self._view.masks(signals["grantable"])
+            masks["action_masks"] = self.view.masks(signals["grantable"])
         action, self._memory = self.model.predict(
-            self._view.rows(observation),
+            self.rows(signals),
             state=self._memory,
-            episode_start=signals["start"].repeat(self._view.rows_per_run),
+            episode_start=signals["start"].repeat(self.view.rows_per_run),
             deterministic=self.deterministic,
             **masks,
         )
-        return self._view.requests(action, len(observation))
+        return self.view.requests(action, len(signals["start"]))
+
+    def rows(self, signals: Signals) -> Rows:
+        """What the model is shown, (N·rows_per_run, entries) float32."""
+        observation = signals["observation"]
+        if self.price is not None:
+            own = observation[:, :-1] if self._shown else observation  # the price comes last
+            column = np.full((len(own), 1), self.price, dtype=np.float32)
+            observation = np.concatenate((own, column), axis=1)
+        return self.view.rows(observation)
 
 
 def priced(task: Task, price_range: tuple[float, float] | None) -> Task:

@@ -21,6 +21,12 @@ class OptimalPolicy:
     are left, the stationary one does not. ``price`` of a token stands for the task's own.
     ``optimum`` holds the cost that it attains.
 
+    Assumes: remote estimation of one source or two, whose model is true.
+
+    Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop channel with
+    Markovian state", IEEE Trans. Automatic Control 65, 2020, for one source
+    (:mod:`fusion_gym.solvers`).
+
     Raises:
         ConfigurationError: a task that is not solved here, or a negative price.
     """

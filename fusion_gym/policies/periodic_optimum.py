@@ -56,6 +56,13 @@ class PeriodicOptimum:
 
     The result of a search is kept while the process lives, and with ``cache``, a path, in a file.
 
+    Assumes: covariances that depend on no data, and that every request is granted.
+
+    Source: none of one paper; exhaustive search. That a periodic schedule comes arbitrarily
+    near the best of all: L. Zhao, W. Zhang, J. Hu, A. Abate and C. J. Tomlin, "On the optimal
+    solutions of the infinite-horizon linear sensor scheduling problem", IEEE Trans. Automatic
+    Control 59, 2014.
+
     Raises:
         ConfigurationError: a number that is not allowed, more schedules than can be compared, a
             task whose access is not "any", or a system whose covariances depend on the data (it

@@ -41,6 +41,8 @@ class Rollout:
     than its base: where one improvement brings little, the base is nearly the best of those near
     it. It does samples · (steps + 1) · (sensors + 1) steps of the base for one of its own.
 
+    Assumes: a model that is true, for what is imagined comes of it.
+
     Source: D. P. Bertsekas, J. N. Tsitsiklis and C. Wu, "Rollout algorithms for combinatorial
     optimization", Journal of Heuristics 3, 1997.
 

@@ -33,6 +33,8 @@ class WhittleIndex:
         ConfigurationError: another system than remote estimation, an unstable source, or
             thresholds that do not grow with the price.
 
+    Assumes: sources that are independent of one another, with |a| <= 1, whose model is true.
+
     Source: P. Whittle, "Restless bandits: activity allocation in a changing world", Journal of
     Applied Probability 25A, 1988.
     """

@@ -25,6 +25,8 @@ class AdaptiveInnovation(Rule):
     request is granted. The printed exponent -b + c |ε| contradicts the text, which wants a
     decreasing function.
 
+    Assumes: a prediction of the measurement at the sensor, and that requests are granted.
+
     Source: adaptive_innovation, equations (9)-(11), defaults of Section 6.
     """
 
@@ -41,16 +43,23 @@ class AdaptiveInnovation(Rule):
         """Forget the last requested innovations."""
         self._last: Array | None = None
 
+    def threshold_after(self, last: Array) -> Array:
+        """The threshold θ on |ε|² after requests at innovations of size ``last``, (sensors, N).
+
+        Source: adaptive_innovation, equation (10), with the sign that the text asks for.
+        """
+        sensors = len(last)
+        exponent = self.column("sensitivity", sensors) * last
+        exponent += self.column("offset", sensors)
+        return self.column("threshold", sensors) * np.exp(-exponent)
+
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
         squared = surprise(signals)
-        sensors = len(squared)
         if self._last is None:
             self._last = np.zeros(squared.shape)
         last = np.where(signals["start"], 0.0, self._last)
-        exponent = self.column("sensitivity", sensors) * last
-        exponent += self.column("offset", sensors)
-        threshold = self.column("threshold", sensors) * np.exp(-exponent)
+        threshold = self.threshold_after(last)
         request: Requests = squared >= threshold
         self._last = np.where(request, np.sqrt(squared), last)
         return request

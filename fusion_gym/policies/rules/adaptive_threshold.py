@@ -28,6 +28,9 @@ class AdaptiveThreshold(Rule):
     Raises:
         ConfigurationError: not 0 <= ρ₀ <= ρ̄ <= 1, or λ <= 0, or a negative scale.
 
+    Assumes: a centre that holds the last delivered value, and for the bound ρ̄ that every
+    request is granted.
+
     Source: unknown_input, equations (5)-(7), defaults of Section 4.
     """
 
@@ -50,10 +53,18 @@ class AdaptiveThreshold(Rule):
         """Forget the thresholds."""
         self._rho: Array | None = None
 
+    def threshold_after(self, rho: Array, squared: Array) -> Array:
+        """The threshold that follows ρ once |σ|² has been judged by it, all (sensors, N).
+
+        Source: unknown_input, equation (7).
+        """
+        limit = self.scale * self.column("rho_bar", len(rho))
+        share = squared / (self.column("adaptation", len(rho)) + squared)
+        return limit + share * (rho - limit)
+
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
         sensors, runs = shape_of(signals)
-        limit = self.scale * self.column("rho_bar", sensors)
         initial = self.scale * self.column("rho_initial", sensors)
         start = signals["start"]
         if self._rho is None:
@@ -62,6 +73,5 @@ class AdaptiveThreshold(Rule):
         difference = signals["measurement"] - signals["held"]
         squared = linalg.dot(difference, difference)
         request: Requests = squared > rho
-        share = squared / (self.column("adaptation", sensors) + squared)
-        self._rho = limit + share * (rho - limit)
+        self._rho = self.threshold_after(rho, squared)
         return request

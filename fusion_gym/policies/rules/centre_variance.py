@@ -22,6 +22,8 @@ class CentreVariance(Rule):
     Unlike the rule ``variance_threshold`` it takes the plain
     trace, and it knows what several packets bring together.
 
+    Assumes: claimed covariances that are true; what was measured plays no part.
+
     Source: the threshold is that of S. Trimpe and R. D'Andrea, "Event-based state estimation with
     variance-based triggering", IEEE Trans. Automatic Control 59, 2014; the choice is ours.
     """

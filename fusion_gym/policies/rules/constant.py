@@ -13,7 +13,12 @@ from fusion_gym.policies.base import Requests, Rule, shape_of
 
 @dataclass
 class Always(Rule):
-    """Every sensor requests at every step."""
+    """Every sensor requests at every step.
+
+    Assumes: nothing.
+
+    Source: none; the end of the trade-off at which everything is sent that the tokens pay for.
+    """
 
     knowledge: ClassVar[Knowledge] = "clock"
 
@@ -24,7 +29,12 @@ class Always(Rule):
 
 @dataclass
 class Never(Rule):
-    """No sensor ever requests."""
+    """No sensor ever requests.
+
+    Assumes: nothing.
+
+    Source: none; the end of the trade-off at which the centre only predicts.
+    """
 
     knowledge: ClassVar[Knowledge] = "clock"
 

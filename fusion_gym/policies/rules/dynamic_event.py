@@ -31,6 +31,9 @@ class DynamicEvent(Rule):
     condition λ χ > 1 that would keep it positive is violated by the paper's own numbers. It
     remembers measurements that were not requested, and ε those that were denied.
 
+    Assumes: a centre that holds the last delivered value, and that requests are granted: ε is
+    taken against the last request.
+
     Source: tobit_token_bucket, equations (11)-(15).
     """
 

@@ -25,6 +25,9 @@ class EstimateDifference(BelievingRule):
     ``own`` every sensor decides by itself, on its own memory and what it hears: without memory
     that is a threshold on what its own measurement would change.
 
+    Assumes: x* is the conditional mean given all that its owner knows: the error is then that
+    of x*, which no decision changes, plus the squared difference.
+
     Sources: Y. Xu and J. P. Hespanha, "Optimal communication logics in networked control systems",
     IEEE CDC 2004; G. M. Lipsa and N. C. Martins, "Remote state estimation with communication costs
     for first-order LTI systems", IEEE Trans. Automatic Control 56, 2011.

@@ -17,6 +17,11 @@ class InformationGain(Rule):
     The reduction is that of a delivery from this sensor alone, relative to the trace without any
     delivery; it does not depend on the measurement. Greedily, the ``at_most`` sensors that gain
     most per token are taken (None: all that reach the threshold).
+
+    Assumes: claimed covariances that are true, and that what counts is the next step alone.
+
+    Source: none; the greedy choice of sensors by predicted variance, here in proportion to the
+    tokens that it costs.
     """
 
     threshold: float = parameter(0.05, validation.number, at_least=0.0)

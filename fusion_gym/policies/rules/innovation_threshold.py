@@ -28,6 +28,9 @@ class InnovationThreshold(Rule):
     in predicted standard deviations. ``at_most`` limits a step to the sensors with the largest
     norms (None: no limit).
 
+    Assumes: a prediction of the measurement at the sensor; with ``whitened`` also that its
+    predicted deviation is true. Silence is taken for no information by the filters here.
+
     Source: after J. Wu, Q.-S. Jia, K. H. Johansson and L. Shi, "Event-based sensor data
     scheduling: trade-off between communication rate and estimation quality", IEEE Trans.
     Automatic Control 58, 2013 (there with the maximum norm of the whitened innovation).

@@ -25,6 +25,8 @@ class KullbackLeibler(BelievingRule):
     ``at_most`` limits a step to the sensors of highest divergence (None: no limit). With ``own``
     every sensor decides by itself.
 
+    Assumes: Gaussian densities, and claimed covariances that are true.
+
     Source: J. W. Marck and J. Sijs, "Relevant sampling applied to event-based state-estimation",
     SENSORCOMM 2010.
 

@@ -19,6 +19,9 @@ class LocalVariance(Rule):
     ``m`` is the threshold. The traces depend on time alone, so the rule is a schedule that becomes
     periodic, whatever is measured, and it prefers the worst node.
 
+    Assumes: node covariances that depend on time alone, as those of linear filters do, so that
+    centre and node know them both.
+
     Source: markov_jump, equation (33).
     """
 

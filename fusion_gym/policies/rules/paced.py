@@ -26,6 +26,10 @@ class Paced(Rule):
 
     For r = 1/period this is ``periodic`` but for the phase. It is what an event trigger of the same
     rate has to beat.
+
+    Assumes: nothing; it looks at the clock alone.
+
+    Source: none; the balanced sequence of a rate r, ⌊(t + 1) r + φ⌋ - ⌊t r + φ⌋.
     """
 
     rate: PerSensor = parameter(0.2, each_number, at_least=0.0, at_most=1.0)

@@ -17,6 +17,10 @@ class Periodic(Rule):
     """Every sensor requests once in ``period`` steps.
 
     ``staggered`` spreads the sensors over the period; otherwise all request together.
+
+    Assumes: nothing; it looks at the clock alone.
+
+    Source: none; what an event trigger is usually compared with.
     """
 
     period: int = parameter(4, validation.integer, at_least=1)
@@ -32,7 +36,13 @@ class Periodic(Rule):
 
 @dataclass
 class RoundRobin(Rule):
-    """One sensor after another, the next one every ``period`` steps."""
+    """One sensor after another, the next one every ``period`` steps.
+
+    Assumes: nothing; it looks at the clock alone.
+
+    Source: round_robin_tobit, equation (4), for the protocol in which one sensor a step may
+    transmit.
+    """
 
     period: int = parameter(1, validation.integer, at_least=1)
     knowledge: ClassVar[Knowledge] = "clock"

@@ -14,7 +14,12 @@ _STREAM = 0x72616E646F6D  # keeps the requests apart from the noise of the same 
 
 @dataclass
 class Random(Rule):
-    """Each sensor requests with probability ``rate``, independently at every step."""
+    """Each sensor requests with probability ``rate``, independently at every step.
+
+    Assumes: nothing; requests are independent of everything.
+
+    Source: none; what an event trigger is usually compared with.
+    """
 
     rate: PerSensor = parameter(0.2, each_number, at_least=0.0, at_most=1.0)
     knowledge: ClassVar[Knowledge] = "clock"

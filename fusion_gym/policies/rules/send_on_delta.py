@@ -14,6 +14,9 @@ from fusion_gym.policies.base import PerSensor, Requests, Rule, not_negative, pa
 class SendOnDelta(Rule):
     """Request when |y - last delivered y| >= ``threshold``, in the unit of the measurement.
 
+    Assumes: a centre that holds the last delivered value: the threshold then bounds how far it
+    is off.
+
     Source: M. Miskowicz, "Send-on-delta concept: an event-based data reporting strategy",
     Sensors 6, 2006.
     """

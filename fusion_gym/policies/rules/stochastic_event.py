@@ -27,6 +27,9 @@ class StochasticEvent(Rule):
     ``filter="stochastic"`` is the exact filter for it (of the plain
     innovation, not of the whitened one).
 
+    Assumes: a prediction of the measurement at the sensor; for the exact posterior a linear
+    Gaussian system, uncensored sensors and requests that are all granted.
+
     Source: D. Han, Y. Mo, J. Wu, S. Weerakkody, B. Sinopoli and L. Shi, "Stochastic
     event-triggered sensor schedule for remote state estimation", IEEE Trans. Automatic Control
     60(10), 2015, the closed-loop schedule.

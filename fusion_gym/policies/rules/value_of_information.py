@@ -34,6 +34,9 @@ class ValueOfInformation(BelievingRule):
     distances over as many steps ahead, without noise and further transmissions. With ``own`` every
     sensor decides by itself, on its own memory and what it hears.
 
+    Assumes: x* is the conditional mean given all that its owner knows, and that what counts is
+    the next ``steps`` steps.
+
     Sources: see :mod:`fusion_gym.core.beliefs`.
 
     Raises:

@@ -19,6 +19,8 @@ class VarianceThreshold(Rule):
     ``threshold`` is in squared units of the state. The ``at_most`` sensors that would reduce the
     trace most are requested (None: all). It looks at no measurement.
 
+    Assumes: claimed covariances that are true; what was measured plays no part.
+
     Source: after S. Trimpe and R. D'Andrea, "Event-based state estimation with variance-based
     triggering", IEEE Trans. Automatic Control 59, 2014.
     """

@@ -1,0 +1,144 @@
+"""Export a saved agent as an ONNX file, for sensors and coordinators that run without this library.
+
+    python -m agents.export zoo:tobit_oscillator_sensors_memory,price=0.02 --onnx coordinator.onnx
+
+The file has everything from the observation to the request, and says what the observation is. It is
+checked against the agent on 10,000 observations of whole episodes, and not kept if it differs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from fusion_gym import zoo
+from fusion_gym.envs.registration import make_task
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.settings import parse_settings
+from fusion_gym.validation import ConfigurationError
+
+from .command_line import Command, Words, start
+from .input.environment import environment_of
+from .input.options import OutputFile
+from .output.files import replacing
+
+_KINDS = ("zoo", "model")
+
+
+@dataclass(frozen=True)
+class Export(Command):
+    """Export a saved agent as an ONNX file."""
+
+    model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
+    """An agent: zoo:NAME, model:PATH or the path of a .zip, with ,price=PRICE for one price."""
+    onnx: Annotated[Path, OutputFile()]
+    """The file to write."""
+    env: str | None = None
+    """Id of a registered environment, instead of the one that the agent was trained in."""
+    config: str | None = None
+    """Take environment and options from a training's YAML, or from a shipped config by its name."""
+    options: Annotated[
+        Words, tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE …")
+    ] = ()
+    """Options of gym.make for the environment; they go before all others."""
+    trust: bool = False
+    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
+
+    def run(self) -> None:
+        """Write the file, check it and say what it is."""
+        for line in export(self):
+            print(line)
+
+    def interrupted(self) -> str:
+        """A file that is not checked is not kept."""
+        return f"interrupted: no new file in {self.onnx}"
+
+
+def export(given: Export) -> list[str]:
+    """Write the file and return what there is to say of it, in lines.
+
+    Raises:
+        ConfigurationError: anything that is not allowed, or a graph that decides otherwise than the
+            agent; then no file is written.
+    """
+    kind, _, rest = spec(given.model).partition(":")
+    env_id, options = _environment(given, kind, rest.partition(",")[0])
+    # Here, for it needs torch, which takes seconds to load.
+    from fusion_gym.evaluation.onnx_export import export_onnx
+    from fusion_gym.policies.onnx_graph import require_onnx
+
+    require_onnx("onnx")
+    task = make_task(env_id, **options)
+    agent = make_policy(f"{kind}:{rest}", task, trust=given.trust)
+    try:
+        with replacing(given.onnx) as unfinished:
+            made = export_onnx(agent, task, unfinished, env_id, given.model)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"model = {given.model!r} is not exported: {error}") from None
+    asked = ", ".join(f"{name} {_shape(shape)}" for name, shape in made.inputs.items())
+    answers = ", ".join(f"{name} {_shape(shape)}" for name, shape in made.outputs.items())
+    found = made.agreement
+    return [
+        f"{given.model} is in {given.onnx}: {made.size:,} bytes",
+        f"from {asked}",
+        f"to {answers}",
+        f"as the agent on {found.observations:,} observations of {found.episodes:,} episodes of "
+        f"{env_id}: all decisions agree, numbers differ by {found.difference:.2g} at most",
+        f"one decision on one thread here: {1e6 * made.latency.median:.1f} µs in the median, 99 % "
+        f"below {1e6 * made.latency.most:.1f} µs",
+    ]
+
+
+def spec(text: str) -> str:
+    """The agent as policies are named: ``model:`` stands before a bare path.
+
+    Raises:
+        ConfigurationError: a policy that is no saved agent.
+    """
+    kind, colon, _ = text.partition(":")
+    if colon and kind in _KINDS:
+        return text
+    if text.partition(",")[0].endswith(".zip"):
+        return f"model:{text}"
+    raise ConfigurationError(
+        f"model = {text!r} is not allowed: it must be zoo:NAME, model:PATH or the path of a .zip"
+    )
+
+
+def _environment(given: Export, kind: str, name: str) -> tuple[str, dict[str, Any]]:
+    """Id and options: those given, else those that the agent was trained in.
+
+    Raises:
+        ConfigurationError: neither is known.
+    """
+    config = given.config
+    if given.env is None and config is None:
+        if kind == "zoo":
+            trained = zoo.card(name)["training"]["environment"]
+            own = parse_settings("option", [word for words in given.options for word in words])
+            return trained["id"], trained["options"] | own
+        beside = Path(name).parent / "config.yaml"
+        if not beside.is_file():
+            raise ConfigurationError(
+                f"env = None is not allowed with model = {given.model!r}, beside which lies no "
+                "config.yaml of its training: give --env ID or --config FILE"
+            )
+        config = str(beside)
+    env_id, options, _ = environment_of(given.env, config, given.options)
+    return env_id, options
+
+
+def _shape(shape: tuple[str | int, ...]) -> str:
+    return f"({', '.join(map(str, shape))})"
+
+
+def main() -> None:
+    """Entry point; exit status 130 after an interrupt."""
+    start(Export)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,152 @@
+"""Whether an ONNX file decides as the agent that it was made of, and how long it takes."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.base import Requests
+from fusion_gym.policies.model import ModelPolicy
+from fusion_gym.policies.onnx_graph import DecisionGraph
+
+OBSERVATIONS = 10_000
+TOLERANCE = 1e-4  # of numbers, relative to 1 + their size; float32 leaves about 1e-6
+_SEED = 700_000_000  # of the first episode: none that trains, tunes or tests
+_CALLS, _WARM = 5000, 200  # that latency is measured over, and before it
+
+Values = dict[str, NDArray[Any]]
+
+
+class Agreement(NamedTuple):
+    """Of so many ``observations`` of so many ``episodes`` the graph decides ``different`` ones
+    otherwise; ``difference`` is the greatest of its other outputs' from the agent's, and
+    ``relative`` the greatest of it over 1 + their size."""
+
+    observations: int
+    episodes: int
+    different: int
+    difference: float
+    relative: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether all decisions agree, and all numbers up to rounding."""
+        return self.different == 0 and self.relative <= TOLERANCE
+
+
+class Latency(NamedTuple):
+    """Seconds of one call with one row on one thread: the ``median``, and what 99 % stay below."""
+
+    median: float
+    most: float
+
+
+def session(path: Path) -> Any:
+    """An onnxruntime session on one thread of the processor, as a node has it."""
+    onnxruntime: Any = importlib.import_module("onnxruntime")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def agreement(
+    agent: ModelPolicy,
+    graph: DecisionGraph,
+    path: Path,
+    task: Task,
+    observations: int = OBSERVATIONS,
+    seed: int = _SEED,
+) -> Agreement:
+    """Play whole episodes with the agent and ask the file at ``path`` beside it, step by step.
+
+    As many episodes as it takes for that many observations, a row each. Decisions are compared
+    with those of Stable-Baselines3, all else with ``graph`` in torch.
+    """
+    rows = task.horizon * agent.view.rows_per_run
+    episodes = math.ceil(observations / rows)
+    beside = _Beside(agent, graph, session(path))
+    run_episodes(task, beside, episodes, seed)
+    return Agreement(
+        rows * episodes, episodes, beside.different, beside.difference, beside.relative
+    )
+
+
+def latency(graph: DecisionGraph, path: Path) -> Latency:
+    """How long the file at ``path`` takes for one row, by many calls one after another."""
+    run = session(path)
+    given = {
+        name: value.numpy() for name, value in zip(graph.inputs, graph.example(1), strict=True)
+    }
+    seconds = np.empty(_CALLS)
+    for call in range(-_WARM, _CALLS):
+        began = time.perf_counter()
+        run.run(None, given)
+        if call >= 0:
+            seconds[call] = time.perf_counter() - began
+    return Latency(float(np.median(seconds)), float(np.quantile(seconds, 0.99)))
+
+
+class _Beside:
+    """The agent as a policy; whatever it is asked the ONNX session is asked as well."""
+
+    def __init__(self, agent: ModelPolicy, graph: DecisionGraph, run: Any) -> None:
+        self.knowledge: Knowledge = agent.knowledge
+        self.remember = agent.remember
+        self._agent, self._graph, self._session = agent, graph, run
+        self._kept = [agent.view.names.index(name) for name in graph.entries]
+        self.different, self.difference, self.relative = 0, 0.0, 0.0
+
+    def reset(self, runs: int, seed: int = 0) -> None:
+        """Forget what was remembered."""
+        self._agent.reset(runs, seed)
+        start = self._graph.example(runs * self._agent.view.rows_per_run)
+        values = dict(zip(self._graph.inputs, (one.numpy() for one in start), strict=True))
+        memory: Values = {name: values[name] for name in ("hidden", "cell") if name in values}
+        self._memories = [memory, memory]
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Requests (sensors, N) of the agent."""
+        asked: Values = {"observation": self._agent.rows(signals)[:, self._kept]}
+        if "grantable" in self._graph.inputs:
+            asked["grantable"] = signals["grantable"].T.reshape(len(asked["observation"]), -1)
+        ours, theirs = self._memories
+        found = self._of_session(asked | ours)
+        wanted = self._of_torch(asked | theirs)
+        self._memories = [_following(found), _following(wanted)]
+        requests = self._agent(signals)
+        decided = requests != found["request"].reshape(requests.shape[1], -1).T
+        self.different += int(decided.T.reshape(len(asked["observation"]), -1).any(1).sum())
+        for name in self._graph.outputs:
+            if name != "request":
+                apart = np.abs(found[name].astype(np.float64) - wanted[name])
+                apart[np.isnan(apart)] = np.inf
+                self.difference = max(self.difference, float(apart.max()))
+                relative = apart / (1.0 + np.abs(wanted[name]))
+                self.relative = max(self.relative, float(relative.max()))
+        return requests
+
+    def _of_session(self, given: Values) -> Values:
+        return dict(zip(self._graph.outputs, self._session.run(None, given), strict=True))
+
+    def _of_torch(self, given: Values) -> Values:
+        inputs = [torch.as_tensor(np.ascontiguousarray(given[name])) for name in self._graph.inputs]
+        with torch.no_grad():
+            found = self._graph(*inputs)
+        return {name: one.numpy() for name, one in zip(self._graph.outputs, found, strict=True)}
+
+
+def _following(found: Values) -> Values:
+    """The memory for the next step."""
+    return {
+        name.removesuffix("_next"): value for name, value in found.items() if name.endswith("_next")
+    }

@@ -1,0 +1,58 @@
+"""An agent as an ONNX file, written, checked and timed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.onnx_check import Agreement, Latency, agreement, latency
+from fusion_gym.policies.base import Policy
+from fusion_gym.policies.model import ModelPolicy
+from fusion_gym.policies.onnx_card import onnx_card
+from fusion_gym.policies.onnx_graph import DecisionGraph, Shapes, require_onnx, save_graph
+from fusion_gym.validation import ConfigurationError
+
+
+class Exported(NamedTuple):
+    """What was written: ``size`` in bytes, names and shapes of what goes in and comes out, how it
+    agrees with the agent, and what a decision takes."""
+
+    size: int
+    inputs: Shapes
+    outputs: Shapes
+    agreement: Agreement
+    latency: Latency
+
+
+def export_onnx(
+    agent: Policy, task: Task, path: str | Path, environment: str, model: str = ""
+) -> Exported:
+    """Write an agent that ``make_policy`` made for this task as an ONNX file, and check it.
+
+    ``environment`` is the id that the task was made of, ``model`` how the agent is called; both
+    stand in the file. Its graph is :class:`~fusion_gym.policies.onnx_graph.DecisionGraph`, its
+    metadata :func:`~fusion_gym.policies.onnx_card.onnx_card`.
+
+    Raises:
+        ConfigurationError: no saved agent, one whose policy cannot be written or that decides by
+            chance, ONNX is not installed, or a file that decides otherwise than the agent on some
+            of at least 10,000 observations, which is removed.
+        OSError: the file cannot be written.
+    """
+    require_onnx("onnx")
+    if not isinstance(agent, ModelPolicy):
+        raise ConfigurationError(
+            f"agent = {agent!r} is not allowed: it must be a saved agent, zoo:NAME or model:PATH"
+        )
+    path, graph = Path(path), DecisionGraph(agent)
+    save_graph(graph, path, onnx_card(agent, graph, environment, model))
+    found = agreement(agent, graph, path, task)
+    if not found.holds:
+        path.unlink()
+        raise ConfigurationError(
+            f"{found.different:,} of {found.observations:,} observations are decided otherwise "
+            f"than by the agent, and numbers differ by up to {found.difference:.3g}"
+        )
+    taken = latency(graph, path)
+    return Exported(path.stat().st_size, graph.inputs, graph.outputs, found, taken)

@@ -1,0 +1,138 @@
+"""What an ONNX file says of itself: its observation with names, scaling and version, its actions.
+
+Every value is text; lists and tables are JSON, in which "inf" and "-inf" are infinite numbers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from typing import Any
+
+import numpy as np
+
+from fusion_gym.core.observation import ObservationLayout
+from fusion_gym.core.options import plain
+from fusion_gym.core.system import MEANING, Block, numbered
+from fusion_gym.envs.views import SensorView
+from fusion_gym.policies.model import ALGORITHMS, ModelPolicy
+from fusion_gym.policies.onnx_graph import DecisionGraph, Shapes
+from fusion_gym.version import __version__
+
+FORMAT = "1"
+_MEANINGS = {
+    "observation": "rows as the environment shows them, clipped to their bounds inside",
+    "grantable": "whom the network would serve: no request is made of others",
+    "hidden": "memory; zero at the start of an episode, then hidden_next",
+    "cell": "memory; zero at the start of an episode, then cell_next",
+    "request": "the decision: 1 requests to transmit",
+    "probability": "of a request, as the agent decides while it learns",
+    "logits": "of the distribution that the agent decides by",
+    "values": "what each choice is worth, as learned",
+    "hidden_next": "memory for the next step",
+    "cell_next": "memory for the next step",
+}
+_TYPES = {"grantable": "bool", "request": "int8"}
+
+
+def onnx_card(
+    agent: ModelPolicy, graph: DecisionGraph, environment: str, model: str
+) -> dict[str, str]:
+    """The metadata of the graph of an agent: ``model`` is how its user calls it."""
+    task, local = agent.task, isinstance(agent.view, SensorView)
+    layout = ObservationLayout(task, "own" if local else "coordinator")
+    names = list(graph.entries)
+    shown = {name.partition("[")[0] for name in names}
+    blocks = [_block(block, local) for block in layout.blocks if block.name in shown]
+    if local and task.own_number:
+        number = Block("sensor", "which sensor it is", np.array, (numbered(task.sensors),))
+        blocks.append(_block(number, local))
+    price = task.reward.price.span
+    told = {
+        "inputs": _ports(graph.inputs),
+        "outputs": _ports(graph.outputs),
+        "observation_names": names,
+        "observation_low": graph.low.tolist(),
+        "observation_high": graph.high.tolist(),
+        "observation_blocks": blocks,
+        "action": _action(agent, graph),
+        "options": task.settings,
+        "price_range": price if agent.price is None else None,
+        "fixed_price": _fixed_price(agent),
+    }
+    words = {
+        "format": FORMAT,
+        "fusion_gym_version": __version__,
+        "model": model,
+        "algorithm": _algorithm(agent),
+        "environment": environment,
+        "decides": "each sensor by itself" if local else "a coordinator of all sensors",
+        "knows": MEANING[agent.knowledge],
+        "observation_version": layout_version(environment, names),
+    }
+    return words | {key: json.dumps(_finite(plain(value))) for key, value in told.items()}
+
+
+def layout_version(environment: str, names: list[str]) -> str:
+    """The id of the environment, whose number is its scaling's, and a hash of names and order."""
+    digest = hashlib.sha256("\n".join(names).encode()).hexdigest()
+    return f"{environment}:{digest[:16]}"
+
+
+def _ports(shapes: Shapes) -> dict[str, Any]:
+    return {
+        name: {
+            "shape": list(shape),
+            "type": _TYPES.get(name, "float32"),
+            "meaning": _MEANINGS[name],
+        }
+        for name, shape in shapes.items()
+    }
+
+
+def _block(block: Block, local: bool) -> dict[str, Any]:
+    """A kind of entries: ``labels`` of its axes, of which a sensor by itself sees its own row."""
+    own = local and block.node == "own"
+    return {
+        "name": block.name,
+        "meaning": block.meaning,
+        "labels": [list(axis) for axis in block.labels],
+        "own_row": own,
+        "bounds": list(block.bounds),
+        "constants": {key: np.asarray(value).tolist() for key, value in block.constants.items()},
+    }
+
+
+def _action(agent: ModelPolicy, graph: DecisionGraph) -> dict[str, Any]:
+    """The action space, and which requests each of its numbers stands for."""
+    choices = None if graph.choices is None else graph.choices.tolist()
+    return {
+        "space": str(agent.view.actions),
+        "sensors": agent.task.sensors,
+        "access": agent.task.access,
+        "choices": choices,
+    }
+
+
+def _fixed_price(agent: ModelPolicy) -> float | None:
+    """The price of a token at which the agent is always asked."""
+    span = agent.task.reward.price.span
+    if agent.price is None or span is None:
+        return None
+    low, high = span
+    return float(low * (high / low) ** agent.price)
+
+
+def _algorithm(agent: ModelPolicy) -> str:
+    names = {kind: name for name, kind in ALGORITHMS.items()}
+    return next(names[kind] for kind in type(agent.model).__mro__ if kind in names)
+
+
+def _finite(value: Any) -> Any:
+    """What JSON has no numbers for, as words."""
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_finite(entry) for entry in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,207 @@
+"""A saved agent as an ONNX graph: what a sensor or a coordinator runs without this library."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from sb3_contrib import MaskablePPO, RecurrentPPO
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.dqn.policies import DQNPolicy
+
+from fusion_gym.policies.card import POLICIES
+from fusion_gym.policies.model import ModelPolicy
+from fusion_gym.validation import ConfigurationError
+
+OPSET = 17  # of ONNX 1.12, 2022: all that these networks need, and what older runtimes know
+PACKAGES = ("onnx", "onnxruntime")
+Shapes = dict[str, tuple[str | int, ...]]  # by name; "batch" is the number of rows
+_CLOSED = -1e8  # the logit that MaskablePPO gives to what is not open
+
+
+def require_onnx(option: str) -> None:
+    """Whether what writes and runs ONNX graphs is installed.
+
+    Raises:
+        ConfigurationError: it is not; names the option that needs it.
+    """
+    for package in PACKAGES:
+        if importlib.util.find_spec(package) is None:
+            raise ConfigurationError(
+                f"{option} needs {package}, which is absent: pip install 'fusion-gym[onnx]'"
+            )
+
+
+class DecisionGraph(torch.nn.Module):
+    """From rows of an observation to requests, with everything in between.
+
+    ``inputs`` and ``outputs`` are the names in their order, each with its shape; B rows are a run
+    each, or with a local view a sensor of a run each, k sensors decide in a row:
+
+    - ``observation`` (B, entries) float32, clipped here to the layout's bounds; ``entries`` are the
+      names, without the price if the agent is asked at one price: that is then inside.
+    - ``grantable`` (B, k) bool, whom the network would serve: of MaskablePPO alone.
+    - ``hidden`` and ``cell`` (layers, B, size) float32, zero at the start of an episode: of
+      RecurrentPPO alone, whose next ones are the outputs ``hidden_next`` and ``cell_next``.
+    - ``request`` (B, k) int8, the decision: 1 requests to transmit.
+    - ``probability`` (B, k) float32 of a request, as the agent decides while it learns; and the
+      ``logits`` of its distribution. DQN has its ``values`` of the choices instead.
+
+    Raises:
+        ConfigurationError: an agent that decides by chance, or whose policy is none of these.
+    """
+
+    def __init__(self, agent: ModelPolicy) -> None:
+        super().__init__()
+        policy: Any = agent.model.policy
+        if not agent.deterministic:
+            raise ConfigurationError(
+                "deterministic = False is not allowed here: it must be True; the graph has the "
+                "probability of every request beside the request"
+            )
+        if not isinstance(policy, tuple(POLICIES.values())):
+            raise ConfigurationError(
+                f"policy {type(policy).__name__} is not allowed here: it must be that of "
+                f"{', '.join(POLICIES)}"
+            )
+        self._policy: Any = agent.model.policy
+        self._policy.eval()
+        self._masked = isinstance(agent.model, MaskablePPO)
+        self._recurrent = isinstance(agent.model, RecurrentPPO)
+        self._values = isinstance(policy, DQNPolicy)
+        self._price = agent.price
+        self._place = agent.view.names.index("price") if agent.price is not None else None
+        kept = [place for place in range(len(agent.view.names)) if place != self._place]
+        self.entries = tuple(agent.view.names[place] for place in kept)
+        self.low: torch.Tensor
+        self.high: torch.Tensor
+        self.register_buffer("low", torch.as_tensor(agent.view.space.low[kept]))
+        self.register_buffer("high", torch.as_tensor(agent.view.space.high[kept]))
+        self.choices = _choices(agent)
+        self._table: torch.Tensor | None
+        table = None if self.choices is None else torch.as_tensor(self.choices, dtype=torch.float32)
+        self.register_buffer("_table", table)
+        sensors = agent.task.sensors if agent.view.rows_per_run == 1 else 1
+        self.inputs, self.outputs = self._named(sensors, policy)
+
+    def _named(self, sensors: int, policy: Any) -> tuple[Shapes, Shapes]:
+        """Names and shapes of what goes in and comes out."""
+        inputs: Shapes = {"observation": ("batch", len(self.entries))}
+        outputs: Shapes = {"request": ("batch", sensors)}
+        if self._masked:
+            inputs["grantable"] = ("batch", sensors)
+        if self._values:
+            outputs["values"] = ("batch", policy.action_space.n)
+        else:
+            outputs["probability"] = ("batch", sensors)
+            outputs["logits"] = ("batch", policy.action_net.out_features)
+        if self._recurrent:
+            memory = (policy.lstm_actor.num_layers, "batch", policy.lstm_actor.hidden_size)
+            inputs |= {"hidden": memory, "cell": memory}
+            outputs |= {"hidden_next": memory, "cell_next": memory}
+        return inputs, outputs
+
+    def forward(self, observation: torch.Tensor, *more: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """The outputs in their order, from the inputs in theirs."""
+        rows = torch.minimum(torch.maximum(observation, self.low), self.high)
+        if self._price is not None:
+            price = torch.full_like(rows[:, :1], self._price)
+            rows = torch.cat((rows[:, : self._place], price, rows[:, self._place :]), dim=1)
+        if self._values:
+            values = self._policy.q_net(rows)
+            return self._taken(values), values
+        logits, memory = self._logits(rows, more)
+        probability = self._probability(logits, more[0] if self._masked else None)
+        if self._table is None:
+            marginal = probability
+            request = (probability > 0.5).to(torch.int8)
+        else:
+            marginal = probability @ self._table
+            request = self._taken(probability)
+        return request, marginal, logits, *memory
+
+    def _logits(
+        self, rows: torch.Tensor, more: tuple[torch.Tensor, ...]
+    ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
+        policy: Any = self._policy
+        memory: tuple[torch.Tensor, ...] = ()
+        extractor = policy.pi_features_extractor
+        features: torch.Tensor = BasePolicy.extract_features(policy, rows, extractor)
+        if self._recurrent:
+            latent, memory = policy.lstm_actor(features.unsqueeze(0), (more[0], more[1]))
+            features = latent.squeeze(0)
+        return policy.action_net(policy.mlp_extractor.forward_actor(features)), memory
+
+    def _probability(self, logits: torch.Tensor, open_: torch.Tensor | None) -> torch.Tensor:
+        """Of a request (B, k) where sensors are drawn apart, else of each choice (B, choices)."""
+        if self._table is not None:
+            if open_ is not None:
+                closed = (1.0 - open_.to(logits.dtype)) @ self._table.T > 0.0
+                logits = torch.where(closed, torch.full_like(logits, _CLOSED), logits)
+            return torch.softmax(logits, dim=1)
+        if open_ is None:
+            return torch.sigmoid(logits)
+        pairs = logits.reshape(-1, open_.shape[1], 2)
+        both = torch.stack((torch.ones_like(open_), open_), dim=2)
+        pairs = torch.where(both, pairs, torch.full_like(pairs, _CLOSED))
+        return torch.softmax(pairs, dim=2)[..., 1]
+
+    def _taken(self, worth: torch.Tensor) -> torch.Tensor:
+        """The requests (B, k) of the best choice, the first of those alike."""
+        assert self._table is not None
+        return self._table[worth.argmax(dim=1)].to(torch.int8)
+
+    def example(self, rows: int) -> tuple[torch.Tensor, ...]:
+        """Inputs of so many rows, at the start of an episode."""
+        found = []
+        for name, shape in self.inputs.items():
+            sizes = [rows if size == "batch" else int(size) for size in shape]
+            kind = torch.bool if name == "grantable" else torch.float32
+            found.append((torch.ones if name == "grantable" else torch.zeros)(sizes, dtype=kind))
+        return tuple(found)
+
+
+def _choices(agent: ModelPolicy) -> np.ndarray[Any, Any] | None:
+    """Who requests by each number of a discrete action, (choices, k) int8; None of binary ones."""
+    view = agent.view
+    number = getattr(view.actions, "n", None)
+    if len(view.actions.shape or ()) or number is None:
+        return None
+    if view.rows_per_run > 1:
+        return np.array([[0], [1]], dtype=np.int8)
+    return np.ascontiguousarray(view.requests(np.arange(number), int(number)).T).astype(np.int8)
+
+
+def save_graph(graph: DecisionGraph, path: Path, told: Mapping[str, str]) -> None:
+    """Write the graph as an ONNX file, with ``told`` as its metadata.
+
+    Raises:
+        ConfigurationError: ONNX is not installed.
+        OSError: the file cannot be written.
+    """
+    require_onnx("onnx")
+    onnx: Any = importlib.import_module("onnx")
+    shapes = {**graph.inputs, **graph.outputs}
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of torch's older exporter, which needs no onnxscript
+        torch.onnx.export(
+            graph,
+            graph.example(2),
+            str(path),
+            input_names=list(graph.inputs),
+            output_names=list(graph.outputs),
+            dynamic_axes={name: {shape.index("batch"): "batch"} for name, shape in shapes.items()},
+            opset_version=OPSET,
+            dynamo=False,
+        )
+    written = onnx.load(str(path))
+    written.graph.name = "fusion_gym"
+    onnx.helper.set_model_props(written, dict(told))
+    onnx.checker.check_model(written)
+    onnx.save(written, str(path))

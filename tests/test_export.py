@@ -1,0 +1,399 @@
+"""An exported file decides as the agent does, says what it sees, and is refused where it cannot."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from sb3_contrib import QRDQN, MaskablePPO, RecurrentPPO
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+import fusion_gym
+from agents.export import Export, export, spec
+from fusion_gym import zoo
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.evaluation.onnx_check import agreement, latency
+from fusion_gym.policies.base import owner_of
+from fusion_gym.policies.model import ModelPolicy, tag_model
+from fusion_gym.policies.onnx_card import onnx_card
+from fusion_gym.policies.onnx_graph import DecisionGraph, save_graph
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError
+
+ENV = "fusion_gym/TobitOscillator-v0"
+OPTIONS: dict[str, Any] = {"filter": "tobit", "horizon": 20}
+DISCRETE, LOCAL = {"action": "discrete"}, {"local": True}
+RELU = {"net_arch": {"pi": [8], "vf": [6, 5]}, "activation_fn": torch.nn.GELU}
+LSTM = {"lstm_hidden_size": 6, "n_lstm_layers": 2, "shared_lstm": True, "enable_critic_lstm": False}
+# Algorithm, kind of policy, options of the environment, arguments.
+MODELS: dict[str, tuple[Any, str, dict[str, Any], dict[str, Any]]] = {
+    "ppo": (PPO, "MlpPolicy", {}, {}),
+    "ppo_memory": (PPO, "MlpPolicy", {"memory": True}, {}),
+    "ppo_discrete": (PPO, "MlpPolicy", DISCRETE, {"policy_kwargs": RELU}),
+    "ppo_local_memory": (PPO, "MlpPolicy", {"memory": True} | LOCAL, {}),
+    "a2c_centre": (A2C, "MlpPolicy", {"information": "centre"}, {}),
+    "dqn": (DQN, "MlpPolicy", DISCRETE, {"buffer_size": 10}),
+    "dqn_local": (DQN, "MlpPolicy", LOCAL, {"buffer_size": 10, "seed": 2}),
+    "maskable_binary": (MaskablePPO, "MlpPolicy", {}, {}),
+    "maskable_single": (MaskablePPO, "MlpPolicy", {"access": "single"}, {}),
+    "maskable_discrete": (MaskablePPO, "MlpPolicy", DISCRETE, {}),
+    "maskable_local": (MaskablePPO, "MlpPolicy", LOCAL, {}),
+    "recurrent": (RecurrentPPO, "MlpLstmPolicy", {}, {"policy_kwargs": LSTM}),
+    "recurrent_local": (RecurrentPPO, "MlpLstmPolicy", LOCAL, {}),
+}
+
+
+def made(name: str) -> tuple[BaseAlgorithm, Task, bool]:
+    """A new model whose weights are far enough from zero that decisions differ."""
+    kind, policy, options, arguments = MODELS[name]
+    env = fusion_gym.make_sb3_vec_env(ENV, 2, **OPTIONS, **options)
+    model = kind(policy, env, device="cpu", **{"seed": 0} | arguments)
+    with torch.no_grad():
+        for weight in model.policy.parameters():
+            weight.mul_(3.0)
+    return model, env.task, options.get("local", False)
+
+
+def asked(name: str) -> tuple[ModelPolicy, Task]:
+    model, task, local = made(name)
+    return ModelPolicy(model, task, local=local), task
+
+
+def written(agent: ModelPolicy, path: Path) -> DecisionGraph:
+    graph = DecisionGraph(agent)
+    save_graph(graph, path, onnx_card(agent, graph, ENV, "test"))
+    return graph
+
+
+def told(path: Path) -> dict[str, Any]:
+    """The metadata as a node reads it."""
+    session = onnxruntime.InferenceSession(str(path))
+    found = dict(session.get_modelmeta().custom_metadata_map)
+    words = {"decides", "knows", "model", "environment", "algorithm", "observation_version"}
+    words |= {"format", "fusion_gym_version"}
+    return found | {key: json.loads(found[key]) for key in found.keys() - words}
+
+
+def played(task: Task, decide: Callable[[Any], Any], owner: Any, runs: int = 30) -> Any:
+    """Requests (steps, sensors, N) of whole episodes."""
+    batch, found = EpisodeBatch.seeded(task, runs, 3, owner), []
+    for _ in range(task.horizon):
+        found.append(decide(batch))
+        batch.step(found[-1])
+    return np.array(found)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_the_file_decides_as_stable_baselines_does(name: str, tmp_path: Path) -> None:
+    """Played by onnxruntime alone, on rows made by hand: the same requests in all steps."""
+    agent, task = asked(name)
+    path = tmp_path / "agent.onnx"
+    graph = written(agent, path)
+    session = onnxruntime.InferenceSession(str(path))
+    view, memory = agent.view, {}
+    for one in session.get_inputs():
+        if one.name in ("hidden", "cell"):
+            shape = (one.shape[0], 30 * view.rows_per_run, one.shape[2])
+            memory[one.name] = np.zeros(shape, dtype=np.float32)
+
+    def by_file(batch: EpisodeBatch) -> Any:
+        given = {"observation": view.rows(batch.observe())} | memory
+        if "grantable" in graph.inputs:
+            given["grantable"] = batch.grantable().T.reshape(len(given["observation"]), -1)
+        found = dict(zip(graph.outputs, session.run(None, given), strict=True))
+        memory.update({key: found[f"{key}_next"] for key in memory})
+        assert found["request"].dtype == np.int8
+        if graph.choices is None:
+            np.testing.assert_array_equal(found["request"], found["probability"] > 0.5)
+        return found["request"].reshape(30, task.sensors).T == 1
+
+    agent.reset(30)
+    wanted = played(task, lambda batch: agent(batch.signals()), owner_of(agent))
+    np.testing.assert_array_equal(played(task, by_file, owner_of(agent)), wanted)
+    assert 0.0 < wanted.mean() < 1.0
+    found = agreement(agent, graph, path, task, observations=500)
+    assert found.holds
+    assert 500 <= found.observations == found.episodes * 20 * view.rows_per_run
+    assert found.difference < 1e-4
+
+
+def test_probabilities_are_those_that_the_agent_draws_with(tmp_path: Path) -> None:
+    """The share of requests of 4,000 draws at one observation, within four deviations."""
+    for name in ("ppo", "ppo_discrete", "maskable_single"):
+        agent, task = asked(name)
+        graph = written(agent, tmp_path / "agent.onnx")
+        batch = EpisodeBatch.seeded(task, 1, 0)
+        rows = np.repeat(agent.view.rows(batch.observe()), 4000, axis=0)
+        masks = {}
+        given = {"observation": rows[:1]}
+        if "grantable" in graph.inputs:
+            allowed = np.array([[True], [False], [True]])
+            masks = {"action_masks": agent.view.masks(allowed.repeat(4000, axis=1))}
+            given["grantable"] = allowed.T
+        session = onnxruntime.InferenceSession(str(tmp_path / "agent.onnx"))
+        probability = session.run(["probability"], given)[0][0]
+        action, _ = agent.model.predict(rows, deterministic=False, **masks)
+        drawn = agent.view.requests(action, 4000).mean(1)
+        slack = 4.0 * np.sqrt(probability * (1.0 - probability) / 4000) + 1e-6
+        assert (np.abs(drawn - probability) < slack).all()
+        if masks:
+            assert probability[1] == 0.0
+
+
+def test_a_single_sensor_by_itself_is_no_coordinator(tmp_path: Path) -> None:
+    where = "fusion_gym/RemoteEstimation-v0"
+    env = fusion_gym.make_sb3_vec_env(where, 2, local=True, belief_features=True)
+    agent = ModelPolicy(PPO("MlpPolicy", env, seed=0, device="cpu"), env.task, local=True)
+    graph = DecisionGraph(agent)
+    save_graph(graph, tmp_path / "agent.onnx", onnx_card(agent, graph, where, "test"))
+    about = told(tmp_path / "agent.onnx")
+    assert about["decides"] == "each sensor by itself"
+    blocks = {one["name"]: one["own_row"] for one in about["observation_blocks"]}
+    assert blocks["own_value"]
+    assert blocks.keys() == {name.partition("[")[0] for name in about["observation_names"]}
+    assert agreement(agent, graph, tmp_path / "agent.onnx", env.task, observations=500).holds
+
+
+def test_another_file_is_told_apart(tmp_path: Path) -> None:
+    agent, task = asked("ppo")
+    other, _ = asked("ppo")
+    with torch.no_grad():
+        other.model.policy.action_net.bias.add_(torch.tensor([0.0, 0.3, 0.0]))
+    written(other, tmp_path / "other.onnx")
+    found = agreement(agent, DecisionGraph(agent), tmp_path / "other.onnx", task, observations=500)
+    assert not found.holds
+    assert found.different > 0
+    assert found.difference == pytest.approx(0.3, abs=1e-3)
+
+
+def test_what_lies_beyond_the_bounds_is_clipped_inside(tmp_path: Path) -> None:
+    agent, _ = asked("ppo")
+    written(agent, tmp_path / "agent.onnx")
+    session = onnxruntime.InferenceSession(str(tmp_path / "agent.onnx"))
+    space = agent.view.space
+    rows = np.random.default_rng(0).normal(0.0, 8.0, (50, *space.shape)).astype(np.float32)
+    inside = np.clip(rows, space.low, space.high)
+    both = [session.run(["logits"], {"observation": given})[0] for given in (rows, inside)]
+    np.testing.assert_array_equal(*both)
+    assert (rows != inside).any()
+
+
+def test_the_time_of_a_call_is_measured(tmp_path: Path) -> None:
+    agent, _ = asked("ppo")
+    graph = written(agent, tmp_path / "agent.onnx")
+    taken = latency(graph, tmp_path / "agent.onnx")
+    assert 0.0 < taken.median <= taken.most < 1.0
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command's own check, on fewer observations."""
+    shorter = functools.partial(agreement, observations=500)
+    monkeypatch.setattr("fusion_gym.evaluation.onnx_export.agreement", shorter)
+
+
+def command(model: str, path: Path, *options: str, **given: Any) -> list[str]:
+    return export(Export(model, path, options=(options,) if options else (), **given))
+
+
+AGENTS = ["remote_estimation_local_none", "biased_oscillator_sensors_memory"]
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_agents_of_the_zoo_are_exported_with_what_they_see(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "agent.onnx"
+    lines = command(f"zoo:{name}", path)
+    assert f"{path.stat().st_size:,} bytes" in lines[0]
+    assert re.search(r"as the agent on 10,[\d]{3} observations of \d+ episodes", lines[3])
+    assert "all decisions agree" in lines[3]
+    assert "µs in the median" in lines[4]
+    trained = zoo.card(name)["training"]["environment"]
+    task = fusion_gym.make_task(trained["id"], **trained["options"])
+    found, local = told(path), "local" in name
+    if local:
+        env: Any = fusion_gym.parallel_env(trained["id"], **trained["options"])
+        names, space = env.observation_names, env.observation_space("sensor_0")
+    else:
+        env = gym.make(trained["id"], **trained["options"]).unwrapped
+        names, space = env.observation_names, env.observation_space
+    assert found["observation_names"] == list(names)
+    np.testing.assert_array_equal(np.float32(found["observation_low"]), space.low)
+    np.testing.assert_array_equal(np.float32(found["observation_high"]), space.high)
+    assert found["inputs"]["observation"]["shape"] == ["batch", len(names)]
+    assert found["outputs"]["request"]["shape"] == ["batch", 1 if local else task.sensors]
+    assert {one["name"] for one in found["observation_blocks"]} == {
+        one.partition("[")[0] for one in names
+    }
+    assert found["environment"] == trained["id"]
+    assert found["options"]["token_rate"] == trained["options"]["token_rate"]
+    assert found["price_range"] == trained["options"]["price_range"]
+    assert found["fixed_price"] is None
+    assert (found["algorithm"], found["format"]) == ("ppo", "1")
+    assert found["fusion_gym_version"] == fusion_gym.__version__
+    assert found["observation_version"].startswith(f"{trained['id']}:")
+    assert found["action"]["sensors"] == task.sensors
+    assert found["decides"].startswith("each sensor" if local else "a coordinator")
+    onnx.checker.check_model(onnx.load(path), full_check=True)
+
+
+@pytest.mark.usefixtures("few")
+def test_a_node_in_an_environment_does_what_run_episodes_does(tmp_path: Path) -> None:
+    """Through PettingZoo, one row at a time, by names from the file: the same share of requests."""
+    name, price = "tobit_oscillator_local_estimate_memory", 0.02
+    path = tmp_path / "sensor.onnx"
+    command(f"zoo:{name},price={price}", path)
+    session = onnxruntime.InferenceSession(str(path))
+    trained = zoo.card(name)["training"]["environment"]
+    env = fusion_gym.parallel_env(trained["id"], **trained["options"])
+    names = told(path)["observation_names"]
+    assert set(env.observation_names) - set(names) == {"price"}
+    columns = [env.observation_names.index(one) for one in names]
+
+    def request(row: Any) -> int:
+        return int(session.run(["request"], {"observation": row[None, columns]})[0][0, 0])
+
+    shares = []
+    for seed in (5, 6):
+        seen, _ = env.reset(seed=seed)
+        made = []
+        while env.agents:
+            actions = {agent: request(seen[agent]) for agent in env.agents}
+            made.append(list(actions.values()))
+            seen = env.step(actions)[0]
+        shares.append(np.mean(made, axis=0))
+    task = fusion_gym.make_task(trained["id"], **trained["options"])
+    policy = make_policy(f"zoo:{name},price={price}", task)
+    wanted = run_episodes(task, policy, 2, 5).requests
+    np.testing.assert_allclose(shares, wanted, atol=1e-12)
+    assert 0.0 < wanted.mean() < 0.9
+
+
+@pytest.mark.usefixtures("few")
+def test_one_price_is_inside_the_file(tmp_path: Path) -> None:
+    name = "zoo:tobit_oscillator_sensors"
+    command(name, tmp_path / "all.onnx")
+    command(f"{name},price=0.03", tmp_path / "one.onnx")
+    every, one = (onnxruntime.InferenceSession(str(tmp_path / f"{n}.onnx")) for n in ("all", "one"))
+    about = told(tmp_path / "one.onnx")
+    assert "price" not in about["observation_names"]
+    assert about["fixed_price"] == pytest.approx(0.03)
+    assert about["price_range"] is None
+    task = fusion_gym.make_task(ENV, **zoo.card(name[4:])["training"]["environment"]["options"])
+    rows = EpisodeBatch.seeded(task, 64, 0).observe()
+    place = told(tmp_path / "all.onnx")["observation_names"].index("price")
+    low, high = told(tmp_path / "all.onnx")["price_range"]
+    rows[:, place] = np.log(0.03 / low) / np.log(high / low)
+    first = every.run(["logits"], {"observation": rows})[0]
+    second = one.run(["logits"], {"observation": np.delete(rows, place, axis=1)})[0]
+    np.testing.assert_allclose(first, second, atol=1e-5)
+    rows[:, place] = 1.0
+    assert (every.run(["probability"], {"observation": rows})[0].mean() < 0.9 * torch.sigmoid(
+        torch.as_tensor(first)).numpy().mean())  # fmt: skip
+
+
+@pytest.mark.usefixtures("few")
+def test_a_training_of_ones_own_says_its_environment(tmp_path: Path) -> None:
+    model, task, _ = made("ppo")
+    tag_model(model, task)
+    model.save(tmp_path / "best_model.zip")
+    text = f"environment: {{id: {ENV}, options: {{filter: tobit, horizon: 20}}}}\n"
+    path = tmp_path / "agent.onnx"
+    with pytest.raises(ConfigurationError, match=r"give --env ID or --config FILE"):
+        command(str(tmp_path / "best_model.zip"), path)
+    (tmp_path / "config.yaml").write_text(
+        text + "algorithm: {name: ppo}\ntraining: {timesteps: 32}\noutput: made\n"
+    )
+    lines = command(str(tmp_path / "best_model.zip"), path)
+    assert f"of {ENV}" in lines[3]
+    assert told(path)["options"]["horizon"] == 20
+    by_hand = command(f"model:{tmp_path / 'best_model.zip'}", path, "filter=tobit", env=ENV)
+    assert by_hand[3] != lines[3]  # its episodes are longer
+
+
+REFUSED = [
+    ("always", {}, "it must be zoo:NAME, model:PATH or the path of a .zip"),
+    ("lookahead:price=0.1", {}, "it must be zoo:NAME"),
+    ("zoo:nobody", {}, "zoo = 'nobody'"),
+    ("absent.zip", {"env": ENV}, "there is no such file"),
+    ("zoo:tobit_oscillator_sensors,deterministic=false", {}, "deterministic = False"),
+    ("zoo:tobit_oscillator_sensors,price=9", {}, "price"),
+    ("zoo:tobit_oscillator_sensors,nothing=9", {}, "nothing"),
+    ("zoo:tobit_oscillator_sensors", {"env": "fusion_gym/CorrelatedTracking-v0"}, "layout"),
+]
+
+
+@pytest.mark.parametrize(("model", "given", "message"), REFUSED)
+def test_what_cannot_be_exported_is_refused(
+    model: str, given: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        command(model, tmp_path / "agent.onnx", **given)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_algorithm_without_such_a_policy_is_refused(tmp_path: Path) -> None:
+    env = fusion_gym.make_sb3_vec_env(ENV, 2, **OPTIONS, **DISCRETE)
+    model = QRDQN("MlpPolicy", env, device="cpu", buffer_size=10)
+    tag_model(model, env.task)
+    model.save(tmp_path / "model.zip")
+    words = ("filter=tobit", "horizon=20", "action=discrete")
+    with pytest.raises(
+        ConfigurationError, match=r"QRDQNPolicy is not allowed here: .*maskable_ppo"
+    ):
+        command(str(tmp_path / "model.zip"), tmp_path / "a.onnx", *words, env=ENV, trust=True)
+
+
+@pytest.mark.usefixtures("few")
+def test_a_file_that_decides_otherwise_is_not_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "agent.onnx"
+    command("zoo:tobit_oscillator_centre,price=0.2", tmp_path / "other.onnx")
+    path.write_text("kept")
+
+    def wrong(graph: Any, to: Path, metadata: Any) -> None:
+        shutil.copy(tmp_path / "other.onnx", to)
+
+    monkeypatch.setattr("fusion_gym.evaluation.onnx_export.save_graph", wrong)
+    with pytest.raises(
+        ConfigurationError, match=r"is not exported: [\d,]+ of .* are decided otherwise"
+    ):
+        command("zoo:tobit_oscillator_centre,price=0.01", path)
+    assert path.read_text() == "kept"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
+def test_a_missing_extra_is_named(
+    package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == package else found(name)
+    )
+    with pytest.raises(ConfigurationError, match=rf"{package}, .*'fusion-gym\[onnx\]'"):
+        command("zoo:tobit_oscillator_centre", tmp_path / "agent.onnx")
+
+
+def test_a_bare_path_is_a_model() -> None:
+    assert spec("runs/a/best_model.zip,price=0.1") == "model:runs/a/best_model.zip,price=0.1"
+    assert spec("zoo:a,price=2") == "zoo:a,price=2"
+    assert spec("model:a") == "model:a"
