@@ -72,9 +72,9 @@ def evaluate(env: str, options: Content, names: list[str], episodes: int, folder
 
 
 def reproduce(config: Path, episodes: int, folder: Path) -> bytes:
-    """The table that ``agents.reproduce`` prints."""
+    """The table that ``agents.table`` prints."""
     words = ("--config", str(config), "--episodes", str(episodes), "--markdown")
-    return command("agents.reproduce", *words).encode()
+    return command("agents.table", *words).encode()
 
 
 def train(plain: Content, folder: Path) -> bytes:

@@ -28,6 +28,7 @@ from agents.output import tables
 from agents.output.ending import told
 from agents.output.files import read_json, write, write_text
 from agents.output.folders import alone_in
+from agents.output.progress import quietly, writing
 from agents.suite.config import load_suite
 from agents.suite.learned import finished, report
 from agents.suite.learning import load_learning
@@ -55,10 +56,11 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=Path("results"), help="with envelopes/")
     parser.add_argument("--output", type=Path, help="for JSON and tables: results/learning")
     parser.add_argument("--work", type=Path, help="for models and episodes: runs/learning")
+    parser.add_argument("--quiet", action="store_true", help="neither progress nor remarks")
     given = parser.parse_args()
     words = [word for word in sys.argv[1:] if word != "--resume"]
     again = shlex.join(["python", "-m", "benchmarks.learning", *words, "--resume"])
-    with told(lambda: f"interrupted; go on with: {again}"):
+    with told(lambda: f"interrupted; go on with: {again}"), quietly(given.quiet):
         # Ended from outside like by Ctrl-C: the workers stop too.
         before = signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
@@ -93,6 +95,7 @@ def run(given: argparse.Namespace) -> None:
                 f"output = {str(output)!r} holds {there[0].name} already: go on with --resume, or "
                 "give another --output and --work"
             )
+        writing(("results", output), ("trainings and episodes", work))
         for study in studies:
             measure_throughput(study)
         teach(studies, given.seeds, Team(given.workers))

@@ -28,6 +28,7 @@ from rich.table import Table
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
+from agents.output.progress import progress_bar, quietly
 from agents.training.checked import load, parse
 from agents.training.config import Experiment
 from agents.training.run import check
@@ -165,14 +166,19 @@ def cost_table(sensors: Sequence[int]) -> tuple[Table, dict[str, Any]]:
 def tuned(task: Task, episodes: int) -> list[str]:
     """Of every family the policy with the best mean return on tuning seeds."""
 
-    def worth(name: str) -> float:
-        policy = make_policy(name, task)
-        return float(run_episodes(task, policy, episodes, TUNING_SEED).returns.mean())
+    trials = sum(map(len, FAMILIES.values()))
+    with progress_bar(trials * episodes * task.horizon, "tuning rules") as bar:
 
-    return [
-        max((family.format(value) for value in values), key=worth)
-        for family, values in FAMILIES.items()
-    ]
+        def worth(name: str) -> float:
+            bar.say(name)
+            policy = make_policy(name, task)
+            found = run_episodes(task, policy, episodes, TUNING_SEED, bar.update)
+            return float(found.returns.mean())
+
+        return [
+            max((family.format(value) for value in values), key=worth)
+            for family, values in FAMILIES.items()
+        ]
 
 
 def floor(task: Task) -> float:
@@ -195,10 +201,12 @@ def comparison(
     task: Task, agent: str, rules: Sequence[str], episodes: int, seed: int
 ) -> list[dict[str, Any]]:
     """Agent and rules, best first, each with its paired difference to the agent."""
-    found: dict[str, EpisodeResults] = {
-        name: run_episodes(task, make_policy(name, task), episodes, seed)
-        for name in (agent, *rules)
-    }
+    found: dict[str, EpisodeResults] = {}
+    with progress_bar((1 + len(rules)) * episodes * task.horizon, "testing") as bar:
+        for name in (agent, *rules):
+            bar.say(name)
+            policy = make_policy(name, task)
+            found[name] = run_episodes(task, policy, episodes, seed, bar.update)
     rows = [
         {
             "policy": name,
@@ -245,24 +253,32 @@ def main() -> None:
     parser.add_argument("--tuning", type=int, default=200, help="episodes of a rule's trial")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, help="write the figures to this JSON file")
+    parser.add_argument("--quiet", action="store_true", help="no progress")
     given = parser.parse_args()
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
-    if given.what == "cost":
-        table, report = cost_table(given.sensors)
-    else:
-        if given.model is None:
-            parser.error("the table needs --model")
-        chosen = load(Experiment, given.config).environment
-        task = make_task(chosen.id, **chosen.options)
-        rules, least = tuned(task, given.tuning), floor(task)
-        rows = comparison(task, f"model:{given.model}", rules, given.episodes, given.seed)
-        table = comparison_table(rows, least)
-        report = {"episodes": given.episodes, "seed": given.seed, "floor": least, "rows": rows}
+    with quietly(given.quiet):
+        table, report = made(given, parser)
     if given.output is not None:
         given.output.parent.mkdir(parents=True, exist_ok=True)
         given.output.write_text(json.dumps(report, indent=1) + "\n")
     Console(width=130).print(table)
+
+
+def made(
+    given: argparse.Namespace, parser: argparse.ArgumentParser
+) -> tuple[Table, dict[str, Any]]:
+    """What was asked for, as a table and for a file."""
+    if given.what == "cost":
+        return cost_table(given.sensors)
+    if given.model is None:
+        parser.error("the table needs --model")
+    chosen = load(Experiment, given.config).environment
+    task = make_task(chosen.id, **chosen.options)
+    rules, least = tuned(task, given.tuning), floor(task)
+    rows = comparison(task, f"model:{given.model}", rules, given.episodes, given.seed)
+    report = {"episodes": given.episodes, "seed": given.seed, "floor": least, "rows": rows}
+    return comparison_table(rows, least), report
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from typing import Any
 import yaml
 
 import fusion_gym
+from agents.output.progress import progress_bar, quietly, remark, writing
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.metrics import mean_interval
@@ -37,13 +38,12 @@ def point(policy: str, found: EpisodeResults) -> dict[str, Any]:
     }
 
 
-def improve(env_id: str, options: dict[str, Any], price: float, given: Any) -> dict[str, Any]:
+def improve(task: Task, price: float, given: Any, progress: Any) -> dict[str, Any]:
     """The point of one improvement at a price, with its base's beside it."""
-    task: Task = fusion_gym.make_task(env_id, **options, memory=True, cost_weight=price)
     base = f"value_of_information:price={price / given.ratio:.3g},at_most=1"
     policy = f"rollout:samples={given.samples},steps={given.steps},price={price:.3g},base={base}"
     found, plain = (
-        run_episodes(task, make_policy(name, task), given.episodes, given.seed)
+        run_episodes(task, make_policy(name, task), given.episodes, given.seed, progress)
         for name in (policy, base)
     )
     gain = mean_interval(found.returns - plain.returns)
@@ -68,20 +68,28 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=8)
     parser.add_argument("--ratio", type=float, default=5.0)
     parser.add_argument("--output", type=Path, required=True, help="a folder")
+    parser.add_argument("--quiet", action="store_true", help="neither progress nor remarks")
     given = parser.parse_args()
     chosen = settings[given.setting]
     low, high = chosen["price_range"]
     prices = given.prices or [(low * high) ** 0.5 * factor for factor in (0.3, 1.0, 3.0, 10.0)]
     environment = chosen["environment"]
-    points = []
-    for price in [float(f"{price:.3g}") for price in prices]:
-        points.append(improve(environment["id"], environment["options"], price, given))
-        last = points[-1]
-        print(f"price {price}: rate {last['rate']:.4f}, MSE {last['mse']:.4g}", flush=True)
+    points, options = [], environment["options"] | {"memory": True}
+    tasks = {
+        price: fusion_gym.make_task(environment["id"], **options, cost_weight=price)
+        for price in (float(f"{price:.3g}") for price in prices)
+    }
+    steps = sum(2 * given.episodes * task.horizon for task in tasks.values())
+    with quietly(given.quiet), progress_bar(steps, given.setting) as bar:
+        writing(("points", given.output))
+        for price, task in tasks.items():
+            points.append(improve(task, price, given, bar.update))
+            last = points[-1]
+            remark(f"price {price}: rate {last['rate']:.4f}, MSE {last['mse']:.4g}")
     report = {
         "setting": given.setting,
         "env": environment["id"],
-        "options": environment["options"] | {"memory": True},
+        "options": options,
         "episodes": given.episodes,
         "seed": given.seed,
         "command": " ".join(["python -m benchmarks.rollout", *sys.argv[1:]]),

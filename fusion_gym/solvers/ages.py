@@ -50,8 +50,8 @@ def solve_ages(
     times the best period.
 
     Raises:
-        ConfigurationError: more than one channel state, more than 300,000 combinations of ages,
-            or no convergence.
+        ConfigurationError: more than one channel state, more than 300,000 combinations of ages or
+            sets of sources, or no convergence.
     """
     count = len(problems)
     limit = count if at_most is None else validation.integer("at_most", at_most, at_least=1)
@@ -61,10 +61,10 @@ def solve_ages(
             "channel must lose packets independently"
         )
     size = longest or max(_default_length(problem, count / limit) for problem in problems)
-    if size**count > _MOST_STATES:
+    if max(size, 2) ** count > _MOST_STATES:
         raise ConfigurationError(
-            f"longest = {size} is not allowed with {count} sources: longest^sources must be at "
-            f"most {_MOST_STATES}"
+            f"longest = {size} is not allowed with {count} sources: longest^sources, and the "
+            f"number 2^{count} of sets of them, must be at most {_MOST_STATES}"
         )
     sets = [s for s in range(2**count) if s.bit_count() <= limit]
     costs = [_step_cost(problems, size, chosen) for chosen in sets]

@@ -103,7 +103,8 @@ def solve_task(task: Task, criterion: str = "finite") -> Optimum:
     alone = len(problems) == 1
     if not alone and not (task.access == "any" and bucket.unlimited):
         return _solve_pair(task, problems, criterion)
-    tokens = TokenLevels.create(bucket)
+    # Of several that share nothing each has tokens without limit, of one level.
+    tokens = TokenLevels.create(bucket) if alone else problems[0].tokens
     costs, errors, rates, found = [], [], [], []
     for i, priced in enumerate(problems):
         problem = replace(priced, tokens=tokens) if alone else priced

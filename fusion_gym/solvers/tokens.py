@@ -12,6 +12,7 @@ from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.validation import ConfigurationError
 
 _MOST_LEVELS = 500
+_MOST_SENSORS = 12
 _DIGITS = 9
 
 
@@ -37,9 +38,15 @@ class TokenLevels:
 
         Raises:
             ConfigurationError: more than 500 levels: rate, cost and capacity have no large common
-                divisor.
+                divisor; or more than 12 sensors, for all sets of them are choices.
         """
         sensors = len(bucket.cost)
+        if sensors > _MOST_SENSORS:
+            raise ConfigurationError(
+                f"sensors = {sensors} is not allowed for the exact optimum under a common bucket: "
+                f"it must be at most {_MOST_SENSORS}, for all 2^{sensors} sets of sensors are "
+                "choices"
+            )
         choices = np.arange(2**sensors)
         sets = (choices >> np.arange(sensors)[:, None] & 1).astype(np.bool_)
         spent = (sets * bucket.cost).sum(0)

@@ -69,7 +69,7 @@ def silence_bound(
     weights: ArrayLike | None = None,
     accuracy: float = 0.01,
     most_points: int = 3_000_000,
-    progress: Callable[[str], object] | None = None,
+    progress: Callable[[int, str], object] | None = None,
 ) -> SilenceBound:
     """Bound the error of every policy of the task from below, best at these rates.
 
@@ -78,8 +78,8 @@ def silence_bound(
     whatever tokens, knowledge of the past and filter for what arrives, has less.
 
     The lattices are so fine that the bound loses about ``accuracy``, relatively, as far as
-    ``most_points`` allow; what was reached is each cost's ``gap``. ``progress`` is told what is
-    being done.
+    ``most_points`` allow; what was reached is each cost's ``gap``. ``progress`` is told how many
+    rates are done, and what is being done.
 
     Raises:
         ConfigurationError: a task to which the bound does not apply, or a value that is not
@@ -89,12 +89,12 @@ def silence_bound(
     wanted = [validation.number("rates", rate, above=0.0, at_most=1.0) for rate in rates]
     share = validation.number("accuracy", accuracy, above=0.0, at_most=0.5)
     limit = validation.integer("most_points", most_points, at_least=1000)
-    told = progress or (lambda text: None)
-    costs = []
+    told = progress or (lambda done, text: None)
+    costs: list[PricedCost] = []
     for rate in wanted:
-        told(f"rate {rate:g}: looking for the price")
+        told(len(costs), f"rate {rate:g}: looking for the price")
         price, rough = _price(model, rate * task.sensors)
-        told(f"rate {rate:g}: price {price:.3g}")
+        told(len(costs), f"rate {rate:g}: price {price:.3g}")
         costs.append(_cost(model, price, rough, rate, share, limit))
     costs.sort(key=lambda cost: cost.price)
     return SilenceBound(model.floor, task.sensors, tuple(costs))

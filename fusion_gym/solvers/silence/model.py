@@ -15,6 +15,7 @@ from fusion_gym.solvers.silence.problem import SilenceProblem
 from fusion_gym.systems.tobit.bound_filter import BoundTobitFilter
 from fusion_gym.systems.tobit.centre import Centre, FeedbackCentre, SequentialCentre
 from fusion_gym.systems.tobit.filters import KalmanFilter
+from fusion_gym.systems.tobit.joint import JointCentre
 from fusion_gym.systems.tobit.system import CensoredSystem
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 from fusion_gym.validation import ConfigurationError
@@ -44,26 +45,25 @@ def silence_model(task: Task, weights: ArrayLike | None = None) -> SilenceModel:
     transition, process = plant.transition[..., 0], plant.process_covariance[..., 0]
     size = plant.size
     weight = validation.positive("weights", np.ones(size) if weights is None else weights, (size,))
-    matrix = sensors.measurement_matrix[..., 0].reshape(-1, size)
-    variance = sensors.variance[..., 0].ravel()
-    covariance, correction = _update(plant.initial_covariance[..., 0], matrix, variance)
+    matrix, sensed = sensors.stacked_matrix[..., 0], sensors.noise_covariance[..., 0]
+    covariance, correction = _update(plant.initial_covariance[..., 0], matrix, sensed)
     # The centre starts without the first measurement, but a policy may know it.
     before = transition @ correction @ transition.T
     noise, floor = np.empty((task.horizon, size, size)), 0.0
     for time in range(task.horizon):
         prior = transition @ covariance @ transition.T + process
-        covariance, noise[time] = _update(prior, matrix, variance)
+        covariance, noise[time] = _update(prior, matrix, sensed)
         floor += float(weight @ np.diagonal(covariance)) / task.horizon
     noise[0] += before
     return SilenceModel(SilenceProblem.create(transition, weight, noise, 1.0), floor, task.sensors)
 
 
-def _update(prior: Array, matrix: Array, variance: Array) -> tuple[Array, Array]:
+def _update(prior: Array, matrix: Array, noise: Array) -> tuple[Array, Array]:
     """The posterior covariance, and that of the correction K (y - C x̂), both (n, n)."""
-    innovation = matrix @ prior @ matrix.T + np.diag(variance)
+    innovation = matrix @ prior @ matrix.T + noise
     gain = np.linalg.solve(innovation, matrix @ prior).T
     keep = np.eye(len(prior)) - gain @ matrix
-    posterior = keep @ prior @ keep.T + gain * variance @ gain.T
+    posterior = keep @ prior @ keep.T + gain @ noise @ gain.T
     correction = gain @ innovation @ gain.T
     return 0.5 * (posterior + posterior.T), 0.5 * (correction + correction.T)
 
@@ -94,7 +94,7 @@ def _system(task: Task) -> CensoredSystem:
 
 def _predicts(centre: Centre) -> bool:
     """Whether A x̂ is all that the centre makes of a step without deliveries."""
-    if isinstance(centre, SequentialCentre):
+    if isinstance(centre, (SequentialCentre, JointCentre)):
         return True
     if not isinstance(centre, FeedbackCentre):
         return False

@@ -1,0 +1,241 @@
+"""What a step costs against the number of sensors and of states, and how it grows.
+
+    python -m benchmarks.many_sensors_step [--output results/many_sensors] [--seconds 0.1]
+
+Processor time of one step of one run, 16 runs side by side on one thread: the environment's step,
+the observation, and what three rules take to decide. On LinearFusion-v0, whose plant and sensors
+are drawn at random, sensors and states are apart; on RemoteEstimation-v0 every sensor has a state
+of its own. Writes ``step.json`` and a figure beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib.pyplot as plt
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from agents.output.figures import save
+from agents.output.palette import BLUE, GREEN, INK, ORANGE, VERMILLION
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import make_task
+from fusion_gym.policies.base import owner_of
+from fusion_gym.policies.registry import make_policy
+
+LINEAR, REMOTE = "LinearFusion-v0", "RemoteEstimation-v0"
+SENSORS, STATES = (3, 6, 12, 25, 50, 100, 200), (2, 5, 10, 20)
+RUNS, HORIZON, TURNS = 16, 1000, 3
+LARGE = {"sensors": 25, "states": 5}  # from which on growth is fitted: below, a step has a floor
+MIDDLE = {"sensors": 50, "states": 10}  # what the figure holds fixed
+# What is timed, and how it is drawn. A part is the environment's own, or a policy's decision.
+RULES = {
+    "information gain": "information_gain:threshold=0.01",
+    "value of information, coordinator": "value_of_information:price=0.01",
+    "value of information, own": "value_of_information:price=0.01,own=true",
+}
+STYLES = {
+    "step": (INK, "o", "-"),
+    "observation": (GREEN, "v", ":"),
+    "information gain": (ORANGE, "s", "--"),
+    "value of information, coordinator": (BLUE, "^", "-"),
+    "value of information, own": (VERMILLION, "D", "-."),
+}
+PARTS = tuple(STYLES)
+
+
+class Cost(NamedTuple):
+    """Microseconds of a part for one step of one run."""
+
+    env: str
+    sensors: int
+    states: int
+    part: str
+    microseconds: float
+
+
+def linear(sensors: int, states: int) -> Task:
+    """A stable plant and sensors of one channel each, both drawn, a tenth of them paid for."""
+    rng = np.random.default_rng(sensors * 1000 + states)
+    transition = rng.normal(size=(states, states))
+    transition *= 0.95 / np.abs(np.linalg.eigvals(transition)).max()
+    return make_task(
+        f"fusion_gym/{LINEAR}",
+        transition=transition.tolist(),
+        process_covariance=(0.1 * np.eye(states)).tolist(),
+        measurement_matrices=rng.normal(size=(sensors, states)).tolist(),
+        horizon=HORIZON,
+        **tokens(sensors),
+    )
+
+
+def remote(sensors: int) -> Task:
+    """Sources of one kind on one bucket."""
+    return make_task(f"fusion_gym/{REMOTE}", sensors=sensors, horizon=HORIZON, **tokens(sensors))
+
+
+def tokens(sensors: int) -> dict[str, Any]:
+    """A bucket that pays for a tenth of the sensors in each step."""
+    capacity = float(max(sensors, 3))
+    return {
+        "tokens": "limited", "token_cost": 1.0, "token_rate": sensors / 10,
+        "token_capacity": capacity, "initial_tokens": 1.0,
+    }  # fmt: skip
+
+
+def cost(task: Task, part: str, seconds: float) -> float:
+    """Microseconds of CPU of a part, over steps that take so many seconds together, two at least.
+
+    What is random is so for all parts alike: every sensor asks, and a tenth of them is granted.
+    """
+    policy = make_policy(RULES[part], task) if part in RULES else None
+    batch = EpisodeBatch.seeded(task, RUNS, 0, owner_of(policy) if policy else None)
+    if policy is not None:
+        policy.reset(RUNS)
+    everyone = np.ones((task.sensors, RUNS), dtype=np.bool_)
+    decide: Callable[[], object]
+    decide = batch.observe if policy is None else lambda: policy(batch.signals())
+    for _ in range(3):  # past the start, at which nothing is old
+        batch.step(everyone)
+    spent, steps = 0.0, 0
+    while (spent < seconds or steps < 2) and steps < HORIZON - 10:
+        began = time.process_time()
+        if part == "step":
+            batch.step(everyone)
+        else:
+            decide()
+        spent += time.process_time() - began
+        steps += 1
+        if policy is not None:  # what is believed of a step is computed once
+            batch.step(everyone)
+    return 1e6 * spent / (steps * RUNS)
+
+
+def measured(sensors: Sequence[int], states: Sequence[int], seconds: float) -> list[Cost]:
+    """Every part at every size, each the least of several turns through all of them."""
+    turns = [list(_turn(sensors, states, seconds)) for _ in range(TURNS)]
+    return [min(same, key=lambda one: one.microseconds) for same in zip(*turns, strict=True)]
+
+
+def _turn(sensors: Sequence[int], states: Sequence[int], seconds: float) -> Iterator[Cost]:
+    for count in sensors:
+        for size in states:
+            task = linear(count, size)
+            for part in PARTS:
+                yield Cost(LINEAR, count, size, part, cost(task, part, seconds))
+        task = remote(count)
+        for part in PARTS:
+            yield Cost(REMOTE, count, count, part, cost(task, part, seconds))
+
+
+def exponents(costs: Sequence[Cost]) -> dict[str, dict[str, dict[str, float]]]:
+    """By environment and part: p and q of c ∝ sensors^p states^q, by least squares of logarithms.
+
+    Over sizes from :data:`LARGE` on, and of one state a sensor p alone.
+    """
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for env in dict.fromkeys(one.env for one in costs):
+        apart = env == LINEAR
+        for part in PARTS:
+            large = [
+                one
+                for one in costs
+                if (one.env, one.part) == (env, part)
+                and one.sensors >= LARGE["sensors"]
+                and one.states >= LARGE["states"]
+            ]
+            names = ["sensors", "states"] if apart else ["sensors"]
+            columns = [np.log([getattr(one, name) for one in large]) for name in names]
+            rows = np.stack([*columns, np.ones(len(large))], axis=1)
+            slopes = np.linalg.lstsq(rows, np.log([one.microseconds for one in large]))[0]
+            values = dict(zip(names, map(float, slopes), strict=False))
+            found.setdefault(env, {})[part] = values
+    return found
+
+
+def table(costs: Sequence[Cost], fitted: dict[str, dict[str, dict[str, float]]]) -> Table:
+    """A row a size, and below the exponents."""
+    result = Table(title="CPU microseconds of a step of one run", box=box.SIMPLE_HEAD)
+    for column in ("environment", "sensors", "states", *PARTS):
+        result.add_column(column, justify="right")
+    rows: dict[tuple[str, int, int], list[str]] = {}
+    for one in sorted(costs, key=lambda one: (one.env, one.states, one.sensors)):
+        place = (one.env, one.sensors, 0 if one.env == REMOTE else one.states)
+        rows.setdefault(place, []).append(f"{one.microseconds:.3g}")
+    for (env, count, size), values in rows.items():
+        result.add_row(env, str(count), str(size or count), *values)
+    for env, parts in fitted.items():
+        for name in ("sensors", "states"):
+            if all(name in values for values in parts.values()):
+                cells = (f"{parts[part][name]:.2f}" for part in PARTS)
+                result.add_row(env, f"exponent, {name}", "", *cells)
+    return result
+
+
+def figure(costs: Sequence[Cost], *paths: Path) -> None:
+    """Cost against sensors and against states of the one, against sensors of the other."""
+    size, count = MIDDLE["states"], MIDDLE["sensors"]
+    panels: tuple[tuple[str, str, str, dict[str, int]], ...] = (
+        (f"{LINEAR}, {size} states", LINEAR, "sensors", {"states": size}),
+        (f"{LINEAR}, {count} sensors", LINEAR, "states", {"sensors": count}),
+        (f"{REMOTE}, a state a sensor", REMOTE, "sensors", {}),
+    )
+    drawn, axes = plt.subplots(1, 3, figsize=(11.5, 4.0), sharey=True, constrained_layout=True)
+    for panel, (title, env, along, fixed) in zip(axes, panels, strict=True):
+        for part, (colour, marker, line) in STYLES.items():
+            points = [
+                (getattr(one, along), one.microseconds)
+                for one in costs
+                if (one.env, one.part) == (env, part)
+                and all(getattr(one, name) == value for name, value in fixed.items())
+            ]
+            if points:
+                panel.loglog(
+                    *zip(*sorted(points), strict=True), line, marker=marker, ms=4.5, lw=1.2,
+                    color=colour, label=part,
+                )  # fmt: skip
+        panel.set_title(title, loc="left", fontsize=9)
+        panel.set_xlabel(along)
+        ticks = SENSORS if along == "sensors" else STATES
+        panel.set_xticks(ticks, [str(tick) for tick in ticks])
+        panel.minorticks_off()
+    axes[0].set_ylabel("CPU µs of a step of one run")
+    axes[0].legend(fontsize=7.5)
+    save(drawn, *paths)
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--sensors", type=int, nargs="+", default=SENSORS)
+    parser.add_argument("--states", type=int, nargs="+", default=STATES)
+    parser.add_argument("--seconds", type=float, default=0.1, help="of each figure and turn")
+    parser.add_argument("--output", type=Path, help="folder for the figures and the table")
+    given = parser.parse_args()
+    costs = measured(given.sensors, given.states, given.seconds)
+    fitted = exponents(costs)
+    Console(width=150).print(table(costs, fitted))
+    if given.output is not None:
+        given.output.mkdir(parents=True, exist_ok=True)
+        report = {
+            "runs": RUNS,
+            "turns": TURNS,
+            "seconds": given.seconds,
+            "costs": [one._asdict() for one in costs],
+            "fitted_from": LARGE,
+            "exponents": fitted,
+        }
+        (given.output / "step.json").write_text(json.dumps(report, indent=1) + "\n")
+        figure(costs, given.output / "step.png", given.output / "step.svg")
+
+
+if __name__ == "__main__":
+    main()
