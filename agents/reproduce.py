@@ -1,94 +1,95 @@
-"""Print the documentation's table of filters, triggers and buckets.
+"""Make the simulation sections of the five papers anew: figures, tables and claims.
 
-    python -m agents.reproduce --config configs/tobit_oscillator_reproduce.yaml
+    python -m agents.reproduce tobit_token_bucket
+    python -m agents.reproduce all --resume
 
-Every row runs on the same seeds. ``--markdown`` prints the table as the documentation holds it.
+Into the output folder go a page a paper (``PAPER.md``), its figures (PNG and SVG), its numbers
+(``PAPER.json``), and ``README.md`` with every claim's verdict. Simulations are kept in the work
+folder as they are finished; ``--resume`` skips those, if they were made from the same inputs.
 """
 
 from __future__ import annotations
 
+import shlex
+import sys
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
-import numpy as np
-from rich import box
-from rich.table import Table
+import tyro
 
-from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.evaluation.intervals import mean_interval
-from fusion_gym.policies.registry import make_policy
-
-from .command_line import Command, start
-from .input.options import Episodes, Seed
-from .output import tables
-from .output.progress import progress_bar
-from .suite.sweep import Comparison
-from .training.checked import load
-
-COLUMNS = ("setting", "requests", "rate", "MSE", "median", "ARMSE", "trace P", "NEES")
+from .command_line import Command, spelled, start
+from .input.options import OutputFolder, Seed, Whole
+from .output.ending import ended_like_by_ctrl_c
+from .output.files import remove_partials
+from .output.folders import alone_in
+from .reproduction.making import Job, make, shown
+from .reproduction.page import write_overview, write_page
+from .reproduction.paper import Paper, Piece
+from .reproduction.papers import NAMES, papers
+from .suite.team import Team
+from .suite.workers import Work, side_by_side
 
 
 @dataclass(frozen=True)
 class Reproduce(Command):
-    """Print the documentation's table of filters, triggers and buckets."""
+    """Make the simulation sections of the five papers anew."""
 
-    config: str = "tobit_oscillator_reproduce"
-    """The rows: a YAML file, or the name of a shipped config."""
-    episodes: Episodes = 2000
-    """Episodes of each row."""
+    papers: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar=f"{{{','.join(NAMES)},all}}")
+    ]
+    """Papers by name, or all."""
+    episodes: Annotated[int | None, Whole(2, 100_000_000)] = None
+    """Episodes of every simulation, instead of its own number."""
     seed: Seed = 0
     """Seed of the first episode."""
-    markdown: bool = False
-    """Print the table as the documentation holds it."""
-    trust: bool = False
-    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
+    resume: bool = False
+    """Keep simulations that are finished."""
+    output: Annotated[Path, OutputFolder()] = Path("docs/reproduction")
+    """Folder for pages, figures and numbers."""
+    work: Annotated[Path, OutputFolder()] = Path("runs/reproduction")
+    """Folder for simulations."""
+    workers: Annotated[int, Whole(1, 512)] = 2
+    """Processes side by side."""
 
     def run(self) -> None:
-        """Run every row and print the table."""
-        rows = table(load(Comparison, self.config), self.episodes, self.seed, trust=self.trust)
-        if self.markdown:
-            lines = [COLUMNS, ("---",) * len(COLUMNS), *rows]
-            print("\n".join("| " + " | ".join(line) + " |" for line in lines))
-            return
-        shown = Table(title=f"{self.episodes} episodes, seed {self.seed}", box=box.SIMPLE_HEAD)
-        for column in COLUMNS:
-            shown.add_column(column, justify="left" if column == "setting" else "right")
-        for row in rows:
-            shown.add_row(*row)
-        tables.console().print(shown)
+        """Simulate what is not there, then write every page.
 
+        Raises:
+            ConfigurationError: no paper, or one that there is not.
+        """
+        chosen = papers(self.papers)
+        jobs = {
+            one.name: {piece.name: self._job(one, piece) for piece in one.pieces} for one in chosen
+        }
+        with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
+            for one in chosen:
+                remove_partials(self.work / one.name)
+            every = [job for some in jobs.values() for job in some.values()]
+            left = [job for job in every if not (self.resume and job.finished())]
+            print(f"simulations go into {self.work}, pages into {self.output}", file=sys.stderr)
+            work = [
+                Work(job.find().weight * job.episodes / job.find().usual, make, (job,))
+                for job in left
+            ]
+            side_by_side(work, Team(self.workers), "reproducing")
+            for one in chosen:
+                made = {
+                    name: {"episodes": job.episodes, "seed": job.seed}
+                    for name, job in jobs[one.name].items()
+                }
+                write_page(one, shown(one, jobs[one.name]), made, self.output)
+                print(f"{one.name}: {self.output / one.name}.md")
+            write_overview(self.output)
 
-def table(
-    comparison: Comparison, episodes: int, seed: int, *, trust: bool = False
-) -> list[tuple[str, ...]]:
-    """One row of text for each of the config's rows; ``trust`` as in ``make_policy``.
+    def _job(self, one: Paper, piece: Piece) -> Job:
+        return Job(one.name, piece.name, self.episodes or piece.usual, self.seed, self.work)
 
-    Raises:
-        ConfigurationError: a row that is not allowed, before the first episode.
-    """
-    made = []
-    for row in comparison.rows:
-        task = make_task(row.environment or comparison.environment, **row.options)
-        made.append((row.label, task, make_policy(row.policy, task, trust=trust)))
-    total = sum(episodes * task.horizon for _, task, _ in made)
-    found = []
-    with progress_bar(total, "reproducing") as bar:
-        for label, task, policy in made:
-            found.append(_cells(label, run_episodes(task, policy, episodes, seed, bar.update)))
-    return found
-
-
-def _cells(label: str, results: EpisodeResults) -> tuple[str, ...]:
-    return (
-        label,
-        " ".join(f"{rate:.3f}" for rate in results.requests.mean(0)),
-        f"{results.rate.mean():.3f}",
-        tables.number(mean_interval(results.mse)._asdict()),
-        f"{np.median(results.mse):.4g}",
-        " ".join(f"{error:.3f}" for error in np.sqrt(results.squared_error).mean(0)),
-        tables.number(mean_interval(results.bound_trace)._asdict()),
-        f"{results.nees.mean():.3f}",
-    )
+    def interrupted(self) -> str:
+        """Finished simulations are kept."""
+        words = [word for word in sys.argv[1:] if word != "--resume"]
+        command = shlex.join([*spelled("reproduce").split(), *words, "--resume"])
+        return f"interrupted; go on with: {command}"
 
 
 def main() -> None:

@@ -1,0 +1,1 @@
+"""The simulation sections of the five papers, made anew: figures, tables, claims, verdicts."""

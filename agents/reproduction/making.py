@@ -1,0 +1,97 @@
+"""Pieces of a reproduction: simulated once, kept in the work folder, shown again from there."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fusion_gym.validation import ConfigurationError
+from fusion_gym.version import __version__
+
+from ..output.files import DAMAGED, replacing
+from ..output.folders import fingerprint
+from .paper import Paper, Piece
+from .papers import paper
+from .shown import Shown
+
+_PLAIN = "plain"  # the entry that holds all that is no array, as JSON
+
+
+@dataclass(frozen=True)
+class Job:
+    """A piece of a paper with its episodes and seed, and where it is kept."""
+
+    paper: str
+    piece: str
+    episodes: int
+    seed: int
+    work: Path
+
+    @property
+    def path(self) -> Path:
+        """The file that keeps it."""
+        return self.work / self.paper / f"{self.piece}.npz"
+
+    @property
+    def made_from(self) -> str:
+        """A hash of what it is made from."""
+        inputs = [self.paper, self.piece, self.episodes, self.seed, __version__]
+        return fingerprint({"inputs": inputs})
+
+    def find(self) -> Piece:
+        """The piece itself."""
+        return next(piece for piece in paper(self.paper).pieces if piece.name == self.piece)
+
+    def finished(self) -> bool:
+        """Whether it is there, made from the same."""
+        try:
+            self.read()
+        except (ConfigurationError, FileNotFoundError):
+            return False
+        return True
+
+    def read(self) -> dict[str, Any]:
+        """What its ``compute`` returned.
+
+        Raises:
+            FileNotFoundError: it is not there.
+            ConfigurationError: it cannot be read, or was made from something else.
+        """
+        if not self.path.exists():
+            raise FileNotFoundError(str(self.path))
+        try:
+            with np.load(self.path, allow_pickle=False) as arrays:
+                if str(arrays["made_from"]) != self.made_from:
+                    raise ValueError("it was made from something else")
+                found: dict[str, Any] = json.loads(str(arrays[_PLAIN]))
+                kept = [name for name in arrays.files if name.startswith("/")]
+                return found | {name[1:]: arrays[name] for name in kept}
+        except (*DAMAGED, zipfile.BadZipFile) as error:
+            raise ConfigurationError(
+                f"work = {str(self.path)!r} cannot be read: {' '.join(str(error).split())}"
+            ) from None
+
+
+def make(job: Job) -> None:
+    """Simulate a piece and keep it."""
+    found = job.find().compute(job.episodes, job.seed)
+    arrays = {f"/{name}": value for name, value in found.items() if isinstance(value, np.ndarray)}
+    plain = {name: value for name, value in found.items() if not isinstance(value, np.ndarray)}
+    with replacing(job.path) as partial:
+        kept: dict[str, Any] = arrays | {_PLAIN: np.array(json.dumps(plain))}
+        np.savez_compressed(partial, made_from=np.array(job.made_from), **kept)
+
+
+def shown(one: Paper, jobs: dict[str, Job]) -> dict[str, Shown]:
+    """What every piece of a paper shows, by its name.
+
+    Raises:
+        FileNotFoundError: one is not there.
+        ConfigurationError: one cannot be read.
+    """
+    return {piece.name: piece.show(jobs[piece.name].read()) for piece in one.pieces}

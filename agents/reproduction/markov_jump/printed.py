@@ -1,0 +1,103 @@
+"""The paper's cross-covariances (46)-(50) with its own filters (14)-(22), as printed.
+
+The environment carries the exact joint covariance instead. This stands beside it to say where the
+printed recursion holds.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym.arrays import Array
+
+
+def covariances(system: Any, sent: NDArray[np.bool_], swapped: bool) -> Array:
+    """Σ(k) (H + 1, l n, l n) at k = 0..H, where ``sent`` (H, l) is what was sent at k = 1..H.
+
+    ``swapped`` takes the third term of (46) as it is printed, with the indices i and j of the
+    first; otherwise it is the transposed second term of the pair (j, i), as its derivation wants.
+    """
+    return np.array(
+        [_collapsed(joint, system.plant.size) for joint in _joint(system, sent, swapped)]
+    )
+
+
+def _joint(system: Any, sent: NDArray[np.bool_], swapped: bool) -> list[Array]:
+    """P_ij (l, l, a, a) of the copies at k = 0..H."""
+    filters, model = system.filters, system.model
+    moved, faded = model.transition, model.faded
+    shared = model.sensors.noise_coupling[..., 0] @ model.plant.noise_covariance  # S_wv
+    noise = shared @ model.sensors.noise_coupling[..., 0].T  # R_ij, i != j
+    count, size = len(faded), model.size
+    steps = [step for _, step in zip(range(len(sent) + 1), model.steps(), strict=False)]
+    start = steps[0].moment - np.outer(steps[0].mean, steps[0].mean)
+    everyone = np.vstack((np.ones((1, count), bool), sent))
+    filtered = np.broadcast_to(start, (count, count, size, size)).copy()
+    crossed = np.zeros((count, count, size, len(model.plant.noise_covariance)))  # P_ςi wj
+    noises = np.broadcast_to(
+        model.plant.noise_covariance, (count, count, *model.plant.noise_covariance.shape)
+    ).copy()
+    result = [filtered]
+    for time, (before, _) in enumerate(pairwise(steps), start=1):
+        entry = before.input
+        place = int(filters.at(np.array([time]))[0])
+        gain, own = filters.gain[..., place], filters.noise_gain[..., place]
+        exact = filters.covariance[..., place]
+        old = crossed, filtered, noises
+        filtered, crossed, noises = np.empty_like(filtered), np.zeros_like(crossed), noises.copy()
+        for i in range(count):
+            for j in range(count):
+                cross, second, white = (of[i, j] for of in old)
+                third = cross.T if swapped and i != j else old[0][j, i].T
+                ahead = (
+                    moved @ second @ moved.T + moved @ cross @ entry.T + entry @ third @ moved.T
+                    + entry @ white @ entry.T + before.additional
+                )  # fmt: skip
+                a, b = float(everyone[time, i]), float(everyone[time, j])
+                if i == j:  # Theorem 2, with (12)-(22) where the node was sent
+                    filtered[i, i] = exact[i, i] if a else ahead
+                    seen = _prior(system, place, i) @ faded[i]
+                    crossed[i, i] = -a * np.outer(seen, own[i])
+                    variance = filters.innovation_covariance[i, i, place]
+                    noises[i, i] = model.plant.noise_covariance - a * variance * np.outer(
+                        own[i], own[i]
+                    )
+                    continue
+                keep_i = np.eye(size) - a * np.outer(gain[i], faded[i])
+                keep_j = np.eye(size) - b * np.outer(gain[j], faded[j])
+                filtered[i, j] = keep_i @ ahead @ keep_j.T
+                filtered[i, j] += a * b * noise[i, j] * np.outer(gain[i], gain[j])
+                crossed[i, j] = (
+                    -b * np.outer(keep_i @ ahead @ faded[j], own[j])
+                    - a * np.outer(gain[i], shared[i])
+                    + a * b * noise[i, j] * np.outer(gain[i], own[j])
+                )
+                noises[i, j] = (
+                    model.plant.noise_covariance
+                    - b * np.outer(shared[j], own[j])
+                    - a * np.outer(own[i], shared[i])
+                    + a * b * (faded[i] @ ahead @ faded[j] + noise[i, j]) * np.outer(own[i], own[j])
+                )
+        result.append(filtered)
+    return result
+
+
+def _prior(system: Any, place: int, node: int) -> Array:
+    """P_i(k|k-1), from (19): P(k|k) = (I - K c) P(k|k-1); without a sample they are the same."""
+    filters = system.filters
+    keep = np.eye(system.model.size) - np.outer(
+        filters.gain[node, :, place], system.model.faded[node]
+    )
+    return np.asarray(np.linalg.solve(keep, filters.covariance[node, node, ..., place]))
+
+
+def _collapsed(joint: Array, states: int) -> Array:
+    """From (l, l, a, a) to Σ (l n, l n): the sums (45) and (51) over the modes."""
+    count, _, size, _ = joint.shape
+    modes = size // states
+    blocks = joint.reshape(count, count, modes, states, modes, states).sum((2, 4))
+    return blocks.transpose(0, 2, 1, 3).reshape(count * states, count * states)

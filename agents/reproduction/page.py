@@ -1,0 +1,189 @@
+"""The pages of a reproduction: one a paper, with its figures and numbers, and one over all."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+from PIL import Image
+
+from ..output import palette
+from ..output.files import read_json, replacing, write, write_text
+from .paper import Paper
+from .papers import NAMES
+from .shown import Claim, Number, Picture, Shown, Table
+
+OVERVIEW = "README.md"
+_ABOUT = """# The five papers, made anew
+
+Every figure and table of the simulation sections of five papers, by one command:
+
+```sh
+fusion-gym reproduce all
+```
+
+Beside each printed number stands ours with its 95 % interval; *agrees* means that it lies where
+95 % of such runs would. Every claim that simulation can touch has a verdict, and its evidence on
+the paper's page.
+"""
+
+
+def write_page(
+    one: Paper, found: Mapping[str, Shown], made: Mapping[str, Mapping[str, int]], output: Path
+) -> None:
+    """A paper's pictures, its page and its numbers as JSON.
+
+    ``made`` has episodes and seed of every piece.
+    """
+    for shown in found.values():
+        for picture in shown.pictures:
+            _draw(picture, output / one.name)
+    lines = [f"# {one.title}", "", one.citation, "", one.introduction.strip(), ""]
+    claims = [claim for shown in found.values() for claim in shown.claims]
+    lines += ["## Claims", "", *_claims(claims), ""]
+    for piece in one.pieces:
+        shown, runs = found[piece.name], made[piece.name]
+        lines += [f"## {piece.title}", ""]
+        for note in shown.notes:
+            lines += [note.strip(), ""]
+        for table in shown.tables:
+            lines += [*_table(table), ""]
+        for picture in shown.pictures:
+            path = f"{one.name}/{picture.name}.png"
+            lines += [
+                f"### {picture.title}", "", f"![{picture.title}]({path})", "",
+                f"*{picture.caption.strip()}*", "",
+            ]  # fmt: skip
+        lines += [f"({runs['episodes']:,} episodes, the first with seed {runs['seed']}.)", ""]
+    lines += [f"Made by `fusion-gym reproduce {one.name}`.", ""]
+    write_text(output / f"{one.name}.md", "\n".join(lines))
+    write(output / f"{one.name}.json", _numbers(one, found, made))
+
+
+def write_overview(output: Path) -> None:
+    """The page over all papers whose numbers are there."""
+    lines = [_ABOUT]
+    for name in NAMES:
+        path = output / f"{name}.json"
+        if not path.exists():
+            continue
+        found = read_json(path, "numbers")
+        judged = [n["verdict"] for t in found["tables"] for n in t["numbers"]]
+        agree, differ = judged.count("agrees"), judged.count("differs")
+        lines += [f"## [{found['title']}]({name}.md)", "", found["citation"], ""]
+        if agree + differ:
+            lines += [f"{agree} of {agree + differ} printed numbers agree with ours.", ""]
+        lines += ["| claim | where | verdict |", "|---|---|---|"]
+        lines += [
+            f"| {_cell(c['text'])} | {_cell(c['source'])} | {c['verdict']} |"
+            for c in found["claims"]
+        ]
+        lines += [""]
+    write_text(output / OVERVIEW, "\n".join(lines))
+
+
+def _draw(picture: Picture, folder: Path) -> None:
+    with plt.rc_context(palette.READABLE):
+        figure = plt.figure(figsize=picture.size, layout="constrained")
+        try:
+            picture.draw(figure)
+            for suffix in ("png", "svg"):
+                with replacing(folder / f"{picture.name}.{suffix}") as partial:
+                    figure.savefig(partial, format=suffix, metadata=_UNDATED[suffix])
+                    _SMALLER[suffix](partial)
+        finally:
+            plt.close(figure)
+
+
+def _fewer_colours(png: Path) -> None:
+    """A fourth of the size: drawings have few colours and their mixtures at edges.
+
+    Maximum coverage keeps a thin line's colour, which a median cut gives up for more frequent ones.
+    """
+    with Image.open(png) as picture:
+        full = picture.convert("RGB")
+        small = full.quantize(_SHADES, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    small.save(png, format="png", optimize=True)
+
+
+def _fewer_digits(svg: Path) -> None:
+    """Paths to a hundredth of a point."""
+    text = svg.read_text(encoding="utf-8")
+    path = re.compile(r' d="[^"]*"')
+    short = path.sub(lambda found: re.sub(r"(\.\d\d)\d+", r"\1", found.group()), text)
+    svg.write_text(short, encoding="utf-8")
+
+
+_SHADES = 128
+_SMALLER = {"png": _fewer_colours, "svg": _fewer_digits}
+_UNDATED: dict[str, dict[str, Any]] = {"png": {"Software": None}, "svg": {"Date": None}}
+
+
+def _claims(claims: list[Claim]) -> list[str]:
+    rows = [
+        f"| {_cell(c.text)} | {_cell(c.source)} | **{c.verdict}** | {_cell(c.evidence)} |"
+        for c in claims
+    ]
+    return ["| claim | where | verdict | evidence |", "|---|---|---|---|", *rows]
+
+
+def _table(table: Table) -> list[str]:
+    if table.columns:
+        return _grid(table)
+    rows = [
+        f"| {_cell(n.what)} | {_printed(n)} | {_ours(n)} | {n.verdict} |" for n in table.numbers
+    ]
+    head = [f"**{table.title}**", "", "| | printed | ours (95 %) | verdict |", "|---|---|---|---|"]
+    return [*head, *rows, *(["", table.note.strip()] if table.note else [])]
+
+
+def _cell(text: str) -> str:
+    """Text for a cell of a Markdown table."""
+    return text.replace("|", "\\|")
+
+
+def _grid(table: Table) -> list[str]:
+    width = len(table.columns)
+    lines = [table.numbers[first : first + width] for first in range(0, len(table.numbers), width)]
+    rows = [
+        " | ".join([f"| {_cell(line[0].what.rsplit(': ', 1)[0])}", *(_ours(n) for n in line)])
+        + " |"
+        for line in lines
+    ]
+    head = [f"**{table.title}** (95 %)", "", "| | " + " | ".join(table.columns) + " |"]
+    return [*head, "|---" * (width + 1) + "|", *rows, *(["", table.note] if table.note else [])]
+
+
+def _printed(number: Number) -> str:
+    return "–" if number.printed is None else f"{number.printed:.4g} {number.unit}".strip()
+
+
+def _ours(number: Number) -> str:
+    exact = number.low == number.mean == number.high  # it depends on no draw
+    interval = "" if exact else f" [{number.low:.4g}, {number.high:.4g}]"
+    return f"{number.mean:.4g}{interval} {number.unit}".strip()
+
+
+def _numbers(
+    one: Paper, found: Mapping[str, Shown], made: Mapping[str, Mapping[str, int]]
+) -> dict[str, Any]:
+    return {
+        "paper": one.name,
+        "title": one.title,
+        "citation": one.citation,
+        "made": {name: dict(runs) for name, runs in made.items()},
+        "tables": [
+            {
+                "piece": name,
+                "name": table.name,
+                "numbers": [asdict(n) | {"verdict": n.verdict} for n in table.numbers],
+            }
+            for name, shown in found.items()
+            for table in shown.tables
+        ],
+        "claims": [asdict(claim) for shown in found.values() for claim in shown.claims],
+    }

@@ -1,0 +1,42 @@
+"""A paper as pieces of work: what is simulated, and what is shown of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from .shown import Shown
+
+# Episodes and a seed to whatever JSON and arrays can hold, by name.
+Compute = Callable[[int, int], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A part of a simulation section: its runs, kept in the work folder, and what they show.
+
+    ``compute(episodes, seed)`` returns numbers, texts, lists and arrays by name; ``show`` takes
+    what was kept of them, where arrays are arrays again. ``weight`` is about how many seconds of
+    one core a run of ``usual`` episodes takes. ``compute`` must be a function of a module, so that
+    another process finds it.
+    """
+
+    name: str
+    title: str
+    compute: Compute
+    show: Callable[[dict[str, Any]], Shown]
+    weight: float
+    usual: int = 1000
+
+
+@dataclass(frozen=True)
+class Paper:
+    """A paper: ``name`` is that of its page, ``citation`` as a list of references has it."""
+
+    name: str
+    title: str
+    citation: str
+    environments: Sequence[str]
+    introduction: str
+    pieces: Sequence[Piece]

@@ -1,0 +1,197 @@
+"""Runs of the biased oscillator and the biased target, and what is kept of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+import fusion_gym
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.runs import Outcome
+from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import BATCH
+from fusion_gym.policies.base import Policy, Requests, Rule, parameter, shape_of
+from fusion_gym.systems.tobit.system import CensoredSystem
+
+from ..shown import Number
+
+OSCILLATOR = "fusion_gym/BiasedOscillator-v0"
+TRACKING = "fusion_gym/BiasedTracking-v0"
+STATES = 3  # x1, x2, b
+PAPER_RUNS = 1000
+_RESAMPLES = 500
+FREE = {"censoring_threshold": -np.inf, "censoring_upper": np.inf}
+
+
+@dataclass
+class Turn(Rule):
+    """One sensor alone, at its own turns of the round robin; nobody transmits at the others'."""
+
+    sensor: int = parameter(0, validation.integer, at_least=0)
+    knowledge: ClassVar[Knowledge] = "clock"
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Requests (sensors, N)."""
+        sensors, _ = shape_of(signals)
+        mine = np.arange(sensors)[:, None] == self.sensor
+        return mine & (signals["step"] % sensors == self.sensor)
+
+
+def round_robin(task: Task) -> Policy:
+    """The policy that the paper runs."""
+    return fusion_gym.make_policy("round_robin", task)
+
+
+def censored(task: Task) -> CensoredSystem:
+    """The task's system, known for what it is."""
+    assert isinstance(task.system, CensoredSystem)
+    return task.system
+
+
+def walk(
+    task: Task,
+    policy: Policy,
+    episodes: int,
+    seed: int,
+    look: Callable[[EpisodeBatch, Outcome, int, slice], None],
+    before: Callable[[EpisodeBatch, int, slice], None] | None = None,
+) -> None:
+    """Run episodes in batches; ``look`` after every step, ``before`` it what was sensed.
+
+    Both get the batch, the step from 0, and which of the episodes the batch holds.
+    """
+    for first in range(0, episodes, BATCH):
+        count = min(BATCH, episodes - first)
+        runs = slice(first, first + count)
+        batch = EpisodeBatch.seeded(task, count, seed + first)
+        policy.reset(count, seed + first)
+        for step in range(task.horizon):
+            requests = policy(batch.signals())
+            if before is not None:
+                before(batch, step, runs)
+            look(batch, batch.step(requests), step, runs)
+
+
+def squares(task: Task, policy: Policy, episodes: int, seed: int) -> Array:
+    """Squared errors (episodes, H, states) of the fused estimate."""
+    found = np.empty((episodes, task.horizon, STATES))
+
+    def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
+        found[runs, step] = outcome.squared_error.T
+
+    walk(task, policy, episodes, seed, look)
+    return found
+
+
+def node_squares(task: Task, policy: Policy, episodes: int, seed: int) -> tuple[Array, Array]:
+    """Those of the fused estimate, and (episodes, H, sensors, states) of the nodes' own."""
+    fused = np.empty((episodes, task.horizon, STATES))
+    local = np.empty((episodes, task.horizon, task.sensors, STATES))
+
+    def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
+        fused[runs, step] = outcome.squared_error.T
+        error = task.system.truth(batch.delivered) - task.system.local_means(batch.delivered)
+        local[runs, step] = (error**2).transpose(2, 0, 1)
+
+    walk(task, policy, episodes, seed, look)
+    return fused, local
+
+
+def resampled(episodes: int, seed: int = 0) -> Array:
+    """Weights (resamples, episodes) with sum 1 of bootstrap samples of the episodes."""
+    drawn = np.random.default_rng(seed).multinomial(
+        episodes, np.full(episodes, 1.0 / episodes), size=_RESAMPLES
+    )
+    return np.asarray(drawn / episodes)
+
+
+def armse(squared: Array) -> dict[str, list[float]]:
+    """The paper's ARMSE a state: mean over time of the root of the mean over runs.
+
+    ``mean``, ``low`` and ``high`` of the 95 % bootstrap interval over episodes, and ``spread``, the
+    standard deviation of what so many runs as the paper's would give.
+    """
+    drawn = _drawn(squared)
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+    spread = drawn.std(0) * np.sqrt(len(squared) / PAPER_RUNS)
+    mean = np.sqrt(squared.mean(0)).mean(0)
+    return {
+        "mean": mean.tolist(), "low": low.tolist(), "high": high.tolist(),
+        "spread": spread.tolist(),
+    }  # fmt: skip
+
+
+def increase(before: Array, after: Array) -> dict[str, list[float]]:
+    """How far :func:`armse` rises a state, from one filter to another on the same seeds.
+
+    ``mean``, ``low`` and ``high`` of the 95 % bootstrap interval of the paired difference.
+    """
+    low, high = np.quantile(_drawn(after) - _drawn(before), [0.025, 0.975], axis=0)
+    mean = (np.sqrt(after.mean(0)) - np.sqrt(before.mean(0))).mean(0)
+    return {"mean": mean.tolist(), "low": low.tolist(), "high": high.tolist()}
+
+
+def medians(squared: Array, state: int = 0) -> tuple[float, Array]:
+    """Median over runs of a run's RMSE of a state, and (resamples,) of bootstrap samples."""
+    roots = np.sqrt(squared[..., state].mean(1))
+    order = np.argsort(roots)
+    reached = np.cumsum(resampled(len(roots))[:, order], axis=1) >= 0.5
+    return float(np.median(roots)), roots[order][np.argmax(reached, axis=1)]
+
+
+def _drawn(squared: Array) -> Array:
+    """ARMSE (resamples, states) of bootstrap samples, the same episodes for every filter."""
+    episodes, horizon, states = squared.shape
+    means = resampled(episodes) @ squared.reshape(episodes, -1)
+    return np.asarray(np.sqrt(means.reshape(-1, horizon, states)).mean(1))
+
+
+def armse_number(
+    what: str, found: dict[str, list[float]], state: int, printed: float | None, unit: str = ""
+) -> Number:
+    """One entry of :func:`armse` beside the printed one."""
+    mean, low, high, spread = (found[key][state] for key in ("mean", "low", "high", "spread"))
+    return Number(what, mean, low, high, printed, spread, unit)
+
+
+def curve(squared: Array) -> Array:
+    """RMSE over time with its 95 % interval: (3, H, states), the root mean, its low, its high."""
+    mean = squared.mean(0)
+    half = 1.96 * squared.std(0, ddof=1) / np.sqrt(len(squared))
+    return np.sqrt(np.stack([mean, np.maximum(mean - half, 0.0), mean + half]))
+
+
+def compared(ours: Array, others: Array) -> Array:
+    """Paired difference of squared errors over time: (2, H, states), mean and standard error."""
+    difference = ours - others
+    return np.stack([difference.mean(0), difference.std(0, ddof=1) / np.sqrt(len(difference))])
+
+
+def floor(env: str, **options: Any) -> list[float]:
+    """ARMSE that no filter beats: Kalman's, on the same packets without censoring.
+
+    The system without censoring is linear and Gaussian, so its covariances are the least there
+    are, and a clipped packet says no more than the whole one. They follow from the matrices alone.
+    """
+    task = fusion_gym.make_task(env, filter="kalman", **(FREE | options))
+    policy = fusion_gym.make_policy("always" if task.access == "any" else "round_robin", task)
+    deviations = np.empty((task.horizon, STATES))
+
+    def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
+        covariance = task.system.fused(batch.delivered)[1]
+        deviations[step] = np.sqrt(np.diagonal(covariance[..., 0]))
+
+    walk(task, policy, 1, 0, look)
+    return [float(value) for value in deviations.mean(0)]
+
+
+def scheduled(outcome: Outcome) -> NDArray[np.intp]:
+    """The sensor (N,) that transmitted; one did, in every run."""
+    return np.argmax(outcome.granted, axis=0)

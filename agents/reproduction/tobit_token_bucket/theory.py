@@ -1,0 +1,161 @@
+"""What the theorems of the token-bucket paper say, computed on recorded episodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.core.task import Task
+
+from .runs import History
+
+_UNCENSORED = 0.01  # q from which (37) is evaluated as printed: it holds 1/q when nothing arrives
+_FLOOR = 1e-140  # of q where it divides and the ratio is squared
+
+
+@dataclass(frozen=True)
+class Terms:
+    """(30) of a node and step as κ₁ (I - K q C) P (I - K q C)ᵀ + K S Kᵀ, in units of q.
+
+    ``prior`` P (…, n, n) · ``seen`` C (…, m, n) · ``probability`` q (…, m) · ``noise`` q⁻¹ S q⁻¹
+    without the held value's square and ``pinned`` √κ₅ ȳ/q, zero where something arrived ·
+    ``silent`` where nothing did. Axes: steps, nodes, episodes first.
+    """
+
+    first: float
+    prior: Array
+    seen: Array
+    probability: Array
+    noise: Array
+    pinned: Array
+    silent: NDArray[np.bool_]
+
+    @property
+    def gain(self) -> Array:
+        """K q by (37), without loss where ȳ/q is huge (Sherman and Morrison)."""
+        cross = self.first * self.prior @ _transposed(self.seen)
+        inverse = np.linalg.inv(self.seen @ cross + self.noise)
+        turned = inverse @ self.pinned[..., None]
+        size = 1.0 + self.pinned[..., None, :] @ turned
+        return cross @ (inverse - turned / size @ _transposed(turned))
+
+    def bound(self, gain: Array) -> Array:
+        """Trace of (30) for any K q."""
+        keep = np.eye(self.prior.shape[-1]) - gain @ self.seen
+        pinned = gain @ self.pinned[..., None]
+        return _trace(
+            self.first * keep @ self.prior @ _transposed(keep)
+            + gain @ self.noise @ _transposed(gain)
+            + pinned @ _transposed(pinned)
+        )
+
+    @property
+    def contraction(self) -> Array:
+        """κ₁ w a² of (42), a the largest singular value of a rotation, which is 1."""
+        keep = np.eye(self.prior.shape[-1]) - self.gain @ self.seen
+        return self.first * np.linalg.norm(keep, ord=2, axis=(-2, -1)) ** 2
+
+
+def terms(task: Task, history: History) -> Terms:
+    """The terms of (30) in every recorded step of the paper's filter, thresholds zero."""
+    system: Any = task.system
+    centre = system.centre
+    sensors, constants = centre.sensors, centre.filter.constants
+    k1, k2, k3, k4, k5, k6, _, _ = constants.kappa
+    grow, shift = constants.second_moment
+    horizon, _, episodes = history.truth.shape
+    share = centre.feedback.share[:, 0]
+    prior = np.moveaxis(history.prior_covariance, -1, 1)[:, None] / share[:, None, None, None]
+    seen = sensors.measurement_matrix[..., 0][:, None]
+    q = np.moveaxis(history.uncensored, -1, 2)
+    mean = np.moveaxis(history.prior_mean, -1, 1)
+    latent = (seen @ mean[:, None, ..., None])[..., 0]
+    moment = grow * seen @ prior @ _transposed(seen) + shift * _squared(latent)
+    bias = np.moveaxis(history.hazard, -1, 2) * sensors.deviation[:, None, :, 0]
+    time = np.arange(1.0, horizon + 1.0)
+    event = centre.filter.event_error.at(time).T[:, :, None, None]
+    variances = np.diagonal(moment, axis1=-2, axis2=-1)
+    own = (q * sensors.variance[:, None, :, 0] + k3 * q * (1.0 - q) * variances + k6 * event) / q**2
+    silent = ~np.moveaxis(history.granted, -1, 2)
+    noise = np.where(
+        silent[..., None, None], k4 * moment, own[..., None] * np.eye(q.shape[-1])
+    ) + k2 * _squared(bias)
+    held = np.moveaxis(history.held_before, -1, 2) / np.maximum(q, _FLOOR)
+    return Terms(
+        first=k1,
+        prior=np.broadcast_to(prior, (horizon, len(share), episodes, *prior.shape[-2:])),
+        seen=seen,
+        probability=q,
+        noise=noise,
+        pinned=np.where(silent[..., None], np.sqrt(k5) * held, 0.0),
+        silent=silent,
+    )
+
+
+def perturbed(found: Terms, history: History, seed: int) -> dict[str, Array]:
+    """Theorem 2 by trial: other gains, and the library's bound beside (30).
+
+    Per episode (E,), over its steps with q of at least 0.01: ``larger``, the share of gains K + ΔK
+    whose bound has the larger trace, ΔK random and of relative size 10⁻³ to 1; ``difference``, the
+    largest relative difference of the trace from that of the filter.
+    """
+    generator = np.random.default_rng(seed)
+    usable = found.probability.min(-1) >= _UNCENSORED
+    gain = found.gain
+    least = found.bound(gain)
+    size = np.linalg.norm(gain, axis=(-2, -1))[..., None, None]
+    larger = np.zeros(usable.shape)
+    scales = (1e-3, 1e-2, 1e-1, 1.0)
+    for scale in scales:
+        other = gain + scale * size * generator.standard_normal(gain.shape)
+        larger += (found.bound(other) >= least * (1.0 - 1e-12)) / len(scales)
+    library = np.moveaxis(history.local_trace, -1, 2)
+    difference = np.where(usable, np.abs(least / library - 1.0), 0.0)
+    counted = usable.sum((0, 1))
+    return {
+        "larger": np.where(usable, larger, 0.0).sum((0, 1)) / np.maximum(counted, 1),
+        "difference": difference.max((0, 1)),
+        "counted": counted / usable[..., 0].size,
+    }
+
+
+def conditioned(found: Terms) -> dict[str, Array]:
+    """Condition (42) by episode (E,): the share of steps in which it holds, of each kind."""
+    holds = found.contraction < 1.0
+    silent = found.silent
+    return {
+        "holds_delivered": (holds & ~silent).sum((0, 1)) / np.maximum((~silent).sum((0, 1)), 1),
+        "holds_silent": (holds & silent).sum((0, 1)) / np.maximum(silent.sum((0, 1)), 1),
+        "least_silent": np.where(silent, found.contraction, np.inf).min((0, 1)),
+    }
+
+
+def claimed(error: Array, bound: Array) -> tuple[Array, Array]:
+    """Largest eigenvalue (H,) of E[z zᵀ], z = P^(-1/2) e, and its standard error.
+
+    At most 1 if the bound holds on average. ``error`` (H, n, E), ``bound`` (H, n, n, E).
+    """
+    root = np.moveaxis(linalg.factor(bound), -1, 1)
+    turned = np.moveaxis(error, 1, -1)[..., None]
+    whitened = np.linalg.solve(root, turned)[..., 0]
+    second = np.einsum("tei,tej->tij", whitened, whitened) / error.shape[-1]
+    values, vectors = np.linalg.eigh(second)
+    along = np.einsum("tei,ti->te", whitened, vectors[..., -1]) ** 2
+    return values[:, -1], along.std(-1, ddof=1) / np.sqrt(error.shape[-1])
+
+
+def _transposed(matrix: Array) -> Array:
+    return np.swapaxes(matrix, -2, -1)
+
+
+def _squared(vector: Array) -> Array:
+    return vector[..., :, None] * vector[..., None, :]
+
+
+def _trace(matrix: Array) -> Array:
+    return np.trace(matrix, axis1=-2, axis2=-1)

@@ -1,0 +1,254 @@
+"""The paper's recursion (17)-(20) exactly as its text has it, on what the trigger delivered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from fusion_gym.arrays import Array
+from fusion_gym.systems.unknown_input.system import UnknownInputSystem
+
+from .runs import CARTS, EXAMPLES, PRINTED, TRIGGER, Record, halves, make, record
+
+# I - C ℬ L in (20) is a projection, its singular values are 0 or at least 1: what lies between is
+# rounding, and half a 1 tells one from the other.
+_EXACT, _SOME, _MACHINE = 0.5, 1e-8, 0.0
+_SMALL = 0.2  # ρ̄ over the noise's variance, where (1 + 1/ε) ρ̄ - V is negative
+_FACTOR = {PRINTED: 1.0, CARTS: 0.2}  # ε = ξ, as in the library's examples
+EXACT, INVERTED = "(20), rounding set to zero", "(20), rounding inverted by the pseudo-inverse"
+PARTLY, DEVIATIONS = "(20), rounding above 1e-8 inverted", "0.001 as standard deviations"
+READINGS: dict[str, dict[str, Any]] = {
+    EXACT: {},
+    INVERTED: {"cutoff": _MACHINE},
+    PARTLY: {"cutoff": _SOME},
+    "every step sampled, a = 1": {"options": {"sampling_period": 1}},
+    DEVIATIONS: {
+        "options": {
+            "process_covariance": ((1e-6, 0.0), (0.0, 1e-6)),
+            "measurement_covariance": 1e-6,
+        },
+    },
+    "everything transmitted": {"policy": "always"},
+}
+
+
+@dataclass(frozen=True)
+class Model:
+    """𝒜, ℬ, 𝒲 of the lifted plant and C, V of one node, ε, ρ̄, x(0) and Ξ(0); no batch axis."""
+
+    transition: Array
+    inputs: Array
+    process: Array
+    matrix: Array
+    noise: Array
+    factor: float
+    rho_bar: float
+    mean: Array
+    covariance: Array
+
+
+def models(system: UnknownInputSystem, factor: float, rho_bar: float) -> list[Model]:
+    """Of every node."""
+    model, sensors, n = system.nodes.model, system.nodes.sensors, system.plant.size
+    return [
+        Model(
+            system.plant.transition[..., 0],
+            system.plant.input_matrix[..., 0],
+            system.plant.process_covariance[..., 0],
+            sensors.matrix[i, ..., 0],
+            sensors.covariance[i, ..., 0],
+            factor,
+            rho_bar,
+            model.initial_mean[:n, 0],
+            model.initial_covariance[:n, :n, 0],
+        )
+        for i in range(sensors.count)
+    ]
+
+
+def gains(model: Model, bound: Array, silent: NDArray[np.bool_], cutoff: float) -> dict[str, Array]:
+    """L, N, Ξ_d and Ξ_x of (17)-(20) from Ξ_x (E, n, n) of the last time, where δ is ``silent``.
+
+    ``best`` is the gain that minimises the same bound (18) among all that meet (14).
+    """
+    a, b, c, v = model.transition, model.inputs, model.matrix, model.noise
+    eye_n, eye_m, cb = np.eye(len(a)), np.eye(len(c)), c @ b
+    moved = a @ bound @ a.T
+    phi = (1.0 + model.factor) * moved + model.process
+    sent = np.where(silent, -1.0, 1.0)[:, None, None]  # 1 - 2 δ
+    noise = sent * v + (1.0 + 1.0 / model.factor) * model.rho_bar * eye_m
+    omega = c @ phi @ c.T + noise  # and Θ, for ξ = ε
+    weighed = cb.T @ np.linalg.inv(omega)
+    onto_input = np.linalg.solve(weighed @ cb, weighed)
+    hidden = eye_m - cb @ onto_input
+    k = (phi @ c.T @ np.linalg.inv(omega) - b @ onto_input) @ _pseudo_inverse(hidden, cutoff)
+    gain = b @ onto_input + k @ hidden
+    free = np.linalg.svd(cb)[0][:, cb.shape[1] :]  # a basis of what (14) leaves free
+    best = b @ onto_input
+    if free.size:
+        best = best + (phi @ c.T - best @ omega) @ free @ np.linalg.inv(
+            free.T @ omega @ free
+        ) @ np.broadcast_to(free.T, (len(omega), *free.T.shape))
+
+    def spread(n: Array) -> Array:
+        kept = eye_n - n @ c
+        return kept @ phi @ kept.swapaxes(1, 2) + n @ noise @ n.swapaxes(1, 2)
+
+    return {
+        "input": onto_input,
+        "gain": gain,
+        "best": best,
+        "state_bound": spread(gain),
+        "best_bound": spread(best),
+        "input_bound": onto_input @ omega @ onto_input.swapaxes(1, 2),
+    }
+
+
+def _pseudo_inverse(matrix: Array, cutoff: float) -> Array:
+    left, values, right = np.linalg.svd(matrix)
+    kept = values > cutoff
+    inverted = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
+    found: Array = (right.swapaxes(1, 2) * inverted[:, None]) @ left.swapaxes(1, 2)
+    return found
+
+
+def run(model: Model, held: Array, granted: NDArray[np.bool_], cutoff: float) -> dict[str, Array]:
+    """A node's filter (8) on held measurements (H, m, E); times first, episodes second.
+
+    ``estimate`` (H, E, s), ``trace`` (H, E) of Ξ_x, ``least`` (H, E) the smallest eigenvalue of
+    Ξ_x, ``hidden`` (H, E) the largest entry of ℬ - N C ℬ (14), and ``excess`` (H, E) how much
+    larger the trace of (18) is than with the best gain.
+    """
+    episodes = held.shape[-1]
+    mean = np.broadcast_to(model.mean, (episodes, len(model.mean)))
+    bound = np.broadcast_to(model.covariance, (episodes, *model.covariance.shape))
+    rows: dict[str, list[NDArray[Any]]] = {
+        name: [] for name in ("estimate", "trace", "least", "hidden", "excess")
+    }
+    b, c = model.inputs, model.matrix
+    for measurement, sent in zip(held, granted, strict=True):
+        found = gains(model, bound, ~sent, cutoff)
+        moved = mean @ model.transition.T
+        apart = (measurement.T - moved @ c.T)[..., None]
+        mean = moved + (found["gain"] @ apart)[..., 0]
+        bound = found["state_bound"]
+        least = np.linalg.eigvalsh(0.5 * (bound + bound.swapaxes(1, 2)))[:, 0]
+        trace, best = (np.trace(found[name], axis1=1, axis2=2) for name in _TRACES)
+        estimate = np.concatenate((mean, (found["input"] @ apart)[..., 0]), axis=1)
+        for name, value in (
+            ("estimate", estimate),
+            ("trace", trace),
+            ("least", least),
+            ("hidden", np.abs(b - found["gain"] @ c @ b).max((1, 2))),
+            ("excess", trace / best - 1.0),
+        ):
+            rows[name].append(value)
+    return {name: np.array(row) for name, row in rows.items()}
+
+
+_TRACES = ("state_bound", "best_bound")
+
+
+def compute(episodes: int, seed: int) -> dict[str, Any]:
+    """Readings of the printed example, the gain (20) on the carts, Theorem 1 for a small ρ̄.
+
+    ``node`` (readings, l, 2, E): mean squared errors of state and input; ``trace``
+    (readings, l, E): the mean trace of (18); ``hidden`` (readings, l): the largest residual of
+    (14); ``power`` (2, E): the mean squares of state and input themselves.
+    """
+    found: dict[str, Any] = {"readings": list(READINGS)}
+    node, trace, hidden = [], [], []
+    for reading in READINGS.values():
+        task, system = make(example=PRINTED, filter="paper", **reading.get("options", {}))
+        seen = record(task, reading.get("policy", TRIGGER), episodes, seed)
+        cutoff = reading.get("cutoff", _EXACT)
+        every = _nodes(system, seen, _FACTOR[PRINTED], _rho(PRINTED), cutoff)
+        error = seen.truth[:, None] - np.stack([_estimate(each) for each in every], axis=1)
+        node.append(halves((error**2).mean(0), system.plant.size, 1))
+        trace.append([each["trace"].mean(0) for each in every])
+        hidden.append([float(each["hidden"].max()) for each in every])
+    found |= {"node": np.array(node), "trace": np.array(trace), "hidden": hidden}
+    found["power"] = halves((seen.truth**2).mean(0), system.plant.size, 0)
+    return found | _theorems(episodes, seed) | _lifted()
+
+
+def _estimate(each: dict[str, Array]) -> Array:
+    return np.moveaxis(each["estimate"], 1, 2)
+
+
+def _rho(example: str) -> float:
+    """ρ̄ of the example's trigger."""
+    task, _ = make(example=example, filter="paper")
+    return float(np.max(task.policy_defaults[TRIGGER]["rho_bar"]))
+
+
+def _nodes(
+    system: UnknownInputSystem, seen: Record, factor: float, rho_bar: float, cutoff: float
+) -> list[dict[str, Array]]:
+    return [
+        run(model, seen.held[:, i], seen.granted[:, i], cutoff)
+        for i, model in enumerate(models(system, factor, rho_bar))
+    ]
+
+
+def _theorems(episodes: int, seed: int) -> dict[str, Any]:
+    """``excess`` (examples, E) of (18) over its least, ``sent`` and ``silent`` (l, E) traces of
+    Ξ_x at the carts, ``negative`` (E): the share of silent instants with an indefinite Ξ_x."""
+    excess, found = [], {}
+    for example in EXAMPLES:
+        task, system = make(example=example, filter="paper")
+        seen = record(task, TRIGGER, episodes, seed)
+        every = _nodes(system, seen, _FACTOR[example], _rho(example), _EXACT)
+        excess.append(np.mean([each["excess"].mean(0) for each in every], axis=0))
+        if example == PRINTED:
+            quiet = [~seen.granted[:, i] for i in range(len(every))]
+            for name, flip in (("silent", False), ("sent", True)):
+                found[name] = np.array(
+                    [
+                        np.nanmean(np.where(where ^ flip, each["trace"], np.nan), axis=0)
+                        for where, each in zip(quiet, every, strict=True)
+                    ]
+                )
+    small = _SMALL * 0.001
+    task, system = make(example=PRINTED, filter="paper", rho_bar=small, rho_initial=small)
+    seen = record(task, TRIGGER, episodes, seed)
+    every = _nodes(system, seen, _FACTOR[PRINTED], small, _EXACT)
+    least = np.stack([each["least"] for each in every], axis=1)
+    negative = float((least[~seen.granted] < 0.0).mean())
+    return found | {"excess": np.array(excess), "negative": negative, "small": small}
+
+
+def _lifted() -> dict[str, Any]:
+    """Rank and columns of C ℬ with ℬ as (3) prints it, for a = 2; condition numbers of the C_i and
+    of B; :func:`_floor`."""
+    paper = make(example=PRINTED, filter="paper")[1]
+    one = make(example=PRINTED, filter="paper", sampling_period=1)[1].plant
+    a, b = one.transition[..., 0], one.input_matrix[..., 0]
+    lifted = block_diag(np.hstack((a @ b, b)), np.hstack((b, 0.0 * b)))
+    c = paper.nodes.sensors.matrix[0, ..., 0]
+    seen = np.hstack((c, 0.0 * c)) @ lifted
+    return {
+        "rank": int(np.linalg.matrix_rank(seen)),
+        "columns": int(seen.shape[1]),
+        "conditions": [float(np.linalg.cond(m)) for m in (*paper.nodes.sensors.matrix[..., 0], b)],
+        "floor": _floor(paper),
+    }
+
+
+def _floor(system: UnknownInputSystem) -> list[list[float]]:
+    """Mean squared errors (l, 2) of state and input of C⁻¹ y, all that (14) leaves, always sent."""
+    b = system.plant.input_matrix[..., 0]
+    found = []
+    for c, v in zip(
+        system.nodes.sensors.matrix[..., 0], system.nodes.sensors.covariance[..., 0], strict=True
+    ):
+        spread = np.linalg.inv(c) @ v @ np.linalg.inv(c).T
+        a, w = system.plant.transition[..., 0], system.plant.process_covariance[..., 0]
+        into = np.linalg.inv(b)
+        inputs = into @ (spread + a @ spread @ a.T + w) @ into.T
+        found.append([float(np.trace(spread)), float(np.trace(inputs))])
+    return found

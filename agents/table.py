@@ -1,0 +1,105 @@
+"""Print the documentation's table of filters, triggers and buckets.
+
+    python -m agents.table --config configs/tobit_oscillator_reproduce.yaml
+
+Every row runs on the same seeds. ``--markdown`` prints the table as the documentation holds it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from rich import box
+from rich import table as rich_table
+
+from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.intervals import mean_interval
+from fusion_gym.policies.registry import make_policy
+
+from .command_line import Long, start
+from .input.options import Episodes, Seed
+from .output import tables
+from .output.progress import progress_bar
+from .suite.sweep import Comparison
+from .training.checked import load
+
+COLUMNS = ("setting", "requests", "rate", "MSE", "median", "ARMSE", "trace P", "NEES")
+
+
+@dataclass(frozen=True)
+class Table(Long):
+    """Print the documentation's table of filters, triggers and buckets."""
+
+    config: str = "tobit_oscillator_reproduce"
+    """The rows: a YAML file, or the name of a shipped config."""
+    episodes: Episodes = 2000
+    """Episodes of each row."""
+    seed: Seed = 0
+    """Seed of the first episode."""
+    markdown: bool = False
+    """Print the table as the documentation holds it."""
+    trust: bool = False
+    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
+
+    keeps = False
+
+    def run(self) -> None:
+        """Run every row and print the table."""
+        rows = rows_of(load(Comparison, self.config), self.episodes, self.seed, trust=self.trust)
+        if self.markdown:
+            lines = [COLUMNS, ("---",) * len(COLUMNS), *rows]
+            print("\n".join("| " + " | ".join(line) + " |" for line in lines))
+            return
+        shown = rich_table.Table(
+            title=f"{self.episodes} episodes, seed {self.seed}", box=box.SIMPLE_HEAD
+        )
+        for column in COLUMNS:
+            shown.add_column(column, justify="left" if column == "setting" else "right")
+        for row in rows:
+            shown.add_row(*row)
+        tables.console().print(shown)
+
+
+def rows_of(
+    comparison: Comparison, episodes: int, seed: int, *, trust: bool = False
+) -> list[tuple[str, ...]]:
+    """One row of text for each of the config's rows; ``trust`` as in ``make_policy``.
+
+    Raises:
+        ConfigurationError: a row that is not allowed, before the first episode.
+    """
+    made = []
+    for row in comparison.rows:
+        task = make_task(row.environment or comparison.environment, **row.options)
+        made.append((row.label, task, make_policy(row.policy, task, trust=trust)))
+    total = sum(episodes * task.horizon for _, task, _ in made)
+    found = []
+    with progress_bar(total, "rows") as bar:
+        for label, task, policy in made:
+            bar.say(label)
+            found.append(_cells(label, run_episodes(task, policy, episodes, seed, bar.update)))
+    return found
+
+
+def _cells(label: str, results: EpisodeResults) -> tuple[str, ...]:
+    return (
+        label,
+        " ".join(f"{rate:.3f}" for rate in results.requests.mean(0)),
+        f"{results.rate.mean():.3f}",
+        tables.number(mean_interval(results.mse)._asdict()),
+        f"{np.median(results.mse):.4g}",
+        " ".join(f"{error:.3f}" for error in np.sqrt(results.squared_error).mean(0)),
+        tables.number(mean_interval(results.bound_trace)._asdict()),
+        f"{results.nees.mean():.3f}",
+    )
+
+
+def main() -> None:
+    """Entry point; exit status 130 after an interrupt."""
+    start(Table)
+
+
+if __name__ == "__main__":
+    main()

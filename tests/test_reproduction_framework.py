@@ -1,0 +1,384 @@
+"""The command that makes papers anew: what it keeps, what it makes, its verdicts and its pages."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import sys
+import types
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_runs import Ended, call
+from hostile_folder import contents
+from scipy import stats
+
+from agents.reproduction import page, papers
+from agents.reproduction.making import Job, make
+from agents.reproduction.page import write_overview, write_page
+from agents.reproduction.paper import Paper, Piece
+from agents.reproduction.shown import Claim, Number, Picture, Shown, Table
+from fusion_gym.validation import ConfigurationError
+
+USUAL = 30
+PIECES = ("first", "second")
+Calls = list[tuple[str, int, int]]
+
+
+def a_paper(name: str, calls: Calls, drawn: bool) -> Paper:
+    """A paper whose simulations are draws; it notes what is simulated in ``calls``.
+
+    With ``drawn`` it has a figure.
+    """
+
+    def computing(piece: str) -> Callable[[int, int], dict[str, Any]]:
+        def compute(episodes: int, seed: int) -> dict[str, Any]:
+            calls.append((f"{name}/{piece}", episodes, seed))
+            sample = np.random.default_rng(seed).normal(size=episodes)
+            return {"sample": sample, "count": len(sample), "nested": {"list": [1.0, None]}}
+
+        return compute
+
+    def showing(piece: str) -> Callable[[dict[str, Any]], Shown]:
+        def show(kept: dict[str, Any]) -> Shown:
+            assert kept["nested"] == {"list": [1.0, None]}
+            number = Number.of(f"mean of {piece}", kept["sample"], printed=0.0, runs=10, unit="m")
+            picture = Picture(
+                f"figure_{piece}", f"Figure of {piece}", "What to see.",
+                lambda figure: figure.subplots().plot(kept["sample"]), (2.0, 1.5),
+            )  # fmt: skip
+            pictures = [picture] if drawn and piece == "first" else []
+            evidence = f"{kept['count']} drawn"
+            claim = Claim(f"{name} claims | {piece}", "Section 1", "holds", evidence)
+            return Shown(pictures, [Table(piece, f"Table of {piece}", [number])], [claim], ["So."])
+
+        return show
+
+    return Paper(
+        name, f"The paper {name}", f"A. Author, “{name}”, 2020.", ("an/Environment-v0",), "Words.",
+        [Piece(one, f"Piece {one}", computing(one), showing(one), 1.0, USUAL) for one in PIECES],
+    )  # fmt: skip
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calls:
+    """Two papers, ``one`` and ``two``, instead of the real ones, in an empty folder."""
+    return put(monkeypatch, tmp_path, drawn=False)
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calls:
+    """The same with figures."""
+    return put(monkeypatch, tmp_path, drawn=True)
+
+
+def put(monkeypatch: pytest.MonkeyPatch, folder: Path, drawn: bool) -> Calls:
+    found: Calls = []
+    for name in ("one", "two"):
+        module = types.ModuleType(f"agents.reproduction.{name}")
+        module.PAPER = a_paper(name, found, drawn)  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    for module in (papers, page):
+        monkeypatch.setattr(module, "NAMES", ("one", "two"))
+    monkeypatch.chdir(folder)
+    return found
+
+
+def reproduce(*words: str) -> Ended:
+    """One process, for the papers are in this one alone."""
+    ended = call("reproduce", [*words, "--workers", "1", "--output", "pages", "--work", "work"])
+    assert ended.status == 0, (ended.err, ended.trace)
+    return ended
+
+
+def made(calls: Calls) -> list[str]:
+    """What was simulated since the last look."""
+    names = [name for name, _, _ in calls]
+    calls.clear()
+    return names
+
+
+def pages(start: str = "") -> dict[str, bytes | None]:
+    found = contents(Path("pages"))
+    return {name: raw for name, raw in found.items() if name.startswith(start)}
+
+
+# --- what is kept -------------------------------------------------------------------------------
+
+
+def test_resume_keeps_what_is_finished(calls: Calls) -> None:
+    reproduce("one")
+    assert made(calls) == ["one/first", "one/second"]
+    before = pages()
+    reproduce("one", "--resume")
+    assert made(calls) == []
+    assert pages() == before
+    reproduce("all", "--resume")
+    assert made(calls) == ["two/first", "two/second"]
+    reproduce("one")  # without it everything is made
+    assert made(calls) == ["one/first", "one/second"]
+
+
+@pytest.mark.parametrize("words", [["--episodes", "7"], ["--seed", "3"]])
+def test_resume_makes_anew_what_was_made_otherwise(calls: Calls, words: list[str]) -> None:
+    reproduce("one")
+    first = pages()
+    calls.clear()
+    reproduce("one", "--resume", *words)
+    episodes, seed = (7, 0) if words[0] == "--episodes" else (USUAL, 3)
+    assert calls == [("one/first", episodes, seed), ("one/second", episodes, seed)]
+    assert pages() != first
+    numbers = json.loads(Path("pages/one.json").read_text())
+    assert numbers["made"]["first"] == {"episodes": episodes, "seed": seed}
+    reproduce("one", "--resume")
+    assert len(calls) == 4
+    assert pages() == first
+
+
+def truncated(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def emptied(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def overwritten(path: Path) -> None:
+    path.write_bytes(b"\x00\xff" * 500)
+
+
+def flipped(path: Path) -> None:
+    raw = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as archive:
+        start = max(entry.header_offset for entry in archive.infolist())
+    for place in range(start, len(raw) - 30):
+        raw[place] ^= 0x5A
+    path.write_bytes(bytes(raw))
+
+
+def robbed(path: Path) -> None:
+    with np.load(path) as arrays:
+        kept = {name: arrays[name] for name in arrays.files if name != "plain"}
+    np.savez(path, **kept)
+
+
+def removed(path: Path) -> None:
+    path.unlink()
+
+
+@pytest.mark.parametrize("damage", [truncated, emptied, overwritten, flipped, robbed, removed])
+def test_resume_makes_anew_what_is_damaged(calls: Calls, damage: Callable[[Path], None]) -> None:
+    reproduce("all")
+    before = pages()
+    calls.clear()
+    damage(Path("work/one/second.npz"))
+    reproduce("all", "--resume")
+    assert made(calls) == ["one/second"]
+    assert pages() == before
+
+
+def test_what_a_killed_process_left_is_removed(calls: Calls) -> None:
+    Path("work/one").mkdir(parents=True)
+    left = Path("work/one/first.123.part.npz")
+    left.write_bytes(b"half")
+    reproduce("one", "--resume")
+    assert made(calls) == ["one/first", "one/second"]
+    assert not left.exists()
+
+
+def test_what_is_read_is_what_was_computed(calls: Calls, tmp_path: Path) -> None:
+    job = Job("one", "first", 5, 11, tmp_path)
+    assert not job.finished()
+    with pytest.raises(FileNotFoundError):
+        job.read()
+    make(job)
+    found = job.read()
+    np.testing.assert_array_equal(found["sample"], np.random.default_rng(11).normal(size=5))
+    assert found.keys() == {"sample", "count", "nested"}
+    other = Job("one", "first", 6, 11, tmp_path)
+    with pytest.raises(ConfigurationError, match="made from something else"):
+        other.read()
+    assert not other.finished()
+
+
+def test_a_piece_that_fails_leaves_the_others(
+    calls: Calls, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(episodes: int, seed: int) -> dict[str, Any]:
+        raise ConfigurationError("threshold = 3 is not allowed")
+
+    good = sys.modules["agents.reproduction.one"].PAPER
+    first, second = good.pieces
+    bad = Piece("second", second.title, fail, second.show, 1.0, USUAL)
+    broken = Paper(good.name, good.title, good.citation, (), "", [first, bad])
+    with monkeypatch.context() as patch:
+        patch.setattr(sys.modules["agents.reproduction.one"], "PAPER", broken)
+        ended = call("reproduce", ["one", "--workers", "1", "--output", "pages", "--work", "work"])
+        assert ended.status != 0
+        assert "threshold = 3 is not allowed" in ended.err
+    assert not Path("pages").exists() or pages() == {}
+    calls.clear()
+    reproduce("one", "--resume")
+    assert made(calls) == ["one/second"]
+
+
+# --- verdicts -----------------------------------------------------------------------------------
+
+
+def test_a_verdict_has_its_edge_where_it_says() -> None:
+    """Both uncertainties are independent: their widths add up in squares."""
+    edge = math.hypot(1.96 * 0.3, 0.25)
+    for side in (-1.0, 1.0):
+        inner = Number("x", 2.0, 1.75, 2.25, 2.0 + side * edge * (1 - 1e-9), 0.3)
+        outer = Number("x", 2.0, 1.75, 2.25, 2.0 + side * edge * (1 + 1e-9), 0.3)
+        assert (inner.verdict, outer.verdict) == ("agrees", "differs")
+    assert Number("x", 2.0, 1.75, 2.25).verdict == "not printed"
+    assert Number("x", 2.0, 2.0, 2.0, 2.0).verdict == "agrees"
+    assert Number("x", 2.0, 2.0, 2.0, 2.001).verdict == "differs"
+
+
+@pytest.mark.parametrize(("runs", "episodes"), [(1, 1000), (100, 1000), (1000, 1000), (1000, 100)])
+def test_true_reprints_agree_in_95_of_100(runs: int, episodes: int) -> None:
+    """Gaussian papers with known deviation: the coverage is 95 %, 4.5 errors of 20,000 papers.
+
+    And a printed value that is off by four deviations of the difference agrees in 2.1 %.
+    """
+    rng, count, deviation = np.random.default_rng(runs), 20_000, 1.7
+    ours = rng.normal(scale=deviation / np.sqrt(episodes), size=count)
+    theirs = rng.normal(scale=deviation / np.sqrt(runs), size=count)
+    half, spread = 1.96 * deviation / np.sqrt(episodes), deviation / np.sqrt(runs)
+    off = 4.0 * math.hypot(deviation / np.sqrt(episodes), spread)
+    for shift in (0.0, off):
+        agreed = np.mean(
+            [
+                Number("x", one, one - half, one + half, other + shift, spread).verdict == "agrees"
+                for one, other in zip(ours, theirs, strict=True)
+            ]
+        )
+        distance = 4.0 if shift else 0.0
+        expected = stats.norm.cdf(1.96 - distance) - stats.norm.cdf(-1.96 - distance)
+        error = np.sqrt(expected * (1.0 - expected) / count)
+        assert agreed == pytest.approx(expected, abs=4.5 * error)
+
+
+@pytest.mark.parametrize("draw", ["normal", "exponential"])
+def test_numbers_of_samples_agree_as_often(draw: str) -> None:
+    """With interval and spread from the sample itself; 4.5 errors of 150 papers."""
+    rng, count, runs = np.random.default_rng(5), 150, 50
+    agreed = 0
+    for _ in range(count):
+        theirs = getattr(rng, draw)(size=runs).mean()
+        number = Number.of("x", getattr(rng, draw)(size=200), theirs, runs)
+        assert number.low < number.mean < number.high
+        agreed += number.verdict == "agrees"
+    assert agreed / count == pytest.approx(0.95, abs=4.5 * np.sqrt(0.95 * 0.05 / count))
+
+
+def test_numbers_of_a_sample_have_its_moments() -> None:
+    sample = np.random.default_rng(0).normal(3.0, 2.0, size=2000)
+    number = Number.of("x", sample, 3.0, 25, "m")
+    assert number.mean == pytest.approx(sample.mean())
+    assert number.spread == pytest.approx(sample.std(ddof=1) / 5.0)
+    half = 1.96 * sample.std(ddof=1) / np.sqrt(2000)
+    assert number.high - number.mean == pytest.approx(half, rel=0.1)
+    assert number.mean - number.low == pytest.approx(half, rel=0.1)
+
+
+# --- pages --------------------------------------------------------------------------------------
+
+
+def test_papers_do_not_disturb_each_other(drawn: Calls) -> None:
+    reproduce("one")
+    alone = pages("one")
+    overview = Path("pages/README.md").read_text()
+    assert "The paper one" in overview
+    assert "The paper two" not in overview
+    reproduce("two")
+    assert pages("one") == alone
+    overview = Path("pages/README.md").read_text()
+    assert overview.index("The paper one") < overview.index("The paper two")
+    both = pages()
+    reproduce("all")
+    assert pages() == both
+    reproduce("two", "--episodes", "9")
+    assert pages("one") == alone
+    assert pages("two") != {name: raw for name, raw in both.items() if name.startswith("two")}
+
+
+def test_pages_are_the_same_bytes_and_hold_no_path(drawn: Calls, tmp_path: Path) -> None:
+    folders = [tmp_path / "a", tmp_path / "deeper" / "b"]
+    for folder in folders:
+        words = ["--output", str(folder / "pages"), "--work", str(folder / "work")]
+        assert call("reproduce", ["all", "--workers", "1", *words]).status == 0
+    first, second = (contents(folder / "pages") for folder in folders)
+    assert first == second
+    assert {Path(name).suffix for name in first} == {"", ".md", ".json", ".png", ".svg"}
+    for name, raw in first.items():
+        for hidden in (str(tmp_path), str(Path.home()), str(Path(__file__).parents[1])):
+            assert raw is None or hidden.encode() not in raw, name
+        if raw is not None and name.endswith((".md", ".json")):
+            assert not re.search(r"[\s\"'(]/\w+/", raw.decode()), name
+
+
+def test_a_page_has_all_that_is_shown(drawn: Calls) -> None:
+    reproduce("one", "--episodes", "40", "--seed", "2")
+    text, numbers = Path("pages/one.md").read_text(), json.loads(Path("pages/one.json").read_text())
+    for figure in re.findall(r"!\[[^]]*\]\(([^)]*)\)", text):
+        assert (Path("pages") / figure).is_file()
+        assert (Path("pages") / figure).with_suffix(".svg").is_file()
+    assert text.count("(40 episodes, the first with seed 2.)") == 2
+    assert len(numbers["claims"]) == len(re.findall(r"\| \*\*holds\*\* \|", text)) == 2
+    sample = np.random.default_rng(2).normal(size=40)
+    for table in numbers["tables"]:
+        (entry,) = table["numbers"]
+        expected = Number.of(entry["what"], sample, 0.0, 10, "m")
+        assert entry["mean"] == expected.mean
+        assert entry["verdict"] == expected.verdict
+        assert f"| {expected.mean:.4g} [{expected.low:.4g}, {expected.high:.4g}] m |" in text
+    for line in text.splitlines():  # a bar in a cell makes no column
+        if line.startswith("| one claims"):
+            assert len(re.findall(r"(?<!\\)\|", line)) == 5
+
+
+def test_the_overview_counts_what_agrees(tmp_path: Path, calls: Calls) -> None:
+    numbers = [Number("a", 1.0, 0.9, 1.1, printed) for printed in (1.0, 1.05, 2.0, None)]
+    shown = {"piece": Shown(tables=[Table("t", "T", numbers)])}
+    one = Paper("one", "The paper one", "Cited.", (), "", [Piece("piece", "P", dict, Shown, 1.0)])  # type: ignore[arg-type]
+    write_page(one, shown, {"piece": {"episodes": 2, "seed": 0}}, tmp_path)
+    write_overview(tmp_path)
+    assert "2 of 3 printed numbers agree" in (tmp_path / "README.md").read_text()
+
+
+# --- what is refused ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["three"], ["paper = 'three'", "one", "two", "all"]),
+        (["one", "three"], ["paper = 'three'"]),
+        (["all", "three"], ["paper = 'three'"]),
+        (["One"], ["paper = 'One'"]),
+        ([], ["papers", "one", "two", "all"]),
+        (["one", "--episodes", "1"], ["episodes = 1", "2"]),
+        (["one", "--episodes", "-3"], ["episodes = -3"]),
+        (["one", "--seed", "-1"], ["seed = -1"]),
+        (["one", "--workers", "0"], ["workers = 0"]),
+    ],
+)
+def test_one_clear_error_before_anything_runs(
+    calls: Calls, words: list[str], said: list[str]
+) -> None:
+    ended = call("reproduce", words)
+    assert ended.status != 0
+    assert ended.trace == ""
+    (line,) = ended.err.splitlines()
+    assert line.startswith("error: ")
+    assert all(part in line for part in said), line
+    assert calls == []
+    assert contents(Path()) == {}

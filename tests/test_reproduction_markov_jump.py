@@ -1,0 +1,84 @@
+"""The page of the Markov jump paper against a fresh quick run, and its printed recursion."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from reproduction_checks import check_claims, check_numbers, check_pictures, committed, quick
+
+import fusion_gym
+from agents.reproduction.markov_jump import PAPER
+from agents.reproduction.markov_jump.printed import covariances
+from agents.reproduction.markov_jump.runs import THRESHOLDS, example, run, trigger
+from agents.reproduction.markov_jump.schedule import period_of
+from agents.reproduction.shown import Shown
+from fusion_gym.evaluation import run_episodes
+
+EPISODES = 30
+UNCERTAIN = (  # differences of a few per cent, which thirty episodes cannot tell
+    "The algorithm tracks",
+    "The tracking becomes worse",
+    "The RMSE curve",
+    "The trigger reduces",
+)
+
+
+@cache
+def fresh() -> dict[str, Shown]:
+    return quick(PAPER, EPISODES)
+
+
+def test_numbers_agree_with_the_page() -> None:
+    assert check_numbers(committed(PAPER.name), fresh(), EPISODES) > 50
+
+
+def test_claims_and_their_verdicts() -> None:
+    check_claims(committed(PAPER.name), fresh(), PAPER.name, UNCERTAIN)
+
+
+def test_figures_draw() -> None:
+    assert check_pictures(fresh(), PAPER.name) == 4
+
+
+def test_recorded_episodes_are_those_of_the_evaluation() -> None:
+    task = example()
+    for policy in (trigger(0.9), "never"):
+        found = run(task, policy, 4, 7)
+        results = run_episodes(task, fusion_gym.make_policy(policy, task), 4, 7)
+        np.testing.assert_allclose(found.squared.sum(1).mean(0), results.mse, rtol=1e-12)
+        np.testing.assert_allclose(found.trace.mean(), results.bound_trace, rtol=1e-12)
+        np.testing.assert_array_equal(found.sent.mean(0), results.rate[0])
+
+
+def test_the_trigger_is_a_schedule_that_no_seed_changes() -> None:
+    task = example(horizon=30)
+    for m in THRESHOLDS[1:3]:
+        first, second = run(task, trigger(m), 2, 0), run(task, trigger(m), 2, 99)
+        np.testing.assert_array_equal(first.sent, second.sent)
+        np.testing.assert_array_equal(first.trace, second.trace)
+
+
+def test_printed_recursion_is_exact_where_its_third_term_is_put_right() -> None:
+    task = example(horizon=20)
+    system = task.system
+    everything = np.ones((20, 3), dtype=bool)
+    place = system.filters.at(np.arange(21))  # type: ignore[attr-defined]
+    exact = system.recursion.local[..., place]  # type: ignore[attr-defined]
+    exact = exact.transpose(4, 0, 2, 1, 3).reshape(21, 6, 6)
+    np.testing.assert_allclose(covariances(system, everything, False), exact, atol=1e-13)
+    assert np.abs(covariances(system, everything, True) - exact).max() > 1e-3
+    silent = run(task, trigger(0.9), 1, 0).sent
+    printed = covariances(system, silent, False)
+    np.testing.assert_allclose(printed, printed.transpose(0, 2, 1), atol=1e-13)
+    assert np.linalg.eigvalsh(printed).min() < -1.0
+
+
+@pytest.mark.parametrize("period", [1, 4, 6])
+def test_period_is_found(period: int) -> None:
+    pattern = np.random.default_rng(0).normal(size=period)
+    values = np.resize(pattern, 300)
+    start = np.exp(-np.arange(300.0))
+    assert period_of(values + start) == period
+    assert period_of(values + 1e-3 * np.arange(300)) is None

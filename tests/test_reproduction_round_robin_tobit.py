@@ -1,0 +1,219 @@
+"""The page of the round-robin paper against a fresh quick run, and the parts that it is made of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from reproduction_checks import SEED, check_claims, check_numbers, check_pictures, committed, quick
+from scipy import stats
+
+import fusion_gym
+from agents.reproduction.round_robin_tobit import PAPER
+from agents.reproduction.round_robin_tobit.bounds import Lower, Seen, Upper, below
+from agents.reproduction.round_robin_tobit.judging import always_below, explained
+from agents.reproduction.round_robin_tobit.readings import READINGS, PrintedTobitFilter, task_of
+from agents.reproduction.round_robin_tobit.runs import (
+    OSCILLATOR,
+    TRACKING,
+    Turn,
+    armse,
+    censored,
+    floor,
+    increase,
+    round_robin,
+    squares,
+)
+from agents.reproduction.shown import Shown
+from fusion_gym.evaluation.episodes import run_episodes
+
+EPISODES = 24
+UNCERTAIN = (  # differences that so few episodes, or heavy tails, cannot tell
+    "FTKF-DB tracks",
+    "RMSE",
+    "The bias's RMSE",
+    "The fused",
+    "The narrower",
+    "The smaller",
+    "(12)",
+    "(13)",
+    "(9)",
+    "(21)",
+    "The local estimate",
+    "Censored observations",
+    "FTKF",
+)
+
+
+@cache
+def fresh() -> dict[str, Shown]:
+    """Without the readings, which have neither numbers nor claims nor figures of the page."""
+    pieces = [piece for piece in PAPER.pieces if piece.name != "readings"]
+    return quick(replace(PAPER, pieces=pieces), EPISODES)
+
+
+def test_numbers_agree_with_the_page() -> None:
+    assert check_numbers(committed(PAPER.name), fresh(), EPISODES) > 100
+
+
+def test_claims_and_their_verdicts() -> None:
+    check_claims(committed(PAPER.name), fresh(), PAPER.name, UNCERTAIN)
+
+
+def test_figures_draw() -> None:
+    assert check_pictures(fresh(), PAPER.name) == 15
+
+
+# --- the parts ----------------------------------------------------------------------------------
+
+
+def test_squared_errors_are_those_of_the_evaluation() -> None:
+    task = fusion_gym.make_task(OSCILLATOR)
+    found = squares(task, round_robin(task), 5, SEED)
+    results = run_episodes(task, round_robin(task), 5, SEED)
+    np.testing.assert_allclose(found.mean(0), results.squared_error, rtol=1e-12)
+    np.testing.assert_allclose(found.sum(2).mean(1), results.mse, rtol=1e-12)
+    np.testing.assert_allclose(armse(found)["mean"], np.sqrt(results.squared_error).mean(0))
+
+
+def test_a_sensor_by_itself_transmits_at_its_turns_alone() -> None:
+    task = fusion_gym.make_task(OSCILLATOR)
+    for sensor in range(2):
+        rate = run_episodes(task, Turn(sensor), 2, 0).rate
+        np.testing.assert_allclose(rate.mean(0), np.eye(2)[sensor] / 2)
+
+
+def test_no_filter_is_below_the_floor() -> None:
+    """The floor is the Riccati equation's; uncensored, the Kalman filter has it."""
+    task = fusion_gym.make_task(TRACKING)
+    system = censored(task)
+    transition = system.plant.transition[..., 0]
+    covariance, process = system.plant.initial_covariance[..., 0], system.plant.process_covariance
+    roots = []
+    for step in range(task.horizon):
+        covariance = transition @ covariance @ transition.T + process[..., 0]
+        row = system.centre.sensors.measurement_matrix[step % 2, 0, :, 0]
+        gain = covariance @ row / (row @ covariance @ row + (0.1, 0.3)[step % 2])
+        covariance = covariance - np.outer(gain, row @ covariance)
+        roots.append(np.sqrt(np.diag(covariance)))
+    np.testing.assert_allclose(floor(TRACKING), np.mean(roots, axis=0), rtol=1e-9)
+    found = armse(squares(task, round_robin(task), 400, SEED))
+    np.testing.assert_allclose(found["mean"], floor(TRACKING), rtol=0.08)
+    assert floor(OSCILLATOR)[2] > 0.5  # √Ξ
+    assert np.all(np.less(floor(OSCILLATOR, access="any"), floor(OSCILLATOR)))
+
+
+def test_intervals_of_the_armse_cover() -> None:
+    """Gaussian errors of deviation 2: the ARMSE is 2; 4.5 errors of 100 samples."""
+    rng, covered, spreads, seen = np.random.default_rng(3), 0, [], []
+    for _ in range(100):
+        found = armse((2.0 * rng.normal(size=(400, 3, 1))) ** 2)
+        covered += found["low"][0] <= 2.0 <= found["high"][0]
+        spreads.append(found["spread"][0])
+        seen.append(found["mean"][0])
+    assert covered >= 95 - 4.5 * np.sqrt(100 * 0.95 * 0.05)
+    # Of 1,000 runs, where these have 400.
+    assert np.mean(spreads) == pytest.approx(np.std(seen) * np.sqrt(0.4), rel=4.5 / np.sqrt(200))
+
+
+def test_a_paired_increase_is_told_from_none() -> None:
+    rng = np.random.default_rng(4)
+    errors = rng.normal(size=(300, 5, 3)) ** 2
+    found = increase(errors, errors * np.array([1.0, 1.02, 0.98]))
+    assert found["low"][0] == found["high"][0] == 0.0
+    assert found["low"][1] > 0.0
+    assert found["high"][2] < 0.0
+
+
+def test_curves_are_judged_by_what_is_clear() -> None:
+    error = np.full((100, 2), 1.0)
+    assert always_below(np.stack([-5 * error, error]))[0] == "holds"
+    one_above = np.where(np.arange(100)[:, None] == 3, 5.0, -5.0) * error
+    assert always_below(np.stack([one_above, error]))[0] == "holds partly"
+    assert always_below(np.stack([0.5 * error, error]))[0] == "does not hold"
+    assert always_below(np.stack([5 * error, error]))[0] == "does not hold"
+    assert explained([1.0, 3.0], [2.0, 3.0]) == pytest.approx([0.75, 0.0])
+
+
+@pytest.mark.parametrize("latent", [-6.0, -1.0, 0.2, 5.5])
+def test_printed_equations_are_as_printed(latent: float) -> None:
+    """Against plain normal distributions, for the oscillator's R = 0.6 and ±5."""
+    sensors = censored(fusion_gym.make_task(OSCILLATOR)).centre.sensors
+    mean = np.zeros((2, 3, 1))
+    mean[:, 0] = mean[:, 1] = latent
+    root = np.sqrt(0.6)
+
+    def printed(name: str) -> tuple[float, float]:
+        found = PrintedTobitFilter(sensors, name).expect(mean)
+        return float(found.value[0, 0, 0]), float(found.truncated_variance[0, 0, 0])
+
+    for name, scale in (("theta", 0.6), ("sign", root), ("argument", root), ("variance", root)):
+        low, high = (-5 - latent) / scale, (5 - latent) / scale
+        inside = stats.norm.cdf(high) - stats.norm.cdf(low)
+        ratio = (stats.norm.pdf(high) - stats.norm.pdf(low)) / inside  # (14)
+        if name == "argument":
+            width = high - low
+            ratio = stats.norm.pdf(width) / stats.norm.sf(width)
+        sign = 1.0 if name in ("sign", "argument") else -1.0
+        value = -5 * stats.norm.cdf(low) + 5 * stats.norm.sf(high)
+        value += inside * (latent + sign * root * ratio)
+        assert printed(name)[0] == pytest.approx(value, rel=1e-6)
+    drawn = np.clip(latent + root * np.random.default_rng(0).normal(size=400_000), -5, 5)
+    assert 0.6 * printed("variance")[1] == pytest.approx(drawn.var(), rel=0.03)
+
+
+def test_readings_are_run() -> None:
+    """Each is another filter or another system; the first is the environment's own."""
+    errors = {}
+    for reading in READINGS:
+        task = task_of(reading)
+        name = "always" if task.access == "any" else "round_robin"
+        errors[reading] = squares(task, fusion_gym.make_policy(name, task), 3, 0).mean()
+    assert len(set(errors.values())) == len(READINGS)
+    own = fusion_gym.make_task(OSCILLATOR)
+    assert errors["corrected equations"] == squares(own, round_robin(own), 3, 0).mean()
+
+
+def test_bounds_of_a_filter_that_is_never_censored() -> None:
+    """With ᾱ = β̄ = 0 the upper bound in its own correction is the Riccati equation itself."""
+    task = fusion_gym.make_task(TRACKING)
+    system = censored(task)
+    covariance = system.plant.initial_covariance.copy()
+    upper, lower = Upper(task, 0, 1.0, -1.0, True), Lower(task, 0, 1.0, False, False)
+    seen = Seen(np.zeros(1), np.ones(1), np.zeros(1))
+    upper.begin(covariance)
+    lower.begin(covariance)
+    transition, process = system.plant.transition[..., 0], system.plant.process_covariance[..., 0]
+    for step in range(6):
+        plain = covariance[..., 0]
+        if step % 2 == 0:
+            gain = plain[:, 0] / (plain[0, 0] + 0.1)
+            plain = plain - np.outer(gain, plain[0])
+        upper.advance(covariance, seen, step % 2 == 0)
+        lower.advance(covariance, seen, step % 2 == 0)
+        covariance = (transition @ plain @ transition.T + process)[..., None]
+        np.testing.assert_allclose(upper.value, covariance, rtol=1e-9)
+        np.testing.assert_allclose(lower.value[..., 0], process, atol=1e-12)
+        assert upper.holds(covariance).all()
+        assert lower.holds(covariance).all()
+        assert not upper.holds(1.001 * covariance).any()
+        assert not replace_value(lower, 1.001 * covariance).holds(covariance).any()
+
+
+def replace_value(bound: Lower, value: np.ndarray) -> Lower:  # type: ignore[type-arg]
+    other = replace(bound)
+    other.value = value
+    return other
+
+
+def test_matrices_are_ordered_by_their_eigenvalues() -> None:
+    rng = np.random.default_rng(0)
+    first, gap = rng.normal(size=(2, 40, 3, 3))
+    first, gap = first @ first.transpose(0, 2, 1), gap + gap.transpose(0, 2, 1)
+    found = below(np.moveaxis(first, 0, -1), np.moveaxis(first + gap + 1.5 * np.eye(3), 0, -1))
+    expected = np.linalg.eigvalsh(gap + 1.5 * np.eye(3))[:, 0] >= 0
+    assert 0 < expected.sum() < 40
+    np.testing.assert_array_equal(found, expected)
+    assert not below(np.eye(3)[..., None], np.full((3, 3, 1), np.nan)).any()

@@ -1,0 +1,104 @@
+"""The page of the token-bucket paper against a fresh quick run, and the theorems' computation."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from reproduction_checks import check_claims, check_numbers, check_pictures, committed, quick
+
+import fusion_gym
+from agents.reproduction.judging import below, percent, told, verdict
+from agents.reproduction.shown import Shown
+from agents.reproduction.tobit_token_bucket import PAPER
+from agents.reproduction.tobit_token_bucket.runs import TRIGGER, Failing, record, scheme
+from agents.reproduction.tobit_token_bucket.theory import claimed, perturbed, terms
+from fusion_gym.evaluation import run_episodes
+from fusion_gym.evaluation.intervals import Interval
+
+EPISODES = 40
+UNCERTAIN = (  # differences of a few per cent, which forty episodes cannot tell
+    "Censoring makes the local",
+    "The fused estimate, fed back",
+    "In most cases",
+    "Fusion improves",
+    "Condition (42)",
+)
+
+
+@cache
+def fresh() -> dict[str, Shown]:
+    return quick(PAPER, EPISODES)
+
+
+def test_numbers_agree_with_the_page() -> None:
+    assert check_numbers(committed(PAPER.name), fresh(), EPISODES) > 60
+
+
+def test_claims_and_their_verdicts() -> None:
+    check_claims(committed(PAPER.name), fresh(), PAPER.name, UNCERTAIN)
+
+
+def test_figures_draw() -> None:
+    assert check_pictures(fresh(), PAPER.name) == 9
+
+
+def test_recorded_episodes_are_those_of_the_evaluation() -> None:
+    task = scheme()
+    found = record(task, 5, 3)
+    results = run_episodes(task, fusion_gym.make_policy(TRIGGER, task), 5, 3)
+    np.testing.assert_allclose(found.fused_error.mean(0), results.mse, rtol=1e-12)
+    np.testing.assert_allclose(found.fused_trace.mean(0), results.bound_trace, rtol=1e-12)
+    np.testing.assert_array_equal(found.granted.mean(0).T, results.rate)
+    sums = np.linalg.inv(np.moveaxis(found.local_bound, -1, 2)).sum(1)  # (50)
+    fused = np.linalg.inv(np.moveaxis(found.bound, -1, 1))
+    np.testing.assert_allclose(sums, fused, rtol=1e-6)
+
+
+def test_a_failed_sensor_never_sends() -> None:
+    task = scheme()
+    found = record(task, 3, 0, Failing(fusion_gym.make_policy(TRIGGER, task), 1))
+    assert not found.requested[:, 1].any()
+    assert found.granted[:, [0, 2]].any()
+
+
+def test_a_wrong_gain_is_told_from_the_best() -> None:
+    task = scheme()
+    history = record(task, 3, 0)
+    found = terms(task, history)
+    least = found.bound(found.gain)
+    assert np.all(found.bound(1.01 * found.gain) > least)
+    assert np.all(found.bound(np.zeros_like(found.gain)) > least)
+    result = perturbed(found, history, 0)
+    assert result["larger"] == pytest.approx(np.ones(3))
+    assert result["difference"].max() < 1e-9
+
+
+def test_a_bound_that_is_too_small_is_found() -> None:
+    rng = np.random.default_rng(0)
+    root = np.array([[2.0, 0.0], [1.0, 0.5]])
+    error = (root @ rng.normal(size=(2, 20_000)))[None]
+    bound = np.broadcast_to((root @ root.T)[None, :, :, None], (1, 2, 2, 20_000))
+    for factor in (0.5, 1.0, 2.0):
+        value, deviation = claimed(error, factor * bound)
+        assert value[0] == pytest.approx(1.0 / factor, abs=5.0 * deviation[0] + 0.02 / factor)
+        assert 0.0 < deviation[0] < 0.03 / factor
+
+
+def test_verdicts_and_their_words() -> None:
+    assert verdict([True, True]) == "holds"
+    assert verdict([True, False]) == "holds partly"
+    assert verdict([False]) == "does not hold"
+    assert told(Interval(0.7, 0.6991, 100.0)) == "0.700 [0.699, 100]"
+    assert [percent(share) for share in (0.0, 0.4567, 0.9996, 1.0)] == [
+        "0 %",
+        "46 %",
+        "99.96 %",
+        "100 %",
+    ]
+    assert percent(0.0004) == "0.04 %"
+    sample = np.random.default_rng(1).normal(size=200)
+    assert below(sample, sample + 0.1)
+    assert not below(sample, sample)
+    assert not below(sample, np.random.default_rng(2).normal(size=200) + 0.001)

@@ -1,0 +1,70 @@
+"""The page of the unknown-input paper against a fresh quick run."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from reproduction_checks import check_claims, check_numbers, check_pictures, committed, quick
+
+from agents.reproduction.shown import Shown
+from agents.reproduction.unknown_input import PAPER
+from agents.reproduction.unknown_input.printed import gains, models
+from agents.reproduction.unknown_input.runs import CARTS, leading, make
+
+EPISODES = 24
+UNCERTAIN = ("Fusion by covariance intersection",)  # differences that need more episodes
+
+
+@cache
+def fresh() -> dict[str, Shown]:
+    return quick(PAPER, EPISODES)
+
+
+def test_numbers_agree_with_the_page() -> None:
+    assert check_numbers(committed(PAPER.name), fresh(), EPISODES) > 40
+
+
+def test_claims_and_their_verdicts() -> None:
+    check_claims(committed(PAPER.name), fresh(), PAPER.name, UNCERTAIN)
+
+
+def test_figures_draw() -> None:
+    assert check_pictures(fresh(), PAPER.name) == 7
+
+
+def test_errors_of_the_bound_itself_fill_it() -> None:
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(2, 2, 40))
+    bounds = np.einsum("ijh,kjh->ikh", roots, roots) + np.eye(2)[..., None]
+    draws = rng.standard_normal((40, 2, 2000))
+    errors = np.linalg.cholesky(np.moveaxis(bounds, -1, 0)) @ draws
+    # 80,000 squares of standard normals have a mean within 0.03 of 1, the larger of two too.
+    assert leading(errors, bounds).mean() == pytest.approx(1.0, abs=0.03)
+    assert leading(0.5 * errors, bounds).mean() == pytest.approx(0.25, abs=0.01)
+
+
+def test_no_gain_that_hides_the_input_has_a_smaller_bound() -> None:
+    """(18) under random gains that meet (14), against the best one and the printed one."""
+    _, system = make(example=CARTS, filter="paper")
+    model = models(system, 0.2, 0.09)[0]
+    found = gains(model, model.covariance[None], np.array([False]), 0.5)
+    a, b, c = model.transition, model.inputs, model.matrix
+    phi = 1.2 * a @ model.covariance @ a.T + model.process
+    noise = model.noise + 6.0 * 0.09 * np.eye(2)
+    free = np.linalg.svd(c @ b)[0][:, 1:]
+
+    def trace(gain: np.ndarray) -> float:
+        kept = np.eye(4) - gain @ c
+        return float(np.trace(kept @ phi @ kept.T + gain @ noise @ gain.T))
+
+    best = found["best"][0]
+    assert trace(best) == pytest.approx(float(np.trace(found["best_bound"][0])))
+    assert best @ c @ b == pytest.approx(b)
+    assert found["gain"][0] @ c @ b == pytest.approx(b)
+    rng = np.random.default_rng(1)
+    for _ in range(200):
+        other = best + 0.3 * rng.normal(size=(4, 1)) @ free.T
+        assert trace(other) >= trace(best)
+    assert trace(found["gain"][0]) > trace(best)
