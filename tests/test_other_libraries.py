@@ -1,0 +1,205 @@
+"""What other libraries ask beside steps: attributes of runs, a joint state, copies, processes."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from pettingzoo.test.state_test import test_parallel_env as pettingzoos_check_of_states
+from pettingzoo.utils.conversions import parallel_to_aec
+
+import fusion_gym
+
+TOBIT = "fusion_gym/TobitOscillator-v0"
+CORRELATED = "fusion_gym/CorrelatedTracking-v0"
+BIASED = "fusion_gym/BiasedOscillator-v0"
+
+
+def vector(mode: str, num_envs: int = 3, **options: Any) -> Any:
+    return gym.make_vec(TOBIT, num_envs, vectorization_mode=mode, **options)
+
+
+def plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+NAMES = ("observation_names", "observation_space", "action_space", "reward_space", "render_mode")
+
+
+@pytest.mark.parametrize("options", [{}, {"action": "discrete", "horizon": 7}], ids=str)
+def test_runs_have_the_attributes_of_single_environments(options: dict[str, Any]) -> None:
+    options = {"reward": "vector", "token_rate": 1.0, **options}
+    native = vector("vector_entry_point", **options)
+    others = [gym.make(TOBIT, disable_env_checker=True, **options) for _ in range(3)]
+    for name in NAMES:
+        assert native.get_attr(name) == tuple(env.get_wrapper_attr(name) for env in others), name
+    assert native.get_attr("task") == (native.task,) * 3
+    (spec, *_), wanted = native.get_attr("spec"), others[0].spec
+    assert (spec.id, spec.max_episode_steps) == (wanted.id, wanted.max_episode_steps)
+    native.reset(seed=5)
+    for run, env in enumerate(others):
+        env.reset(seed=5 + run)
+    random = np.random.default_rng(0)
+    seen = set()
+    for _ in range(6):
+        masks = native.call("action_masks")
+        np.testing.assert_array_equal(masks, native.action_masks())
+        for mask, env in zip(masks, others, strict=True):
+            assert mask.tolist() == env.get_wrapper_attr("action_masks")().tolist()
+        seen.add(str(plain(np.array(masks))))
+        requests = random.integers(0, 8, 3)
+        actions = requests if "action" in options else requests[:, None] >> np.arange(3) & 1
+        native.step(actions)
+        for action, env in zip(actions, others, strict=True):
+            env.step(action)
+    assert len(seen) > 1
+
+
+def test_infos_have_types_and_stack_to_plain_arrays() -> None:
+    """TorchRL asks each value for its type; Gymnasium stacks them by it."""
+    env = gym.make(TOBIT)
+    native, stacked = vector("vector_entry_point"), vector("sync")
+    for kind, infos in (("reset", env.reset()[1]), ("step", env.step(np.ones(3, dtype=int))[-1])):
+        assert all(isinstance(value, (np.ndarray, np.floating)) for value in infos.values())
+        if kind == "reset":
+            found, wanted = native.reset(seed=0)[1], stacked.reset(seed=0)[1]
+        else:
+            actions = np.ones((3, 3), dtype=np.int8)
+            found, wanted = native.step(actions)[-1], stacked.step(actions)[-1]
+        assert found.keys() == wanted.keys()
+        for key, value in wanted.items():
+            assert value.dtype == found[key].dtype != object, key
+            np.testing.assert_array_equal(value, found[key])
+
+
+def test_what_runs_do_not_have_is_refused() -> None:
+    envs = vector("vector_entry_point")
+    for name in ("gravity", "step", "reset", "reward_space", "_started"):
+        with pytest.raises(AttributeError, match=rf"no '{name}': known are action_masks, render"):
+            envs.call(name)
+        with pytest.raises(AttributeError, match=name):
+            envs.get_attr(name)
+    with pytest.raises(AttributeError, match=r"cannot set 'token_rate'.*make a new environment"):
+        envs.set_attr("token_rate", [1.0, 2.0, 3.0])
+
+
+def test_pictures_of_runs_by_call() -> None:
+    assert vector("vector_entry_point").call("render") == (None, None, None)
+    envs = vector("vector_entry_point", 2, render_mode="rgb_array")
+    envs.reset(seed=0)
+    for _ in range(3):
+        envs.step(np.ones((2, 3), dtype=np.int8))
+    first, second = envs.call("render")
+    assert first.shape == second.shape
+    assert not np.array_equal(first, second)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options"),
+    [
+        (TOBIT, {}),
+        (CORRELATED, {"memory": True, "broadcast": "packets"}),
+        (BIASED, {"own_number": False, "clock": True}),
+    ],
+)
+def test_the_joint_state_is_what_all_agents_see_together(
+    env_id: str, options: dict[str, Any]
+) -> None:
+    env = fusion_gym.parallel_env(env_id, horizon=12, **options)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.state()
+    pettingzoos_check_of_states(env)
+    coordinator = gym.make(env_id, horizon=12, **options)
+    common = [n for n in coordinator.unwrapped.observation_names if n in env.state_names]  # type: ignore[attr-defined]
+    assert len(common) > 5
+    seen = [env.state_names.index(name) for name in common]
+    theirs = [coordinator.unwrapped.observation_names.index(name) for name in common]  # type: ignore[attr-defined]
+    observations, infos = env.reset(seed=4)
+    observation, _ = coordinator.reset(seed=4)
+    assert set(map(str, infos.values())) == {str({"granted": False, "cost": 0.0})}
+    random = np.random.default_rng(1)
+    while env.agents:
+        state = env.state()
+        assert env.state_space.contains(state)
+        np.testing.assert_array_equal(state[seen], observation[theirs])
+        every = np.concatenate(list(observations.values()))
+        numbers = np.isin(every, [0.0, 1.0])  # a sensor's own number is no part of the state
+        assert np.isin(every[~numbers], state).all()
+        chosen = int(random.integers(len(env.agents)))
+        bits = np.eye(len(env.agents), dtype=np.int8)[chosen]
+        observations, _, _, _, infos = env.step(dict(zip(env.agents, bits.tolist(), strict=True)))
+        single = isinstance(coordinator.action_space, gym.spaces.Discrete)  # 0 is for nobody
+        observation, *_ = coordinator.step(chosen + 1 if single else bits)
+    assert not np.array_equal(state, env.state())
+
+
+def test_the_state_holds_nothing_of_the_truth() -> None:
+    env = fusion_gym.parallel_env(TOBIT)
+    env.reset(seed=0)
+    before = env.state()
+    hidden = env.batch.state
+    hidden.truth = hidden.truth + 100.0
+    np.testing.assert_array_equal(env.state(), before)
+    hidden.measurement = hidden.measurement + 0.1
+    assert not np.array_equal(env.state(), before)
+
+
+def test_agents_in_turn_see_the_state_too() -> None:
+    env = parallel_to_aec(fusion_gym.parallel_env(TOBIT, horizon=3))
+    env.reset(seed=0)
+    states = [env.state()]
+    for agent in env.agent_iter():
+        *_, terminated, truncated, _ = env.last()
+        over = terminated or truncated
+        env.step(None if over else env.action_space(agent).sample())
+        states.append(env.state())
+    assert len({state.tobytes() for state in states}) == 4
+
+
+@pytest.mark.parametrize("kind", ["single", "vector", "parallel"])
+def test_a_copy_goes_on_alike(kind: str) -> None:
+    made: dict[str, Any] = {
+        "single": lambda: gym.make(TOBIT, horizon=9),
+        "vector": lambda: vector("vector_entry_point", horizon=9),
+        "parallel": lambda: fusion_gym.parallel_env(TOBIT, horizon=9),
+    }
+    env = made[kind]()
+    env.reset(seed=0)
+    twins = [env, copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    for _ in range(4):
+        actions = {"sensor_0": 1, "sensor_1": 0, "sensor_2": 1}
+        action = actions if kind == "parallel" else env.action_space.sample()
+        first, *rest = (str(twin.step(action)) for twin in twins)
+        assert set(rest) == {first}
+
+
+def test_a_specification_survives_a_file() -> None:
+    env = gym.make(TOBIT, horizon=11, filter="tobit", token_rate=1.5)
+    assert env.spec is not None
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.spec is not None
+    assert again.spec.max_episode_steps == 11
+    first = again.reset(seed=2)[0], again.step(np.ones(3, dtype=np.int8))[0]
+    second = env.reset(seed=2)[0], env.step(np.ones(3, dtype=np.int8))[0]
+    np.testing.assert_array_equal(first, second)
+
+
+def test_a_child_process_finds_an_id_with_its_module() -> None:
+    """A child that has not imported the package does so by the name before the colon."""
+    options: dict[str, Any] = {"horizon": 4, "filter": "tobit"}
+    envs = gym.make_vec(
+        f"fusion_gym:{TOBIT}", 1, vectorization_mode="async",
+        vector_kwargs={"context": "spawn"}, **options,
+    )  # fmt: skip
+    action = np.ones((1, 3), dtype=np.int8)
+    try:
+        rows = [envs.reset(seed=3)[0]] + [envs.step(action)[0] for _ in range(3)]
+    finally:
+        envs.close()
+    env = gym.make(TOBIT, **options)
+    wanted = [env.reset(seed=3)[0]] + [env.step(action[0])[0] for _ in range(3)]
+    np.testing.assert_array_equal(np.concatenate(rows), wanted)
