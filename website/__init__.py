@@ -1,0 +1,1 @@
+"""What turns docs/, the results and the docstrings into the documentation site (`make docs`)."""

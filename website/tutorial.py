@@ -1,0 +1,21 @@
+"""What the tutorials' hidden lines use: figures on the page."""
+
+from __future__ import annotations
+
+import base64
+import io
+
+from fusion_gym.agents.output import palette  # the name by which the tutorials import it
+from fusion_gym.agents.output.palette import plt
+from matplotlib.figure import Figure
+
+plt.rcParams.update(palette.LARGE | {"svg.fonttype": "path", "figure.constrained_layout.use": True})
+
+
+def figure_html(figure: Figure) -> str:
+    """A figure as HTML; its caption is the paragraph in italics behind the block that prints it."""
+    image = io.BytesIO()
+    figure.savefig(image, format="svg", metadata={"Date": None})
+    plt.close(figure)
+    data = base64.b64encode(image.getvalue()).decode()
+    return f'<p><img alt="" src="data:image/svg+xml;base64,{data}"></p>'
