@@ -1,0 +1,113 @@
+"""From an empty folder to a front: the page's own lines run, with less of everything."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from command_runs import call
+
+from agents.compare import Compare
+from agents.suite.sweep import Sweep
+from agents.training.checked import load
+from agents.training.config import Experiment
+from fusion_gym.envs.registration import make_task
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError
+
+ROOT = Path(__file__).parent.parent
+PAGE = (ROOT / "docs" / "newcomer.md").read_text()
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+LESS = {
+    "evaluate": ["--episodes", "3"],
+    "train": ["--timesteps", "4096", "--set", "horizon=8"],
+    "compare": ["--episodes", "3"],
+}
+
+
+def command_lines() -> list[list[str]]:
+    text = "".join(block for language, block in BLOCKS if language == "bash")
+    return [shlex.split(line) for line in text.replace("\\\n", " ").splitlines()]
+
+
+def test_a_reader_writes_thirty_lines_at_most() -> None:
+    assert {language for language, _ in BLOCKS} == {"bash", "yaml"}
+    lines = [line for _, block in BLOCKS for line in block.splitlines()]
+    assert 10 < len(lines) <= 30
+
+
+def test_the_lines_of_the_page_lead_to_a_front(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (text,) = (block for language, block in BLOCKS if language == "yaml")
+    first, *_ = text.splitlines()
+    Path(first.removeprefix("# ")).write_text(text)
+    installing, *commands = command_lines()
+    assert installing[:2] == ["pip", "install"]
+    assert [words[1] for words in commands] == list(LESS)
+    for program, name, *words in commands:
+        assert program == "fusion-gym"
+        ended = call(name, [*words, *LESS[name]])
+        assert ended.status == 0, ended.err + ended.trace
+        if name == "evaluate":
+            assert "kitchen" in ended.out
+    assert (tmp_path / "runs/comparison/pareto.png").stat().st_size > 20_000
+    points = json.loads((tmp_path / "runs/comparison/comparison.json").read_text())["points"]
+    prices = [float(point["agent"].partition("price=")[2]) for point in points]
+    np.testing.assert_allclose(prices, np.geomspace(0.01, 1.0, 7), rtol=1e-3)
+    assert prices[0] == 0.01
+    assert prices[-1] == 1.0
+    # The plant of the file belongs to the training, wherever the file has gone.
+    kept = yaml.safe_load((tmp_path / "runs/front/config.yaml").read_text())["environment"]
+    assert kept["options"] == {
+        "memory": True, "cost_weight": "random", "price_range": [0.01, 1.0], "horizon": 8,
+        **yaml.safe_load(text),
+    }  # fmt: skip
+    Path("rooms.yaml").write_text(text.replace("0.05", "0.04"))
+    same = ["--config", "linear_fusion_front", "--output", "runs/front", "--set", "horizon=8"]
+    ended = call("train", [*same, "system=rooms.yaml", "--resume", "--timesteps", "8192"])
+    assert ended.status == 1
+    assert "environment" in ended.err
+    assert "transition" in ended.err
+
+
+def front(**options: Any) -> Any:
+    experiment = load(Experiment, "linear_fusion_front").changed(None, options)
+    return make_task(experiment.environment.id, **experiment.environment.options)
+
+
+def asked(policy: str, prices: int | None) -> Compare:
+    return Compare(config="a", sweep="b", policy=policy, output=Path("c"), prices=prices)
+
+
+def test_prices_are_for_agents_that_see_one() -> None:
+    task = front()
+    assert asked("always", None).asked(task) == ["always"]
+    assert asked("model:a.zip", 3).asked(task) == [
+        "model:a.zip,price=0.01", "model:a.zip,price=0.1", "model:a.zip,price=1.0"
+    ]  # fmt: skip
+    narrow = front(price_range=[0.0123456789, 0.2])
+    assert asked("zoo:x", 2).asked(narrow)[0] == "zoo:x,price=0.0123456789"
+    with pytest.raises(ConfigurationError, match=r"prices = 3 .* no agent"):
+        asked("always", 3).asked(task)
+    with pytest.raises(ConfigurationError, match=r"prices = 3 .* no price_range"):
+        asked("model:a.zip", 3).asked(make_task("fusion_gym/LinearFusion-v0"))
+
+
+def test_the_scale_free_rules_fit_any_environment() -> None:
+    """All of them are made, and tried out, for a plant whose unit is a thousandth."""
+    sweep = load(Sweep, "scale_free_sweep", "sweep")
+    tiny = front(
+        process_covariance=[[1e-8, 0], [0, 1e-8]],
+        initial_covariance=[[1e-6, 0], [0, 1e-6]],
+        measurement_covariances=1e-7,
+    )
+    for name in sweep.policies:
+        make_policy(name, tiny)
