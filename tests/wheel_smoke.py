@@ -154,7 +154,7 @@ def use(programs: Path, folder: Path) -> None:
     quick = ("--episodes", "2", "--timesteps", "8192")
     call(program, "demo", *quick, "--output", "demo", cwd=folder)
     assert (folder / "demo" / "coordinator" / "front.png").exists()
-    table = call(program, "reproduce", "--episodes", "2", "--markdown", cwd=folder).stdout
+    table = call(program, "table", "--episodes", "2", "--markdown", cwd=folder).stdout
     assert table.startswith("| setting |"), table
     (folder / "suite.yaml").write_text(json.dumps(SUITE))
     suite = ("--config", "suite.yaml", "--results", "results", "--work", "work", "--workers", "1")
@@ -168,7 +168,10 @@ def use(programs: Path, folder: Path) -> None:
 
 
 def main() -> None:
-    """Build, install, use; then look for every file, and run tests, in the source distribution."""
+    """Build, install, use; look for every file, and run tests, in the source distribution.
+
+    Then run what the pages show.
+    """
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         source, built = copy(folder / "source"), folder / "built"
@@ -198,6 +201,9 @@ def main() -> None:
             "configs or algorithm or name",
         )
         call(programs / "python", *tests, cwd=unpacked)
+        from wheel_blocks import run_pages  # which takes `copy` from here
+
+        run_pages((), wheel)
     print("the package works from the wheel, and the source distribution is complete")
 
 

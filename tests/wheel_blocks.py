@@ -1,0 +1,265 @@
+"""Run every block of README and docs as printed, with the wheel and the extras it names alone.
+
+    python tests/wheel_blocks.py [PAGE …] [--wheel FILE]
+
+The blocks of a page run in its order, in an empty folder. What would take longer than minutes, or
+needs what is not here, stands in ``LISTED`` with the reason; such a command is run with less where
+its own options allow, and else its options are read and checked.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import yaml
+from page_blocks import Block, blocks_of, stray_commands
+from warm_python import Warm
+from wheel_environments import Absent, Environment, Wheel, build
+from wheel_smoke import copy
+
+ROOT = Path(__file__).parent.parent
+LIMIT = 60.0  # seconds of the processor for a block; what takes longer belongs into the list
+PATIENCE = 600.0  # seconds until it is ended
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A command that does not run as printed, by how it begins: why, and what it runs with.
+
+    Without ``instead`` its options are read and checked, and nothing runs.
+    """
+
+    begins: str
+    reason: str
+    instead: str = ""
+
+
+LISTED = (
+    Listed("make ", "works in a clone: its targets are looked for in the Makefile"),
+    Listed("python -m pytest", "works in a clone"),
+    Listed("python -m fusion_gym.envs.pages", "works in a clone, on pages that are being written"),
+    Listed("pip install ", "downloads: its extras are looked for in the wheel"),
+    Listed("fusion-gym train --config tobit_oscillator_front", "minutes; wheel_smoke.py trains it"),
+    Listed("fusion-gym train ", "minutes", "--timesteps 1024"),
+    Listed("fusion-gym compare ", "minutes, for more than a hundred policies"),
+    Listed("fusion-gym evaluate --env fusion_gym/RemoteEstimation-v0", "minutes", "--episodes 4"),
+    Listed("fusion-gym table ", "minutes, for policies that search for their schedules"),
+    Listed("fusion-gym mismatch ", "half a minute", "--episodes 20"),
+    Listed("fusion-gym watch ", "half a minute, for a film of all of an episode", "--steps 10"),
+    Listed("fusion-gym bound ", "minutes", "--set horizon=20 --episodes 8 --accuracy 0.3"),
+    Listed("fusion-gym envelope", "an hour"),
+    Listed("fusion-gym benchmark", "hours, and a cluster that is not here"),
+    Listed("fusion-gym report", "draws what hours of fusion-gym benchmark have written"),
+    Listed("fusion-gym robustness", "an hour"),
+    Listed("fusion-gym reproduce ", "half an hour"),
+    Listed("fusion-gym tune ", "hours, and a database that is not here"),
+    Listed("tensorboard ", "serves until it is interrupted"),
+)
+READ = """
+import contextlib, io, json, os, sys
+from fusion_gym.agents.__main__ import load
+from fusion_gym.agents.command_line import read
+from fusion_gym.agents.input.options import check_options
+from fusion_gym.agents.training.checked import config_path
+from fusion_gym.agents.input.files import read_text
+for place, folder, (program, name, *words) in json.loads(sys.stdin.read()):
+    os.chdir(folder)
+    sys.argv, said = [program, *words], io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            given = read(getattr(load(name), name.capitalize()))
+            check_options(given)
+            for option in ("config", "sweep"):
+                if getattr(given, option, None) is not None:
+                    read_text(option, config_path(getattr(given, option), option))
+    except (Exception, SystemExit) as error:
+        print(f"{place}: {error} {said.getvalue()}")
+"""
+
+
+@dataclass
+class Pages:
+    """What was run of the pages, and what was not."""
+
+    wheel: Wheel
+    makefile: str
+    failed: list[str] = field(default_factory=list)
+    left: list[str] = field(default_factory=list)
+    used: set[Listed] = field(default_factory=set)
+    warm: dict[Environment, Warm] = field(default_factory=dict)
+    unread: list[tuple[str, str, list[str]]] = field(default_factory=list)
+
+    def run(self, page: Path, text: str, folder: Path) -> None:
+        """The blocks of a page, in a folder that is made for them."""
+        folder.mkdir(parents=True)
+        blocks = blocks_of(page, text)
+        stray = stray_commands(page, text)
+        self.failed += [f"{one}: a command outside of a shell block" for one in stray]
+        for place, block in enumerate(blocks):
+            began = self.seconds
+            said = self._run(block, blocks[place + 1 :], folder)
+            taken = self.seconds - began
+            if said is None and taken > LIMIT:
+                said = f"takes {taken:.0f} s: it belongs into LISTED of {Path(__file__).name}"
+            if said is not None:
+                self.failed.append(f"{block.place}: {said}")
+            print(f"{taken:5.1f} s  {block.place}{'  failed' if said else ''}", flush=True)
+
+    def _run(self, block: Block, later: Sequence[Block], folder: Path) -> str | None:
+        """What is wrong with a block; ``None`` if nothing is."""
+        if block.file is not None:
+            (folder / block.file).write_text(block.text)
+        if block.language == "yaml":
+            return _wrong_yaml(block, later)
+        extras = block.needs(self.wheel.extra_of)
+        try:
+            unknown = extras - set(self.wheel.extras)
+            if unknown:
+                raise Absent(", ".join(unknown))
+            environment = self.wheel.environment(extras)
+        except Absent as absent:
+            self.left.append(f"{block.place} (needs {absent})")
+            return None
+        if block.language == "python":
+            script = folder / (block.file or f"block_{block.line}.py")
+            script.write_text(block.text)
+            return self._wrong(["run", script.name], environment, folder)
+        return self._wrong_shell(block, environment, folder)
+
+    def _wrong_shell(self, block: Block, environment: Environment, folder: Path) -> str | None:
+        lines = []
+        for line, words in block.commands():
+            listed = next((one for one in LISTED if line.startswith(one.begins)), None)
+            if listed is None:
+                lines.append(line)
+            elif listed.instead:
+                self.used.add(listed)
+                lines.append(f"{shlex.join(words)} {listed.instead}")
+            else:
+                self.used.add(listed)
+                said = self._wrong_words(words, environment)
+                if said is not None:
+                    return said
+                if words[0] == "fusion-gym":
+                    self.unread.append((block.place, str(folder), words))
+        script = "\n".join(["set -euo pipefail", *lines])
+        return self._wrong(["bash", "-c", script], environment, folder) if lines else None
+
+    def _wrong(self, words: list[str], environment: Environment, folder: Path) -> str | None:
+        """What a program said, if it did not end well."""
+        warm = self.warm.setdefault(environment, Warm(environment, _variables(environment)))
+        variables = _variables(environment, warm.programs)
+        assert warm.process
+        try:
+            done = _run(words, variables, folder)
+        except subprocess.TimeoutExpired:
+            warm.end()
+            return f"has not ended after {PATIENCE:.0f} s"
+        return None if done.returncode == 0 else f"{done.stdout[-1000:]}\n{done.stderr[-3000:]}"
+
+    @property
+    def seconds(self) -> float:
+        """Of the processor, of this process and of what has ended."""
+        return sum(os.times()[:4]) + sum(one.seconds for one in self.warm.values())
+
+    def read(self) -> None:
+        """Read and check the options of the commands that were not run, all at once."""
+        environment = self.wheel.environment(frozenset({"agents"}))
+        words = [str(environment.programs / "python"), "-c", READ]
+        wrong = _run(words, _variables(environment), self.wheel.folder, self.unread)
+        self.failed += [wrong.stderr] if wrong.returncode else wrong.stdout.splitlines()
+
+    def _wrong_words(self, words: list[str], environment: Environment) -> str | None:
+        """What is wrong with a command that is not run, but for its options."""
+        if words[0] == "make":
+            there = re.search(rf"^{words[1]}:", self.makefile, re.MULTILINE)
+            return None if there else f"the Makefile has no target {words[1]}"
+        if words[0] == "pip":
+            asked = {part for word in words for part in re.findall(r"\[(.*?)\]", word)}
+            extras = {name for part in asked for name in part.split(",")}
+            return None if extras <= set(self.wheel.extras) else f"no extras {extras}"
+        if words[0] == "python" and words[2] != "pytest":
+            file = Path(*words[2].split(".")).with_suffix(".py")
+            return None if (ROOT / file).exists() else f"no module {words[2]}"
+        there = (environment.programs / words[0]).exists()
+        return None if there else f"no program {words[0]}"
+
+
+def _wrong_yaml(block: Block, later: Sequence[Block]) -> str | None:
+    """A file of the page has a name, which a later block uses."""
+    yaml.safe_load(block.text)
+    if block.file is None:
+        return "the first line does not name the file, as # plant.yaml does"
+    if not any(block.file in one.text for one in later):
+        return f"no later block uses {block.file}"
+    return None
+
+
+def _variables(environment: Environment, *before: Path) -> dict[str, str]:
+    """Of a program in an environment, which finds others in the folders ``before`` first."""
+    plain = {key: text for key, text in os.environ.items() if not key.startswith("PYTHON")}
+    path = os.pathsep.join(map(str, (*before, environment.programs, os.environ["PATH"])))
+    # No window, and one thread, as the reference machine has them.
+    return plain | {"PATH": path, "OMP_NUM_THREADS": "1", "SDL_VIDEODRIVER": "dummy"}
+
+
+def _run(
+    words: list[str], variables: dict[str, str], folder: Path, handed: object = None
+) -> subprocess.CompletedProcess[str]:
+    """Run a program."""
+    return subprocess.run(
+        words, cwd=folder, env=variables, input=json.dumps(handed), capture_output=True, text=True,
+        timeout=PATIENCE,
+    )  # fmt: skip
+
+
+def run_pages(pages: Sequence[Path], wheel: Path | None) -> None:
+    """Run the blocks of pages (none: of all) with a wheel, which is built where none is given.
+
+    Raises:
+        SystemExit: a block does not run, or an entry of the list is of no use.
+    """
+    chosen = pages or [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        file = wheel or build(copy(folder / "source"), folder / "built")
+        run = Pages(Wheel(file, folder), (ROOT / "Makefile").read_text())
+        try:
+            for number, page in enumerate(chosen):
+                own = page.resolve().is_relative_to(ROOT)
+                shown = page.resolve().relative_to(ROOT) if own else page
+                run.run(shown, page.read_text(), folder / f"page_{number}" / shown.stem)
+            run.read()
+        finally:
+            for warm in run.warm.values():
+                warm.end()
+    for text in run.left:
+        print(f"left to make integrations: {text}")
+    print(f"{run.seconds:.0f} s of the processor")
+    useless = [one.begins for one in LISTED if one not in run.used] if not pages else []
+    wrong = [*run.failed, *(f"LISTED: no page shows {begins!r}" for begins in useless)]
+    if wrong:
+        sys.exit("\n".join(wrong))
+
+
+def main() -> None:
+    """Entry point; exit status 1 if something is wrong."""
+    parser = argparse.ArgumentParser(description="Run the blocks of README and docs as printed.")
+    parser.add_argument("pages", nargs="*", type=Path, help="all by default")
+    parser.add_argument("--wheel", type=Path, help="one that was built")
+    given = parser.parse_args()
+    run_pages(given.pages, given.wheel)
+
+
+if __name__ == "__main__":
+    main()
