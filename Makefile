@@ -10,10 +10,11 @@ QUICK  := tests/conformance/test_faces.py tests/test_bad_input.py tests/test_env
 	tests/test_agents.py::test_training_writes_its_results_and_resumes \
 	tests/test_benchmark.py::test_from_tuning_to_report_and_zoo
 
-.PHONY: help demo test test-all test-lowest wheel-test wheel lint format bench clean
+.PHONY: help demo test test-all test-lowest wheel-test wheel films docs integrations integrations-tianshou integrations-rllib \
+	lint format bench clean
 
 help:  ## list the targets
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 13
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 23
 
 # torch comes first and at its pinned version: left to a range, an installer may take a build
 # with several GB of GPU libraries.
@@ -53,6 +54,40 @@ wheel-test: $(STAMP)  ## build the package and try it in an empty folder, outsid
 wheel: $(STAMP)  ## build the wheel into dist/
 	$(BIN)/python -m build --wheel
 
+# One episode of every environment under its paper's rule, for the pages.
+WATCH := $(BIN)/fusion-gym watch --steps 40 --fps 6 --env fusion_gym
+films: $(STAMP)  ## the films of docs/films
+	$(WATCH)/TobitOscillator-v0 --policy dynamic_event --save docs/films/tobit_oscillator.gif
+	$(WATCH)/BiasedOscillator-v0 --policy round_robin --save docs/films/biased_oscillator.gif
+	$(WATCH)/BiasedTracking-v0 --policy round_robin --save docs/films/biased_tracking.gif
+	$(WATCH)/CorrelatedTracking-v0 --policy adaptive_innovation --save docs/films/correlated_tracking.gif
+	$(WATCH)/MarkovJumpTracking-v0 --policy local_variance:m=0.9 --save docs/films/markov_jump.gif
+	$(WATCH)/UnknownInput-v0 --policy adaptive_threshold --save docs/films/unknown_input.gif
+	$(WATCH)/RemoteEstimation-v0 --policy whittle --save docs/films/remote_estimation.gif
+	$(WATCH)/LinearFusion-v0 --policy value_of_information --save docs/films/linear_fusion.gif
+
+# Libraries beside this one: each folder of integrations/ has pins and a virtual environment of its own,
+# .venv-light, .venv-tianshou, .venv-rllib.
+.venv-%/.installed: integrations/%/requirements.txt integrations/%/constraints.txt pyproject.toml setup.py
+	$(PYTHON) -m venv --clear .venv-$*
+	.venv-$*/bin/python -m pip install --disable-pip-version-check --quiet --no-compile \
+		--constraint integrations/$*/constraints.txt \
+		$$(grep '^torch==' integrations/$*/requirements.txt) $$(grep '^uv==' constraints.txt)
+	.venv-$*/bin/uv pip install --quiet --system-certs --python .venv-$*/bin/python \
+		--constraint integrations/$*/constraints.txt --overrides integrations/$*/left_out.txt \
+		--requirements integrations/$*/requirements.txt
+	.venv-$*/bin/uv pip install --quiet --system-certs --python .venv-$*/bin/python --no-deps --editable .
+	touch $@
+
+integrations: .venv-light/.installed  ## other libraries: SB3, rl-zoo3, TorchRL, SuperSuit, MO-Gymnasium
+	.venv-light/bin/python -m pytest integrations/light
+
+integrations-tianshou: .venv-tianshou/.installed  ## Tianshou
+	.venv-tianshou/bin/python -m pytest integrations/tianshou
+
+integrations-rllib: .venv-rllib/.installed  ## RLlib
+	.venv-rllib/bin/python -m pytest integrations/rllib
+
 lint: $(STAMP)  ## ruff and mypy
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -62,8 +97,17 @@ format: $(STAMP)  ## let ruff mend what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# Beside the other packages, for the tutorials train agents. Warnings end it (strict, in mkdocs.yml).
+$(VENV)/.docs: $(STAMP)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable '.[agents,docs]'
+	touch $@
+
+docs: $(VENV)/.docs  ## the documentation site into site/, its tutorials executed, its links checked
+	NO_MKDOCS_2_WARNING=1 OMP_NUM_THREADS=1 $(BIN)/python -m mkdocs build
+	$(BIN)/python -m website.check site
+
 bench: $(STAMP)  ## steps per second beside the alternatives, as ratios of one run
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.throughput
 
 clean:  ## remove the virtual environment and caches (not runs/)
-	rm -rf $(VENV) $(LOWEST) build .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) $(LOWEST) .venv-light .venv-tianshou .venv-rllib site build .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

@@ -12,8 +12,6 @@ whose checkpoints hold pickles. ``python -m agents.report`` makes tables and fig
 
 from __future__ import annotations
 
-import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +19,10 @@ from typing import Annotated
 
 from fusion_gym.validation import ConfigurationError, choice
 
-from .command_line import Command, spelled, start
+from .command_line import Long, spelled, start
 from .input.options import OutputFolder, Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
+from .output.progress import writing
 from .suite.beside_rules import SHIPPED
 from .suite.classes import names_of, trained
 from .suite.committed import FOLDER, Shelf, complete
@@ -38,7 +37,7 @@ from .training.checked import parse
 
 
 @dataclass(frozen=True)
-class Benchmark(Command):
+class Benchmark(Long):
     """The benchmark of policies: tuned baselines, learned fronts and references."""
 
     config: str = "benchmark"
@@ -71,12 +70,6 @@ class Benchmark(Command):
         with ended_like_by_ctrl_c():
             self._run()
 
-    def interrupted(self) -> str:
-        """Finished pieces of work are kept."""
-        words = [word for word in sys.argv[1:] if word != "--resume"]
-        command = shlex.join([*spelled("benchmark").split(), *words, "--resume"])
-        return f"interrupted; go on with: {command}"
-
     def suite(self) -> Suite:
         """The config with what the command line says instead, checked again.
 
@@ -105,6 +98,7 @@ class Benchmark(Command):
             setting_task(setting)
         with folders.alone():
             self._check_resumed(folders, chosen)
+            writing(("finished pieces", folders.results), ("trainings and episodes", folders.work))
             shelf = self._shelf(suite, chosen, folders)
             for setting in chosen:
                 compared = [of.name for of in trained(suite, setting)]

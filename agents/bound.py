@@ -20,21 +20,22 @@ from rich.table import Table
 
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.floor import everything_delivered
+from fusion_gym.evaluation.floor import everything_delivered, opened
 from fusion_gym.policies.settings import parse_settings
-from fusion_gym.solvers.silence import SilenceBound, silence_bound
+from fusion_gym.solvers.silence import SilenceBound, silence_bound, silence_model
 from fusion_gym.validation import choice
 
-from .command_line import Command, Words, start
+from .command_line import Long, Words, start
 from .input.options import Between, Episodes, OutputFile, Seed, Whole
 from .output import tables
 from .output.files import write
+from .output.progress import progress_bar, writing
 
 _WEIGHTS = ("mse", "reward")
 
 
 @dataclass(frozen=True)
-class Bound(Command):
+class Bound(Long):
     """Print what no policy can undercut: floors, and a proven lower bound at each rate."""
 
     env: str
@@ -60,11 +61,16 @@ class Bound(Command):
     json: Annotated[Path | None, OutputFile()] = None
     """Write the results to this file."""
 
+    keeps = False
+
     def run(self) -> None:
         """Work out floors and bound, write and print them."""
         options = parse_settings("option", list(chain(*self.options)))
         choice("weights", self.weights, _WEIGHTS)
-        task = make_task(self.env, **options)
+        task, open_wide = make_task(self.env, **options), opened(self.env, options, self.filters)
+        weights = _reward_weights(task) if self.weights == "reward" else None
+        if self.rates:
+            silence_model(task, weights)  # refuses what the bound does not hold for
         report: dict[str, Any] = {
             "env": self.env,
             "settings": task.settings,
@@ -72,21 +78,36 @@ class Bound(Command):
             "sensors": task.sensors,
             "weights": self.weights,
         }
-        console = tables.console()
+        if self.json is not None:
+            writing(("the results", self.json))
         if self.rates:
-            weights = _reward_weights(task) if self.weights == "reward" else None
-            bound = silence_bound(
-                task, self.rates, weights, self.accuracy, self.points, progress=console.print
+            report |= summary(self._bound(task, weights), self.rates)
+        steps = len(open_wide) * self.episodes * task.horizon
+        with progress_bar(steps, "everything delivered") as bar:
+            delivered = everything_delivered(
+                self.env, options, self.filters, self.episodes, self.seed, bar.update
             )
-            report |= summary(bound, self.rates)
-        delivered = everything_delivered(self.env, options, self.filters, self.episodes, self.seed)
         report["everything_delivered"] = {
             name: found._asdict() for name, found in delivered.items()
         }
         write(self.json, report)
+        console = tables.console()
         console.print(_floors(report))
         if self.rates:
             console.print(_table(report))
+
+    def _bound(self, task: Task, weights: Any) -> SilenceBound:
+        with progress_bar(len(self.rates), "bounding", unit="rates") as bar:
+
+            def told(done: int, text: str) -> None:
+                bar.say(text)
+                bar.reach(done)
+
+            found = silence_bound(
+                task, self.rates, weights, self.accuracy, self.points, progress=told
+            )
+            bar.reach(len(self.rates))
+            return found
 
 
 def summary(bound: SilenceBound, rates: tuple[float, ...]) -> dict[str, Any]:

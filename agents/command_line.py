@@ -7,11 +7,12 @@ import io
 import itertools
 import os
 import re
+import shlex
 import sys
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import tyro
 
@@ -19,6 +20,7 @@ from fusion_gym.validation import ConfigurationError
 
 from .input.options import check_options
 from .output.ending import flush, told
+from .output.progress import quietly
 
 Words = tuple[tuple[str, ...], ...]  # of an option that may be given several times
 _Kind = TypeVar("_Kind", bound="Command")
@@ -40,6 +42,31 @@ class Command(ABC):
     def interrupted(self) -> str:
         """What to say after an interrupt."""
         return "interrupted"
+
+
+@dataclass(frozen=True)
+class Long(Command):
+    """A command that may take long: it shows where it is, and says how to go on."""
+
+    quiet: bool = field(default=False, kw_only=True)
+    """Show neither progress nor remarks: results and errors alone."""
+
+    keeps: ClassVar[bool] = True  # what is finished, before all of it is
+
+    def interrupted(self) -> str:
+        """The command line that goes on, where something is kept."""
+        if not self.keeps:
+            return "interrupted: nothing is kept"
+        return f"interrupted; go on with: {self.again()}"
+
+    def again(self, *added: str, without: tuple[str, ...] = ()) -> str:
+        """The words of the command line, with ``--resume`` where the command has it.
+
+        Those ``added`` are not repeated, and those ``without`` are left out.
+        """
+        more = [*added, *(["--resume"] if "resume" in {one.name for one in fields(self)} else [])]
+        words = [word for word in sys.argv[1:] if word not in (*more, *without)]
+        return shlex.join([*spelled(type(self).__name__.lower()).split(), *words, *more])
 
 
 def spelled(command: str) -> str:
@@ -85,7 +112,8 @@ def start(kind: type[Command]) -> None:
     with told(lambda: command.interrupted() if command else "interrupted"):
         command = read(kind)
         check_options(command)
-        command.run()
+        with quietly(isinstance(command, Long) and command.quiet):
+            command.run()
 
 
 def _check_words() -> None:

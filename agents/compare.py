@@ -4,8 +4,9 @@
         --sweep configs/biased_sweep.yaml \\
         --policy model:runs/biased_oscillator_ppo/best_model.zip --output runs/comparison
 
-All policies run on the same seeds. Into the output folder go ``evaluation.json`` (every policy),
-``comparison.json`` (the verdict) and ``pareto.png``.
+An agent that sees the price of a token is asked at as many prices as ``--prices`` says: its whole
+front. All policies run on the same seeds. Into the output folder go ``evaluation.json`` (every
+policy), ``comparison.json`` (the verdict) and ``pareto.png``.
 """
 
 from __future__ import annotations
@@ -14,11 +15,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from fusion_gym.envs.registration import make_task
-from fusion_gym.policies.registry import make_policy
+import numpy as np
 
-from .command_line import Command, start
-from .input.options import Episodes, OutputFolder, Seed
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import make_task
+from fusion_gym.policies.registry import make_policy, policy_names
+from fusion_gym.validation import refusal
+
+from .command_line import Long, start
+from .input.options import Episodes, OutputFolder, Seed, Whole
+from .output.progress import writing
 from .suite.comparison import compare, run_all
 from .suite.sweep import Sweep
 from .training.checked import load
@@ -26,7 +32,7 @@ from .training.config import Experiment
 
 
 @dataclass(frozen=True)
-class Compare(Command):
+class Compare(Long):
     """Compare one policy with the lower envelope of swept baselines, at the policy's own rate."""
 
     config: str
@@ -41,18 +47,46 @@ class Compare(Command):
     """Episodes of each policy."""
     seed: Seed = 0
     """Seed of the first episode."""
+    prices: Annotated[int | None, Whole(2, 1000)] = None
+    """Ask an agent that sees the price at as many, over the config's price_range."""
     trust: bool = False
     """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
+
+    keeps = False
 
     def run(self) -> None:
         """Run all policies on the same seeds; write, print and draw the comparison."""
         chosen, sweep = load(Experiment, self.config).environment, load(Sweep, self.sweep, "sweep")
         task = make_task(chosen.id, **chosen.options)
-        make_policy(self.policy, task, trust=self.trust)
+        asked = self.asked(task)
+        for policy in asked:
+            make_policy(policy, task, trust=self.trust)
+        writing(("evaluation, comparison and figure", self.output))
         baselines = run_all(
             task, sweep.policies, self.episodes, self.seed, "baselines", trust=self.trust
         )
-        compare(chosen.id, task, sweep, baselines, self.policy, self.seed, self.output, self.trust)
+        compare(chosen.id, task, sweep, baselines, asked, self.seed, self.output, self.trust)
+
+    def asked(self, task: Task) -> list[str]:
+        """The policy, or the policy at each of the prices.
+
+        Raises:
+            ConfigurationError: prices, but none that is drawn, or a policy that is no agent.
+        """
+        if self.prices is None:
+            return [self.policy]
+        span = task.reward.price.span
+        if span is None:
+            raise refusal(
+                "prices", self.prices, "left out where the config has no price_range, as here"
+            )
+        if self.policy.partition(":")[0] not in policy_names("agent"):
+            raise refusal(
+                "prices", self.prices, f"left out with policy = {self.policy!r}, which is no agent"
+            )
+        low, high = (repr(float(end)) for end in span)  # to the last digit: it knows no others
+        inner = [f"{price:.4g}" for price in np.geomspace(*span, self.prices)[1:-1]]
+        return [f"{self.policy},price={price}" for price in (low, *inner, high)]
 
 
 def main() -> None:

@@ -27,12 +27,13 @@ from fusion_gym.evaluation.episodes import record_episode
 from fusion_gym.evaluation.intervals import Interval
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Command, start
+from .command_line import Long, start
 from .input.options import Episodes, OutputFolder, Steps
 from .output import figures, front_figure, tables
 from .output.ending import ended_like_by_ctrl_c
 from .output.files import write
 from .output.folders import alone_in
+from .output.progress import writing
 from .suite.beside_rules import Ground, Trials
 from .suite.envelope_table import at_least
 from .suite.envelopes import task_of
@@ -83,7 +84,7 @@ LEARNERS = (
 
 
 @dataclass(frozen=True)
-class Demo(Command):
+class Demo(Long):
     """Two fronts learned in minutes, and a fair comparison with the strongest rules."""
 
     output: Annotated[Path, OutputFolder()] = Path("runs/demo")
@@ -108,6 +109,7 @@ class Demo(Command):
         with ended_like_by_ctrl_c(), alone_in(self.output, "output"):
             if self.fresh:
                 remove(folders.values())
+            writing(("models, figures and tables", self.output))
             began = time.perf_counter()
             train_beside(experiments)
             trained = time.perf_counter()
@@ -124,8 +126,8 @@ class Demo(Command):
         print(f"figures, tables and models are in {self.output}; {sum(seconds):.0f} s: {parts}")
 
     def interrupted(self) -> str:
-        """Nothing is lost."""
-        return "interrupted: run the same command again (without --fresh) to go on"
+        """Nothing is lost, unless it is begun afresh."""
+        return f"interrupted; go on with: {self.again(without=('--fresh',))}"
 
 
 def remove(folders: Iterable[Path]) -> None:

@@ -11,17 +11,16 @@ interrupted run goes on where it was.
 
 from __future__ import annotations
 
-import shlex
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from fusion_gym.validation import ConfigurationError, choice
 
-from .command_line import Command, spelled, start
+from .command_line import Long, spelled, start
 from .input.options import OutputFolder, Whole, writable_folder
 from .output.files import write_text
+from .output.progress import writing
 from .suite.classes import classes_of
 from .suite.committed import FOLDER, complete, path_of, present
 from .suite.config import load_suite
@@ -31,7 +30,7 @@ from .suite.team import Team
 
 
 @dataclass(frozen=True)
-class Envelope(Command):
+class Envelope(Long):
     """Tune the rules of every setting and class, and commit their envelopes."""
 
     config: str = "benchmark"
@@ -50,11 +49,6 @@ class Envelope(Command):
     """Folder for tuned rules and episodes, instead of runs/benchmark/full or quick."""
     workers: Annotated[int, Whole(1, 512)] = 2
     """Processes side by side."""
-
-    def interrupted(self) -> str:
-        """Finished pieces of work are kept."""
-        words = [word for word in sys.argv[1:] if word != "--resume"]
-        return f"interrupted; go on with: {shlex.join([*spelled('envelope').split(), *words])}"
 
     def run(self) -> None:
         """Do all work that is not finished, and write the table."""
@@ -79,6 +73,10 @@ class Envelope(Command):
                     f"results = {str(folders.results)!r} holds {len(there)} of these envelopes: go "
                     "on with --resume, or give another --results"
                 )
+            writing(
+                ("finished envelopes", folders.results / FOLDER),
+                ("what was tuned and tested", folders.work),
+            )
             complete(
                 suite, settings, self.classes, folders.results, folders.work, Team(self.workers)
             )

@@ -23,18 +23,18 @@ from fusion_gym.evaluation.metrics import paired_difference, robust_summary, sum
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Command, Words, start
+from .command_line import Long, Words, start
 from .input.environment import environment_of
 from .input.files import checked
 from .input.options import Episodes, OutputFile, Seed
 from .output import tables
 from .output.files import read_json, write
-from .output.progress import progress_bar
+from .output.progress import progress_bar, remark, writing
 from .suite.reports import Evaluation
 
 
 @dataclass(frozen=True)
-class Evaluate(Command):
+class Evaluate(Long):
     """Evaluate policies on paired episodes."""
 
     policies: Annotated[
@@ -67,8 +67,12 @@ class Evaluate(Command):
         evaluate(self)
 
     def interrupted(self) -> str:
-        """Finished policies are kept."""
-        return "interrupted: finished policies are in the JSON, if one was asked for"
+        """Finished policies are in the JSON; a reference needs the episodes of all."""
+        if self.json is None:
+            return "interrupted: nothing is kept (--json FILE keeps finished policies)"
+        if self.reference is not None:
+            return f"interrupted: finished policies are in {self.json}; --reference begins anew"
+        return super().interrupted()
 
 
 def evaluate(given: Evaluate) -> dict[str, Any]:
@@ -106,14 +110,18 @@ def evaluate(given: Evaluate) -> dict[str, Any]:
     done = finished(given.json, report) if given.resume else {"policies": {}}
     results: dict[str, EpisodeResults] = {}
     steps = given.episodes * task.horizon
-    with progress_bar(len(names) * steps, "evaluating") as bar:
+    if given.json is None:
+        remark("nothing is written (--json FILE keeps the results)")
+    else:
+        writing(("the results of each policy", given.json))
+    earlier = steps * len(done["policies"].keys() & policies.keys())
+    with progress_bar(len(names) * steps, "evaluating", earlier) as bar:
         for name, policy in policies.items():
             if name in done["policies"]:
                 report["policies"][name] = done["policies"][name]
                 report["quantiles"][name] = done["quantiles"][name]
-                bar.update(steps)
                 continue
-            bar.set_postfix_str(name, refresh=False)
+            bar.say(name)
             results[name] = run_episodes(task, policy, given.episodes, given.seed, bar.update)
             report["policies"][name] = summarise(results[name])
             report["quantiles"][name] = robust_summary(results[name])

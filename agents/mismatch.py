@@ -24,15 +24,16 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.cross_term import CrossTerm, cross_terms, usual_policies, worst
 from fusion_gym.policies.registry import make_policy
 
-from .command_line import Command, Words, start
+from .command_line import Long, Words, start
 from .input.environment import environment_of
 from .input.options import OutputFile, Seed, Whole
 from .output import tables
 from .output.files import write
+from .output.progress import progress_bar, writing
 
 
 @dataclass(frozen=True)
-class Mismatch(Command):
+class Mismatch(Long):
     """Measure whether a training may take the mismatch for the error: the cross term."""
 
     env: str | None = None
@@ -58,6 +59,8 @@ class Mismatch(Command):
     trust: bool = False
     """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
 
+    keeps = False
+
     def run(self) -> None:
         """Measure, write and print the cross term under each policy."""
         env_id, options, experiment = environment_of(self.env, self.config, self.options)
@@ -67,7 +70,13 @@ class Mismatch(Command):
         system = reference_system(env_id, options, chosen)
         names = list(dict.fromkeys(chain(*self.policies))) or usual_policies(task)
         policies = {name: make_policy(name, task, trust=self.trust) for name in names}
-        found = cross_terms(task, system, policies, self.episodes, self.seed)
+        if self.json is not None:
+            writing(("the results", self.json))
+        total = len(policies) * self.episodes * task.horizon
+        with progress_bar(total, "measuring the cross term") as bar:
+            found = cross_terms(
+                task, system, policies, self.episodes, self.seed, progress=bar.update
+            )
         report: dict[str, Any] = {
             "env": env_id,
             "settings": task.settings,

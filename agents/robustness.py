@@ -11,8 +11,6 @@ the table. With ``--trained`` agents are trained besides over draws of the pertu
 
 from __future__ import annotations
 
-import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +20,11 @@ import tyro
 
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Command, spelled, start
+from .command_line import Long, spelled, start
 from .input.options import Episodes, InputFolder, OutputFolder, Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
 from .output.folders import alone_in
+from .output.progress import writing
 from .suite.committed import Shelf
 from .suite.config import Suite, load_suite
 from .suite.robust_pieces import (
@@ -49,7 +48,7 @@ USUAL = Path("runs/benchmark/full")
 
 
 @dataclass(frozen=True)
-class Robustness(Command):
+class Robustness(Long):
     """Try rules and agents where the truth is not what they assume."""
 
     config: str = "robustness"
@@ -84,12 +83,6 @@ class Robustness(Command):
         with ended_like_by_ctrl_c():
             self._run()
 
-    def interrupted(self) -> str:
-        """Finished pieces of work are kept."""
-        words = [word for word in sys.argv[1:] if word != "--resume"]
-        command = shlex.join([*spelled("robustness").split(), *words, "--resume"])
-        return f"interrupted; go on with: {command}"
-
     def _run(self) -> None:
         config = load_robustness(self.config)
         folders = Folders(self.results, self.work)
@@ -105,6 +98,7 @@ class Robustness(Command):
                     f"results = {str(self.results)!r} holds {len(there)} finished pieces of work: "
                     "go on with --resume, or give another --results and --work"
                 )
+            writing(("finished pieces", place), ("trainings and episodes", self.work))
             self._work(trials, ("rules", "agents"), folders)
             trainings = [one for trial in trials for one in trial.trainings]
             if trainings:

@@ -16,16 +16,18 @@ from rich import box
 from rich.table import Table
 
 from fusion_gym.core.options import nature_of
+from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Command, start
+from .command_line import Long, start
 from .input.options import Episodes, OutputFolder, Seed, TrainingSeeds
 from .output import tables
 from .output.files import read_json, write
 from .output.folders import fingerprint
+from .output.progress import progress_bar, writing
 from .suite.verdict import excess
 from .training.checked import load
 from .training.config import Experiment
@@ -33,7 +35,7 @@ from .training.run import holds_training, train
 
 
 @dataclass(frozen=True)
-class Solved(Command):
+class Solved(Long):
     """Train agents in the solved case and print what they cost above the optimum."""
 
     config: str = "remote_estimation_ppo"
@@ -53,20 +55,21 @@ class Solved(Command):
         name, chosen = experiment.algorithm.name, experiment.environment
         task = make_task(chosen.id, **chosen.options)
         nature_of(task.system).refuse("for the solved optimum")
-        best = run_episodes(task, make_policy("optimal", task), self.episodes, self.seed)
+        best = self._tested(task, "optimal", "testing the optimum")
         if best.returns.mean() == 0.0:
             raise ConfigurationError(
                 f"config {self.config!r} is not allowed: its optimum costs nothing, so nothing can "
                 "be compared with it"
             )
+        writing(("trainings and costs", self.output))
         table = Table(title=f"{self.config}: {self.episodes} episodes", box=box.SIMPLE_HEAD)
         for column in ("policy", "cost of an episode", "rate", "above the optimum [95 %]"):
             table.add_column(column, justify="left" if column == "policy" else "right")
         report: dict[str, Any] = {"config": self.config, "agents": {}}
         table.add_row("optimal", f"{-best.returns.mean():.4f}", f"{best.rate.mean():.4f}", "")
         for seed in self.seeds:
-            policy = make_policy(f"model:{trained(experiment, seed, self.output)}", task)
-            agent = run_episodes(task, policy, self.episodes, self.seed)
+            model = trained(experiment, seed, self.output)
+            agent = self._tested(task, f"model:{model}", f"testing training seed {seed}")
             found = excess(agent.returns, best.returns)
             report["agents"][str(seed)] = found
             write(self.output / f"{name}.json", report)
@@ -77,6 +80,11 @@ class Solved(Command):
                 f"{found['mean']:+.2%} [{found['low']:+.2%}, {found['high']:+.2%}]",
             )
         tables.console().print(table)
+
+    def _tested(self, task: Task, name: str, description: str) -> EpisodeResults:
+        policy = make_policy(name, task)
+        with progress_bar(self.episodes * task.horizon, description) as bar:
+            return run_episodes(task, policy, self.episodes, self.seed, bar.update)
 
 
 def trained(experiment: Experiment, seed: int, folder: Path) -> Path:

@@ -19,22 +19,32 @@ own alone, for a foreign folder runs whatever code is in it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
-from .command_line import Command, start
+import tyro
+
+from fusion_gym.policies.settings import parse_settings
+from fusion_gym.validation import ConfigurationError
+
+from .command_line import Long, Words, start
 from .input.options import Between, OutputFolder, Steps, TrainingSeed, writable_folder
 from .training.checked import load
 from .training.config import Experiment
-from .training.run import train
+from .training.run import holds_training, train
 
 
 @dataclass(frozen=True)
-class Train(Command):
+class Train(Long):
     """Train a Stable-Baselines3 agent on the native vector environment."""
 
     config: str
     """The experiment: a YAML file, or the name of a shipped config."""
+    options: Annotated[
+        Words, tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE …")
+    ] = ()
+    """Options of gym.make for the environment; they go before the config's."""
     timesteps: Steps = None
     """Steps of all runs together, instead of the config's."""
     seed: TrainingSeed = None
@@ -53,15 +63,27 @@ class Train(Command):
             ConfigurationError: a config or a value that is not allowed.
         """
         return load(Experiment, self.config).changed(
-            self.output, timesteps=self.timesteps, seed=self.seed, target_rate=self.target_rate
+            self.output,
+            parse_settings("option", list(chain(*self.options))),
+            timesteps=self.timesteps,
+            seed=self.seed,
+            target_rate=self.target_rate,
         )
 
     def run(self) -> None:
-        """Train; an interrupted training has said how to go on."""
+        """Train as far as the config says."""
         experiment = self.experiment()
         writable_folder("output", Path(experiment.output))
         if not train(experiment, resume=self.resume)["finished"]:
             raise KeyboardInterrupt
+
+    def interrupted(self) -> str:
+        """Nothing but a training that has begun is gone on with."""
+        try:
+            begun = holds_training(Path(self.experiment().output))
+        except ConfigurationError:
+            begun = False
+        return super().interrupted() if begun else "interrupted before the training began"
 
 
 def main() -> None:

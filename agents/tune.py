@@ -19,9 +19,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import shlex
 import sqlite3
-import sys
 import time
 import warnings
 from dataclasses import dataclass
@@ -34,14 +32,14 @@ import yaml
 from optuna.exceptions import ExperimentalWarning, StorageInternalError
 from optuna.trial import TrialState
 from sqlalchemy.exc import IntegrityError, OperationalError, SQLAlchemyError
-from tqdm import tqdm
 
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Command, spelled, start
+from .command_line import Long, start
 from .input.options import OutputFolder, Steps, Whole
 from .output.files import write_text
 from .output.folders import alone_in, check_inputs, fingerprint
+from .output.progress import Bar, progress_bar, writing
 from .training.checked import load, parse
 from .training.config import Experiment
 from .training.run import Diverged, check, holds_training, train
@@ -62,7 +60,7 @@ FACTORS = (0.25, 0.5, 1, 2)  # of the config's steps between two updates
 
 
 @dataclass(frozen=True)
-class Tune(Command):
+class Tune(Long):
     """Find an agent's hyper-parameters with Optuna, in a study that can be gone on with."""
 
     config: str
@@ -90,14 +88,9 @@ class Tune(Command):
             raise ConfigurationError(
                 f"trials = {self.trials} is not enough: all of them were pruned"
             )
-        command = shlex.join([*spelled("tune").split(), *sys.argv[1:]])
         path = self.output / "best.yaml"
-        write_text(path, best_config(study, experiment, command))
+        write_text(path, best_config(study, experiment, self.again()))
         print(f"best return {study.best_value:.4g} with {study.best_params}; config in {path}")
-
-    def interrupted(self) -> str:
-        """Finished trials are kept."""
-        return "interrupted; the same command goes on"
 
 
 def choices(experiment: Experiment) -> dict[str, tuple[Any, ...]]:
@@ -148,6 +141,7 @@ def tune(
     try:
         shared = None if storage is None else shared_study(experiment, storage)
         with alone_in(folder, "output"):
+            writing(("study, trials and best.yaml", folder))
             if shared is not None:
                 return together(shared, experiment, trials, folder)
             study = open_study(experiment, folder)
@@ -207,14 +201,15 @@ def search(study: optuna.Study, experiment: Experiment, trials: int, folder: Pat
     for trial in study.get_trials(states=(TrialState.RUNNING,)):
         study.tell(trial.number, state=TrialState.FAIL)  # its process is gone
     done = min(ended(study), trials)
-    with tqdm(total=trials, desc="tuning", unit="trial", initial=done) as bar:
+    with progress_bar(trials, "tuning", done, unit="trials") as bar:
         while ended(study) < trials:
             if not ended(study) and not study.get_trials(states=(TrialState.WAITING,)):
                 begin_with(study, experiment)
             study.sampler = sampler(experiment, ended(study))
             output = folder / f"trial_{ended(study)}"
-            study.optimize(functools.partial(run_trial, experiment=experiment, output=output), 1)
-            bar.update()
+            work = functools.partial(run_trial, experiment=experiment, output=output, bar=bar)
+            study.optimize(work, 1)
+            bar.reach(ended(study))
 
 
 def shared_study(experiment: Experiment, storage: str) -> optuna.Study:
@@ -271,14 +266,13 @@ def together(
     active = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.RUNNING)
     if not study.get_trials(deepcopy=False):
         begin_with(study, experiment)
-    with tqdm(total=trials, desc="tuning", unit="trial") as bar:
+    with progress_bar(trials, "tuning", min(ended(study), trials), unit="trials") as bar:
         while len(study.get_trials(deepcopy=False, states=active)) < trials:
             study.optimize(
-                lambda trial: run_trial(trial, experiment, folder / f"trial_{trial.number}"),
+                lambda trial: run_trial(trial, experiment, folder / f"trial_{trial.number}", bar),
                 n_trials=1,
             )
-            bar.n = min(ended(study), trials)
-            bar.refresh()
+            bar.reach(ended(study))
     return study
 
 
@@ -306,8 +300,10 @@ def sampler(experiment: Experiment, place: int) -> optuna.samplers.BaseSampler:
     return optuna.samplers.TPESampler(seed=int(seeds.generate_state(1)[0]))
 
 
-def run_trial(trial: optuna.Trial, experiment: Experiment, output: Path) -> float:
+def run_trial(trial: optuna.Trial, experiment: Experiment, output: Path, bar: Bar) -> float:
     """Train with a trial's hyper-parameters in a folder; returns the best validation return.
+
+    The ``bar`` of all trials shows how far it is.
 
     Raises:
         TrialPruned: it fell behind, or diverged.
@@ -315,12 +311,15 @@ def run_trial(trial: optuna.Trial, experiment: Experiment, output: Path) -> floa
     """
     trial.set_user_attr("folder", output.name)
     chosen = suggest(trial, experiment, output)
-    best = -float("inf")
+    best, begun = -float("inf"), bar.done
     pruned = False
 
     def watch(record: dict[str, Any]) -> bool:
         nonlocal best, pruned
         best = max(best, record["return"])
+        part = record["timesteps"] / chosen.training.timesteps
+        bar.say(f"{output.name}: {part:.0%}, return {best:.4g}")
+        bar.reach(begun, (begun + min(part, 1.0)) / bar.total)
         if record["timesteps"] >= chosen.training.timesteps:
             return False  # the finished model's validation
         trial.report(best, record["timesteps"])

@@ -20,9 +20,10 @@ from typing import Annotated, Any
 from fusion_gym import zoo
 from fusion_gym.validation import ConfigurationError, choice
 
-from .command_line import Command, spelled, start
+from .command_line import Long, spelled, start
 from .input.options import InputFolder, OutputFolder
 from .output.files import read_json, replacing, write
+from .output.progress import writing
 from .output.small_model import small_model
 from .suite.classes import HEARD, KNOWS
 from .suite.reports import Agent, read
@@ -32,7 +33,7 @@ MOST = 4_000_000  # bytes of all of them
 
 
 @dataclass(frozen=True)
-class Zoo(Command):
+class Zoo(Long):
     """Put the benchmark's best agents into the model zoo, with their cards."""
 
     envs: tuple[str, ...] = ()
@@ -61,6 +62,7 @@ class Zoo(Command):
                 f"{len(models)} agents have {size:,} bytes: all together must have at most "
                 f"{MOST:,}; name fewer --envs or --classes"
             )
+        writing((f"{len(every)} agents with their cards", self.zoo))
         for name, report in every.items():
             add(name, report, models[name], self.zoo)
             print(f"zoo:{name}")

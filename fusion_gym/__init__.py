@@ -17,11 +17,15 @@ if TYPE_CHECKING:
     from fusion_gym import evaluation, zoo
     from fusion_gym.envs.parallel import FusionParallelEnv, parallel_env
     from fusion_gym.envs.sb3 import FusionSB3VecEnv, make_sb3_vec_env
+    from fusion_gym.envs.single import FusionEnv
+    from fusion_gym.envs.vector import FusionVectorEnv
 
 __all__ = [
     "ConfigurationError",
+    "FusionEnv",
     "FusionParallelEnv",
     "FusionSB3VecEnv",
+    "FusionVectorEnv",
     "__version__",
     "evaluation",
     "make_policy",
@@ -34,8 +38,10 @@ __all__ = [
     "zoo",
 ]
 
-# Faces whose package is part of the extra "agents", and their modules.
+# Faces and their modules; the package of most is part of the extra "agents".
 _FACES = {
+    "FusionEnv": "single",
+    "FusionVectorEnv": "vector",
     "FusionSB3VecEnv": "sb3",
     "make_sb3_vec_env": "sb3",
     "FusionParallelEnv": "parallel",
@@ -45,14 +51,21 @@ _FACES = {
 register()
 
 
-def __getattr__(name: str) -> Any:
-    """Stable-Baselines3, torch and PettingZoo are imported only where they are used."""
-    if name in _FACES:
-        try:
-            return getattr(importlib.import_module(f"{__name__}.envs.{_FACES[name]}"), name)
-        except ModuleNotFoundError as error:
-            missing = f"{error}: pip install 'fusion-gym[agents]'"
-            raise ModuleNotFoundError(missing, name=error.name) from None
-    if name in ("evaluation", "zoo"):
-        return importlib.import_module(f"{__name__}.{name}")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+def __dir__() -> list[str]:
+    """Also what is imported when it is first asked for."""
+    return sorted({*globals(), *__all__})
+
+
+if not TYPE_CHECKING:  # a type checker knows the names above, and no others
+
+    def __getattr__(name: str) -> Any:
+        """Stable-Baselines3, torch and PettingZoo are imported only where they are used."""
+        if name in _FACES:
+            try:
+                return getattr(importlib.import_module(f"{__name__}.envs.{_FACES[name]}"), name)
+            except ModuleNotFoundError as error:
+                missing = f"{error}: pip install 'fusion-gym[agents]'"
+                raise ModuleNotFoundError(missing, name=error.name) from None
+        if name in ("evaluation", "zoo"):
+            return importlib.import_module(f"{__name__}.{name}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -14,7 +14,8 @@ Array = NDArray[np.float64]
 def take_runs(state: Any, runs: NDArray[np.int64]) -> Any:
     """The given runs of a state, in this order and possibly again and again.
 
-    Through dataclasses and named tuples, whose arrays have the batch as last axis.
+    Through dataclasses and named tuples, whose arrays have the batch as last axis, and functions
+    that return such.
     """
     if isinstance(state, np.ndarray):
         return state.take(runs, axis=-1)
@@ -22,6 +23,8 @@ def take_runs(state: Any, runs: NDArray[np.int64]) -> Any:
         return None
     if isinstance(state, tuple):
         return type(state)(*(take_runs(part, runs) for part in state))
+    if callable(state):
+        return lambda: take_runs(state(), runs)
     return type(state)(
         *(take_runs(getattr(state, field.name), runs) for field in dataclasses.fields(state))
     )

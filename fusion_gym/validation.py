@@ -24,6 +24,7 @@ from fusion_gym.errors import (
 # Filters square what they are given and divide by it: from here to there float64 can hold that.
 SMALLEST, LARGEST = 1e-15, 1e15
 LONGEST = 100  # entries of an axis of any length; matrices are multiplied entry by entry
+MOST_SENSORS = 1000  # the network serves them in a loop
 MOST_RUNS = 1_000_000  # each has a generator and a block of noise
 LONGEST_HORIZON = 50_000  # scales and tables are worked out step by step
 
@@ -46,8 +47,10 @@ def _numbers(field: str, value: ArrayLike, allowed: str) -> Array:
     return result
 
 
-def array(field: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
-    """A finite float64 array of the given shape; ``None`` in it is any length from 1 to 100.
+def array(
+    field: str, value: ArrayLike, shape: tuple[int | None, ...], longest: int = LONGEST
+) -> Array:
+    """A finite float64 array of this shape; ``None`` in it is any length from 1 to ``longest``.
 
     Raises:
         ConfigurationError: not numeric, not finite, or of another shape.
@@ -55,11 +58,11 @@ def array(field: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
     result = _numbers(field, value, "an array of numbers")
     wanted = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
     matches = len(shape) == result.ndim and all(
-        1 <= have <= LONGEST if size is None else have == size
+        1 <= have <= longest if size is None else have == size
         for size, have in zip(shape, result.shape, strict=False)
     )
     if not matches:
-        limit = f" (any up to {LONGEST})" if max(result.shape, default=0) > LONGEST else ""
+        limit = f" (any up to {longest})" if max(result.shape, default=0) > longest else ""
         raise refusal(field, value, f"an array of shape {wanted}{limit}, not {result.shape}")
     if not np.all(np.isfinite(result)):
         raise refusal(field, value, "finite")

@@ -83,9 +83,12 @@ def without_rights(wanted: bool) -> Iterator[None]:
 SAID = {
     "policies": {"policy", "model", "zoo"},
     "policy": {"policy", "model", "zoo"},
+    "against": {"policy", "model", "zoo"},
     "set": {"option", "horizon", "cost_weight", "token_rate", "information", "access"},
     "env": {"environment"},
     "seeds": {"seed"},
+    "model": {"the command line"},
+    "papers": {"the command line", "paper"},
 }
 
 
@@ -103,7 +106,7 @@ def flaw(tried: Try, folder: Path) -> str | None:
         return f"not one line: {ended.err[:300]!r}"
     shown = lines[0].replace("\\\\", "\\")
     spelled = {tried.option, tried.option.replace("_", "-")}
-    spec = tried.option in ("policies", "policy", "set")
+    spec = tried.option in ("policies", "policy", "against", "set")
     part = re.split("[:=,]", tried.value)[0] if spec else tried.value
     part = repr(part)[1:-1]
     if part[:100] not in shown:

@@ -38,7 +38,12 @@ BASES: dict[str, dict[str, list[str]]] = {
         "output": ["made"], "episodes": ["2"],
     },
     "report": {"results": ["results"]},
-    "reproduce": {"config": ["rows.yaml"], "episodes": ["2"]},
+    "table": {"config": ["rows.yaml"], "episodes": ["2"]},
+    "reproduce": {
+        "papers": ["markov_jump"], "output": ["made"], "work": ["made_too"], "episodes": ["2"],
+    },
+    "watch": {"env": [ENV], "set": ["horizon=4"], "policy": ["always"], "save": ["made.gif"]},
+    "export": {"model": ["zoo:remote_estimation_sensors"], "onnx": ["made.onnx"]},
     "zoo": {"results": ["results"], "work": ["work"], "zoo": ["made"]},
     "demo": {"output": ["made"], "episodes": ["2"], "timesteps": ["32"]},
     "solved": {
@@ -80,6 +85,8 @@ FILES = ["folder", "text/made.json", "locked/made.json", f"{LONG}.json", "loop",
          "/proc/self/made.json"]  # fmt: skip
 UNREADABLE = ["absent.yaml", "absent", "folder", "locked/file.yaml", "text/below.yaml", LONG,
               "loop.yaml"]  # fmt: skip
+# Words without a name before them.
+POSITIONAL = {("reproduce", "papers"), ("export", "model")}
 # Numbers among the hostile ones that an option may have after all.
 ALLOWED = {("seed", "0"), ("seeds", "0"), ("seed", "9" * 30)}
 
@@ -116,7 +123,7 @@ def hostile(option: str, kind: Any, present: list[str] | None = None) -> list[st
         values = [*FOLDERS, *(results if present == ["results"] else [])]
     elif OutputFile in marks:
         values = FILES
-    elif option in ("policies", "policy"):
+    elif option in ("policies", "policy", "against"):
         values = POLICIES
     elif option == "set":
         values = SETTINGS
@@ -154,8 +161,16 @@ def tries() -> Iterator[Try]:
 
 def line(command: str, given: dict[str, list[str]]) -> list[str]:
     """The words behind the command."""
-    joined = []
+    first: list[str] = []
+    joined: list[str] = []
+    last: list[str] = []
     for option, words in given.items():
         name = f"--{option.replace('_', '-')}"
-        joined += [f"{name}={words[0]}"] if words[0].startswith("-") else [name, *words]
-    return joined
+        if (command, option) in POSITIONAL:
+            if words[0].startswith("-"):
+                last = ["--", *words]
+            else:
+                first = words
+        else:
+            joined += [f"{name}={words[0]}"] if words[0].startswith("-") else [name, *words]
+    return [*first, *joined, *last]

@@ -7,6 +7,7 @@ import dataclasses
 import json
 import math
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from stable_baselines3 import PPO
 from training_configs import ENV, SMALL, read_records, small_config
 
 import fusion_gym
-from agents import demo, evaluate, reproduce
+from agents import demo, evaluate, table
 from agents.command_line import read
 from agents.suite.beside_rules import Ground, Trials
 from agents.suite.config import Suite
@@ -246,13 +247,20 @@ def test_an_interrupted_training_loses_nothing(tmp_path: Path, number: signal.Si
     while not (folder / "latest.zip").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     os.kill(process.pid, number)
-    output, _ = process.communicate(timeout=60)
+    _, error = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert b"go on with --resume" in output
+    told, again = error.decode().splitlines()[-1].split("go on with: ")
+    assert told == "interrupted; "
+    assert shlex.split(again) == ["python", *command[1:], "--resume"]
     summary = json.loads((folder / "summary.json").read_text())
     assert not summary["finished"]
     records = len(read_records(folder))
-    resumed = [*command, "--resume", "--timesteps", str(summary["timesteps"] + 1500)]
+    resumed = [
+        sys.executable,
+        *shlex.split(again)[1:],
+        "--timesteps",
+        str(summary["timesteps"] + 1500),
+    ]
     subprocess.run(resumed, cwd=ROOT, check=True, capture_output=True, timeout=120)
     later = json.loads((folder / "summary.json").read_text())
     assert later["finished"]
@@ -436,7 +444,8 @@ def test_an_interrupted_demo_ends_its_trainings_with_a_checkpoint(tmp_path: Path
     process.terminate()
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert error.decode().splitlines()[-1].startswith("interrupted: run the same command again")
+    again = error.decode().splitlines()[-1].removeprefix("interrupted; go on with: ")
+    assert shlex.split(again) == ["python", *command[1:]]
     assert b"Traceback" not in error
     for agent in agents:
         summary = json.loads((agent / "summary.json").read_text())
@@ -453,8 +462,8 @@ def test_an_interrupted_demo_ends_its_trainings_with_a_checkpoint(tmp_path: Path
     assert all(summary["finished"] for summary in resumed.values())
 
 
-def test_reproduce_prints_every_row() -> None:
+def test_table_prints_every_row() -> None:
     comparison = load(Comparison, CONFIGS / "tobit_oscillator_reproduce.yaml")
-    rows = reproduce.table(comparison, episodes=3, seed=0)
+    rows = table.rows_of(comparison, episodes=3, seed=0)
     assert [row[0] for row in rows] == [row.label for row in comparison.rows]
-    assert all(len(row) == len(reproduce.COLUMNS) for row in rows)
+    assert all(len(row) == len(table.COLUMNS) for row in rows)

@@ -10,6 +10,7 @@ import typing
 from pathlib import Path
 
 import pytest
+import tyro
 from small_results import small_results
 
 from agents import __main__ as everything
@@ -42,7 +43,12 @@ def test_help_shows_every_option_with_a_sentence_and_its_default(
         if own in options:
             options[option] = options.pop(own)
     listed = shown.partition("--help")[2]  # the usage above it may name options as well
+    hints = typing.get_type_hints(kind, include_extras=True)
     for option, field in options.items():
+        if tyro.conf.Positional[int].__metadata__[0] in getattr(
+            hints[field.name], "__metadata__", ()
+        ):
+            continue  # stands in the usage
         entry = listed.split(f"--{option.replace('_', '-')} ")[1].split(" --")[0]
         assert len(entry.split()) > 3, option
         repeatable = "tuple" in str(typing.get_type_hints(kind, include_extras=True)[field.name])

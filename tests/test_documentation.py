@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import ast
+import importlib.util
 import pydoc
 import re
-import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,6 +16,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from page_blocks import blocks_of, imported, stray_commands
 
 import fusion_gym
 from agents import report
@@ -38,8 +39,16 @@ README = (ROOT / "README.md").read_text()
 DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [path for path in DOCS if "<!-- observation: " in path.read_text()]  # of environments
 TEXTS = README + "".join(path.read_text() for path in (*DOCS, ROOT / "CONTRIBUTING.md"))
-BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", TEXTS, re.DOTALL | re.MULTILINE)
-EXAMPLES = [text for language, text in BLOCKS if language == "python"]
+BLOCKS = {
+    path.name: blocks_of(path.relative_to(ROOT), path.read_text())
+    for path in (ROOT / "README.md", *DOCS, ROOT / "CONTRIBUTING.md")
+}
+EXAMPLES = [
+    (name, place)
+    for name, blocks in BLOCKS.items()
+    for place, block in enumerate(blocks)
+    if block.language == "python"
+]
 
 
 @pytest.fixture
@@ -53,15 +62,34 @@ def registries() -> Iterator[None]:
         table.update(before)
 
 
-@pytest.mark.parametrize("code", EXAMPLES, ids=range(len(EXAMPLES)))
-def test_python_examples_run(code: str, registries: None) -> None:
-    exec(compile(code, "example", "exec"), {})
+@pytest.mark.parametrize(("name", "place"), EXAMPLES)
+def test_python_examples_run(
+    name: str, place: int, registries: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As far as what they import is here; ``tests/wheel_blocks.py`` runs those of all pages."""
+    monkeypatch.chdir(tmp_path)
+    block = BLOCKS[name][place]
+    for other in BLOCKS[name][:place]:
+        if other.file is not None:
+            Path(other.file).write_text(other.text)
+    for module in imported(block.text):
+        if importlib.util.find_spec(module.partition(".")[0]) is None:
+            pytest.skip(f"{module} is absent")
+    exec(compile(block.text, "example", "exec"), {})
+
+
+def test_commands_stand_in_shell_blocks() -> None:
+    pages = sorted((ROOT / "docs").rglob("*.md"))
+    assert not [line for path in pages for line in stray_commands(path, path.read_text())]
 
 
 def test_the_evaluation_command_runs(tmp_path: Path) -> None:
-    block = next(text for _, text in BLOCKS if text.startswith("fusion-gym evaluate"))
-    words = shlex.split(block.replace("\\\n", " "))
-    assert words[0] == "fusion-gym"
+    words = next(
+        words
+        for block in BLOCKS["policies.md"]
+        for _, words in block.commands()
+        if words[:2] == ["fusion-gym", "evaluate"]
+    )
     words[words.index("--json") + 1] = str(tmp_path / "evaluation.json")
     line = [sys.executable, "-m", "agents", *words[1:]]
     subprocess.run(line, cwd=ROOT, check=True, capture_output=True)
@@ -80,7 +108,7 @@ def test_what_a_page_links_exists(path: Path) -> None:
 
 
 def test_configs_that_the_texts_name_exist() -> None:
-    configs = re.findall(r"(?:--config|--sweep) (\w+)(?![\w/])", TEXTS)
+    configs = re.findall(r"(?:--config|--sweep) (\w+)(?![\w/]|\.yaml)", TEXTS)
     assert configs
     missing = [name for name in configs if not (ROOT / f"configs/{name}.yaml").exists()]
     assert not missing
@@ -209,7 +237,7 @@ def test_help_shows_the_whole_page(env_id: str) -> None:
     prefix = f"fusion_gym.envs.registered.{class_name(env_id)}"
     text = pydoc.plain(pydoc.render_doc(f"{prefix}Env"))
     options = [field.name for field in fields(options_of(env_id))]
-    assert not [name for name in options if f"    {name} = " not in text]
+    assert not [name for name in options if not re.search(rf"^.*    {name}: \S.* = \S", text, re.M)]
     infos = reset_infos(fusion_gym.make_task(env_id), 1)
     assert not [key for key in infos if f"`{key}`" not in text]
     assert "Starting state: " in text

@@ -27,7 +27,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 import fusion_gym
-from agents import compare, evaluate, reproduce
+from agents import compare, evaluate, table
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.policies import archive
@@ -481,7 +481,7 @@ def test_commands_load_foreign_code_with_trust_alone(
     for command, arguments in (
         (evaluate, ["--config", config, "--policies", policy]),
         (compare, ["--config", config, "--sweep", sweep, "--policy", policy, "--output"]),
-        (reproduce, ["--config", str(tmp_path / "rows.yaml")]),
+        (table, ["--config", str(tmp_path / "rows.yaml")]),
     ):
         if command is compare:
             arguments.append(str(tmp_path / "comparison"))

@@ -190,5 +190,6 @@ def test_no_error_at_all_can_be_drawn_and_compared(tmp_path: Path) -> None:
     assert all(path.stat().st_size > 10_000 for path in paths)
     task = make_task(ENV, horizon=3)
     found = run_episodes(task, make_policy("always", task), 2, 0)
-    table = comparison_table(Comparison(Interval(0.0, 0.0, 0.0), 0.0, ("always",)), found)
+    nothing = Comparison(Interval(0.0, 0.0, 0.0), 0.0, ("always",))
+    table = comparison_table({"always": nothing}, {"always": found})
     assert list(table.columns[4].cells) == ["–"]

@@ -16,7 +16,7 @@ import numpy as np
 
 from fusion_gym.arrays import merge_runs, take_runs
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.beliefs import Beliefs
+from fusion_gym.core.beliefs import Beliefs, Estimate
 from fusion_gym.core.memory import Memory, Shadows
 from fusion_gym.core.signals import MEMORY_SIGNALS
 from fusion_gym.core.system import Knowledge, Signals, covers
@@ -51,7 +51,7 @@ class Believed:
         result: Values = {}
         for name, value in self.values.items():
             parts = (value, *(other.values[name] for other in others))
-            if isinstance(value, tuple):
+            if isinstance(value, Estimate):
                 result[name] = type(value)(*(change(*same) for same in zip(*parts, strict=True)))
             else:
                 result[name] = change(*parts)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich import box
 from rich.table import Table
 
@@ -29,50 +31,46 @@ def run_all(
     *,
     trust: bool = False,
 ) -> dict[str, EpisodeResults]:
-    """Every policy on the same seeds, with a progress bar; ``trust`` as in ``make_policy``."""
+    """Every policy on the same seeds, with a bar of progress; ``trust`` as in ``make_policy``."""
     made = {name: make_policy(name, task, trust=trust) for name in policies}
     total = len(policies) * episodes * task.horizon
     with progress_bar(total, description) as bar:
-        return {
-            name: run_episodes(task, policy, episodes, seed, bar.update)
-            for name, policy in made.items()
-        }
+        found = {}
+        for name, policy in made.items():
+            bar.say(name)
+            found[name] = run_episodes(task, policy, episodes, seed, bar.update)
+        return found
 
 
 def compare(
-    env_id: str, task: Task, sweep: Sweep, baselines: dict[str, EpisodeResults], agent: str,
-    seed: int, folder: Path, trust: bool = False,
+    env_id: str, task: Task, sweep: Sweep, baselines: dict[str, EpisodeResults],
+    agents: Sequence[str], seed: int, folder: Path, trust: bool = False,
 ) -> None:  # fmt: skip
-    """Run the agent on the baselines' episodes; write, print and draw the comparison.
+    """Run the agent, or the agent at each of its prices, on the baselines' episodes.
+
+    Writes, prints and draws the comparison.
 
     Raises:
         ConfigurationError: the agent transmits less than every baseline.
     """
     episodes = next(iter(baselines.values())).episodes
-    learned = run_all(task, [agent], episodes, seed, "agent", trust=trust)[agent]
-    comparison = compare_with_envelope(learned, baselines)
+    learned = run_all(task, list(agents), episodes, seed, "agent", trust=trust)
+    found = {name: compare_with_envelope(one, baselines) for name, one in learned.items()}
     envelope = lower_envelope(baselines)
-    results = baselines | {agent: learned}
+    results = baselines | learned
     report: dict[str, Any] = {
         "env": env_id,
-        "episodes": learned.episodes,
+        "episodes": episodes,
         "seed": seed,
         "horizon": task.horizon,
         "settings": task.settings,
-        "policies": {name: summarise(found) for name, found in results.items()},
-        "quantiles": {name: robust_summary(found) for name, found in results.items()},
+        "policies": {name: summarise(one) for name, one in results.items()},
+        "quantiles": {name: robust_summary(one) for name, one in results.items()},
     }
     write(folder / "evaluation.json", report)
-    verdict = {
-        "agent": agent,
-        "rate": float(learned.rate.mean()),
-        "mse": float(learned.mse.mean()),
-        "envelope": comparison.envelope,
-        "difference": comparison.difference._asdict(),
-        "between": list(comparison.between),
-    }
-    write(folder / "comparison.json", verdict)
-    shown = dict.fromkeys([*sweep.points, *(point.name for point in envelope), agent])
+    points = [_point(name, learned[name], comparison) for name, comparison in found.items()]
+    write(folder / "comparison.json", {"points": points})
+    shown = dict.fromkeys([*sweep.points, *(point.name for point in envelope), *learned])
     console = tables.console()
     console.print(
         tables.evaluation_table(
@@ -83,29 +81,50 @@ def compare(
             {},
         )
     )
-    console.print(comparison_table(comparison, learned))
+    console.print(comparison_table(found, learned))
     lines = [
         figures.Line(curve.label, [baselines[name] for name in curve.policies])
         for curve in sweep.curves
     ]
-    points = {name: baselines[name] for name in sweep.points}
-    label = "PPO agent" if agent.startswith("model:") else agent
-    figures.pareto(folder / "pareto.png", env_id, lines, points, {label: learned}, envelope)
+    single = {name: baselines[name] for name in sweep.points}
+    agent = figures.Line(_label(agents), list(learned.values()))
+    figures.pareto(folder / "pareto.png", env_id, lines, single, agent, envelope)
 
 
-def comparison_table(comparison: Comparison, learned: EpisodeResults) -> Table:
-    """The agent against the envelope at its own rate."""
+def _point(name: str, learned: EpisodeResults, comparison: Comparison) -> dict[str, Any]:
+    return {
+        "agent": name,
+        "rate": float(learned.rate.mean()),
+        "mse": float(learned.mse.mean()),
+        "envelope": comparison.envelope,
+        "difference": comparison.difference._asdict(),
+        "between": list(comparison.between),
+    }
+
+
+def _label(agents: Sequence[str]) -> str:
+    if len(agents) > 1:
+        return f"the agent, at {len(agents)} prices"
+    return "the agent" if agents[0].startswith("model:") else agents[0]
+
+
+def comparison_table(
+    found: Mapping[str, Comparison], learned: Mapping[str, EpisodeResults]
+) -> Table:
+    """The agent against the envelope, at its own rate at each of its prices."""
     table = Table(title="the agent against the lower envelope at its own rate", box=box.SIMPLE_HEAD)
     for name in ("rate", "agent's MSE", "envelope's MSE", "difference [95 %]", "relative"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("envelope between", overflow="fold")
-    table.add_row(
-        f"{learned.rate.mean():.4f}",
-        f"{learned.mse.mean():.4f}",
-        f"{comparison.envelope:.4f}",
-        tables.difference(comparison.difference),
-        # Whoever always transmits over a perfect channel has no error to compare with.
-        f"{comparison.difference.mean / comparison.envelope:+.1%}" if comparison.envelope else "–",
-        "\n".join(comparison.between),
-    )
+    for name, comparison in found.items():
+        share = comparison.difference.mean / (comparison.envelope or np.nan)
+        table.add_row(
+            f"{learned[name].rate.mean():.4f}",
+            f"{learned[name].mse.mean():.4f}",
+            f"{comparison.envelope:.4f}",
+            tables.difference(comparison.difference),
+            # Whoever always transmits over a perfect channel has no error to compare with.
+            "–" if np.isnan(share) else f"{share:+.1%}",
+            "\n".join(comparison.between),
+        )
     return table

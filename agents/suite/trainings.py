@@ -1,4 +1,4 @@
-"""Trainings side by side: a process and a progress bar each, one interrupt for all."""
+"""Trainings side by side: a process and a bar of progress each, one interrupt for all."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from typing import Any
 
 from fusion_gym.validation import ConfigurationError
 
-from ..output.progress import progress_bars
+from ..output.progress import progress_bar
 from ..training.config import Experiment
+from ..training.monitor import shown
 from ..training.run import holds_training, train
 from .workers import end_with
 
@@ -63,11 +64,18 @@ def _watch(experiments: Mapping[str, Experiment], left: set[Future[dict[str, Any
     Raises:
         KeyboardInterrupt: one was interrupted; or what went wrong in it.
     """
-    with progress_bars({name: one.training.timesteps for name, one in experiments.items()}) as show:
+    with contextlib.ExitStack() as stack:
+        bars = {
+            name: stack.enter_context(progress_bar(one.training.timesteps, f"training {name}"))
+            for name, one in experiments.items()
+        }
         while left:
             done, left = wait(left, _EVERY)
             for name, one in experiments.items():
-                show(name, _last_validation(Path(one.output)))
+                last = _last_validation(Path(one.output))
+                if last is not None:
+                    bars[name].say(shown(last))
+                    bars[name].reach(last["timesteps"])
             for future in done:
                 if not future.result()["finished"]:
                     raise KeyboardInterrupt

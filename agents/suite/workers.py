@@ -11,10 +11,10 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any, NamedTuple
 
 import joblib
-from tqdm import tqdm
 
 from fusion_gym.validation import ConfigurationError
 
+from ..output.progress import progress_bar
 from .team import Team
 
 _EVERY = 1.0  # seconds between two looks
@@ -29,7 +29,7 @@ class Work(NamedTuple):
 
 
 def side_by_side(work: Sequence[Work], team: Team, description: str) -> None:
-    """Let the team do the work, with an estimate of the remaining time.
+    """Let the team do the work, and show how far it is.
 
     Raises:
         ConfigurationError: some of it does not fit, there is no such team, or the system ended a
@@ -37,23 +37,21 @@ def side_by_side(work: Sequence[Work], team: Team, description: str) -> None:
     """
     if not work:
         return
-    total = sum(one.weight for one in work)
-    began = time.perf_counter()
+    total, done = sum(one.weight for one in work), 0.0
     parent = os.getpid() if team.here else None
-    bar = tqdm(total=round(total), desc=description, unit="s of work", smoothing=0.0)
-    with bar, team.gathered():
+    with progress_bar(len(work), description, unit="pieces") as bar, team.gathered():
         weights = joblib.Parallel(return_as="generator_unordered", batch_size=1)(
             joblib.delayed(_do)(one, parent) for one in work
         )
         try:
-            for weight in weights:
-                bar.update(min(weight, bar.total - bar.n))
+            for place, weight in enumerate(weights, 1):
+                done += weight
+                bar.reach(place, done / total)
         except BrokenProcessPool:
             raise ConfigurationError(
                 f"workers = {team.workers}: the system ended one of them, perhaps for want of "
                 "memory; finished pieces of work are kept: go on as after an interrupt"
             ) from None
-    print(f"{description}: {len(work)} pieces of work in {time.perf_counter() - began:.0f} s")
 
 
 def _do(work: Work, parent: int | None) -> float:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import pydantic
+
+from fusion_gym.envs.registration import opened
 
 from .algorithms import AnyAlgorithm
 from .checked import Positive, Share, Strict, parse
@@ -14,12 +17,18 @@ from .checked import Positive, Share, Strict, parse
 class EnvironmentConfig(Strict):
     """A registered environment and the options of ``gym.make`` that differ from its defaults.
 
-    ``local`` trains one policy that every sensor runs by itself, on what it sees by itself.
+    ``local`` trains one policy that every sensor runs by itself, on what it sees by itself. A file
+    of options that ``options`` name as ``system`` is read here: what it says belongs to the config.
     """
 
     id: str
     options: dict[str, Any] = pydantic.Field(default_factory=dict)
     local: bool = False
+
+    @pydantic.field_validator("options")
+    @classmethod
+    def _opened(cls, options: dict[str, Any], info: pydantic.ValidationInfo) -> dict[str, Any]:
+        return opened(info.data["id"], options) if "id" in info.data else options
 
 
 class TrainingConfig(Strict):
@@ -69,12 +78,16 @@ class Experiment(Strict):
             mode="json", exclude={"output": True, "training": {"timesteps": True, "threads": True}}
         )
 
-    def changed(self, output: str | Path | None, **training: Any) -> Experiment:
-        """The experiment with another output or training, where they are given, checked again.
+    def changed(
+        self, output: str | Path | None, options: Mapping[str, Any] | None = None, **training: Any
+    ) -> Experiment:
+        """The experiment with another output, options, training where given, checked again.
 
         Raises:
             ConfigurationError: a value that is not allowed.
         """
         plain = self.model_dump() | ({} if output is None else {"output": str(output)})
+        environment = plain["environment"]
+        environment["options"] |= opened(environment["id"], options or {})
         plain["training"] |= {key: value for key, value in training.items() if value is not None}
         return parse(Experiment, plain, "command line")

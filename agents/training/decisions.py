@@ -16,6 +16,7 @@ from fusion_gym.validation import ConfigurationError
 
 Kind = Literal["all", "flips"]
 MOST_ALTERNATIVES = 16  # sets of requests that are all stepped unless told otherwise
+MOST_SENSORS = 10  # whose sets of requests are all stepped where that is asked for
 Chosen = NDArray[np.int64]  # choices (runs, D)
 
 
@@ -27,7 +28,8 @@ class Decisions:
       where the sensors decide by themselves.
 
     Raises:
-        ConfigurationError: flips of an action that is one number.
+        ConfigurationError: flips of an action that is one number, or all sets of more than 10
+            sensors.
     """
 
     def __init__(self, env: PrivilegedVecEnv, kind: Kind | None) -> None:
@@ -50,11 +52,28 @@ class Decisions:
         self.choices = 2
         if self.kind == "all":
             self.choices = 2**self.sensors if self.binary else int(space.n)  # type: ignore[attr-defined]
+            self._check_choices()
             numbers = np.arange(self.choices)
             bits = (numbers[:, None] >> np.arange(self.sensors) & 1).astype(np.bool_)
             actions = bits if self.binary else numbers
             self.bits = torch.as_tensor(bits, dtype=torch.float32)
             self.requests = env.view.requests(actions, self.choices).T[:, :, None]
+
+    def _check_choices(self) -> None:
+        """Refuse more than can be stepped: of one sensor at a time there are no more than sensors.
+
+        Raises:
+            ConfigurationError: all sets of more than 10 sensors.
+        """
+        if self.choices <= 2**MOST_SENSORS:
+            return
+        asked, instead = ("action = 'discrete'", "action must be 'binary'")
+        if self.binary:
+            asked, instead = ("alternatives = 'all'", "it must be 'flips'")
+        raise ConfigurationError(
+            f"{asked} is not allowed here with {self.sensors} sensors: all 2^{self.sensors} sets "
+            f"of requests would be stepped, of at most {MOST_SENSORS} sensors; {instead}"
+        )
 
     def log_probabilities(self, logits: torch.Tensor) -> torch.Tensor:
         """Of all choices, (runs, D, C).

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.evaluation.cross_term import cross_terms, usual_policies, worst
 from fusion_gym.policies.registry import make_policy
 
+from ..output.progress import remark
 from .config import Experiment
 
 EPISODES = 150  # of each of two policies: a second or two in the slowest environment
@@ -29,9 +28,8 @@ def warn_of_cross_term(experiment: Experiment, env: FusionSB3VecEnv) -> None:
     policies = {name: make_policy(name, task) for name in (usual[0], usual[-1])}
     name, found = worst(cross_terms(task, reference, policies, EPISODES, SEED, LEVEL))
     if not found.compatible:
-        print(
+        remark(
             f"warning: training.error = 'mismatch' leaves out a cross term of {found.shown} of the "
             f"error under {name} ({EPISODES} episodes); error: excess has none, and the command "
-            "mismatch measures it under other policies and filters",
-            file=sys.stderr,
+            "mismatch measures it under other policies and filters"
         )

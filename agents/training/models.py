@@ -53,10 +53,21 @@ def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
 
 
 def _reference(task: Task, where: EnvironmentConfig, error_filter: str | None) -> System[Any]:
-    """What takes in every measurement: the task's own memory where that has the same filter."""
+    """What takes in every measurement: the task's own memory where that has the same filter.
+
+    Raises:
+        ConfigurationError: the environment has no such filter.
+    """
     if task.shadow is not None and error_filter in (None, where.options.get("memory_filter")):
         return task.shadow
-    return reference_system(where.id, where.options, error_filter)
+    try:
+        return reference_system(where.id, where.options, error_filter)
+    except ConfigurationError as error:
+        if error_filter is None:
+            raise
+        raise ConfigurationError(
+            f"error_filter = {error_filter!r} is not allowed: {error}"
+        ) from None
 
 
 def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from tqdm import tqdm
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
@@ -25,6 +24,7 @@ from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.model import ModelPolicy
 
 from ..output.files import replacing, write_text
+from ..output.progress import Bar
 from . import checkpoint
 from .checkpoint import Journal
 from .config import Experiment
@@ -74,7 +74,7 @@ class Progress(BaseCallback):
         folder: Path,
         task: Task,
         interrupt: Interrupt,
-        bar: tqdm[Any],
+        bar: Bar,
         journal: Journal,
         watch: Callable[[dict[str, Any]], bool] | None = None,
         measure: Measure | None = None,
@@ -118,7 +118,7 @@ class Progress(BaseCallback):
         self._measure("policy")
         self.journal.seconds["policy"] -= environment
         self.journal.seconds["environment"] += environment
-        self.bar.update(self.num_timesteps - self.bar.n)
+        self.bar.reach(self.num_timesteps)
         # The last validation is that of the finished model.
         if self._next <= self.num_timesteps < self.experiment.training.timesteps:
             self._plan()
@@ -185,9 +185,7 @@ class Progress(BaseCallback):
 
     def _show(self, record: dict[str, Any]) -> None:
         """A validation to the bar, and to whoever watches and may end the training."""
-        self.bar.set_postfix(
-            mse=f"{record['mse']:.4f}", rate=f"{record['rate']:.3f}", refresh=False
-        )
+        self.bar.say(shown(record))
         if self.watch is not None:
             self.stopped = self.watch(record)
 
@@ -220,6 +218,11 @@ class Progress(BaseCallback):
         env = self.training_env.unwrapped
         assert isinstance(env, FusionSB3VecEnv)
         return env
+
+
+def shown(record: dict[str, Any]) -> str:
+    """A validation in a few words."""
+    return f"MSE {record['mse']:.4f}, rate {record['rate']:.3f}"
 
 
 def _now() -> tuple[float, float]:

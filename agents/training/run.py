@@ -22,7 +22,7 @@ from fusion_gym.validation import ConfigurationError
 
 from ..output.files import replacing, write, write_text
 from ..output.folders import alone_in, check_inputs, fingerprint
-from ..output.progress import progress_bar
+from ..output.progress import progress_bar, writing
 from .checked import load
 from .checkpoint import Journal, read_journal, restore
 from .config import Experiment
@@ -141,6 +141,8 @@ def train(
                 warn_of_cross_term(experiment, env)
         else:
             model = restore(folder / "latest.zip", type(model), env)
+        if not quiet:
+            writing(("checkpoints, models and validations", folder))
         plain = experiment.model_dump(mode="json")
         write_text(folder / "config.yaml", yaml.safe_dump(plain, sort_keys=False))
         return _learn(experiment, folder, model, env, scored, journal, quiet, watch, measure)
@@ -216,6 +218,4 @@ def describe(summary: dict[str, Any], folder: Path, elapsed: float) -> str:
             f"best validation at {best['timesteps']:,} steps: return {best['return']:.3f}, "
             f"MSE {best['mse']:.4f}, rate {best['rate']:.4f}"
         )
-    if not summary["finished"]:
-        lines.append("go on with --resume")
     return "\n".join([*lines, f"results in {folder}"])

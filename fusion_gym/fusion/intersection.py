@@ -155,6 +155,9 @@ def covariance_intersection(
         relative 1e-6 of the optimum. A lane with a covariance that is not positive definite is
         NaN, except for the weights.
 
+    Assumes: P_A and P_B bound their own error covariances; nothing of the correlation of the
+    two.
+
     Source: adaptive_innovation, equations (37), (38) and (42); S. J. Julier and J. K. Uhlmann, "A
     non-divergent estimation algorithm in the presence of unknown correlations", 1997.
     """
@@ -215,6 +218,8 @@ def inverse_covariance_intersection(
         relative 1e-6 of the optimum. A lane with a covariance that is not positive definite is
         NaN, except for the weights.
 
+    Assumes: common information of the structure above; nothing else that both estimates share.
+
     Source: adaptive_innovation, equations (47) to (54), with a factor P added to the second terms
     of (49) and (50); B. Noack, J. Sijs, M. Reinhardt and U. D. Hanebeck, "Decentralized data
     fusion with inverse covariance intersection", Automatica 79, 2017.
@@ -240,6 +245,8 @@ class SequentialIntersection(FusionRule):
 
     Raises:
         ConfigurationError: an order that is no permutation, or not one of the l estimates.
+
+    Assumes: what ``join`` assumes, at every step.
 
     Source: adaptive_innovation, equations (37) to (40) and (47) to (52), gains by (56) and (59).
     """

@@ -84,6 +84,18 @@ def own_covariances(covariance: Array) -> Array:
     return np.stack([covariance[i, i] for i in range(len(covariance))])
 
 
+def alike(covariance: Array) -> bool:
+    """Whether the covariances (l, n, n, N) of all estimates are one and the same in memory."""
+    return len(covariance) > 1 and covariance.strides[0] == 0
+
+
+def inverses(covariance: Array) -> Array:
+    """Inverses of covariances (l, n, n, N), of those that are :func:`alike` once."""
+    if not alike(covariance):
+        return linalg.inverse(covariance)
+    return np.broadcast_to(linalg.inverse(covariance[:1]), covariance.shape)
+
+
 @dataclass(frozen=True)
 class InformationFusion(FusionRule):
     """Sum of the informations of independent estimates: P = (Σ P_i⁻¹)⁻¹, x = P Σ P_i⁻¹ x_i.
@@ -91,6 +103,8 @@ class InformationFusion(FusionRule):
     It has no parameters. The result is optimal for independent errors, and for those of nodes
     that share a prior in shares of its information. A prior that several estimates have in full
     is counted as often as they do, and P is then too small.
+
+    Assumes: independent errors, or nodes whose common prior was shared out among them.
 
     Source: tobit_token_bucket, equation (50).
     """
@@ -103,16 +117,47 @@ class InformationFusion(FusionRule):
         if active is not None:
             information = np.where(active[:, None, None], information, 0.0)
             means = np.where(active[:, None], means, 0.0)
+        return self.fuse_information(means, information)
+
+    def fuse_information(self, means: Array, information: Array) -> Fused:
+        """The same of informations P_i⁻¹ (l, n, n, N), zero for estimates that take no part."""
         fused = linalg.inverse(information.sum(0))
         mean = linalg.matvec(fused, linalg.matvec(information, means).sum(0))
         return Fused(mean, fused, lambda: linalg.matmul(fused, information))
 
+    def fuse_each(
+        self, means: Array, information: Array, others: Array, gained: Array
+    ) -> tuple[Array, Array]:
+        """The estimates joined with one of them replaced, each in its turn.
+
+        From means (l, n, N) and informations (l, n, n, N), and the ``others`` and what is
+        ``gained`` that stand for them, of the same shapes, to means (l, n, N) and covariances
+        (l, n, n, N): bitwise those of l calls of :meth:`fuse_information`.
+        """
+        fused = linalg.inverse(_replaced_in_turn(information, gained))
+        vector = _replaced_in_turn(linalg.matvec(information, means), linalg.matvec(gained, others))
+        return linalg.matvec(fused, vector), fused
+
     def fuse_alone(self, silent: Array, delivered: Array) -> tuple[Array, Array]:
         """See :class:`FusionRule`: informations are sums."""
-        information = linalg.inverse(silent)
+        information = inverses(silent)
         total = information.sum(0)
         gained = linalg.inverse(delivered) - information
         return linalg.inverse(total), linalg.inverse(linalg.symmetrise(total + gained))
+
+
+def _replaced_in_turn(terms: Array, others: Array) -> Array:
+    """Sums of ``terms`` (l, …, N), in the i-th of which ``others[i]`` stands for the i-th.
+
+    (l, …, N), each summed in the order of the terms, as ``sum(0)`` does.
+    """
+    total = np.repeat(terms[:1], len(terms), axis=0)
+    total[0] = others[0]
+    for place in range(1, len(terms)):
+        before = total[place] + others[place]
+        total += terms[place]
+        total[place] = before
+    return total
 
 
 @dataclass(frozen=True)
@@ -126,6 +171,9 @@ class MatrixWeightedFusion(FusionRule):
     Cov(D) is singular too, and a relative ridge of 1e-12 on it stands for its pseudo-inverse. The
     result is that of (eᵀ T⁺ e)⁺ eᵀ T⁺ with T = Σ + e eᵀ. The covariance is
     weights · Σ · weightsᵀ of the given Σ, the true one for these weights.
+
+    Assumes: the joint covariance of all errors is known, cross-covariances included; no
+    Gaussian law is needed.
 
     Source: markov_jump, equations (55)-(57); the printed (57), (eᵀ Σ⁻¹ e)⁻¹, needs a regular Σ.
     """

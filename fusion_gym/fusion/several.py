@@ -81,6 +81,8 @@ def covariance_intersection_many(
     The multiplicative update w_i <- w_i sqrt(tr(P Y_i P)) has the same optimum, but where
     estimates are alike thousands of its steps do not reach it. Newton's need four to thirty.
 
+    Assumes: the P_i bound their own error covariances; nothing of their correlations.
+
     Source: the optimum is an A-optimal design, and the gap is J. Kiefer's, "General equivalence
     theory for optimum designs", Annals of Statistics 2, 1974.
     """

@@ -19,6 +19,7 @@ from fusion_gym.fusion.rules import FusionRule, InformationFusion, MatrixWeighte
 from fusion_gym.fusion.several import CovarianceIntersection
 from fusion_gym.validation import ConfigurationError
 
+MOST_TOGETHER = 40  # sensors whose estimates a rule joins at once, at a cost of their cube
 Order = tuple[int, ...] | None
 Assumption = Literal[
     "nothing",
@@ -50,14 +51,15 @@ class Rule:
     """A row of the table.
 
     ``make`` gives the rule for an order of arrival, ``assumes`` is what it needs to hold for its
-    covariance to be a bound, ``pair`` means exactly two estimates, and ``ordered`` that the order
-    belongs to it.
+    covariance to be a bound, ``pair`` means exactly two estimates, ``ordered`` that the order
+    belongs to it, and ``cubic`` that its cost grows with the cube of the number of estimates.
     """
 
     make: Callable[[Order], FusionRule]
     assumes: Assumption
     pair: bool = False
     ordered: bool = False
+    cubic: bool = False
 
 
 _IN_TURN = partial(SequentialIntersection, covariance_intersection)
@@ -65,11 +67,11 @@ _INVERSE = partial(SequentialIntersection, inverse_covariance_intersection)
 RULES = {
     "federated": Rule(lambda order: InformationFusion(), "information shares"),
     "information": Rule(lambda order: InformationFusion(), "independence"),
-    "matrix": Rule(lambda order: MatrixWeightedFusion(), "joint covariance"),
+    "matrix": Rule(lambda order: MatrixWeightedFusion(), "joint covariance", cubic=True),
     "sici": Rule(_INVERSE, "common information", ordered=True),
     "sci": Rule(_IN_TURN, "nothing", ordered=True),
-    "ci": Rule(lambda order: CovarianceIntersection(), "nothing"),
-    "exact_ci": Rule(lambda order: CovarianceIntersection(), "tracked weights"),
+    "ci": Rule(lambda order: CovarianceIntersection(), "nothing", cubic=True),
+    "exact_ci": Rule(lambda order: CovarianceIntersection(), "tracked weights", cubic=True),
     "ici": Rule(_INVERSE, "common information", pair=True),
 }
 
@@ -102,8 +104,9 @@ def choose_rule(
 
     Raises:
         ConfigurationError: an unknown rule, one that is unsound for this structure, "ici" for
-            other than two estimates, an order for a rule that has none, or one that is no
-            permutation of the sensors 0 to l - 1.
+            other than two estimates, more than 40 sensors for a rule that is cubic in them, an
+            order for a rule that has none, or one that is no permutation of the sensors 0 to
+            l - 1.
     """
     offered = [key for key, rule in RULES.items() if structure.refusal(rule) is None]
     if isinstance(name, str) and name in RULES and name not in offered:
@@ -117,6 +120,13 @@ def choose_rule(
         raise ConfigurationError(
             f"fusion = {name!r} is not allowed with {sensors} sensors: it joins two "
             f"estimates{prediction}; it must be 'sici' (two at a time) for more"
+        )
+    if rule.cubic and sensors > MOST_TOGETHER:
+        others = [key for key in offered if not RULES[key].cubic and not RULES[key].pair]
+        instead = f", so it must be {' or '.join(map(repr, others))}" if others else ""
+        raise ConfigurationError(
+            f"fusion = {name!r} is not allowed with {sensors} sensors: it joins the estimates of "
+            f"at most {MOST_TOGETHER}, for its cost grows with the cube of their number{instead}"
         )
     if order is None:
         return rule.make(None)

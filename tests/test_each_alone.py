@@ -1,0 +1,152 @@
+"""What each packet alone would do, all at once: the same as one delivery after another."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fusion_gym
+from fusion_gym import linalg
+from fusion_gym.arrays import Array, take_runs
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.system import TryingSystem
+from fusion_gym.core.task import Task
+from fusion_gym.fusion.rules import InformationFusion, alike
+from fusion_gym.systems.tobit.filters import Outcomes
+
+MANY, STATES = 8, 4
+
+
+def task_of(**options: Any) -> Task:
+    rng = np.random.default_rng(3)
+    transition = 0.3 * rng.normal(size=(STATES, STATES))
+    return fusion_gym.make_task(
+        "fusion_gym/LinearFusion-v0",
+        transition=transition.tolist(),
+        process_covariance=(0.2 * np.eye(STATES)).tolist(),
+        measurement_matrices=rng.normal(size=(MANY, 2, STATES)).tolist(),
+        token_rate=12.0,
+        **options,
+    )
+
+
+def sensed(task: Task, runs: int) -> Any:
+    """A state after some steps of random requests, from the same noise for any number of runs."""
+    batch, rng = EpisodeBatch.seeded(task, 6, 0), np.random.default_rng(1)
+    for _ in range(5):
+        batch.step(rng.random((MANY, 6)) < 0.3)
+    return take_runs(batch.state, np.arange(runs))
+
+
+def one_by_one(task: Task, state: Any) -> tuple[Array, Array]:
+    runs = task.system.truth(state).shape[-1]
+    found = []
+    for sensor in range(task.sensors):
+        alone = np.zeros((task.sensors, runs), dtype=np.bool_)
+        alone[sensor] = True
+        found.append(task.system.fused(task.system.deliver(state, alone)))
+    return np.array([mean for mean, _ in found]), np.array([covariance for _, covariance in found])
+
+
+KINDS: dict[str, dict[str, Any]] = {
+    "kalman": {},
+    "tobit": {"filter": "tobit", "censoring_threshold": -0.5},
+    "stochastic": {"filter": "stochastic", "stochastic_weight": 0.5},
+    "shares": {"information_shares": np.arange(1.0, MANY + 1.0) / 36.0},
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("runs", [1, 6])
+def test_all_at_once_is_bitwise_one_after_another(name: str, runs: int) -> None:
+    task = task_of(**KINDS[name])
+    assert isinstance(task.system, TryingSystem)
+    wanted = one_by_one(task, sensed(task, runs))
+    found = task.system.fused_alone(sensed(task, runs))
+    assert found is not None
+    np.testing.assert_array_equal(found[0], wanted[0])
+    np.testing.assert_array_equal(found[1], wanted[1])
+    assert len(np.unique(found[0][:, 0, 0])) == MANY
+
+
+def test_the_joint_filter_agrees_up_to_rounding() -> None:
+    correlated = np.eye(2 * MANY) + 0.3
+    task = task_of(filter="joint", joint_measurement_covariance=correlated.tolist())
+    state = sensed(task, 6)
+    wanted, found = one_by_one(task, state), task.system.fused_alone(state)
+    np.testing.assert_allclose(found[0], wanted[0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found[1], wanted[1], rtol=1e-9, atol=1e-12)
+
+
+def test_where_nothing_is_saved_it_is_none() -> None:
+    for options in ({"fusion": "sci"}, {"filter": "adf", "censoring_threshold": -1.0}):
+        task = task_of(**options)
+        assert task.system.fused_alone(sensed(task, 2)) is None
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_informations_after_an_answer_are_the_inverses_of_what_results(shared: bool) -> None:
+    rng = np.random.default_rng(0)
+
+    def covariances(count: int) -> Array:
+        root = rng.normal(size=(count, STATES, STATES, 5))
+        return np.einsum("sijN,skjN->sikN", root, root) + np.eye(STATES)[:, :, None]
+
+    silent = np.ascontiguousarray(covariances(1 if shared else MANY))
+    silent = np.broadcast_to(silent, (MANY, *silent.shape[1:]))
+    assert alike(silent) == shared
+    delivered = np.ascontiguousarray(covariances(MANY))
+    means = rng.normal(size=(MANY, STATES, 5))
+    for granted in (
+        np.zeros((MANY, 5), dtype=np.bool_),
+        np.ones((MANY, 5), dtype=np.bool_),
+        rng.random((MANY, 5)) < 0.3,
+    ):
+        outcomes = Outcomes(means[:, None], delivered, means, silent)
+        assert outcomes.informed == shared
+        local = np.where(granted[:, None, None], delivered, silent)
+        wanted = InformationFusion().fuse(means, local)
+        for _ in range(2):  # the second time from what is known by then
+            found = InformationFusion().fuse_information(means, outcomes.information(granted))
+            np.testing.assert_array_equal(found.mean, wanted.mean)
+            np.testing.assert_array_equal(found.covariance, wanted.covariance)
+            assert outcomes.delivered_information is not None
+        assert outcomes.informed
+
+
+@pytest.mark.parametrize("rows", [2, 7, 8, 30])
+def test_diagonal_matrices_are_solved_with_the_same_roundings(rows: int) -> None:
+    rng = np.random.default_rng(rows)
+    diagonal = 10.0 ** rng.uniform(-12.0, 12.0, (3, rows, 50))
+    diagonal[0, 1, :2], diagonal[1, 0, 3], diagonal[2, 1, 4] = 0.0, -1.0, np.inf
+    matrix = np.zeros((3, rows, rows, 50))
+    matrix[:, np.arange(rows), np.arange(rows)] = diagonal
+    vector = rng.normal(size=(3, rows, 50))
+    wanted = linalg.solve(matrix, vector[..., None, :])[..., 0, :]
+    np.testing.assert_array_equal(linalg.solve_vector(matrix, vector), wanted)
+    matrix[..., 0, 1, 7] = matrix[..., 1, 0, 7] = 0.1
+    wanted = linalg.solve(matrix, vector[..., None, :])[..., 0, :]
+    np.testing.assert_array_equal(linalg.solve_vector(matrix, vector), wanted)
+
+
+def test_sources_believe_as_with_all_covariances(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Means alone, and with the covariances that nobody asked for: the same values."""
+    for owner, options in (
+        ("coordinator", {}), ("own", {}), ("own", {"broadcast": "estimate"}),
+        ("coordinator", {"channel": "independent"}),
+    ):  # fmt: skip
+        task = fusion_gym.make_task("fusion_gym/RemoteEstimation-v0", sensors=5, **options)
+        found = []
+        for means_alone in (True, False):
+            if not means_alone:
+                monkeypatch.delattr(type(task.system), "fused_mean")
+            batch = EpisodeBatch.seeded(task, 4, 0, owner)
+            for _ in range(6):
+                batch.step(np.arange(20).reshape(5, 4) % 3 == 0)
+            beliefs = batch.beliefs()
+            found.append([beliefs.value(), beliefs.loss(), beliefs.sent.covariance])
+            monkeypatch.undo()
+        for ours, theirs in zip(*found, strict=True):
+            np.testing.assert_array_equal(ours, theirs)

@@ -1,0 +1,215 @@
+"""Where long commands say they are: bars, lines, silence, and the command line that goes on."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import itertools
+import json
+import os
+import pty
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_runs import call
+from hostile_commands import BASES, line
+
+from agents import __main__ as everything
+from agents import command_line, evaluate
+from agents.command_line import Long
+from agents.output import progress
+from agents.output.progress import progress_bar, quietly, remark, writing
+from agents.suite.team import Team
+from agents.suite.workers import Work, side_by_side
+
+ROOT = Path(__file__).parent.parent
+EVALUATE = [
+    *("--env", "fusion_gym/TobitOscillator-v0", "--set", "horizon=20"),
+    *("--policies", "always", "never", "--episodes", "3"),
+]
+LONG = [
+    name
+    for name in everything.COMMANDS
+    if issubclass(getattr(importlib.import_module(f"agents.{name}"), name.capitalize()), Long)
+]
+
+
+class Clock:
+    """Seconds that pass when they are told to."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 1000.0
+        monkeypatch.setattr(progress.time, "monotonic", lambda: self.now)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    return Clock(monkeypatch)
+
+
+def test_what_remains_is_told_by_the_mean_speed_and_counts_down(clock: Clock) -> None:
+    bar = progress.Bar("training", 1000, "steps", initial=200)
+    assert bar.left is None
+    clock.now += 10.0
+    bar.update(200)  # 20 steps a second, and 600 are left
+    assert bar.left == pytest.approx(30.0)
+    clock.now += 12.0
+    assert bar.left == pytest.approx(18.0)
+    clock.now += 100.0
+    assert bar.left == 0.0
+    bar.reach(900, 0.5)  # of the work, whatever is counted: 0.3 in 122 s
+    assert (bar.done, bar.left) == (900, pytest.approx(122.0 / 0.3 * 0.5))
+    bar.reach(5000)
+    assert (bar.done, bar.share, bar.left) == (1000, 1.0, 0.0)
+    assert progress.Bar("nothing", 0, "steps").left == 0.0
+
+
+def test_where_nobody_watches_a_line_is_printed_now_and_then(
+    clock: Clock, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = []
+    with progress_bar(10_000, "evaluating") as bar:
+        bar.say("always")
+        for _ in range(10_000):
+            clock.now += 1.0
+            bar.update()
+            said = capsys.readouterr().err
+            if said:
+                told.append((clock.now - 1000.0, said))
+    assert told[0] == (20.0, "evaluating: 0 %, 20/10,000 steps, 0:20, 2:46:20 left, always\n")
+    gaps = [later - earlier for (earlier, _), (later, _) in itertools.pairwise(told)]
+    assert all(20.0 <= gap <= 600.0 for gap in gaps)
+    assert gaps == sorted(gaps)
+    assert len(told) < 70
+    assert capsys.readouterr() == ("", "evaluating: 100 %, 10,000/10,000 steps, 2:46:40, always\n")
+
+
+def test_work_that_was_done_before_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress_bar(8, "evaluating", 8):
+        pass
+    assert capsys.readouterr() == ("", "")
+
+
+def test_quiet_says_nothing_and_ends(capsys: pytest.CaptureFixture[str]) -> None:
+    with quietly(), quietly(False), progress_bar(3, "evaluating") as bar:
+        writing(("results", "here"))
+        bar.update(3)
+    assert capsys.readouterr() == ("", "")
+    writing(("results", "here"), ("episodes", "there"))
+    assert capsys.readouterr().err == "writing results into here, episodes into there\n"
+
+
+def test_a_closed_stderr_gets_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", None)
+    with progress_bar(2, "evaluating") as bar:
+        bar.update()
+        remark("heard by nobody")
+    assert bar.done == 1
+
+
+CHILD = """
+from agents.output.progress import progress_bar, writing
+writing(("results", "here"))
+with progress_bar(700_000, "training a") as first, progress_bar(30, "b", unit="trials") as second:
+    first.say("MSE 0.1234")
+    first.reach(350_000)
+    print("a result")
+    second.reach(30)
+"""
+
+
+def test_a_terminal_gets_bars_and_stdout_none_of_them() -> None:
+    mine, theirs = pty.openpty()
+    environment = os.environ | {"TERM": "xterm", "COLUMNS": "100"}
+    words = [sys.executable, "-c", CHILD]
+    done = subprocess.run(
+        words, cwd=ROOT, env=environment, text=True, check=True, stdout=-1, stderr=theirs
+    )
+    os.close(theirs)
+    shown = os.read(mine, 100_000).decode()
+    os.close(mine)
+    assert done.stdout == "a result\n"
+    assert shown.startswith("writing results into here\r\n")
+    first, second = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", shown).splitlines()[-2:]
+    assert re.search(
+        r"training a ━{4,10}[╸╺ ]?━* 350,000/700,000 steps 0:0\d, 0:0\d left MSE", first
+    )
+    assert re.search(r"^b +━{8,20} 30/30 trials +0:0\d", second)
+
+
+def test_a_pipe_gets_whole_lines_and_quiet_nothing() -> None:
+    said = call("evaluate", EVALUATE)
+    assert not re.search(r"[\x00-\x09\x0b-\x1f]", said.err)
+    assert re.fullmatch(r"nothing is written.*\nevaluating: 100 %, .* 0:0\d, never\n", said.err)
+    quiet = call("evaluate", [*EVALUATE, "--quiet"])
+    assert (quiet.out, quiet.err) == (said.out, "")
+
+
+def test_every_long_command_can_be_quiet() -> None:
+    assert set(everything.COMMANDS) - set(LONG) <= {"report", "export", "reproduce"}
+
+
+@pytest.mark.parametrize("name", LONG)
+def test_the_command_that_goes_on_is_one(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is read as the command that was interrupted, to be resumed where it can be."""
+    words = [*line(name, BASES[name]), "--quiet"]
+    kind = getattr(importlib.import_module(f"agents.{name}"), name.capitalize())
+    monkeypatch.setattr(sys, "argv", [f"agents/{name}.py", *words])
+    given = command_line.read(kind)
+    program, *again = shlex.split(given.again())
+    assert (program, *again[:2]) == ("python", "-m", f"agents.{name}")
+    resumes = "resume" in {field.name for field in dataclasses.fields(kind)}
+    assert again[2:] == [*words, *(["--resume"] if resumes else [])]
+    monkeypatch.setattr(sys, "argv", [f"agents/{name}.py", *again[2:]])
+    read = command_line.read(kind)
+    assert read == (dataclasses.replace(given, resume=True) if resumes else given)
+    assert shlex.split(read.again()) == [program, *again]
+
+
+def test_an_interrupted_evaluation_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, ran = tmp_path / "evaluation.json", []
+
+    def run_episodes(task: Any, policy: Any, *given: Any) -> Any:
+        ran.append(policy)
+        if len(ran) == 2:
+            raise KeyboardInterrupt
+        return whole(task, policy, *given)
+
+    whole = evaluate.run_episodes
+    monkeypatch.setattr(evaluate, "run_episodes", run_episodes)
+    ended = call("evaluate", [*EVALUATE, "--json", str(file)])
+    assert (ended.status, ended.trace) == (130, "")
+    assert ended.err.splitlines()[0] == f"writing the results of each policy into {file}"
+    told, again = ended.err.splitlines()[-1].split(": ", 1)
+    assert told == "interrupted; go on with"
+    assert list(json.loads(file.read_text())["policies"]) == ["always"]
+    program, name, *words = shlex.split(again)
+    assert (program, name) == ("fusion-gym", "evaluate")
+    assert call(name, words).status == 0
+    assert len(ran) == 3  # always once
+    assert list(json.loads(file.read_text())["policies"]) == ["always", "never"]
+
+
+def test_an_interrupt_that_loses_all_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def run_episodes(*_: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(evaluate, "run_episodes", run_episodes)
+    ended = call("evaluate", EVALUATE)
+    assert (ended.status, ended.err.splitlines()[-1]) == (
+        130, "interrupted: nothing is kept (--json FILE keeps finished policies)",
+    )  # fmt: skip
+    absent = call("train", ["--config", "tobit_oscillator_ppo", "--output", "absent", "--resume"])
+    assert absent.err == "error: output = 'absent' holds no training: nothing to resume\n"
+
+
+def test_pieces_of_work_are_counted_and_weighed(capsys: pytest.CaptureFixture[str]) -> None:
+    side_by_side([Work(weight, len, ((),)) for weight in (1.0, 9.0)], Team(1), "pieces")
+    assert re.fullmatch(r"pieces: 100 %, 2/2 pieces, 0:0\d\n", capsys.readouterr().err)
