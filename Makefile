@@ -48,8 +48,9 @@ $(LOWEST)/.installed: pyproject.toml constraints.txt
 test-lowest: $(LOWEST)/.installed  ## quick tests with the lowest versions that pyproject.toml allows
 	$(LOWEST)/bin/python -m pytest -m "not slow" -n 2 $(QUICK)
 
-wheel-test: $(STAMP)  ## build the package and try it in an empty folder, outside the repository
+wheel-test: $(STAMP)  ## the package outside the repository, and every block of README and docs with it
 	$(BIN)/python tests/wheel_smoke.py
+	OMP_NUM_THREADS=1 $(BIN)/python tests/wheel_blocks.py
 
 wheel: $(STAMP)  ## build the wheel into dist/
 	$(BIN)/python -m build --wheel
