@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import subprocess
 import sys
 import time
@@ -90,6 +91,39 @@ def test_a_worker_that_ends_in_the_middle_loses_nothing(tmp_path: Path) -> None:
         assert workers[1].poll() is None
     assert found(many) == found(alone)
     assert {"agent_sensors_0.json", "agent_sensors_1.json", "verdict.json"} <= found(many).keys()
+
+
+@pytest.mark.slow
+def test_ray_gives_the_work_of_a_lost_worker_to_another(tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+
+    def ends_its_first_worker(folder: Path) -> float:
+        """Of each folder. It stands here, for ray's workers do not find this file."""
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            return float(folder.name)
+        os._exit(1)
+
+    def is_wrong(_: Any) -> float:
+        raise ConfigurationError("filter = 'x' is not allowed")
+
+    team = Team(2, "ray")
+    with team.gathered():
+        done = list(team.done(ends_its_first_worker, [tmp_path / str(n) for n in range(3)]))
+        assert sorted(done) == [0.0, 1.0, 2.0]
+        with pytest.raises(ConfigurationError, match=r"^filter = 'x' is not allowed$"):
+            list(team.done(is_wrong, [0]))
+
+
+@pytest.mark.slow
+def test_ray_finds_what_this_machine_finds(tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    suite = small_suite(tmp_path, timesteps=8_000, classes=["sensors"])
+    alone, many = tmp_path / "alone", tmp_path / "many"
+    subprocess.run(benchmark(suite, alone), cwd=ROOT, check=True)
+    subprocess.run(benchmark(suite, many, "--backend", "ray"), cwd=ROOT, check=True)
+    assert found(many) == found(alone)
 
 
 def test_a_team_that_is_not_there_is_refused() -> None:

@@ -1,14 +1,15 @@
 """Who does the work: processes of this machine, or a cluster that is there already.
 
-joblib hands it out, through its own processes (``loky``), a dask scheduler or a ray cluster. On
-other machines every path must be the same: the folders of results and work are shared.
+joblib hands it out, through its own processes (``loky``) or a dask scheduler; a ray cluster does it
+as ray's tasks, for joblib's backend of it gives nothing back before all is done. On other machines
+every path must be the same: the folders of results and work are shared.
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -47,9 +48,30 @@ class Team:
         """Whether the workers are processes of this one."""
         return self.backend == "loky"
 
+    def done(self, function: Callable[[Any], float], pieces: Sequence[Any]) -> Iterator[float]:
+        """Let the team do the pieces; what the function returns, as it comes. While gathered."""
+        if self.backend == "ray":
+            yield from self._done_by_ray(function, pieces)
+        else:
+            calls = (joblib.delayed(function)(piece) for piece in pieces)
+            yield from joblib.Parallel(return_as="generator_unordered", batch_size=1)(calls)
+
+    def _done_by_ray(
+        self, function: Callable[[Any], float], pieces: Sequence[Any]
+    ) -> Iterator[float]:
+        ray = self._package()
+        task = ray.remote(num_cpus=1, max_retries=-1)(lambda piece: function(piece))
+        left = [task.remote(piece) for piece in pieces]
+        while left:
+            ended, left = ray.wait(left)
+            try:
+                yield from ray.get(ended)
+            except ray.exceptions.RayTaskError as error:
+                raise error.cause from None
+
     @contextlib.contextmanager
     def gathered(self) -> Iterator[None]:
-        """joblib's work goes to the team while this is entered.
+        """Work goes to the team while this is entered.
 
         Raises:
             ConfigurationError: the backend's package is not installed, or nobody is at the address.
@@ -57,10 +79,11 @@ class Team:
         with contextlib.ExitStack() as stack:
             if self.backend == "dask":
                 stack.enter_context(self._dask())
-            elif self.backend == "ray":
+            if self.backend == "ray":
                 stack.enter_context(self._ray())
-            jobs = self.workers if self.here else -1
-            stack.enter_context(joblib.parallel_config(self.backend, n_jobs=jobs))
+            else:
+                jobs = self.workers if self.here else -1
+                stack.enter_context(joblib.parallel_config(self.backend, n_jobs=jobs))
             yield
 
     @contextlib.contextmanager
@@ -87,7 +110,6 @@ class Team:
         except (OSError, ValueError) as error:
             raise self._nobody(error) from None
         try:
-            importlib.import_module("ray.util.joblib").register_ray()
             yield
         finally:
             ray.shutdown()

@@ -10,8 +10,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, NamedTuple
 
-import joblib
-
 from fusion_gym.validation import ConfigurationError
 
 from ..output.progress import progress_bar
@@ -40,9 +38,7 @@ def side_by_side(work: Sequence[Work], team: Team, description: str) -> None:
     total, done = sum(one.weight for one in work), 0.0
     parent = os.getpid() if team.here else None
     with progress_bar(len(work), description, unit="pieces") as bar, team.gathered():
-        weights = joblib.Parallel(return_as="generator_unordered", batch_size=1)(
-            joblib.delayed(_do)(one, parent) for one in work
-        )
+        weights = team.done(functools.partial(_do, parent), work)
         try:
             for place, weight in enumerate(weights, 1):
                 done += weight
@@ -54,7 +50,7 @@ def side_by_side(work: Sequence[Work], team: Team, description: str) -> None:
             ) from None
 
 
-def _do(work: Work, parent: int | None) -> float:
+def _do(parent: int | None, work: Work) -> float:
     """Do a piece of work; returns its weight. A worker of this machine ends with its ``parent``."""
     if parent is not None and os.getpid() != parent:
         end_with(parent)
