@@ -1,6 +1,6 @@
 """Try rules and agents where the truth is not what they assume: noises, limits, motion, tokens.
 
-    python -m agents.robustness [--envs NAME …] [--class sensors_memory] [--trained] [--resume]
+    python -m agents.robustness [--envs NAME …] [--class local_packets] [--trained] [--resume]
 
 The rules of a committed envelope and the agents of its class run under every case of a config, as
 they were tuned and trained, on the same test episodes. Every piece of work writes its JSON into
@@ -25,8 +25,9 @@ from .input.options import Episodes, InputFolder, OutputFolder, Steps, Whole, wr
 from .output.ending import ended_like_by_ctrl_c
 from .output.folders import alone_in
 from .output.progress import writing
+from .suite.classes import trained
 from .suite.committed import Shelf
-from .suite.config import Suite, load_suite
+from .suite.config import Setting, Suite, load_suite
 from .suite.robust_pieces import (
     FOLDER,
     Folders,
@@ -55,8 +56,9 @@ class Robustness(Long):
     """The cases: a YAML file, or the name of a shipped config."""
     envs: tuple[str, ...] = ()
     """Settings by name; none stands for all."""
-    of: Annotated[str, tyro.conf.arg(name="class")] = "sensors_memory"
-    """The class of rules and agents, as sensors or local_packets_memory."""
+    of: Annotated[str | None, tyro.conf.arg(name="class")] = None
+    """The class of rules and agents, as local_packets; none stands for sensors_memory, and for
+    sensors in settings in which nothing is left to remember."""
     agents: tuple[str, ...] = ()
     """Files of agents, patterns with {setting} and {class}; none stands for those of models."""
     models: Annotated[Path | None, InputFolder()] = None
@@ -91,7 +93,9 @@ class Robustness(Long):
         writable_folder("results", place)
         with alone_in(place, "results"), alone_in(self.work, "work"):
             there = [
-                path for t in trials for path in place.glob(f"{t.setting.name}/{self.of}/*/*.json")
+                path
+                for trial in trials
+                for path in place.glob(f"{trial.setting.name}/{trial.of.name}/*/*.json")
             ]
             if there and not self.resume:
                 raise ConfigurationError(
@@ -124,7 +128,7 @@ class Robustness(Long):
         changed = {key: value for key, value in changed.items() if value is not None}
         suite = parse(Suite, suite.model_dump() | changed, "command line")
         setting = next(setting for setting in suite.settings if setting.name == one.setting)
-        of = class_named(setting, self.of)
+        of = class_named(setting, self.of or _usual_class(suite, setting))
         agents = agents_of(setting, of, self.agents, self.models, USUAL)
         return Trial.create(
             suite, setting, one, config.cases_of(one), of, envelope_of(shelf, setting, of), agents,
@@ -140,6 +144,12 @@ class Robustness(Long):
             Team(self.workers),
             " and ".join(kinds),
         )
+
+
+def _usual_class(suite: Suite, setting: Setting) -> str:
+    """The class of a coordinator that knows most."""
+    names = [of.name for of in trained(suite, setting)]
+    return "sensors_memory" if "sensors_memory" in names else "sensors"
 
 
 def main() -> None:

@@ -13,6 +13,7 @@ import yaml
 from command_runs import call
 from small_suite import small_suite
 
+from agents.robustness import _usual_class
 from agents.suite import verdict
 from agents.suite.classes import classes_of
 from agents.suite.config import load_suite
@@ -237,3 +238,13 @@ def test_scaled_options_have_defaults() -> None:
     with pytest.raises(ConfigurationError, match="must be a number, and is None"):
         world(setting, Case(name="a", title="a", scaled={"nothing": 2.0}))
     assert np.isfinite(options["token_rate"])
+
+
+def test_without_a_class_it_takes_the_coordinator_that_knows_most() -> None:
+    suite = load_suite("benchmark")
+    taken = {setting.name: _usual_class(suite, setting) for setting in suite.settings}
+    assert {name for name, of in taken.items() if of == "sensors"} == {
+        "markov_jump",
+        "remote_estimation",
+    }
+    assert set(taken.values()) == {"sensors", "sensors_memory"}
