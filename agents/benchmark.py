@@ -23,6 +23,8 @@ from .command_line import Long, spelled, start
 from .input.options import OutputFolder, Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
 from .output.progress import writing
+from .output.tables import console
+from .suite.agreement import agreement
 from .suite.beside_rules import SHIPPED
 from .suite.classes import names_of, trained
 from .suite.committed import FOLDER, Shelf, complete
@@ -34,6 +36,8 @@ from .suite.team import BackendName, Team
 from .suite.work import run
 from .suite.workers import Work, side_by_side
 from .training.checked import parse
+
+USUAL = Path("results")  # of the full benchmark
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ class Benchmark(Long):
     classes: tuple[str, ...] = ()
     """Agents of these classes, as sensors_memory or local_packets; none stands for all."""
     quick: bool = False
-    """Less of everything, in minutes."""
+    """Less of everything, in minutes; its verdicts are shown beside those in results."""
     resume: bool = False
     """Skip what is finished, go on with trainings of one's own: their checkpoints hold pickles."""
     results: Annotated[Path | None, OutputFolder()] = None
@@ -124,6 +128,10 @@ class Benchmark(Long):
             )
             judged = [Work(30.0, conclude, (suite, one, folders, shelf)) for one in chosen]
             side_by_side(judged, team, "verdicts")
+        if self.quick:
+            beside = agreement(folders.results, USUAL, [one.name for one in chosen])
+            if beside is not None:
+                console().print(beside)
         report = f"{spelled('report')} --results {folders.results}"
         print(f"results in {folders.results}: {report}")
 

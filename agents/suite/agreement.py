@@ -1,0 +1,57 @@
+"""The quick benchmark's verdicts beside those of the full one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.table import Table
+
+from ..output.files import read_json
+from ..output.markup import share
+
+VERDICT = "verdict.json"
+
+
+def agreement(quick: Path, full: Path, settings: Sequence[str]) -> Table | None:
+    """Each class of agents over the middle of its front: what both say, and whether they agree.
+
+    They agree where their 95 % intervals have a value in common. ``None`` where the folder
+    ``full`` has no verdict of any class that the folder ``quick`` has.
+
+    Raises:
+        ConfigurationError: a verdict that is damaged.
+    """
+    rows = []
+    for name in settings:
+        ours, theirs = _middles(quick / name / VERDICT), _middles(full / name / VERDICT)
+        for of, found in ours.items():
+            if of in theirs:
+                rows.append((name, of, found, theirs[of], _overlap(found, theirs[of])))
+    if not rows:
+        return None
+    agreeing = sum(row[-1] for row in rows)
+    table = Table(
+        title="agents against the rules of their class: the quick benchmark and the full one",
+        box=box.SIMPLE_HEAD,
+        caption=f"{agreeing} of {len(rows)} verdicts agree: their 95 % intervals overlap",
+    )
+    for column in ("setting", "class", "quick", "full", "agree"):
+        table.add_column(column, no_wrap=True)
+    for name, of, found, known, agrees in rows:
+        table.add_row(name, of, share(found), share(known), "yes" if agrees else "no")
+    return table
+
+
+def _middles(path: Path) -> dict[str, Mapping[str, float]]:
+    """The verdict of every class over the middle of its front."""
+    if not path.exists():
+        return {}
+    classes: Mapping[str, Any] = read_json(path, "results")["classes"]
+    return {of: found["middle"] for of, found in classes.items() if "middle" in found}
+
+
+def _overlap(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
+    return one["low"] <= other["high"] and other["low"] <= one["high"]
