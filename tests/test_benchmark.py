@@ -189,8 +189,13 @@ def test_trainings_of_the_committed_suite(tmp_path: Path) -> None:
                 assert task.broadcast == of.broadcast
             assert training.seed == 3
             assert training.num_envs == (
-                setting.envs.get(of.mode) or setting.num_envs or suite.num_envs
+                setting.envs.get(of.name)
+                or setting.envs.get(of.mode)
+                or setting.num_envs
+                or suite.num_envs
             )
+            length = setting.lengths.get(of.name, setting.lengths.get(of.mode, 1.0))
+            assert training.timesteps == suite.timesteps * setting.longer * length
             assert training.error == (setting.error or suite.error)
             wanted = setting.price_exponent
             assert training.price_exponent == (suite.price_exponent if wanted is None else wanted)
@@ -215,6 +220,11 @@ def test_a_class_that_a_setting_has_not_is_refused(tmp_path: Path) -> None:
     suite = load_suite(small_suite(tmp_path, settings=[wrong]))
     with pytest.raises(ConfigurationError, match=r"agents of small = 'local_none' is not allowed"):
         trained(suite, suite.settings[0])
+    for field in ("envs", "lengths"):
+        wrong = SMALL["settings"][0] | {field: {"locale": 2}}
+        suite = load_suite(small_suite(tmp_path, settings=[wrong]))
+        with pytest.raises(ConfigurationError, match=f"{field} of small = 'locale' is not"):
+            trained(suite, suite.settings[0])
 
 
 def test_results_survive_the_disk(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 from fusion_gym.core.communication import FEATURES
 from fusion_gym.core.system import Knowledge, covers
@@ -96,9 +96,13 @@ def trained(suite: Suite, setting: Setting) -> list[Class]:
     """The classes of a setting in which the suite trains agents.
 
     Raises:
-        ConfigurationError: ``agents`` of the setting names none of its classes.
+        ConfigurationError: ``agents``, ``envs`` or ``lengths`` of the setting name none of its
+            classes (or modes).
     """
     every = {c.name: c for c in classes_of(setting)}
+    for field in ("envs", "lengths"):
+        for name in getattr(setting, field):
+            choice(f"{field} of {setting.name}", name, [*get_args(Mode), *every])
     own = list(every) if setting.agents is None else setting.agents
     for name in own:
         choice(f"agents of {setting.name}", name, every)

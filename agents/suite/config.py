@@ -99,10 +99,10 @@ class Setting(Strict):
 
     ``agents`` are the classes in which agents are trained, by name (all by default), and
     ``agent_options`` tell them what rules know anyway. ``longer`` multiplies the length of their
-    trainings, ``lengths`` those of one mode; ``price_exponent``, ``num_envs``, ``error`` and
-    ``tuning`` replace the suite's, ``envs`` the number of environments of one mode; ``algorithm``
-    changes entries of the suite's, ``algorithms`` those of one mode; ``pace`` is about how many
-    steps a second they train, for the time that is told to remain.
+    trainings, ``lengths`` those of one mode or class; ``price_exponent``, ``num_envs``, ``error``
+    and ``tuning`` replace the suite's, ``envs`` the number of environments of one mode or class;
+    ``algorithm`` changes entries of the suite's, ``algorithms`` those of one mode; ``pace`` is
+    about how many steps a second they train, for the time that is told to remain.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
@@ -115,10 +115,10 @@ class Setting(Strict):
     informed: tuple[str, ...] = ()
     references: tuple[str, ...] = ()
     longer: Longer = 1.0
-    lengths: dict[Mode, Longer] = pydantic.Field(default_factory=dict)
+    lengths: dict[str, Longer] = pydantic.Field(default_factory=dict)
     price_exponent: Share | None = None
     num_envs: Positive | None = None
-    envs: dict[Mode, Positive] = pydantic.Field(default_factory=dict)
+    envs: dict[str, Positive] = pydantic.Field(default_factory=dict)
     error: Error | None = None
     agents: tuple[str, ...] | None = None
     agent_options: dict[str, Any] = pydantic.Field(default_factory=dict)
@@ -160,13 +160,15 @@ class Suite(Strict):
         of_mode = self.algorithms.get(mode, {}) | setting.algorithms.get(mode, {})
         return settings(self.algorithm.model_dump() | setting.algorithm | of_mode)
 
-    def num_envs_of(self, setting: Setting, mode: Mode) -> int:
-        """Environments side by side in a training."""
-        return setting.envs.get(mode) or setting.num_envs or self.num_envs
+    def num_envs_of(self, setting: Setting, name: str, mode: Mode) -> int:
+        """Environments side by side in a training of a class."""
+        own = setting.envs.get(name, setting.envs.get(mode))
+        return own or setting.num_envs or self.num_envs
 
-    def timesteps_of(self, setting: Setting, mode: Mode) -> int:
-        """Steps of a training, where sensors decide by themselves of each of their rows."""
-        return round(self.timesteps * setting.longer * setting.lengths.get(mode, 1.0))
+    def timesteps_of(self, setting: Setting, name: str, mode: Mode) -> int:
+        """Steps of a training of a class; where sensors decide by themselves, of all their rows."""
+        length = setting.lengths.get(name, setting.lengths.get(mode, 1.0))
+        return round(self.timesteps * setting.longer * length)
 
     def tuning_of(self, setting: Setting) -> Tuning:
         """The setting's budget of tuning, checked again.

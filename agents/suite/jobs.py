@@ -112,7 +112,7 @@ def jobs(
         for setting in settings:
             for of in wanted[setting.name]:
                 if of.name in classes:
-                    weight = 10.0 + suite.timesteps_of(setting, of.mode) / setting.pace
+                    weight = 10.0 + suite.timesteps_of(setting, of.name, of.mode) / setting.pace
                     kept = ((of.name, hashes[setting.name][of.name]),)
                     yield Job(setting, "agent", of, seed, weight, kept)
 
@@ -212,7 +212,7 @@ def experiment_of(suite: Suite, setting: Setting, of: Class, seed: int, work: Pa
         "cost_weight": "random",
         "price_range": list(setting.price_range),
     }
-    timesteps = suite.timesteps_of(setting, of.mode)
+    timesteps = suite.timesteps_of(setting, of.name, of.mode)
     own = setting.price_exponent
     return Experiment(
         environment=EnvironmentConfig(
@@ -221,7 +221,7 @@ def experiment_of(suite: Suite, setting: Setting, of: Class, seed: int, work: Pa
         algorithm=suite.algorithm_of(setting, of.mode),
         training=TrainingConfig(
             timesteps=timesteps,
-            num_envs=suite.num_envs_of(setting, of.mode),
+            num_envs=suite.num_envs_of(setting, of.name, of.mode),
             seed=seed,
             price_exponent=suite.price_exponent if own is None else own,
             error=setting.error or suite.error,
