@@ -40,7 +40,9 @@ class Report(Command):
     def run(self) -> None:
         """Draw the figures, write README.md and report.html."""
         found = read_results(self.results)
-        pages = {path: documented(read_text("pages", path), found) for path in self.pages}
+        pages = {
+            path: documented(read_text("pages", path), found, self.results) for path in self.pages
+        }
         quick = " --quick" if self.results.name == "quick" else ""
         text = text_of(found, f"{spelled('benchmark')}{quick}", spelled("report"))
         overview.draw(self.results, found)

@@ -29,7 +29,6 @@ from .suite.classes import trained
 from .suite.committed import Shelf
 from .suite.config import Setting, Suite, load_suite
 from .suite.robust_pieces import (
-    FOLDER,
     Folders,
     agents_of,
     class_named,
@@ -37,6 +36,7 @@ from .suite.robust_pieces import (
     run_piece,
     run_training,
 )
+from .suite.robust_summary import FOLDER
 from .suite.robust_table import write_table
 from .suite.robust_trial import Trial
 from .suite.robustness import Perturbed, chosen, load_robustness
@@ -116,9 +116,17 @@ class Robustness(Long):
             side_by_side(rows, Team(self.workers), "verdicts")
             for trial in trials:
                 trial.conclude()
-            known = [one.setting for one in config.settings]
-            table = write_table(self.results, known, spelled("robustness"))
+            every = {one.name: one.title for one in load_suite(config.suite).settings}
+            titles = {one.setting: every[one.setting] for one in config.settings}
+            table = write_table(self.results, titles, spelled("robustness") + self._how())
         print(f"results in {place}, the table in {table}")
+
+    def _how(self) -> str:
+        """The options that the results depend on."""
+        seeds = "" if self.seeds is None else f" --seeds {self.seeds}"
+        trained = f" --trained{seeds}" if self.trained else ""
+        episodes = "" if self.episodes == Robustness.episodes else f" --episodes {self.episodes}"
+        return trained + episodes
 
     def _trial(self, config: Config, one: Perturbed, folders: Folders) -> Trial:
         """A setting with its agents, everything checked."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from small_results import SETTING, small_results
@@ -28,18 +30,18 @@ The rest stays. <!-- end -->
 def test_a_setting_is_said_in_its_sentences(tmp_path: Path) -> None:
     small_results(tmp_path)
     found = read_results(tmp_path)
-    text = documented(PAGE.format(name=SETTING), found)
+    text = documented(PAGE.format(name=SETTING), found, tmp_path)
     assert "what was said before" not in text
     assert text.endswith("\nThe rest stays. <!-- end -->\n")
     for sentence in sentences(found[SETTING]):
         assert f"\n- {sentence}\n" in text
-    assert documented(text, found) == text, "made anew it is the same"
+    assert documented(text, found, tmp_path) == text, "made anew it is the same"
 
 
 def test_the_headline_counts_points_and_seeds(tmp_path: Path) -> None:
     small_results(tmp_path, seeds=3)
     found = read_results(tmp_path)
-    text = documented(PAGE.format(name="headline"), found)
+    text = documented(PAGE.format(name="headline"), found, tmp_path)
     count = headline_count(found)
     assert f"{count[0].upper()}{count[1:]}; training seeds of a class: 3." in text
     assert "| setting |" in text
@@ -49,9 +51,9 @@ def test_settings_without_results(tmp_path: Path) -> None:
     """One of the benchmark has none so far; what nobody knows is refused."""
     small_results(tmp_path)
     found = read_results(tmp_path)
-    assert "No agents" in documented(PAGE.format(name="markov_jump"), found)
+    assert "No agents" in documented(PAGE.format(name="markov_jump"), found, tmp_path)
     with pytest.raises(ConfigurationError, match=r"results = 'tobit_osc' .*'tobit_oscillator'"):
-        documented(PAGE.format(name="tobit_osc"), found)
+        documented(PAGE.format(name="tobit_osc"), found, tmp_path)
 
 
 def test_the_command_writes_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -68,3 +70,27 @@ def test_the_command_writes_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(sys, "argv", [*words[:-1], str(tmp_path / "absent.md")])
     with pytest.raises(SystemExit, match="pages"):
         report.main()
+
+
+def test_perturbed_cases_are_counted(tmp_path: Path) -> None:
+    def row(title: str, low: float, high: float) -> dict[str, Any]:
+        middle = {"mean": (low + high) / 2, "low": low, "high": high}
+        return {"title": title, "agents": {"middle": middle}}
+
+    cases = {
+        "as_assumed": row("as assumed", -0.3, -0.1),
+        "loud": row("loud", -0.2, -0.1),
+        "louder": row("louder", 0.01, 0.03),
+        "still": row("still", -0.1, 0.1),
+        "none": {"title": "none", "agents": {}},
+    }
+    folder = tmp_path / "robustness" / "tobit_oscillator" / "sensors"
+    folder.mkdir(parents=True)
+    report = {"setting": "tobit_oscillator", "class": "sensors", "cases": cases}
+    (folder / "verdict.json").write_text(json.dumps(report))
+    text = documented(PAGE.format(name="robustness"), {}, tmp_path)
+    wanted = "| Tobit oscillator | as they are | -20.0% [-30.0%, -10.0%] | 1 | 1 | 1 | "
+    assert f"{wanted}+2.0% [+1.0%, +3.0%], louder |" in text
+    assert "trained over draws" not in text
+    nothing = documented(PAGE.format(name="robustness"), {}, tmp_path / "absent")
+    assert "- Nothing has been tried so far." in nothing

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from pathlib import Path
 
 from fusion_gym.validation import choice
 
@@ -11,35 +12,40 @@ from .config import load_suite
 from .found import Found
 from .overview import headline_count, headline_table
 from .report_words import sentences
+from .robust_summary import read_reports, summary
 
-HEADLINE = "headline"
+HEADLINE, ROBUSTNESS = "headline", "robustness"
 _MARKED = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-def documented(text: str, found: Mapping[str, Found]) -> str:
+def documented(text: str, found: Mapping[str, Found], results: Path) -> str:
     """The text with all its marked parts made anew.
 
-    ``<!-- results: SETTING -->`` to ``<!-- end -->`` holds what was found in a setting, and with
-    ``headline`` in its place the table of all settings and how many points lie above envelopes.
+    ``<!-- results: SETTING -->`` to ``<!-- end -->`` holds what was found in a setting, with
+    ``headline`` in its place the table of all settings and how many points lie above envelopes,
+    and with ``robustness`` what the folder ``results`` has of perturbed cases.
 
     Raises:
         ConfigurationError: a setting that neither the results nor the benchmark has.
     """
 
     def part(match: re.Match[str]) -> str:
-        return match[1] + "\n".join(["", *lines_of(match[2], found), ""]) + match[3]
+        return match[1] + "\n".join(["", *lines_of(match[2], found, results), ""]) + match[3]
 
     return _MARKED.sub(part, text)
 
 
-def lines_of(name: str, found: Mapping[str, Found]) -> list[str]:
+def lines_of(name: str, found: Mapping[str, Found], results: Path) -> list[str]:
     """The lines of a marked part.
 
     Raises:
         ConfigurationError: as :func:`documented`.
     """
-    settings = [setting.name for setting in load_suite("benchmark").settings]
-    choice("results", name, dict.fromkeys([HEADLINE, *found, *settings]))
+    titles = {setting.name: setting.title for setting in load_suite("benchmark").settings}
+    choice("results", name, dict.fromkeys([HEADLINE, ROBUSTNESS, *found, *titles]))
+    if name == ROBUSTNESS:
+        tried = read_reports(results, list(titles))
+        return summary(tried, titles) if tried else ["- Nothing has been tried so far.", ""]
     if name not in (HEADLINE, *found):
         return ["- No agents have been trained here so far.", ""]
     if name != HEADLINE:

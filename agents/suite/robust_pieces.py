@@ -31,8 +31,8 @@ from .config import Setting, Suite
 from .envelopes import task_of
 from .fronts import prices_of
 from .jobs import agent_options, experiment_of
+from .robust_summary import FOLDER
 
-FOLDER = "robustness"  # in that of the results
 RULES = "rules"
 Options = tuple[tuple[str, Any], ...]
 

@@ -13,14 +13,13 @@ from fusion_gym.evaluation.envelope import chosen_mse
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import mean_interval
 
-from ..output.files import read_json, write_text
-from .robust_pieces import FOLDER, RULES, Folders, Piece
+from ..output.files import write_text
+from .robust_pieces import RULES, Folders, Piece
+from .robust_summary import FOLDER, KINDS, is_gain, read_reports, summary
 from .robustness import NOMINAL
 from .verdict import MIDDLE, Searches, judge
 
-VERDICT = "verdict.json"
 Rules = Mapping[str, EpisodeResults]
-KINDS = {"agents": "agent_", "trained": "trained_"}  # what their labels begin with
 
 _TEXT = """\
 # What is left where the truth is not what everybody assumes
@@ -36,11 +35,17 @@ and agents are as they were tuned and trained for the case "as assumed".
   at the agents' own rates, over the middle of the front; a dash where they were not tried, or have
   a rate in the middle at none of their prices.
 - **left of the gain**: the agents' gain over the rules under the case, as a share of their gain as
-  assumed; a dash where they have no gain as assumed.
+  assumed; a dash where the interval of that holds nothing.
 - **trained over draws**: as "agents", of those whose training drew the perturbations anew in every
   episode.
 
 Brackets hold 95 % intervals, over paired episodes, training seeds, rates and tuning seeds.
+
+## All cases but "as assumed", counted
+
+Better and worse are cases whose whole interval lies below and above the rules; left out are those
+in which no price leads to a rate in the middle.
+
 """
 _HEAD = """
 ## {of}
@@ -113,26 +118,27 @@ def change(nominal: Rules, case: Rules, rate: float) -> dict[str, float] | None:
 
 
 def _left(row: Mapping[str, Any] | None, nominal: Mapping[str, Any] | None) -> float | None:
-    """The gain of a case as a share of the nominal one, where there is one."""
+    """The gain of a case as a share of the nominal one, where that is no accident."""
     if row is None or nominal is None or "middle" not in row or "middle" not in nominal:
         return None
-    gain = -nominal["middle"]["mean"]
-    return -row["middle"]["mean"] / gain if gain > 0.0 else None
+    before = nominal["middle"]
+    return float(row["middle"]["mean"] / before["mean"]) if is_gain(before) else None
 
 
-def write_table(results: Path, settings: Sequence[str], command: str) -> Path:
+def write_table(results: Path, titles: Mapping[str, str], command: str) -> Path:
     """The tables of all settings that have a verdict, in their order, by class; returns their file.
+
+    ``titles`` of the settings, by name.
 
     Raises:
         ConfigurationError: a verdict that is damaged.
     """
     folder = results / FOLDER
+    reports = read_reports(results, list(titles))
     found: dict[str, list[dict[str, Any]]] = {}
-    for name in settings:
-        for path in sorted(folder.glob(f"{name}/*/{VERDICT}")):
-            report = read_json(path, "results")
-            found.setdefault(report["class"], []).append(report)
-    parts = [_TEXT.format(command=command)]
+    for report in reports:
+        found.setdefault(report["class"], []).append(report)
+    parts = [_TEXT.format(command=command), "\n".join(summary(reports, titles))]
     for of, reports in sorted(found.items()):
         counts = {report["episodes"] for report in reports}
         asked = " or ".join(str(count) for count in sorted(counts))

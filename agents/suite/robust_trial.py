@@ -16,8 +16,9 @@ from .classes import Class
 from .config import Setting, Suite
 from .fronts import prices_of
 from .jobs import agent_task
-from .robust_pieces import FOLDER, RULES, Folders, Piece, agent_piece, rules_piece, training
-from .robust_table import KINDS, VERDICT, judged, with_shares
+from .robust_pieces import RULES, Folders, Piece, agent_piece, rules_piece, training
+from .robust_summary import FOLDER, KINDS, VERDICT
+from .robust_table import judged, with_shares
 from .robustness import NOMINAL, Case, Perturbed, drawn_world, world
 
 

@@ -1,0 +1,72 @@
+"""All perturbed cases of a setting in a line: in how many of them agents are ahead of the rules."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fusion_gym.validation import choice
+
+from ..output.files import read_json
+from ..output.markup import NONE, plain, share, table
+from .robustness import NOMINAL
+
+FOLDER = "robustness"  # in that of the results
+VERDICT = "verdict.json"
+KINDS = {"agents": "agent_", "trained": "trained_"}  # what their labels begin with
+_HEAD = ["setting", "agents", "as assumed", "better", "undecided", "worse", "at worst"]
+_NAMES = {"agents": "as they are", "trained": "trained over draws"}
+Report = Mapping[str, Any]
+
+
+def read_reports(results: Path, settings: Sequence[str]) -> list[dict[str, Any]]:
+    """What was found in settings, in their order, by class.
+
+    Raises:
+        ConfigurationError: a verdict that is damaged.
+    """
+    paths = (path for name in settings for path in _verdicts(results, name))
+    return [read_json(path, "results") for path in paths]
+
+
+def _verdicts(results: Path, name: str) -> list[Path]:
+    return sorted((results / FOLDER).glob(f"{name}/*/{VERDICT}"))
+
+
+def summary(reports: Sequence[Report], titles: Mapping[str, str]) -> list[str]:
+    """A table: each setting's agents as they are, and those trained over draws.
+
+    ``titles`` of the settings by name; what stands before their first comma is shown.
+
+    Raises:
+        ConfigurationError: a setting without a title.
+    """
+    rows = []
+    for report in reports:
+        choice("setting", report["setting"], titles)
+        title = titles[report["setting"]].partition(",")[0]
+        for kind, name in _NAMES.items():
+            if kind in report["cases"][NOMINAL]:
+                rows.append([plain(title), name, *_cells(report["cases"], kind)])
+    return table(_HEAD, rows)
+
+
+def _cells(cases: Mapping[str, Report], kind: str) -> Iterator[str]:
+    nominal = cases[NOMINAL][kind].get("middle")
+    found = {
+        row["title"]: row[kind]["middle"]
+        for name, row in cases.items()
+        if name != NOMINAL and "middle" in row.get(kind, {})
+    }
+    better = sum(is_gain(middle) for middle in found.values())
+    worse = sum(middle["low"] > 0.0 for middle in found.values())
+    yield share(nominal)
+    yield from map(str, (better, len(found) - better - worse, worse))
+    worst = max(found, key=lambda title: float(found[title]["mean"]), default=None)
+    yield NONE if worst is None else f"{share(found[worst])}, {plain(worst)}"
+
+
+def is_gain(middle: Mapping[str, float]) -> bool:
+    """Whether the whole interval lies on the side of the agents."""
+    return middle["high"] < 0.0
