@@ -63,7 +63,8 @@ def test_the_command_writes_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     words = ["report", "--results", str(results), "--pages", str(page)]
     monkeypatch.setattr(sys, "argv", words)
     report.main()
-    assert page.read_text() == documented(PAGE.format(name="headline"), read_results(results))
+    found = read_results(results)
+    assert page.read_text() == documented(PAGE.format(name="headline"), found, results)
     page.write_text(PAGE.format(name="nobody"))
     with pytest.raises(SystemExit, match="results = 'nobody'"):
         report.main()
