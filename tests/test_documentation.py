@@ -6,6 +6,7 @@ import ast
 import importlib.util
 import pydoc
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -22,9 +23,12 @@ import fusion_gym
 from agents import report
 from agents.output.files import read_json
 from agents.suite import envelope_table, learning_table
+from agents.suite.config import load_suite
 from agents.suite.found import read_results
 from agents.suite.learning import load_learning
 from agents.suite.report_pages import documented
+from agents.suite.robust_table import write_table
+from agents.suite.robustness import load_robustness
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.options import Scenario
 from fusion_gym.envs import pages
@@ -143,6 +147,19 @@ def test_the_committed_report_says_what_the_results_say() -> None:
     for path in (ROOT / "README.md", *DOCS):
         text = path.read_text()
         assert documented(text, found, ROOT / "results") == text, path.name
+
+
+def test_the_committed_table_of_perturbed_cases_is_that_of_the_verdicts(tmp_path: Path) -> None:
+    folder = ROOT / "results" / "robustness"
+    shutil.copytree(folder, tmp_path / "robustness")
+    written = (folder / "README.md").read_text()
+    command = re.search(r"^Made by `(.*?)`", written, re.M)
+    assert command is not None
+    suite = {setting.name: setting.title for setting in load_suite("benchmark").settings}
+    titles = {one.setting: suite[one.setting] for one in load_robustness("robustness").settings}
+    assert write_table(tmp_path, titles, command[1]).read_text() == written
+    tried = {path.parts[-3] for path in folder.glob("*/*/verdict.json")}
+    assert tried == set(titles)
 
 
 def test_the_committed_envelopes_are_what_the_pages_say() -> None:
