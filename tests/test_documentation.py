@@ -43,6 +43,14 @@ README = (ROOT / "README.md").read_text()
 DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [path for path in DOCS if "<!-- observation: " in path.read_text()]  # of environments
 TEXTS = README + "".join(path.read_text() for path in (*DOCS, ROOT / "CONTRIBUTING.md"))
+
+
+def importable(code: str) -> bool:
+    """Whether all packages that it imports are here."""
+    packages = {module.partition(".")[0] for module in imported(code)}
+    return all(importlib.util.find_spec(package) is not None for package in packages)
+
+
 BLOCKS = {
     path.name: blocks_of(path.relative_to(ROOT), path.read_text())
     for path in (ROOT / "README.md", *DOCS, ROOT / "CONTRIBUTING.md")
@@ -51,7 +59,8 @@ EXAMPLES = [
     (name, place)
     for name, blocks in BLOCKS.items()
     for place, block in enumerate(blocks)
-    if block.language == "python"
+    # Those of libraries that are not here are run by `make integrations` and its sisters.
+    if block.language == "python" and (name != "other_libraries.md" or importable(block.text))
 ]
 
 
@@ -70,15 +79,12 @@ def registries() -> Iterator[None]:
 def test_python_examples_run(
     name: str, place: int, registries: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As far as what they import is here; ``tests/wheel_blocks.py`` runs those of all pages."""
+    """``tests/wheel_blocks.py`` runs them again, with the wheel and the extras that they need."""
     monkeypatch.chdir(tmp_path)
     block = BLOCKS[name][place]
     for other in BLOCKS[name][:place]:
         if other.file is not None:
             Path(other.file).write_text(other.text)
-    for module in imported(block.text):
-        if importlib.util.find_spec(module.partition(".")[0]) is None:
-            pytest.skip(f"{module} is absent")
     exec(compile(block.text, "example", "exec"), {})
 
 

@@ -11,8 +11,7 @@ from rich.table import Table
 
 from ..output.files import read_json
 from ..output.markup import share
-
-VERDICT = "verdict.json"
+from .reports import VERDICT
 
 
 def agreement(quick: Path, full: Path, settings: Sequence[str]) -> Table | None:

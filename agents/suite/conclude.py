@@ -11,6 +11,7 @@ from .classes import names_of, trained
 from .committed import Shelf
 from .config import Setting, Suite
 from .jobs import Folders, finished, jobs
+from .reports import VERDICT
 from .verdict import judge
 from .worth import Tested, at_rates, worths
 
@@ -64,5 +65,5 @@ def conclude(
         "classes": classes,
         "worth": worths(tested, always),
     }
-    write(folders.results / setting.name / "verdict.json", verdict)
+    write(folders.results / setting.name / VERDICT, verdict)
     return verdict

@@ -13,7 +13,7 @@ from fusion_gym.validation import ConfigurationError
 
 from .committed import path_of, read_envelopes
 from .envelope_table import bound_of, hull_of, measured
-from .reports import Agent, Baselines, Tested, Verdict, read
+from .reports import VERDICT, Agent, Baselines, Tested, Verdict, read
 
 Points = list[tuple[float, float]]  # rate and error
 
@@ -78,8 +78,7 @@ def read_results(results: Path) -> dict[str, Found]:
         ConfigurationError: there are none, or a file that is no such JSON.
     """
     found = {
-        path.parent.name: read_setting(path.parent)
-        for path in sorted(results.glob("*/verdict.json"))
+        path.parent.name: read_setting(path.parent) for path in sorted(results.glob(f"*/{VERDICT}"))
     }
     if not found:
         raise ConfigurationError(
@@ -96,7 +95,7 @@ def read_setting(folder: Path) -> Found:
             fit together.
     """
     name, results = folder.name, folder.parent
-    verdict = read(Verdict, folder / "verdict.json", "results")
+    verdict = read(Verdict, folder / VERDICT, "results")
     baselines = read(Baselines, folder / "baselines.json", "results")
     named = [one for curve in baselines["curves"].values() for one in curve["policies"]]
     named += [place["name"] for of in verdict["classes"].values() for place in of["envelope"]]
@@ -104,7 +103,7 @@ def read_setting(folder: Path) -> Found:
         if one not in baselines["policies"]:
             raise ConfigurationError(
                 f"results = {str(folder)!r} do not fit together: baselines.json has no policy "
-                f"{one!r}, of which it or verdict.json speaks"
+                f"{one!r}, of which it or {VERDICT} speaks"
             )
     classes, committed = verdict["classes"], path_of(results, name)
     agents = _agents(folder, classes)

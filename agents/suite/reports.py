@@ -17,6 +17,7 @@ from ..input.files import checked
 from ..output.files import read_json
 
 NAME = r"^[a-z0-9_]+$"  # of a setting: a part of a path
+VERDICT = "verdict.json"  # in the folder of a setting, or of a class under perturbed cases
 
 
 class Shape(pydantic.BaseModel):

@@ -10,10 +10,10 @@ from fusion_gym.validation import choice
 
 from ..output.files import read_json
 from ..output.markup import NONE, plain, share, table
+from .reports import VERDICT
 from .robustness import NOMINAL
 
 FOLDER = "robustness"  # in that of the results
-VERDICT = "verdict.json"
 KINDS = {"agents": "agent_", "trained": "trained_"}  # what their labels begin with
 _HEAD = ["setting", "agents", "as assumed", "better", "undecided", "worse", "at worst"]
 _NAMES = {"agents": "as they are", "trained": "trained over draws"}
@@ -26,12 +26,9 @@ def read_reports(results: Path, settings: Sequence[str]) -> list[dict[str, Any]]
     Raises:
         ConfigurationError: a verdict that is damaged.
     """
-    paths = (path for name in settings for path in _verdicts(results, name))
+    folder = results / FOLDER
+    paths = [path for name in settings for path in sorted(folder.glob(f"{name}/*/{VERDICT}"))]
     return [read_json(path, "results") for path in paths]
-
-
-def _verdicts(results: Path, name: str) -> list[Path]:
-    return sorted((results / FOLDER).glob(f"{name}/*/{VERDICT}"))
 
 
 def summary(reports: Sequence[Report], titles: Mapping[str, str]) -> list[str]:

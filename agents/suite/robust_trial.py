@@ -16,8 +16,9 @@ from .classes import Class
 from .config import Setting, Suite
 from .fronts import prices_of
 from .jobs import agent_task
+from .reports import VERDICT
 from .robust_pieces import RULES, Folders, Piece, agent_piece, rules_piece, training
-from .robust_summary import FOLDER, KINDS, VERDICT
+from .robust_summary import FOLDER, KINDS
 from .robust_table import judged, with_shares
 from .robustness import NOMINAL, Case, Perturbed, drawn_world, world
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -47,7 +48,7 @@ class Seen(NamedTuple):
 
 
 @dataclass
-class Bound:
+class Bound(ABC):
     """A bound (states, states, N) of a sensor, beside the covariance P⁻ that it is to bound.
 
     ``inflation`` is 1 for a filter by itself and ε⁻¹ for a node, whose process covariance is
@@ -59,17 +60,17 @@ class Bound:
     inflation: float
     value: Array = field(default_factory=lambda: np.zeros(0), init=False)
 
+    @abstractmethod
     def begin(self, covariance: Array) -> None:
         """At the first step, from P⁻."""
-        raise NotImplementedError
 
+    @abstractmethod
     def holds(self, covariance: Array) -> NDArray[np.bool_]:
         """Whether (N,) it bounds P⁻."""
-        raise NotImplementedError
 
+    @abstractmethod
     def advance(self, covariance: Array, seen: Seen, turn: bool) -> None:
         """To the next step, from P⁻, what is expected, and whether it is this sensor's turn."""
-        raise NotImplementedError
 
     def moved(self, kept: Array, share: Array | float = 1.0) -> Array:
         """A ``kept`` Aᵀ and the process covariance, of which the lower bound may take a share."""
