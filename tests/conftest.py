@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
 import pytest
 import torch
 
+from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.policies import registry
 
 # Two test processes share two cores: more threads would only wait for each other.
@@ -15,3 +20,14 @@ torch.set_num_threads(1)
 def own_table(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a test registers as a policy is gone after it."""
     monkeypatch.setattr(registry, "_ROWS", dict(registry._ROWS))
+
+
+@pytest.fixture
+def registries() -> Iterator[None]:
+    """What a test registers, environments too, is gone after it."""
+    tables: tuple[dict[str, Any], ...] = (ENVIRONMENTS, gym.registry, registry._ROWS)
+    kept = [(table, dict(table)) for table in tables]
+    yield
+    for table, before in kept:
+        table.clear()
+        table.update(before)

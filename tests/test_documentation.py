@@ -9,7 +9,6 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,6 @@ from fusion_gym.core.options import Scenario
 from fusion_gym.envs import pages
 from fusion_gym.envs.registration import ENVIRONMENTS, class_name, options_of
 from fusion_gym.envs.vector import reset_infos
-from fusion_gym.policies import registry
 from fusion_gym.policies.registry import policy_names
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions, build
 
@@ -62,17 +60,6 @@ EXAMPLES = [
     # Those of libraries that are not here are run by `make integrations` and its sisters.
     if block.language == "python" and (name != "other_libraries.md" or importable(block.text))
 ]
-
-
-@pytest.fixture
-def registries() -> Iterator[None]:
-    """What an example registers is gone after it."""
-    tables: tuple[dict[str, Any], ...] = (ENVIRONMENTS, gym.registry, registry._ROWS)
-    kept = [(table, dict(table)) for table in tables]
-    yield
-    for table, before in kept:
-        table.clear()
-        table.update(before)
 
 
 @pytest.mark.parametrize(("name", "place"), EXAMPLES)

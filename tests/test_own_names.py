@@ -84,12 +84,13 @@ NUMBER = 3
 
 
 @pytest.fixture
-def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, registries: None) -> Path:
     """A folder with the module ``own_names``, on Python's path."""
     (tmp_path / "own_names.py").write_text(MODULE)
     (tmp_path / "broken_names.py").write_text("1 / 0")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.chdir(tmp_path)
+    sys.modules.pop("own_names", None)  # it registers anew
     return tmp_path
 
 
