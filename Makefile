@@ -11,14 +11,14 @@ QUICK  := tests/conformance/test_faces.py tests/test_bad_input.py tests/test_env
 	tests/test_benchmark.py::test_from_tuning_to_report_and_zoo
 
 .PHONY: help demo test test-all test-lowest wheel-test wheel films docs integrations integrations-tianshou integrations-rllib \
-	lint format bench clean
+	lines lint format bench clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 23
 
 # torch comes first and at its pinned version: left to a range, an installer may take a build
 # with several GB of GPU libraries.
-$(STAMP): pyproject.toml setup.py constraints.txt
+$(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.12 ...")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt torch
@@ -26,7 +26,7 @@ $(STAMP): pyproject.toml setup.py constraints.txt
 	touch $@
 
 demo: $(STAMP)  ## train two fronts, compare them with the strongest rules, draw the figures
-	$(BIN)/python -m agents.demo
+	$(BIN)/fusion-gym demo
 
 test: $(STAMP)  ## the tests, without the slow ones
 	$(BIN)/python -m pytest -m "not slow" -n 2
@@ -69,7 +69,7 @@ films: $(STAMP)  ## the films of docs/films
 
 # Libraries beside this one: each folder of integrations/ has pins and a virtual environment of its own,
 # .venv-light, .venv-tianshou, .venv-rllib.
-.venv-%/.installed: integrations/%/requirements.txt integrations/%/constraints.txt pyproject.toml setup.py
+.venv-%/.installed: integrations/%/requirements.txt integrations/%/constraints.txt pyproject.toml
 	$(PYTHON) -m venv --clear .venv-$*
 	.venv-$*/bin/python -m pip install --disable-pip-version-check --quiet --no-compile \
 		--constraint integrations/$*/constraints.txt \
@@ -88,6 +88,9 @@ integrations-tianshou: .venv-tianshou/.installed  ## Tianshou
 
 integrations-rllib: .venv-rllib/.installed  ## RLlib
 	.venv-rllib/bin/python -m pytest integrations/rllib
+
+lines:  ## code lines without blanks, comments and docstrings
+	@$(PYTHON) tests/lines.py
 
 lint: $(STAMP)  ## ruff and mypy
 	$(BIN)/ruff check .

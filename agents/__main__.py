@@ -1,4 +1,4 @@
-"""All commands under one name: ``fusion-gym COMMAND``, which is ``python -m agents.COMMAND``."""
+"""All commands under one name: ``fusion-gym COMMAND``."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def main() -> None:
             print(usage())
             return
         module = load(name)
-        del sys.argv[1]  # as python -m agents.COMMAND has it
+        del sys.argv[1]
         module.main()
 
 

@@ -1,13 +1,13 @@
 """The benchmark of policies: tuned envelopes, learned fronts and references in every setting.
 
-    python -m agents.benchmark [--envs NAME …] [--classes sensors_memory …] [--quick] [--resume]
+    fusion-gym benchmark [--envs NAME …] [--classes sensors_memory …] [--quick] [--resume]
 
-Envelopes that are missing are tuned first, as ``python -m agents.envelope`` does; every agent keeps
+Envelopes that are missing are tuned first, as ``fusion-gym envelope`` does; every agent keeps
 the hash of the one that it is compared with. Every piece of work (one training seed of one agent,
 say) writes its JSON into
 the results folder as it is finished, and its episodes into the work folder; ``--resume`` skips
 what is there, if it was made from the same inputs, and goes on with trainings in the work folder,
-whose checkpoints hold pickles. ``python -m agents.report`` makes tables and figures of it.
+whose checkpoints hold pickles. ``fusion-gym report`` makes tables and figures of it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Annotated
 
 from fusion_gym.validation import ConfigurationError, choice
 
-from .command_line import Long, spelled, start
+from .command_line import Long, start
 from .input.options import OutputFolder, Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
 from .output.progress import writing
@@ -132,7 +132,7 @@ class Benchmark(Long):
             beside = agreement(folders.results, USUAL, [one.name for one in chosen])
             if beside is not None:
                 console().print(beside)
-        report = f"{spelled('report')} --results {folders.results}"
+        report = f"fusion-gym report --results {folders.results}"
         print(f"results in {folders.results}: {report}")
 
     def _check_resumed(self, folders: Folders, chosen: Sequence[Setting]) -> None:
@@ -159,7 +159,3 @@ class Benchmark(Long):
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Benchmark)
-
-
-if __name__ == "__main__":
-    main()

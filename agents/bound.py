@@ -1,6 +1,6 @@
 """Print what no policy can undercut: floors, and a proven lower bound of the error at each rate.
 
-    python -m agents.bound --env fusion_gym/TobitOscillator-v0 \\
+    fusion-gym bound --env fusion_gym/TobitOscillator-v0 \\
         --set filter=tobit random_start=true token_rate=2 --filters tobit adf --rates 0.03 0.1
 
 Rates are transmissions a sensor and step; ``docs/bounds.md`` has the proof and says where it does
@@ -149,7 +149,3 @@ def _table(report: dict[str, Any]) -> Table:
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Bound)
-
-
-if __name__ == "__main__":
-    main()

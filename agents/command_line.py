@@ -11,7 +11,6 @@ import shlex
 import sys
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, fields
-from pathlib import Path
 from typing import ClassVar, TypeVar
 
 import tyro
@@ -66,14 +65,7 @@ class Long(Command):
         """
         more = [*added, *(["--resume"] if "resume" in {one.name for one in fields(self)} else [])]
         words = [word for word in sys.argv[1:] if word not in (*more, *without)]
-        return shlex.join([*spelled(type(self).__name__.lower()).split(), *words, *more])
-
-
-def spelled(command: str) -> str:
-    """A command as the user types it: ``fusion-gym NAME`` or ``python -m agents.NAME``."""
-    if Path(sys.argv[0]).stem == "fusion-gym":
-        return f"fusion-gym {command}"
-    return f"python -m {__package__}.{command}"
+        return shlex.join(["fusion-gym", type(self).__name__.lower(), *words, *more])
 
 
 def read(kind: type[_Kind]) -> _Kind:
@@ -90,7 +82,7 @@ def read(kind: type[_Kind]) -> _Kind:
         with contextlib.redirect_stderr(said):
             return tyro.cli(
                 kind,
-                prog=spelled(kind.__name__.lower()),
+                prog=f"fusion-gym {kind.__name__.lower()}",
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
     except SystemExit as end:

@@ -1,6 +1,6 @@
 """Compare one policy with the lower envelope of swept baselines, at the policy's own rate.
 
-    python -m agents.compare --config configs/biased_oscillator_ppo.yaml \\
+    fusion-gym compare --config configs/biased_oscillator_ppo.yaml \\
         --sweep configs/biased_sweep.yaml \\
         --policy model:runs/biased_oscillator_ppo/best_model.zip --output runs/comparison
 
@@ -92,7 +92,3 @@ class Compare(Long):
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Compare)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """The project's main job, end to end: two fronts learned in minutes, and a fair comparison.
 
-    python -m agents.demo [--output runs/demo] [--episodes 1000] [--fresh]
+    fusion-gym demo [--output runs/demo] [--episodes 1000] [--fresh]
 
 In the Tobit oscillator's benchmark setting it trains an agent for a coordinator and one for sensors
 by themselves, side by side; both see the price of a token. It runs them at seven prices, and on the
@@ -234,7 +234,3 @@ def draw_episodes(folder: Path, learner: Learner, tests: Trials) -> None:
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Demo)
-
-
-if __name__ == "__main__":
-    main()

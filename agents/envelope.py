@@ -1,10 +1,10 @@
 """Tune the rules of every setting and class, and commit their envelopes before agents are trained.
 
-    python -m agents.envelope [--envs NAME …] [--classes NAME …] [--quick] [--resume]
+    fusion-gym envelope [--envs NAME …] [--classes NAME …] [--quick] [--resume]
 
 For each class of knowledge the vertices of the lower envelope are chosen on tuning seeds and then
 measured on the test seeds. ``envelopes/SETTING.json`` in the results folder holds them, each class
-with a SHA-256 of its content, which ``agents.benchmark`` keeps with every agent that it trains;
+with a SHA-256 of its content, which ``fusion-gym benchmark`` keeps with every agent that it trains;
 ``envelopes/README.md`` has the table. What was tuned stays in the work folder, so that an
 interrupted run goes on where it was.
 """
@@ -17,7 +17,7 @@ from typing import Annotated
 
 from fusion_gym.validation import ConfigurationError, choice
 
-from .command_line import Long, spelled, start
+from .command_line import Long, start
 from .input.options import OutputFolder, Whole, writable_folder
 from .output.files import write_text
 from .output.progress import writing
@@ -81,14 +81,10 @@ class Envelope(Long):
                 suite, settings, self.classes, folders.results, folders.work, Team(self.workers)
             )
             readme = folders.results / FOLDER / "README.md"
-            write_text(readme, text_of(folders.results, spelled("envelope")))
+            write_text(readme, text_of(folders.results, "fusion-gym envelope"))
         print(f"envelopes in {path_of(folders.results, '').parent}, the table in {readme}")
 
 
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Envelope)
-
-
-if __name__ == "__main__":
-    main()

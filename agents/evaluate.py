@@ -1,6 +1,6 @@
 """Evaluate policies on paired episodes.
 
-    python -m agents.evaluate --env fusion_gym/TobitOscillator-v0 --set filter=tobit \\
+    fusion-gym evaluate --env fusion_gym/TobitOscillator-v0 --set filter=tobit \\
         --policies always dynamic_event innovation_threshold:threshold=1 --reference always
 
 Every policy runs on the same seeds, so that the same noise meets every policy. The JSON is
@@ -171,7 +171,3 @@ def finished(path: Path | None, report: dict[str, Any]) -> dict[str, Any]:
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Evaluate)
-
-
-if __name__ == "__main__":
-    main()

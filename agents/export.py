@@ -1,6 +1,6 @@
 """Export a saved agent as an ONNX file, for sensors and coordinators that run without this library.
 
-    python -m agents.export zoo:tobit_oscillator_sensors_memory,price=0.02 --onnx coordinator.onnx
+    fusion-gym export zoo:tobit_oscillator_sensors_memory,price=0.02 --onnx coordinator.onnx
 
 The file has everything from the observation to the request, and says what the observation is. It is
 checked against the agent on 10,000 observations of whole episodes, and not kept if it differs.
@@ -138,7 +138,3 @@ def _shape(shape: tuple[str | int, ...]) -> str:
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Export)
-
-
-if __name__ == "__main__":
-    main()

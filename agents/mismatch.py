@@ -1,7 +1,7 @@
 """Measure whether a training may take the mismatch for the error: the cross term, in a setting.
 
-    python -m agents.mismatch --env fusion_gym/UnknownInput-v0 --set token_rate=2
-    python -m agents.mismatch --config correlated_tracking_front --episodes 2000
+    fusion-gym mismatch --env fusion_gym/UnknownInput-v0 --set token_rate=2
+    fusion-gym mismatch --config correlated_tracking_front --episodes 2000
 
 The error ‖x - x̂‖² of the centre's estimate x̂ is a floor ‖x - x*‖², a mismatch ‖x* - x̂‖² and a
 cross term, with x* the estimate that takes in every measurement. ``training.error: mismatch`` is
@@ -134,7 +134,3 @@ _CAPTION = (
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Mismatch)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Tables and figures of the benchmark's results, as Markdown and as one self-contained page.
 
-    python -m agents.report [--results results] [--pages README.md docs/biased.md …]
+    fusion-gym report [--results results] [--pages README.md docs/biased.md …]
 
 Reads the JSON in the results folder and writes ``README.md``, figures of all settings together and
 of each, and ``report.html`` with the figures inside. What the JSON says is text there, no markup.
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote
 
-from .command_line import Command, spelled, start
+from .command_line import Command, start
 from .input.files import read_text
 from .input.options import OutputFolder
 from .output.files import write_text
@@ -44,7 +44,7 @@ class Report(Command):
             path: documented(read_text("pages", path), found, self.results) for path in self.pages
         }
         quick = " --quick" if self.results.name == "quick" else ""
-        text = text_of(found, f"{spelled('benchmark')}{quick}", spelled("report"))
+        text = text_of(found, f"fusion-gym benchmark{quick}", "fusion-gym report")
         overview.draw(self.results, found)
         for name, one in found.items():
             report_layers.draw(self.results / name, one)
@@ -56,7 +56,7 @@ class Report(Command):
         print(f"wrote {', '.join(map(str, (readme, page, *pages)))}")
 
 
-def text_of(found: dict[str, Found], command: str, second: str = "python -m agents.report") -> str:
+def text_of(found: dict[str, Found], command: str, second: str = "fusion-gym report") -> str:
     """The report in Markdown, made by these two commands."""
     lines = [
         f"# {TITLE}",
@@ -133,7 +133,3 @@ def setting_section(found: Found) -> list[str]:
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Report)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Make the simulation sections of the five papers anew: figures, tables and claims.
 
-    python -m agents.reproduce tobit_token_bucket
-    python -m agents.reproduce all --resume
+    fusion-gym reproduce tobit_token_bucket
+    fusion-gym reproduce all --resume
 
 Into the output folder go a page a paper (``PAPER.md``), its figures (PNG and SVG), its numbers
 (``PAPER.json``), and ``README.md`` with every claim's verdict. Simulations are kept in the work
@@ -18,7 +18,7 @@ from typing import Annotated
 
 import tyro
 
-from .command_line import Command, spelled, start
+from .command_line import Command, start
 from .input.options import OutputFolder, Seed, Whole
 from .output.ending import ended_like_by_ctrl_c
 from .output.files import remove_partials
@@ -88,14 +88,10 @@ class Reproduce(Command):
     def interrupted(self) -> str:
         """Finished simulations are kept."""
         words = [word for word in sys.argv[1:] if word != "--resume"]
-        command = shlex.join([*spelled("reproduce").split(), *words, "--resume"])
+        command = shlex.join(["fusion-gym", "reproduce", *words, "--resume"])
         return f"interrupted; go on with: {command}"
 
 
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Reproduce)
-
-
-if __name__ == "__main__":
-    main()

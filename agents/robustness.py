@@ -1,6 +1,6 @@
 """Try rules and agents where the truth is not what they assume: noises, limits, motion, tokens.
 
-    python -m agents.robustness [--envs NAME …] [--class local_packets] [--trained] [--resume]
+    fusion-gym robustness [--envs NAME …] [--class local_packets] [--trained] [--resume]
 
 The rules of a committed envelope and the agents of its class run under every case of a config, as
 they were tuned and trained, on the same test episodes. Every piece of work writes its JSON into
@@ -20,7 +20,7 @@ import tyro
 
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Long, spelled, start
+from .command_line import Long, start
 from .input.options import Episodes, InputFolder, OutputFolder, Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
 from .output.folders import alone_in
@@ -118,7 +118,7 @@ class Robustness(Long):
                 trial.conclude()
             every = {one.name: one.title for one in load_suite(config.suite).settings}
             titles = {one.setting: every[one.setting] for one in config.settings}
-            table = write_table(self.results, titles, spelled("robustness") + self._how())
+            table = write_table(self.results, titles, "fusion-gym robustness" + self._how())
         print(f"results in {place}, the table in {table}")
 
     def _how(self) -> str:
@@ -163,7 +163,3 @@ def _usual_class(suite: Suite, setting: Setting) -> str:
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Robustness)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Train agents in the solved case and print what they cost above the optimum.
 
-    python -m agents.solved --config configs/remote_estimation_ppo.yaml --seeds 0 1 2
+    fusion-gym solved --config configs/remote_estimation_ppo.yaml --seeds 0 1 2
 
 Trainings go into ``runs/solved``; a finished one is not repeated, an interrupted one is gone on
 with. Costs are compared on the same test seeds, paired.
@@ -115,7 +115,3 @@ def is_finished(experiment: Experiment) -> bool:
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Solved)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Print the documentation's table of filters, triggers and buckets.
 
-    python -m agents.table --config configs/tobit_oscillator_reproduce.yaml
+    fusion-gym table --config configs/tobit_oscillator_reproduce.yaml
 
 Every row runs on the same seeds. ``--markdown`` prints the table as the documentation holds it.
 """
@@ -99,7 +99,3 @@ def _cells(label: str, results: EpisodeResults) -> tuple[str, ...]:
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Table)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Train a Stable-Baselines3 agent on the native vector environment.
 
-    python -m agents.train --config configs/tobit_oscillator_ppo.yaml [--resume]
+    fusion-gym train --config configs/tobit_oscillator_ppo.yaml [--resume]
 
 Into the config's ``output`` folder go, as they are made: ``config.yaml``, ``latest.zip`` (the
 checkpoint), ``best_model.zip`` (best return on the validation seeds), ``validation.jsonl``,
@@ -89,7 +89,3 @@ class Train(Long):
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Train)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Find an agent's hyper-parameters with Optuna, in a study that can be gone on with.
 
-    python -m agents.tune --config configs/tobit_oscillator_ppo.yaml --trials 30 \\
+    fusion-gym tune --config configs/tobit_oscillator_ppo.yaml --trials 30 \\
         --timesteps 1000000 --output runs/tune/tobit_oscillator
 
 The study is a SQLite file in the output folder: running the command again goes on with it until it
@@ -349,7 +349,3 @@ def best_config(study: optuna.Study, experiment: Experiment, command: str) -> st
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Tune)
-
-
-if __name__ == "__main__":
-    main()

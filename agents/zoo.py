@@ -1,6 +1,6 @@
 """Put the benchmark's best agents into the model zoo, with their cards.
 
-    python -m agents.zoo [--envs NAME …] [--classes NAME …] [--results results]
+    fusion-gym zoo [--envs NAME …] [--classes NAME …] [--results results]
                          [--work runs/benchmark/full]
 
 For each setting and chosen class the training seed with the best validation return goes into
@@ -20,7 +20,7 @@ from typing import Annotated, Any
 from fusion_gym import zoo
 from fusion_gym.validation import ConfigurationError, choice
 
-from .command_line import Long, spelled, start
+from .command_line import Long, start
 from .input.options import InputFolder, OutputFolder
 from .output.files import read_json, replacing, write
 from .output.progress import writing
@@ -149,7 +149,7 @@ def add(name: str, report: dict[str, Any], model: bytes, folder: Path) -> None:
         "mode": report["mode"],
         "knows": KNOWS[report["mode"], bool(options.get("memory", False))],
         "training": report["training"] | {"output": f"runs/{name}"},
-        "command": f"{spelled('benchmark')} --envs {report['setting']} --classes "
+        "command": f"fusion-gym benchmark --envs {report['setting']} --classes "
         f"{report['class']}, training seed {report['training_seed']}",
         "test": {
             "episodes": report["episodes"],
@@ -178,7 +178,3 @@ def remove_others(folder: Path, kept: Iterable[str]) -> list[str]:
 def main() -> None:
     """Entry point; exit status 130 after an interrupt."""
     start(Zoo)
-
-
-if __name__ == "__main__":
-    main()

@@ -42,16 +42,17 @@ Work = Callable[[Path], bytes]
 Content = dict[str, Any]
 
 
-def command(module: str, *words: str) -> str:
-    """Run ``python -m module`` in the current directory, on one thread; its standard output.
+def command(name: str, *words: str) -> str:
+    """Run a command of the current directory on one thread; its standard output.
 
     Raises:
         RuntimeError: it failed; the message ends with what it said.
     """
-    line, env = [sys.executable, "-m", module, *words], os.environ | {"OMP_NUM_THREADS": "1"}
+    line = [sys.executable, "-m", "fusion_gym.agents", name, *words]
+    env = os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(line, env=env, capture_output=True, text=True)
     if done.returncode != 0:
-        raise RuntimeError(f"{module} ended with {done.returncode}: {done.stderr.strip()[-1000:]}")
+        raise RuntimeError(f"{name} ended with {done.returncode}: {done.stderr.strip()[-1000:]}")
     return done.stdout
 
 
@@ -61,20 +62,20 @@ def read(path: Path) -> Any:
 
 
 def evaluate(env: str, options: Content, names: list[str], episodes: int, folder: Path) -> bytes:
-    """Summaries and quantiles that ``agents.evaluate`` writes for these policies."""
+    """Summaries and quantiles that ``fusion-gym evaluate`` writes for these policies."""
     words = ["--env", env, "--policies", *names, "--episodes", str(episodes), "--seed", "0"]
     if options:
         words += ["--set", *(f"{key}={value}" for key, value in options.items())]
-    command("agents.evaluate", *words, "--json", str(folder / "evaluation.json"))
+    command("evaluate", *words, "--json", str(folder / "evaluation.json"))
     report = read(folder / "evaluation.json")
     chosen = {key: report[key] for key in ("policies", "quantiles")}
     return json.dumps(chosen, sort_keys=True).encode()
 
 
 def reproduce(config: Path, episodes: int, folder: Path) -> bytes:
-    """The table that ``agents.table`` prints."""
+    """The table that ``fusion-gym table`` prints."""
     words = ("--config", str(config), "--episodes", str(episodes), "--markdown")
-    return command("agents.table", *words).encode()
+    return command("table", *words).encode()
 
 
 def train(plain: Content, folder: Path) -> bytes:
@@ -83,7 +84,7 @@ def train(plain: Content, folder: Path) -> bytes:
     plain = plain | {"validation": plain.get("validation", {}) | VALIDATION}
     config.write_text(yaml.safe_dump(plain, sort_keys=False))
     words = ("--config", str(config), "--timesteps", str(TIMESTEPS), "--output", str(output))
-    command("agents.train", *words)
+    command("train", *words)
     with zipfile.ZipFile(output / "final_model.zip") as model:
         weights = torch.load(io.BytesIO(model.read("policy.pth")), "cpu", weights_only=True)
     tensors = (weights[key].contiguous().numpy().tobytes() for key in sorted(weights))
@@ -105,7 +106,7 @@ def benchmark(setting: str, folder: Path) -> bytes:
     """The numbers in every file that the quick benchmark of a setting writes."""
     results, work = folder / "results", folder / "work"
     words = ["--quick", "--envs", setting, "--workers", "1"]
-    command("agents.benchmark", *words, "--results", str(results), "--work", str(work))
+    command("benchmark", *words, "--results", str(results), "--work", str(work))
     files = sorted(results.glob(f"{setting}/*.json"))
     return json.dumps({file.name: list(numbers(read(file))) for file in files}).encode()
 

@@ -24,19 +24,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from agents.output import tables
-from agents.output.ending import told
-from agents.output.files import read_json, write, write_text
-from agents.output.folders import alone_in
-from agents.output.progress import quietly, writing
-from agents.suite.config import load_suite
-from agents.suite.learned import finished, report
-from agents.suite.learning import load_learning
-from agents.suite.learning_table import overview, text_of
-from agents.suite.lessons import run_lesson, run_reference
-from agents.suite.study import Kind, Lesson, Study
-from agents.suite.team import Team
-from agents.suite.workers import Work, side_by_side
+from fusion_gym.agents.output import tables
+from fusion_gym.agents.output.ending import told
+from fusion_gym.agents.output.files import read_json, write, write_text
+from fusion_gym.agents.output.folders import alone_in
+from fusion_gym.agents.output.progress import quietly, writing
+from fusion_gym.agents.suite.config import load_suite
+from fusion_gym.agents.suite.learned import finished, report
+from fusion_gym.agents.suite.learning import load_learning
+from fusion_gym.agents.suite.learning_table import overview, text_of
+from fusion_gym.agents.suite.lessons import run_lesson, run_reference
+from fusion_gym.agents.suite.study import Kind, Lesson, Study
+from fusion_gym.agents.suite.team import Team
+from fusion_gym.agents.suite.workers import Work, side_by_side
 from fusion_gym.validation import ConfigurationError, choice, integer
 
 from .throughput import measured, remembering, vector

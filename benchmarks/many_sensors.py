@@ -1,7 +1,7 @@
 """Many sensors of one kind on one bucket: what learning costs, and what it leaves beside the rules.
 
     python -m benchmarks.many_sensors cost
-    python -m agents.train --config configs/many_sensors.yaml
+    fusion-gym train --config configs/many_sensors.yaml
     python -m benchmarks.many_sensors table --model runs/many_sensors/best_model.zip
 
 The first measures a counterfactual training step against the number of sensors. The last plays the
@@ -28,10 +28,10 @@ from rich.table import Table
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
-from agents.output.progress import progress_bar, quietly
-from agents.training.checked import load, parse
-from agents.training.config import Experiment
-from agents.training.run import check
+from fusion_gym.agents.output.progress import progress_bar, quietly
+from fusion_gym.agents.training.checked import load, parse
+from fusion_gym.agents.training.config import Experiment
+from fusion_gym.agents.training.run import check
 from fusion_gym.core.task import Task
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.envs.registration import make_task

@@ -23,8 +23,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from agents.output.figures import save
-from agents.output.palette import BLUE, GREEN, INK, ORANGE, VERMILLION
+from fusion_gym.agents.output.figures import save
+from fusion_gym.agents.output.palette import BLUE, GREEN, INK, ORANGE, VERMILLION
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task

@@ -17,7 +17,7 @@ from typing import NamedTuple
 from hostile_commands import Try
 from hostile_folder import contents
 
-from agents import __main__ as everything
+from fusion_gym.agents import __main__ as everything
 
 NOBODY = 65534
 

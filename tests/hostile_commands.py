@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 from hostile_folder import BROKEN, ENV
 
-from agents.command_line import Command
-from agents.input.options import OutputFile, OutputFolder
+from fusion_gym.agents.command_line import Command
+from fusion_gym.agents.input.options import OutputFile, OutputFolder
 
 LONG = "n" * 300
 JSON = [name for name in BROKEN if name not in ("date", "tag")]  # which a JSON reader knows not
@@ -105,7 +105,9 @@ class Try(NamedTuple):
 
 def options(name: str) -> dict[str, Any]:
     """A command's options and their types, with what is annotated."""
-    kind: type[Command] = getattr(importlib.import_module(f"agents.{name}"), name.capitalize())
+    kind: type[Command] = getattr(
+        importlib.import_module(f"fusion_gym.agents.{name}"), name.capitalize()
+    )
     hints = typing.get_type_hints(kind, include_extras=True)
     found = {field.name: hints[field.name] for field in dataclasses.fields(kind)}
     for field, option in (("options", "set"), ("of", "class")):

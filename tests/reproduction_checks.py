@@ -14,9 +14,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from agents.output import palette
-from agents.reproduction.paper import Paper
-from agents.reproduction.shown import Shown
+from fusion_gym.agents.output import palette
+from fusion_gym.agents.reproduction.paper import Paper
+from fusion_gym.agents.reproduction.shown import Shown
 
 PAGES = Path(__file__).parents[1] / "docs" / "reproduction"
 ERRORS = 4.5  # of both samples together

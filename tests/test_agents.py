@@ -23,18 +23,18 @@ from stable_baselines3 import PPO
 from training_configs import ENV, SMALL, read_records, small_config
 
 import fusion_gym
-from agents import demo, evaluate, table
-from agents.command_line import read
-from agents.suite.beside_rules import Ground, Trials
-from agents.suite.config import Suite
-from agents.suite.sweep import Comparison, Sweep
-from agents.suite.team import Team
-from agents.suite.trainings import train_beside
-from agents.training import run as train
-from agents.training.algorithms import TABLE
-from agents.training.checked import load
-from agents.training.config import Experiment
-from agents.training.constraint import score
+from fusion_gym.agents import demo, evaluate, table
+from fusion_gym.agents.command_line import read
+from fusion_gym.agents.suite.beside_rules import Ground, Trials
+from fusion_gym.agents.suite.config import Suite
+from fusion_gym.agents.suite.sweep import Comparison, Sweep
+from fusion_gym.agents.suite.team import Team
+from fusion_gym.agents.suite.trainings import train_beside
+from fusion_gym.agents.training import run as train
+from fusion_gym.agents.training.algorithms import TABLE
+from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.training.config import Experiment
+from fusion_gym.agents.training.constraint import score
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.metrics import summarise
@@ -240,7 +240,7 @@ def test_a_target_rate_needs_a_fixed_price(tmp_path: Path) -> None:
 )
 def test_an_interrupted_training_loses_nothing(tmp_path: Path, number: signal.Signals) -> None:
     config = small_config(tmp_path, training={"timesteps": 10_000_000, "num_envs": 8})
-    command = [sys.executable, "-m", "agents.train", "--config", str(config)]
+    command = [sys.executable, "-m", "fusion_gym.agents", "train", "--config", str(config)]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     folder = tmp_path / "run"
     deadline = time.monotonic() + 120
@@ -433,7 +433,7 @@ def test_what_is_drawn_beside_the_rules_lies_as_it_lay_on_its_own_episodes() -> 
 @pytest.mark.slow
 def test_an_interrupted_demo_ends_its_trainings_with_a_checkpoint(tmp_path: Path) -> None:
     words = ["--output", str(tmp_path), "--episodes", "2", "--timesteps", "10000000"]
-    command = [sys.executable, "-m", "agents.demo", *words]
+    command = [sys.executable, "-m", "fusion_gym.agents", "demo", *words]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     agents = [tmp_path / learner.name / "agent" for learner in demo.LEARNERS]
     deadline = time.monotonic() + 120

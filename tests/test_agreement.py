@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from agents.suite.agreement import agreement
+from fusion_gym.agents.suite.agreement import agreement
 
 
 def verdict(folder: Path, **middles: tuple[float, float, float] | None) -> Path:

@@ -18,17 +18,17 @@ from small_results import small_results
 from small_suite import ENV, SMALL, small_suite
 
 import fusion_gym
-from agents import benchmark, report, solved, tune, zoo
-from agents.output.files import load_results, save_results
-from agents.output.markup import code, page_of
-from agents.suite import jobs
-from agents.suite.classes import classes_of, trained
-from agents.suite.committed import read_envelopes
-from agents.suite.config import load_suite
-from agents.suite.envelopes import searches_of
-from agents.suite.found import read_results
-from agents.training.checked import load
-from agents.training.config import Experiment
+from fusion_gym.agents import benchmark, report, solved, tune, zoo
+from fusion_gym.agents.output.files import load_results, save_results
+from fusion_gym.agents.output.markup import code, page_of
+from fusion_gym.agents.suite import jobs
+from fusion_gym.agents.suite.classes import classes_of, trained
+from fusion_gym.agents.suite.committed import read_envelopes
+from fusion_gym.agents.suite.config import load_suite
+from fusion_gym.agents.suite.envelopes import searches_of
+from fusion_gym.agents.suite.found import read_results
+from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.training.config import Experiment
 from fusion_gym.core.system import covers
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.periodic_optimum import Schedule
@@ -46,7 +46,7 @@ def run_main(monkeypatch: pytest.MonkeyPatch, module: Any, *arguments: str) -> N
 def test_from_tuning_to_report_and_zoo(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("agents.suite.verdict.RESAMPLES", 50)
+    monkeypatch.setattr("fusion_gym.agents.suite.verdict.RESAMPLES", 50)
     results, work = tmp_path / "results", tmp_path / "work"
     arguments = [
         "--config", str(small_suite(tmp_path)), "--results", str(results), "--work", str(work),
@@ -406,7 +406,15 @@ def test_processes_share_a_study(tmp_path: Path) -> None:
     def begun(name: str) -> subprocess.Popen[bytes]:
         words = ["--config", str(config), "--trials", "4", "--storage", storage]
         return subprocess.Popen(
-            [sys.executable, "-m", "agents.tune", *words, "--output", str(tmp_path / name)],
+            [
+                sys.executable,
+                "-m",
+                "fusion_gym.agents",
+                "tune",
+                *words,
+                "--output",
+                str(tmp_path / name),
+            ],
             cwd=Path(__file__).parent.parent,
         )
 
@@ -456,7 +464,7 @@ def test_tuning_goes_on_with_its_study(
 
     run_main(monkeypatch, tune, *arguments, str(folder), "--trials", "1")
     with monkeypatch.context() as patch:
-        patch.setattr("agents.training.monitor.Progress.finish", killed)
+        patch.setattr("fusion_gym.agents.training.monitor.Progress.finish", killed)
         with pytest.raises(Killed):
             run_main(monkeypatch, tune, *arguments, str(folder), "--trials", "3")
     for trials in (2, 3, 3):
@@ -470,7 +478,7 @@ def test_tuning_goes_on_with_its_study(
     trainings = sorted(path.name for path in folder.glob("trial_*"))
     assert trainings == ["trial_0", "trial_1", "trial_2"], "it was gone on with"
     best = (folder / "best.yaml").read_text()
-    assert best.startswith("# Found by python -m agents.tune --config")
+    assert best.startswith("# Found by fusion-gym tune --config")
     assert ": best of 3 trials, " in best.splitlines()[0]
     for words, message in (
         (["--timesteps", "512"], "timesteps = 512 differs"),

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from small_suite import small_suite
 
-from agents.suite.team import Team
+from fusion_gym.agents.suite.team import Team
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -56,7 +56,16 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.P
 
 def benchmark(suite: Path, folder: Path, *words: str) -> list[str]:
     places = ["--results", str(folder / "results"), "--work", str(folder / "work")]
-    return [sys.executable, "-m", "agents.benchmark", "--config", str(suite), *places, *words]
+    return [
+        sys.executable,
+        "-m",
+        "fusion_gym.agents",
+        "benchmark",
+        "--config",
+        str(suite),
+        *places,
+        *words,
+    ]
 
 
 def found(folder: Path) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import collections
 import errno
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -18,11 +17,11 @@ from command_runs import call, flaw
 from hostile_commands import BASES, Try, line, options, tries
 from hostile_folder import ROOT, contents, scratch
 
-from agents import __main__ as everything
-from agents.command_line import Command, start
-from agents.demo import remove
-from agents.output.ending import told
-from agents.suite.sweep import Curve
+from fusion_gym.agents import __main__ as everything
+from fusion_gym.agents.command_line import Command, start
+from fusion_gym.agents.demo import remove
+from fusion_gym.agents.output.ending import told
+from fusion_gym.agents.suite.sweep import Curve
 from fusion_gym.policies.settings import parse_value
 from fusion_gym.validation import ConfigurationError
 
@@ -143,33 +142,10 @@ def run(command: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_output_that_nobody_reads_or_takes() -> None:
-    gone = run("python -m agents | true; echo ${PIPESTATUS[0]}")
+    gone = run("python -m fusion_gym.agents | true; echo ${PIPESTATUS[0]}")
     assert (gone.stdout, gone.stderr) == ("141\n", "")
-    full = run("python -m agents > /dev/full; echo $?")
+    full = run("python -m fusion_gym.agents > /dev/full; echo $?")
     assert (full.stdout, full.stderr) == ("1\n", "error: No space left on device\n")
-
-
-@pytest.mark.parametrize("line", ["-m agents.evaluate", "-m agents evaluate"])
-def test_an_interrupt_while_a_command_loads_has_no_traceback(line: str) -> None:
-    """Sent as soon as numpy is being imported, which the commands do first."""
-    process = subprocess.Popen(
-        [sys.executable, "-v", *line.split(), "--help"], cwd=ROOT, text=True,
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a job in the background
-    )  # fmt: skip
-    assert process.stderr is not None
-    said = []
-    for text in process.stderr:
-        said.append(text)
-        if "import 'scipy" in text:
-            process.send_signal(signal.SIGINT)
-            break
-    said += process.stderr.readlines()
-    process.wait(timeout=60)
-    own = [text for text in said if text[0] not in "#" and not text.startswith("import ")]
-    assert "interrupted\n" in own
-    assert not any(text.startswith("Traceback") for text in own)
-    assert process.returncode in (130, -signal.SIGINT)
 
 
 def test_a_fresh_demo_removes_nothing_but_a_demo(here: Path) -> None:

@@ -11,12 +11,12 @@ import torch
 from training_configs import ENV, small_config
 
 import fusion_gym
-from agents.training import run
-from agents.training.algorithms import TABLE
-from agents.training.checked import load
-from agents.training.config import Experiment
-from agents.training.counterfactual import CounterfactualPPO, Rollout, _Step
-from agents.training.decisions import Decisions
+from fusion_gym.agents.training import run
+from fusion_gym.agents.training.algorithms import TABLE
+from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.training.config import Experiment
+from fusion_gym.agents.training.counterfactual import CounterfactualPPO, Rollout, _Step
+from fusion_gym.agents.training.decisions import Decisions
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.evaluation.episodes import run_episodes
@@ -247,7 +247,7 @@ def test_its_models_are_ordinary_ones(
     task = fusion_gym.make_task(ENV, **priced)
     policy: Any = make_policy(f"model:{model}", task)
     plain = next(
-        base for base in TABLE[kind].model.__mro__ if base.__module__.split(".")[0] != "agents"
+        base for base in TABLE[kind].model.__mro__ if base.__module__.split(".")[0] != "fusion_gym"
     )
     assert type(policy.model) is plain
     loaded = plain.load(model, device="cpu")  # type: ignore[attr-defined]

@@ -11,10 +11,10 @@ import pytest
 from command_runs import call
 from training_configs import small_config
 
-from agents.training.checked import load
-from agents.training.config import Experiment
-from agents.training.models import make_env
-from agents.training.run import train
+from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.training.config import Experiment
+from fusion_gym.agents.training.models import make_env
+from fusion_gym.agents.training.run import train
 from fusion_gym.core.system import System
 from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_system
 from fusion_gym.envs.registration import make_task

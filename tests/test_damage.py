@@ -13,8 +13,8 @@ import pytest
 from small_suite import ENV, small_suite
 from training_configs import small_config
 
-from agents import benchmark, evaluate, train, tune
-from agents.suite import verdict
+from fusion_gym.agents import benchmark, evaluate, train, tune
+from fusion_gym.agents.suite import verdict
 
 DAMAGES: dict[str, Callable[[bytes, bytes], bytes]] = {
     "cut short": lambda content, other: content[: len(content) * 2 // 3],

@@ -11,11 +11,11 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from training_configs import ENV, SMALL, read_records, small_config
 
-from agents.training.algorithms import TABLE
-from agents.training.checked import load
-from agents.training.config import Experiment
-from agents.training.diagnosis import by_price, prices_of
-from agents.training.run import train
+from fusion_gym.agents.training.algorithms import TABLE
+from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.training.config import Experiment
+from fusion_gym.agents.training.diagnosis import by_price, prices_of
+from fusion_gym.agents.training.run import train
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy

@@ -19,15 +19,15 @@ import pytest
 from page_blocks import blocks_of, imported, stray_commands
 
 import fusion_gym
-from agents import report
-from agents.output.files import read_json
-from agents.suite import envelope_table, learning_table
-from agents.suite.config import load_suite
-from agents.suite.found import read_results
-from agents.suite.learning import load_learning
-from agents.suite.report_pages import documented
-from agents.suite.robust_table import write_table
-from agents.suite.robustness import load_robustness
+from fusion_gym.agents import report
+from fusion_gym.agents.output.files import read_json
+from fusion_gym.agents.suite import envelope_table, learning_table
+from fusion_gym.agents.suite.config import load_suite
+from fusion_gym.agents.suite.found import read_results
+from fusion_gym.agents.suite.learning import load_learning
+from fusion_gym.agents.suite.report_pages import documented
+from fusion_gym.agents.suite.robust_table import write_table
+from fusion_gym.agents.suite.robustness import load_robustness
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.options import Scenario
 from fusion_gym.envs import pages
@@ -88,7 +88,7 @@ def test_the_evaluation_command_runs(tmp_path: Path) -> None:
         if words[:2] == ["fusion-gym", "evaluate"]
     )
     words[words.index("--json") + 1] = str(tmp_path / "evaluation.json")
-    line = [sys.executable, "-m", "agents", *words[1:]]
+    line = [sys.executable, "-m", "fusion_gym.agents", *words[1:]]
     subprocess.run(line, cwd=ROOT, check=True, capture_output=True)
     assert (tmp_path / "evaluation.json").exists()
 
@@ -122,8 +122,6 @@ def test_files_and_names_of_the_library_that_the_texts_name_exist() -> None:
     assert len(files) > 10
     assert len(names) > 10
     assert not [name for name in files if "/my_" not in name and not (ROOT / name).exists()]
-    # Installed, the commands are a part of the library.
-    names = [name.replace("fusion_gym.agents", "agents") for name in names]
     assert not [name for name in names if pydoc.locate(name) is None]
 
 
@@ -136,7 +134,7 @@ def test_every_policy_is_on_its_page() -> None:
 def test_the_committed_report_says_what_the_results_say() -> None:
     found = read_results(ROOT / "results")
     written = (ROOT / "results" / "README.md").read_text()
-    assert written == report.text_of(found, "python -m agents.benchmark")
+    assert written == report.text_of(found, "fusion-gym benchmark")
     for path in (ROOT / "README.md", *DOCS):
         text = path.read_text()
         assert documented(text, found, ROOT / "results") == text, path.name
@@ -158,7 +156,7 @@ def test_the_committed_table_of_perturbed_cases_is_that_of_the_verdicts(tmp_path
 def test_the_committed_envelopes_are_what_the_pages_say() -> None:
     results = ROOT / "results"
     written = (results / "envelopes" / "README.md").read_text()
-    assert written == envelope_table.text_of(results, "python -m agents.envelope")
+    assert written == envelope_table.text_of(results, "fusion-gym envelope")
     missing = [line for line in envelope_table.headline_table(results) if line not in TEXTS]
     assert not missing
 

@@ -12,12 +12,12 @@ import pytest
 from small_suite import ENV, small_suite
 
 import fusion_gym
-from agents import envelope
-from agents.suite.classes import Class, classes_of
-from agents.suite.committed import merged_curves, read_envelopes
-from agents.suite.config import Choices, Family, Range, Tuning, load_suite
-from agents.suite.envelope_table import cell
-from agents.suite.tuning import Trial, first_values, near_hull, policy_text, search
+from fusion_gym.agents import envelope
+from fusion_gym.agents.suite.classes import Class, classes_of
+from fusion_gym.agents.suite.committed import merged_curves, read_envelopes
+from fusion_gym.agents.suite.config import Choices, Family, Range, Tuning, load_suite
+from fusion_gym.agents.suite.envelope_table import cell
+from fusion_gym.agents.suite.tuning import Trial, first_values, near_hull, policy_text, search
 from fusion_gym.core.system import covers
 from fusion_gym.evaluation.beside import run_beside
 from fusion_gym.evaluation.envelope import EnvelopePoint, chosen_mse, lower_hull

@@ -22,8 +22,8 @@ from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 import fusion_gym
-from agents.export import Export, export, spec
 from fusion_gym import zoo
+from fusion_gym.agents.export import Export, export, spec
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes

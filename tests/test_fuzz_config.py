@@ -13,11 +13,11 @@ from fuzzing import FREE, HOSTILE
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from agents.training.algorithms import TABLE
-from agents.training.checked import load, parse
-from agents.training.config import Experiment
-from agents.training.run import check
 from fusion_gym import ConfigurationError
+from fusion_gym.agents.training.algorithms import TABLE
+from fusion_gym.agents.training.checked import load, parse
+from fusion_gym.agents.training.config import Experiment
+from fusion_gym.agents.training.run import check
 
 Content = dict[str, Any]
 _UNKNOWN = ("nobody_knows_this",)

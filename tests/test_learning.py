@@ -19,20 +19,20 @@ import yaml
 from small_suite import SMALL, small_suite
 from training_configs import read_records, small_config
 
-from agents.output.files import write, write_text
-from agents.suite.committed import complete
-from agents.suite.config import load_suite
-from agents.suite.fronts import excess_over, is_below
-from agents.suite.learned import closed, judged, reached
-from agents.suite.learning import load_learning
-from agents.suite.learning_table import row, text_of
-from agents.suite.lessons import beyond, run_lesson
-from agents.suite.study import Lesson, Study
-from agents.suite.team import Team
-from agents.training.checked import load
-from agents.training.config import Experiment
-from agents.training.run import train
 from benchmarks import learning
+from fusion_gym.agents.output.files import write, write_text
+from fusion_gym.agents.suite.committed import complete
+from fusion_gym.agents.suite.config import load_suite
+from fusion_gym.agents.suite.fronts import excess_over, is_below
+from fusion_gym.agents.suite.learned import closed, judged, reached
+from fusion_gym.agents.suite.learning import load_learning
+from fusion_gym.agents.suite.learning_table import row, text_of
+from fusion_gym.agents.suite.lessons import beyond, run_lesson
+from fusion_gym.agents.suite.study import Lesson, Study
+from fusion_gym.agents.suite.team import Team
+from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.training.config import Experiment
+from fusion_gym.agents.training.run import train
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import EnvelopePoint
@@ -223,7 +223,7 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def fewer_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("agents.suite.verdict.RESAMPLES", 20)
+    monkeypatch.setattr("fusion_gym.agents.suite.verdict.RESAMPLES", 20)
 
 
 def given(school: Path, folder: Path, **changes: Any) -> argparse.Namespace:
@@ -304,7 +304,7 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
 def test_plain_ppo_ends_with_its_budget_or_below_the_rules(
     school: Path, tmp_path: Path, budget: float, below: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("agents.suite.study.is_below", lambda *_: below)
+    monkeypatch.setattr("fusion_gym.agents.suite.study.is_below", lambda *_: below)
     study = replace(study_of(school), work=tmp_path, output=tmp_path)
     lesson = Lesson(study, "plain", 0, budget)
     run_lesson(lesson, 1)
@@ -437,7 +437,7 @@ def test_the_seconds_of_a_training_are_the_processors_without_validations(
     clocks = SimpleNamespace(
         perf_counter=lambda: float(next(wall)), process_time=lambda: float(next(processor))
     )
-    monkeypatch.setattr("agents.training.monitor.time", clocks)
+    monkeypatch.setattr("fusion_gym.agents.training.monitor.time", clocks)
     experiment = load(Experiment, small_config(tmp_path))
     train(experiment, quiet=True, measure=lambda model, seconds: {"seconds": seconds})
     # Eight rollouts and as many updates, of which the fourth comes after the first validation; one

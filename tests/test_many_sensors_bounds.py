@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fusion_gym
-from agents.training.decisions import Decisions
+from fusion_gym.agents.training.decisions import Decisions
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.envs.privileged import PrivilegedVecEnv

@@ -13,10 +13,10 @@ import pytest
 import yaml
 from command_runs import call
 
-from agents.compare import Compare
-from agents.suite.sweep import Sweep
-from agents.training.checked import load
-from agents.training.config import Experiment
+from fusion_gym.agents.compare import Compare
+from fusion_gym.agents.suite.sweep import Sweep
+from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.training.config import Experiment
 from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError

@@ -172,7 +172,7 @@ def test_what_cannot_be_had_is_told_in_one_line(own: Path, make: Any, told: str)
 def test_a_command_finds_the_module_beside_it(own: Path) -> None:
     words = ["--env", "own_names:me/OwnCart-v0", "--set", "error=own_names:worst", "horizon=10"]
     policies = ["--policies", "own_names:Oldest:steps=2", "always", "--episodes", "8"]
-    line = [sys.executable, "-c", "import agents.__main__ as m; m.main()", "evaluate"]
+    line = [sys.executable, "-c", "import fusion_gym.agents.__main__ as m; m.main()", "evaluate"]
     root = Path(__file__).parent.parent
     done = subprocess.run(
         [*line, *words, *policies, "--json", "found.json"],

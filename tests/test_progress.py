@@ -19,13 +19,13 @@ import pytest
 from command_runs import call
 from hostile_commands import BASES, line
 
-from agents import __main__ as everything
-from agents import command_line, evaluate
-from agents.command_line import Long
-from agents.output import progress
-from agents.output.progress import progress_bar, quietly, remark, writing
-from agents.suite.team import Team
-from agents.suite.workers import Work, side_by_side
+from fusion_gym.agents import __main__ as everything
+from fusion_gym.agents import command_line, evaluate
+from fusion_gym.agents.command_line import Long
+from fusion_gym.agents.output import progress
+from fusion_gym.agents.output.progress import progress_bar, quietly, remark, writing
+from fusion_gym.agents.suite.team import Team
+from fusion_gym.agents.suite.workers import Work, side_by_side
 
 ROOT = Path(__file__).parent.parent
 EVALUATE = [
@@ -35,7 +35,9 @@ EVALUATE = [
 LONG = [
     name
     for name in everything.COMMANDS
-    if issubclass(getattr(importlib.import_module(f"agents.{name}"), name.capitalize()), Long)
+    if issubclass(
+        getattr(importlib.import_module(f"fusion_gym.agents.{name}"), name.capitalize()), Long
+    )
 ]
 
 
@@ -113,7 +115,7 @@ def test_a_closed_stderr_gets_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 CHILD = """
-from agents.output.progress import progress_bar, writing
+from fusion_gym.agents.output.progress import progress_bar, writing
 writing(("results", "here"))
 with progress_bar(700_000, "training a") as first, progress_bar(30, "b", unit="trials") as second:
     first.say("MSE 0.1234")
@@ -158,14 +160,14 @@ def test_every_long_command_can_be_quiet() -> None:
 def test_the_command_that_goes_on_is_one(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is read as the command that was interrupted, to be resumed where it can be."""
     words = [*line(name, BASES[name]), "--quiet"]
-    kind = getattr(importlib.import_module(f"agents.{name}"), name.capitalize())
+    kind = getattr(importlib.import_module(f"fusion_gym.agents.{name}"), name.capitalize())
     monkeypatch.setattr(sys, "argv", [f"agents/{name}.py", *words])
     given = command_line.read(kind)
     program, *again = shlex.split(given.again())
-    assert (program, *again[:2]) == ("python", "-m", f"agents.{name}")
+    assert (program, again[0]) == ("fusion-gym", name)
     resumes = "resume" in {field.name for field in dataclasses.fields(kind)}
-    assert again[2:] == [*words, *(["--resume"] if resumes else [])]
-    monkeypatch.setattr(sys, "argv", [f"agents/{name}.py", *again[2:]])
+    assert again[1:] == [*words, *(["--resume"] if resumes else [])]
+    monkeypatch.setattr(sys, "argv", [f"agents/{name}.py", *again[1:]])
     read = command_line.read(kind)
     assert read == (dataclasses.replace(given, resume=True) if resumes else given)
     assert shlex.split(read.again()) == [program, *again]

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from small_results import SETTING, small_results
 
-from agents import report
-from agents.suite.found import read_results
-from agents.suite.overview import headline_count
-from agents.suite.report_pages import documented
-from agents.suite.report_words import sentences
+from fusion_gym.agents import report
+from fusion_gym.agents.suite.found import read_results
+from fusion_gym.agents.suite.overview import headline_count
+from fusion_gym.agents.suite.report_pages import documented
+from fusion_gym.agents.suite.report_words import sentences
 from fusion_gym.validation import ConfigurationError
 
 PAGE = """# A page

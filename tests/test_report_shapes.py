@@ -13,11 +13,11 @@ from command_runs import call
 from hostile_folder import contents
 from small_results import CLASSES, ENV, SETTING, small_model, small_results
 
-from agents.output import pareto_figure
-from agents.output.palette import AGENTS, RULES
-from agents.output.pareto_figure import Differences, Limits, Panel, Series
-from agents.suite.comparison import comparison_table
-from agents.suite.found import read_setting
+from fusion_gym.agents.output import pareto_figure
+from fusion_gym.agents.output.palette import AGENTS, RULES
+from fusion_gym.agents.output.pareto_figure import Differences, Limits, Panel, Series
+from fusion_gym.agents.suite.comparison import comparison_table
+from fusion_gym.agents.suite.found import read_setting
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import Comparison
 from fusion_gym.evaluation.episodes import run_episodes
@@ -139,7 +139,7 @@ def test_the_zoo_takes_a_choice_and_removes_what_is_not_in_it(
         ended = call("zoo", [*words, *wrong])
         assert (ended.status, ended.trace) == (1, "")
         assert message in ended.err
-    monkeypatch.setattr("agents.zoo.MOST", 200)
+    monkeypatch.setattr("fusion_gym.agents.zoo.MOST", 200)
     ended = call("zoo", words)
     assert (ended.status, ended.trace) == (1, "")
     assert "all together must have at most 200; name fewer" in ended.err

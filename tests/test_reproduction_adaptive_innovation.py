@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from reproduction_checks import check_claims, check_numbers, check_pictures, committed, quick
 
-from agents.reproduction.adaptive_innovation import PAPER
-from agents.reproduction.adaptive_innovation.errors import _largest, _whitened
-from agents.reproduction.shown import Shown
+from fusion_gym.agents.reproduction.adaptive_innovation import PAPER
+from fusion_gym.agents.reproduction.adaptive_innovation.errors import _largest, _whitened
+from fusion_gym.agents.reproduction.shown import Shown
 
 EPISODES = 12
 UNCERTAIN = (  # decided by rare errors, or by intervals that twelve episodes leave wide

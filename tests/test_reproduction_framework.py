@@ -18,11 +18,11 @@ from command_runs import Ended, call
 from hostile_folder import contents
 from scipy import stats
 
-from agents.reproduction import page, papers
-from agents.reproduction.making import Job, make
-from agents.reproduction.page import write_overview, write_page
-from agents.reproduction.paper import Paper, Piece
-from agents.reproduction.shown import Claim, Number, Picture, Shown, Table
+from fusion_gym.agents.reproduction import page, papers
+from fusion_gym.agents.reproduction.making import Job, make
+from fusion_gym.agents.reproduction.page import write_overview, write_page
+from fusion_gym.agents.reproduction.paper import Paper, Piece
+from fusion_gym.agents.reproduction.shown import Claim, Number, Picture, Shown, Table
 from fusion_gym.validation import ConfigurationError
 
 USUAL = 30
@@ -80,7 +80,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calls:
 def put(monkeypatch: pytest.MonkeyPatch, folder: Path, drawn: bool) -> Calls:
     found: Calls = []
     for name in ("one", "two"):
-        module = types.ModuleType(f"agents.reproduction.{name}")
+        module = types.ModuleType(f"fusion_gym.agents.reproduction.{name}")
         module.PAPER = a_paper(name, found, drawn)  # type: ignore[attr-defined]
         monkeypatch.setitem(sys.modules, module.__name__, module)
     for module in (papers, page):
@@ -212,12 +212,12 @@ def test_a_piece_that_fails_leaves_the_others(
     def fail(episodes: int, seed: int) -> dict[str, Any]:
         raise ConfigurationError("threshold = 3 is not allowed")
 
-    good = sys.modules["agents.reproduction.one"].PAPER
+    good = sys.modules["fusion_gym.agents.reproduction.one"].PAPER
     first, second = good.pieces
     bad = Piece("second", second.title, fail, second.show, 1.0, USUAL)
     broken = Paper(good.name, good.title, good.citation, (), "", [first, bad])
     with monkeypatch.context() as patch:
-        patch.setattr(sys.modules["agents.reproduction.one"], "PAPER", broken)
+        patch.setattr(sys.modules["fusion_gym.agents.reproduction.one"], "PAPER", broken)
         ended = call("reproduce", ["one", "--workers", "1", "--output", "pages", "--work", "work"])
         assert ended.status != 0
         assert "threshold = 3 is not allowed" in ended.err

@@ -9,11 +9,11 @@ import pytest
 from reproduction_checks import check_claims, check_numbers, check_pictures, committed, quick
 
 import fusion_gym
-from agents.reproduction.markov_jump import PAPER
-from agents.reproduction.markov_jump.printed import covariances
-from agents.reproduction.markov_jump.runs import THRESHOLDS, example, run, trigger
-from agents.reproduction.markov_jump.schedule import period_of
-from agents.reproduction.shown import Shown
+from fusion_gym.agents.reproduction.markov_jump import PAPER
+from fusion_gym.agents.reproduction.markov_jump.printed import covariances
+from fusion_gym.agents.reproduction.markov_jump.runs import THRESHOLDS, example, run, trigger
+from fusion_gym.agents.reproduction.markov_jump.schedule import period_of
+from fusion_gym.agents.reproduction.shown import Shown
 from fusion_gym.evaluation import run_episodes
 
 EPISODES = 30

@@ -11,11 +11,15 @@ from reproduction_checks import SEED, check_claims, check_numbers, check_picture
 from scipy import stats
 
 import fusion_gym
-from agents.reproduction.round_robin_tobit import PAPER
-from agents.reproduction.round_robin_tobit.bounds import Lower, Seen, Upper, below
-from agents.reproduction.round_robin_tobit.judging import always_below, explained
-from agents.reproduction.round_robin_tobit.readings import READINGS, PrintedTobitFilter, task_of
-from agents.reproduction.round_robin_tobit.runs import (
+from fusion_gym.agents.reproduction.round_robin_tobit import PAPER
+from fusion_gym.agents.reproduction.round_robin_tobit.bounds import Lower, Seen, Upper, below
+from fusion_gym.agents.reproduction.round_robin_tobit.judging import always_below, explained
+from fusion_gym.agents.reproduction.round_robin_tobit.readings import (
+    READINGS,
+    PrintedTobitFilter,
+    task_of,
+)
+from fusion_gym.agents.reproduction.round_robin_tobit.runs import (
     OSCILLATOR,
     TRACKING,
     Turn,
@@ -26,7 +30,7 @@ from agents.reproduction.round_robin_tobit.runs import (
     round_robin,
     squares,
 )
-from agents.reproduction.shown import Shown
+from fusion_gym.agents.reproduction.shown import Shown
 from fusion_gym.evaluation.episodes import run_episodes
 
 EPISODES = 24

@@ -9,11 +9,11 @@ import pytest
 from reproduction_checks import check_claims, check_numbers, check_pictures, committed, quick
 
 import fusion_gym
-from agents.reproduction.judging import below, percent, told, verdict
-from agents.reproduction.shown import Shown
-from agents.reproduction.tobit_token_bucket import PAPER
-from agents.reproduction.tobit_token_bucket.runs import TRIGGER, Failing, record, scheme
-from agents.reproduction.tobit_token_bucket.theory import claimed, perturbed, terms
+from fusion_gym.agents.reproduction.judging import below, percent, told, verdict
+from fusion_gym.agents.reproduction.shown import Shown
+from fusion_gym.agents.reproduction.tobit_token_bucket import PAPER
+from fusion_gym.agents.reproduction.tobit_token_bucket.runs import TRIGGER, Failing, record, scheme
+from fusion_gym.agents.reproduction.tobit_token_bucket.theory import claimed, perturbed, terms
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.evaluation.intervals import Interval
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from reproduction_checks import check_claims, check_numbers, check_pictures, committed, quick
 
-from agents.reproduction.shown import Shown
-from agents.reproduction.unknown_input import PAPER
-from agents.reproduction.unknown_input.printed import gains, models
-from agents.reproduction.unknown_input.runs import CARTS, leading, make
+from fusion_gym.agents.reproduction.shown import Shown
+from fusion_gym.agents.reproduction.unknown_input import PAPER
+from fusion_gym.agents.reproduction.unknown_input.printed import gains, models
+from fusion_gym.agents.reproduction.unknown_input.runs import CARTS, leading, make
 
 EPISODES = 24
 UNCERTAIN = ("Fusion by covariance intersection",)  # differences that need more episodes

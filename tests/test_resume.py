@@ -15,10 +15,10 @@ import torch
 import yaml
 from training_configs import small_config
 
-from agents.training import run
-from agents.training.algorithms import TABLE
-from agents.training.checked import load
-from agents.training.config import Experiment
+from fusion_gym.agents.training import run
+from fusion_gym.agents.training.algorithms import TABLE
+from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.training.config import Experiment
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import ConfigurationError
 
@@ -162,7 +162,9 @@ def test_the_best_model_outlives_a_kill_between_its_validation_and_the_checkpoin
     experiment = experiment_of(tmp_path / "a", "ppo", timesteps=512)
     folder = Path(experiment.output)
     with monkeypatch.context() as patch:
-        patch.setattr("agents.training.monitor.Progress._write_records", die_with_records(2))
+        patch.setattr(
+            "fusion_gym.agents.training.monitor.Progress._write_records", die_with_records(2)
+        )
         with pytest.raises(Killed):
             run.train(experiment, quiet=True)
     assert (folder / "best_model.zip").exists()

@@ -13,15 +13,15 @@ import yaml
 from command_runs import call
 from small_suite import small_suite
 
-from agents.robustness import _usual_class
-from agents.suite import verdict
-from agents.suite.classes import classes_of
-from agents.suite.config import load_suite
-from agents.suite.jobs import experiment_of
-from agents.suite.robust_table import change
-from agents.suite.robustness import Case, load_robustness, world
-from agents.training.config import Experiment
-from agents.training.run import train
+from fusion_gym.agents.robustness import _usual_class
+from fusion_gym.agents.suite import verdict
+from fusion_gym.agents.suite.classes import classes_of
+from fusion_gym.agents.suite.config import load_suite
+from fusion_gym.agents.suite.jobs import experiment_of
+from fusion_gym.agents.suite.robust_table import change
+from fusion_gym.agents.suite.robustness import Case, load_robustness, world
+from fusion_gym.agents.training.config import Experiment
+from fusion_gym.agents.training.run import train
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import chosen_mse
 from fusion_gym.evaluation.episodes import run_episodes

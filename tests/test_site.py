@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.output import palette
+from fusion_gym.agents.output import palette
 from fusion_gym.envs import drawing
 from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.fusion.table import RULES

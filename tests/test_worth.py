@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from test_verdict import made_up
 
-from agents.suite.classes import Class, classes_of, trained
-from agents.suite.config import load_suite
-from agents.suite.verdict import middles
-from agents.suite.worth import SHARES, Tested, at_rates, pairs, worths
+from fusion_gym.agents.suite.classes import Class, classes_of, trained
+from fusion_gym.agents.suite.config import load_suite
+from fusion_gym.agents.suite.verdict import middles
+from fusion_gym.agents.suite.worth import SHARES, Tested, at_rates, pairs, worths
 from fusion_gym.core.system import covers
 
 NOISE = np.random.default_rng(0).uniform(0.5, 1.5, 300)

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from agents.training.algorithms import TABLE
+from fusion_gym.agents.training.algorithms import TABLE
 
 ENV = "fusion_gym/TobitOscillator-v0"
 SMALL: dict[str, dict[str, Any]] = {

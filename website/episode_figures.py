@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 import fusion_gym
-from agents.output import palette
-from agents.output.palette import plt
+from fusion_gym.agents.output import palette
+from fusion_gym.agents.output.palette import plt
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import owner_of

@@ -6,8 +6,8 @@ import io
 
 import numpy as np
 
-from agents.output import palette
-from agents.output.palette import plt
+from fusion_gym.agents.output import palette
+from fusion_gym.agents.output.palette import plt
 from fusion_gym.fusion.table import RULES
 
 FIRST = np.array([[4.0, 1.2], [1.2, 1.0]])

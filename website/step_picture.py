@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from agents.output import palette
-from agents.output.palette import plt
+from fusion_gym.agents.output import palette
+from fusion_gym.agents.output.palette import plt
 from website.places import DOCS
 
 # Column, row from above, heading, text, colour of the frame.

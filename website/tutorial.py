@@ -5,9 +5,10 @@ from __future__ import annotations
 import base64
 import io
 
+from matplotlib.figure import Figure
+
 from fusion_gym.agents.output import palette  # the name by which the tutorials import it
 from fusion_gym.agents.output.palette import plt
-from matplotlib.figure import Figure
 
 plt.rcParams.update(palette.LARGE | {"svg.fonttype": "path", "figure.constrained_layout.use": True})
 

@@ -39,7 +39,7 @@ class Price(Shape):
 
 
 class Bound(Shape):
-    """``bounds/SETTING.json``, as ``agents.bound`` writes it."""
+    """``bounds/SETTING.json``, as ``fusion-gym bound`` writes it."""
 
     sensors: int
     floor: float

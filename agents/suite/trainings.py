@@ -32,7 +32,7 @@ def train_beside(experiments: Mapping[str, Experiment]) -> dict[str, dict[str, A
 
     Raises:
         KeyboardInterrupt: they were interrupted.
-        ConfigurationError: as :func:`agents.training.run.train`, or the system ended a process.
+        ConfigurationError: as :func:`.training.run.train`, or the system ended a process.
     """
     others = set(multiprocessing.active_children())
     spawn = multiprocessing.get_context("spawn")

@@ -1,1 +1,0 @@
-"""Shipped configs of trainings, sweeps, tables and the benchmark."""
