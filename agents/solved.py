@@ -15,7 +15,6 @@ from typing import Annotated, Any
 from rich import box
 from rich.table import Table
 
-from fusion_gym.core.options import nature_of
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
@@ -54,7 +53,7 @@ class Solved(Long):
         experiment = load(Experiment, self.config)
         name, chosen = experiment.algorithm.name, experiment.environment
         task = make_task(chosen.id, **chosen.options)
-        nature_of(task.system).refuse("for the solved optimum")
+        task.system.nature.refuse("for the solved optimum")
         best = self._tested(task, "optimal", "testing the optimum")
         if best.returns.mean() == 0.0:
             raise ConfigurationError(

@@ -66,7 +66,7 @@ def test_the_value_is_in_squared_units_of_the_states(memory: bool) -> None:
     batch = later(task)
     best = after(task, batch.state, *range(3))[0]
     if memory:
-        best = after(task, batch.shadows.every, *range(3))[0]  # type: ignore[union-attr]
+        best = after(task, batch.memory.states.every, *range(3))[0]  # type: ignore[union-attr]
     silent = weighted(task, best - after(task, batch.state)[0])
     each = [weighted(task, best - after(task, batch.state, s)[0]) for s in range(3)]
     value = silent - np.array(each)
@@ -129,7 +129,7 @@ def test_steps_ahead_sum_what_is_left_of_the_difference() -> None:
     task = task_of(memory=True, filter="kalman", censoring_threshold=-np.inf)
     batch = later(task)
     matrix = np.array(task.system.plant.transition)[..., 0]  # type: ignore[attr-defined]
-    best = after(task, batch.shadows.every, 0, 1, 2)[0]  # type: ignore[union-attr]
+    best = after(task, batch.memory.states.every, 0, 1, 2)[0]  # type: ignore[union-attr]
     total = np.zeros((4, batch.num_envs))
     centres = [after(task, batch.state)[0], *(after(task, batch.state, s)[0] for s in range(3))]
     for power in range(3):
@@ -169,7 +169,7 @@ def test_a_sensor_without_memory_looks_at_what_its_measurement_would_change(env_
     """A threshold on |W^½ (x̂(s) - x̂)|."""
     task = task_of(env_id, access="any")
     batch = later(task, "own", runs=8)
-    assert batch.shadows is None
+    assert batch.memory.states is None
     silent = after(task, batch.state)[0]
     each = [after(task, batch.state, s)[0] - silent for s in range(task.sensors)]
     size = np.sqrt(weighted(task, np.array(each)))

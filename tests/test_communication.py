@@ -193,7 +193,7 @@ def test_nodes_hear_by_default_what_the_papers_let_them_hear(env_id: str, broadc
     task: Task = fusion_gym.make_task(env_id)
     assert task.broadcast == broadcast
     assert (task.memory, task.packet, task.shadow) == (False, "measurement", None)
-    assert EpisodeBatch(task, 1).shadows is None
+    assert EpisodeBatch(task, 1).memory.states is None
 
 
 def test_a_sensor_by_itself_looks_one_step_ahead() -> None:

@@ -69,11 +69,13 @@ def test_what_is_hidden_does_not_matter(name: str) -> None:
     asked = 0
     for _ in range(8):
         other, blind = copy.copy(batch), copy.deepcopy(policy)
-        other._beliefs = None
+        other.memory = batch.memory.with_states(batch.memory.states)
         other.state = otherwise(task.system, batch.state, rng)
-        if batch.shadows is not None and task.shadow is not None:
-            hidden = otherwise(task.shadow, batch.shadows.every, rng)
-            other.shadows = dataclasses.replace(batch.shadows, every=hidden)
+        if batch.memory.states is not None and task.shadow is not None:
+            hidden = otherwise(task.shadow, batch.memory.states.every, rng)
+            other.memory = batch.memory.with_states(
+                dataclasses.replace(batch.memory.states, every=hidden)
+            )
         other._ring = np.roll(batch._ring, 1, axis=0) + (batch.task.access != "random")
         other._ring[batch._cursor % batch._block] = batch.normals()
         answer = policy(batch.signals())
@@ -182,7 +184,7 @@ def test_what_is_imagined_follows_what_is_believed(name: str) -> None:
         lost = state.lost.reshape(-1, 2, count).mean(-1)
         np.testing.assert_allclose(1.0 - lost, arrives[:, [0, count]], atol=0.03)
     if task.shadow is not None:
-        shadow = imagined.shadows.every
+        shadow = imagined.memory.states.every
         np.testing.assert_array_equal(task.shadow.truth(shadow), task.system.truth(state))
         for hidden in ("mode", "process_noise", "scale", "signal"):
             if hasattr(state, hidden) and hasattr(shadow, hidden):

@@ -285,11 +285,11 @@ class TestWhoKnows:
         batch = EpisodeBatch.seeded(task, 4, 0)
         for _ in range(5):
             batch.step(np.zeros((3, 4), dtype=np.bool_))
-            assert batch.shadows is not None
-            np.testing.assert_array_equal(batch.shadows.every.truth, batch.state.truth)
+            assert batch.memory.states is not None
+            np.testing.assert_array_equal(batch.memory.states.every.truth, batch.state.truth)
             sampled = task.system.sensors.sampled(batch.state.time)
             np.testing.assert_array_equal(
-                batch.shadows.every.measurement[sampled], batch.state.measurement[sampled]
+                batch.memory.states.every.measurement[sampled], batch.state.measurement[sampled]
             )
 
     def test_a_rule_is_made_from_the_model(self) -> None:

@@ -16,8 +16,8 @@ import numpy as np
 
 from fusion_gym.arrays import merge_runs, take_runs
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.beliefs import Beliefs, Estimate
-from fusion_gym.core.memory import Memory, Shadows
+from fusion_gym.core.beliefs import Beliefs, Estimate, Shadows
+from fusion_gym.core.memory import Memory
 from fusion_gym.core.signals import MEMORY_SIGNALS
 from fusion_gym.core.system import Knowledge, Signals, covers
 from fusion_gym.core.task import Task
@@ -81,15 +81,15 @@ def read(signals: Signals, policy: Any) -> Values:
     return {n: Believed.of(v, steps) if isinstance(v, Beliefs) else v for n, v in found.items()}
 
 
-def with_shadows(batch: EpisodeBatch, state: Any, shadows: Shadows | None) -> EpisodeBatch:
+def with_states(batch: EpisodeBatch, state: Any, memory: Memory) -> EpisodeBatch:
     """The batch with another state and memory."""
     result = copy.copy(batch)
-    result.state, result.shadows, result._beliefs = state, shadows, None
+    result.state, result.memory = state, memory
     return result
 
 
 def moved_otherwise(
-    batch: EpisodeBatch, remembered: Shadows | None, rng: np.random.Generator
+    batch: EpisodeBatch, remembered: Memory, rng: np.random.Generator
 ) -> EpisodeBatch:
     """The same history, but the last move and all new measurements are made of other noise.
 
@@ -98,31 +98,30 @@ def moved_otherwise(
     if batch.delivered is None:
         return batch
     noise = rng.standard_normal((batch.task.system.noise_channels, batch.num_envs))
-    shadows = None if remembered is None else batch.memory.sense(remembered, noise)
-    return with_shadows(batch, batch.task.system.sense(batch.delivered, noise), shadows)
+    remembered.sense(noise)
+    return with_states(batch, batch.task.system.sense(batch.delivered, noise), remembered)
 
 
 def forgotten(batch: EpisodeBatch) -> EpisodeBatch:
     """Without what was measured and not sent."""
-    task = dataclasses.replace(batch.task, shadow=None)
-    shadows = None if batch.shadows is None else Shadows(alone=batch.shadows.alone)
-    result = with_shadows(batch, batch.state, shadows)
-    result.memory = Memory(task, batch.memory.owner)
-    return result
+    states = batch.memory.states
+    memory = Memory(dataclasses.replace(batch.task, shadow=None), batch.memory.owner)
+    states = None if states is None else Shadows(alone=states.alone)
+    return with_states(batch, batch.state, memory.with_states(states))
 
 
 def with_other_truth(batch: EpisodeBatch, rng: np.random.Generator) -> EpisodeBatch:
     """All that the system's visible state hides is changed: the truth, coming losses."""
-    system, kept = batch.task.system, batch.shadows
-    state, shadows = tampered(system, batch.state, rng), kept
-    if kept is not None:
+    system, states = batch.task.system, batch.memory.states
+    if states is not None:
         shadow = batch.task.shadow
-        shadows = Shadows(
-            tampered(shadow, kept.every, rng),
-            tampered(shadow, kept.own, rng),
-            tampered(system, kept.alone, rng),
+        states = Shadows(
+            tampered(shadow, states.every, rng),
+            tampered(shadow, states.own, rng),
+            tampered(system, states.alone, rng),
         )
-    return with_shadows(batch, state, shadows)
+    state = tampered(system, batch.state, rng)
+    return with_states(batch, state, batch.memory.with_states(states))
 
 
 def tampered(system: Any, state: Any, rng: np.random.Generator) -> Any:
@@ -245,7 +244,7 @@ def what_matters(policy: Policy, task: Task) -> set[str]:
     """Play episodes with the policy and see which changes move its copies' requests."""
     rng, seed = np.random.default_rng(1), 3
     batch = EpisodeBatch.seeded(task, RUNS, seed, owner_of(policy))
-    remembered = None
+    remembered = batch.memory
     timed, blind, forgetful, honest, *alone = (
         copy.deepcopy(policy) for _ in range(4 + task.sensors)
     )
@@ -272,8 +271,9 @@ def what_matters(policy: Policy, task: Task) -> set[str]:
             compare(OTHERS, answer[sensor], asked[sensor])
         if task.shadow is not None:
             compare(PAST, copy.deepcopy(forgetful)(forgotten(batch).signals()), asked)
-        believed, granted = batch.beliefs(), batch.step(asked).granted
-        remembered = batch.memory.deliver(believed, granted)
+        remembered, state = batch.memory.branch(None, batch.num_envs), batch.state
+        granted = batch.step(asked).granted
+        remembered.deliver(state, batch.delivered, granted)
         if step % 2 == 0:
             compare(PAST, forgetful(signals), asked)
         else:

@@ -11,8 +11,8 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, merge_runs
-from fusion_gym.core.beliefs import Shadows, arrived
-from fusion_gym.core.memory import Memory, Owner
+from fusion_gym.core.beliefs import Owner, arrived
+from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Outcome, Runs
 from fusion_gym.core.system import System
@@ -48,7 +48,6 @@ class EpisodeBatch(Runs):
         memory = Memory(task, "coordinator" if remember is None else remember)
         super().__init__(task, memory, ObservationLayout(task, memory.owner))
         self.num_envs = num_envs
-        self.shadows = Shadows() if memory.keeps else None
         self.generators: list[np.random.Generator | None] = [None] * num_envs
         self._episode_starts: list[Any] = [None] * num_envs
         self.state = None
@@ -116,17 +115,12 @@ class EpisodeBatch(Runs):
         first = np.ascontiguousarray(noise.T)
         fresh = system.start(first)
         row = self.noise() if everyone else self.noise()[:, runs]
-        if self.shadows is not None:
-            shadows = self.memory.sense(self.memory.start(first, fresh), row)
-            if not everyone:
-                shadows = self.memory.merge(self.shadows, shadows, runs, self.num_envs)
-            self.shadows = shadows
+        self.memory.begin(first, fresh, row, runs, self.num_envs)
         if self.reference is not None and not self._shared:
             beside = self.reference.sense(self.reference.start(first), row)
             self._beside = beside if everyone else merge_runs(self._beside, beside, runs)
         fresh = system.sense(fresh, row)
         self.state = fresh if everyone else merge_runs(self.state, fresh, runs)
-        self._beliefs = None
         self.tokens = merge_runs(self.tokens, self.task.bucket.start(len(runs)), runs)
         self.steps[runs] = 0
         self.finished[runs] = False
@@ -170,23 +164,25 @@ class EpisodeBatch(Runs):
 
     def snapshot(self) -> dict[str, Any]:
         """Where all runs are, without the task, for :meth:`restore`; valid until the next step."""
-        made = ("task", "layout", "memory", "reference", "_beliefs")
-        return {key: value for key, value in vars(self).items() if key not in made}
+        fixed = ("task", "layout", "memory", "reference")
+        moving = {key: value for key, value in vars(self).items() if key not in fixed}
+        return moving | {"memory_states": self.memory.states}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Put the runs where they were at a :meth:`snapshot` of a batch like this one."""
-        vars(self).update(snapshot)
-        self._beliefs = None
+        moving = dict(snapshot)
+        self.memory = self.memory.with_states(moving.pop("memory_states"))
+        vars(self).update(moving)
 
     def _refer(self, system: System[Any]) -> None:
         """Let the reference take in every measurement of this step."""
         if self._shared:
-            assert self.shadows is not None
-            beside = self.shadows.every
+            assert self.memory.states is not None
+            beside = self.memory.states.every
         else:
             everyone = np.ones((self.task.sensors, self.num_envs), dtype=np.bool_)
             self._beside = beside = arrived(system, self._beside, everyone)
-        self.reference_error = system.truth(beside) - system.fused(beside)[0]
+        self.reference_error = system.truth(beside) - system.fused_mean(beside)
 
     def _lottery(self) -> Array | None:
         return self.normals()[-1] if self.task.access == "random" else None

@@ -20,16 +20,17 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeGuard
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, take_runs
-from fusion_gym.core.system import LossySystem, System
+from fusion_gym.core.system import System
 from fusion_gym.core.task import Task
 from fusion_gym.fusion.intersection import covariance_intersection
 
+Owner = Literal["coordinator", "own"]
 Packets = NDArray[np.bool_]
 
 
@@ -84,7 +85,7 @@ class Beliefs(ABC):
         self.task, self.shadows, self._state = task, shadows, state
         system = task.system
         self.arrival: Array | None = None
-        if loses(system):
+        if system.offers("arrival_probability"):
             self.arrival = system.arrival_probability(state)
         self._runs = system.truth(state).shape[-1]
 
@@ -155,8 +156,8 @@ class CoordinatorBeliefs(Beliefs):
         """See :class:`Beliefs`; with ``packet="estimate"`` every packet carries x*."""
         if self.task.packet == "estimate":
             return Estimate(*(np.repeat(part, self.task.sensors, axis=0) for part in self.best))
-        if (together := _together(self.task.system, self._state)) is not None:
-            return together
+        if self.task.system.offers("fused_alone"):
+            return Estimate(*self.task.system.fused_alone(self._state))
         each = [_of(self.task.system, delivered) for delivered in self._sent]
         return Estimate(
             np.concatenate([one.mean for one in each]),
@@ -238,8 +239,8 @@ class OwnBeliefs(Beliefs):
         """See :class:`Beliefs`."""
         system, itself = self.task.system, self._itself
         if self.shadows.alone is None:
-            if (together := _together(system, self._state)) is not None:
-                return together
+            if system.offers("fused_alone"):
+                return Estimate(*system.fused_alone(self._state))
             every = np.tile(np.arange(self._runs), self.task.sensors)
             return self._each(system, arrived(system, take_runs(self._state, every), itself))
         own = self._each(system, arrived(system, self.shadows.alone, itself))
@@ -286,15 +287,7 @@ def _one(steps: int) -> None:
 
 def arriving(system: System[Any], state: Any, packets: Packets) -> Any:
     """The state of a system in which these packets (sensors, N), if they are sent, arrive."""
-    return system.arriving(state, packets) if loses(system) else state
-
-
-def loses(system: System[Any]) -> TypeGuard[LossySystem[Any]]:
-    """Whether the channel of a system may lose packets.
-
-    Asked in every step, where the protocol's own check would cost as much as a delivery.
-    """
-    return hasattr(system, "arriving")
+    return system.arriving(state, packets) if system.offers("arriving") else state
 
 
 def silent_path(system: System[Any], delivered: Any, steps: int) -> Array:
@@ -305,18 +298,11 @@ def silent_path(system: System[Any], delivered: Any, steps: int) -> Array:
     runs = system.truth(delivered).shape[-1]
     still = np.zeros((system.noise_channels, runs))
     silence = np.zeros((system.sensor_count, runs), dtype=np.bool_)
-    means = [system.fused(delivered)[0]]
+    means = [system.fused_mean(delivered)]
     for _ in range(steps - 1):
         delivered = system.deliver(system.sense(delivered, still), silence)
-        means.append(system.fused(delivered)[0])
+        means.append(system.fused_mean(delivered))
     return np.stack(means)
-
-
-def _together(system: System[Any], state: Any) -> Estimate | None:
-    """The estimates after each sensor's packet alone, where the system has them all at once."""
-    tried = getattr(system, "fused_alone", None)
-    found = None if tried is None else tried(state)
-    return None if found is None else Estimate(*found)
 
 
 def arrived(system: System[Any], state: Any, packets: Packets) -> Any:
@@ -325,12 +311,7 @@ def arrived(system: System[Any], state: Any, packets: Packets) -> Any:
 
 
 def _of(system: System[Any], delivered: Any) -> Estimate:
-    if hasattr(system, "fused_mean"):
-        return Estimate(
-            system.fused_mean(delivered)[None], lambda: system.fused(delivered)[1][None]
-        )
-    mean, covariance = system.fused(delivered)
-    return Estimate(mean[None], covariance[None])
+    return Estimate(system.fused_mean(delivered)[None], lambda: system.fused(delivered)[1][None])
 
 
 def _joined(first: Estimate, second: Estimate) -> Estimate:

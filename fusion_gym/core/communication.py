@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from fusion_gym import validation
 from fusion_gym.core.options import Scenario
-from fusion_gym.core.system import AdoptingSystem, LossySystem, System
+from fusion_gym.core.system import System
 from fusion_gym.validation import ConfigurationError
 
 PACKETS = ("measurement", "estimate")
@@ -70,9 +70,7 @@ def _check_estimates(scenario: Scenario, remembers: bool) -> None:
     reason = scenario.no_estimates
     if not remembers:
         reason = "it holds what the coordinator remembers, which takes memory=True"
-    elif isinstance(scenario.system, LossySystem) or not isinstance(
-        scenario.system, AdoptingSystem
-    ):
+    elif scenario.system.offers("arriving") or not scenario.system.offers("adopt"):
         reason = reason or "this system's centre cannot go on from an estimate that is sent to it"
     if reason is not None:
         raise ConfigurationError(

@@ -1,8 +1,8 @@
-"""What was measured and not sent: the shadows of a run.
+"""What was measured and not sent: the memory of the owner of N runs, and what it believes.
 
-A shadow is the same plant on the same noise, tokens and past channel, with a filter that has taken
-in every measurement that its owner has. The coordinator sees all sensors. A sensor by itself has
-its own measurements and what it hears, by the option ``broadcast``:
+A memory state is the same plant on the same noise, tokens and past channel, with a filter that has
+taken in every measurement that its owner has. The scheduler sees all sensors. A local sensor has
+its own measurements and what it receives, by the option ``broadcast``:
 
 - ``"none"``: nothing. It knows which of its packets arrived, and takes for the centre's estimate
   what that would be if nobody else ever sent.
@@ -10,12 +10,14 @@ its own measurements and what it hears, by the option ``broadcast``:
   by covariance intersection, for it does not know what the two have in common.
 - ``"packets"``: every packet that arrived, so it knows all that the centre knows.
 
-What follows from the shadows is in :mod:`fusion_gym.core.beliefs`.
+What follows from the memory is in :mod:`fusion_gym.core.beliefs`.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import copy
+from collections.abc import Callable, Mapping
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,26 +28,27 @@ from fusion_gym.core.beliefs import (
     CoordinatorBeliefs,
     Estimate,
     OwnBeliefs,
+    Owner,
     Shadows,
     arriving,
 )
+from fusion_gym.core.signals import memory_signals, missing_signals
 from fusion_gym.core.task import Task
 from fusion_gym.errors import refusal
 
-Owner = Literal["coordinator", "own"]
-
 
 class Memory:
-    """Moves the shadows of a task's runs and says what is believed by them; it holds no runs.
+    """What the owner of a task's runs remembers, moved along with them, and what it believes.
 
-    ``owner`` says whose: the coordinator's, or every sensor's by itself.
+    ``owner`` is the coordinator, or every sensor by itself. ``states`` are the memory states after
+    sensing, ``None`` where nothing is remembered from step to step.
 
     Raises:
         ConfigurationError: sensors by themselves, where packets hold the coordinator's estimate.
     """
 
     def __init__(self, task: Task, owner: Owner) -> None:
-        self.task, self.owner, sensors = task, owner, task.sensors
+        self.task, self.owner = task, owner
         own = owner == "own"
         if own and task.packet == "estimate":
             raise refusal(
@@ -58,86 +61,139 @@ class Memory:
         self._needs_alone = own and distant
         self._needs_own = own and task.shadow is not None
         self.keeps_every = not own and task.shadow is not None
-        self._itself = np.eye(sensors, dtype=np.bool_)
+        keeps = self.keeps_every or self._needs_own or self._needs_alone
+        self.states = Shadows() if keeps else None
+        self._beliefs: Beliefs | None = None
 
-    @property
-    def keeps(self) -> bool:
-        """Whether there is anything to keep from step to step."""
-        return self.keeps_every or self._needs_own or self._needs_alone
+    def begin(
+        self, noise: Array, fresh: Any, row: Array, runs: NDArray[np.int64], num_envs: int
+    ) -> None:
+        """Start and sense in the given ones of ``num_envs`` runs.
 
-    def start(self, noise: Array, fresh: Any) -> Shadows:
-        """Of runs that begin with this noise (start_channels, N) in the states ``fresh``."""
+        ``noise`` (start_channels, R) and ``fresh`` are the start's normals and states, ``row``
+        (noise_channels, R) the normals of the first sensing.
+        """
+        self._beliefs = None
+        if self.states is None:
+            return
         first, system = fresh, self.task.shadow
         if system is not None and system is not self.task.system:
             first = system.start(noise)
         every = np.tile(np.arange(noise.shape[-1]), self.task.sensors)
-        return Shadows(
-            every=first if self.keeps_every else None,
-            own=take_runs(first, every) if self._needs_own else None,
-            alone=take_runs(fresh, every) if self._needs_alone else None,
+        new = self._sensed(
+            Shadows(
+                every=first if self.keeps_every else None,
+                own=take_runs(first, every) if self._needs_own else None,
+                alone=take_runs(fresh, every) if self._needs_alone else None,
+            ),
+            row,
         )
+        if len(runs) < num_envs:
+            old, many = self.states, self._places(runs, num_envs)
+            new = Shadows(
+                every=merge_runs(old.every, new.every, runs),
+                own=merge_runs(old.own, new.own, many),
+                alone=merge_runs(old.alone, new.alone, many),
+            )
+        self.states = new
 
-    def sense(self, shadows: Shadows, noise: Array) -> Shadows:
-        """After the plant has moved and the sensors have measured, noise (noise_channels, N)."""
+    def beliefs(self, state: Any) -> Beliefs:
+        """Return what the owner believes before anything is sent, of the runs' sensed state."""
+        if self._beliefs is None:
+            self._beliefs = self._make_beliefs(state)
+        return self._beliefs
+
+    def deliver(self, state: Any, delivered: Any, granted: NDArray[np.bool_]) -> Any:
+        """Take in the network's answer (sensors, N) to the runs' sensed state.
+
+        The owner remembers its own measurements and receives others' packets. Returns the
+        delivered state; with ``packet="estimate"`` its centre goes on from x* where a packet
+        arrived.
+        """
+        if self.task.packet == "estimate":
+            mean, covariance = self.beliefs(state).best
+            arrived = np.asarray(granted.any(0))
+            delivered = self.task.system.adopt(delivered, mean[0], covariance[0], arrived)
+        if self.states is not None:
+            self.states = self._delivered(self.states, self.beliefs(state), granted)
+        return delivered
+
+    def sense(self, noise: Array) -> None:
+        """Move the plant and measure, with noise (noise_channels, N)."""
+        if self.states is not None:
+            self.states = self._sensed(self.states, noise)
+        self._beliefs = None
+
+    def branch(self, runs: NDArray[np.int64] | None, num_envs: int) -> Self:
+        """Return the memory of the given ones of ``num_envs`` runs, or of all, to move apart."""
+        result = copy.copy(self)
+        if runs is not None:
+            result._beliefs = None
+            if self.states is not None:
+                many = self._places(runs, num_envs)
+                result.states = Shadows(
+                    every=take_runs(self.states.every, runs),
+                    own=take_runs(self.states.own, many),
+                    alone=take_runs(self.states.alone, many),
+                )
+        return result
+
+    def with_states(self, states: Shadows | None) -> Self:
+        """Return the memory of other runs, in these states."""
+        result = copy.copy(self)
+        result.states, result._beliefs = states, None
+        return result
+
+    def with_best(self, state: Any, best: Estimate) -> Self:
+        """Return the memory of runs in a sensed state whose x* is known and not computed."""
+        result = self.with_states(None)
+        result._beliefs = result._make_beliefs(state, best)
+        return result
+
+    def signals(self, beliefs: Callable[[], Beliefs]) -> Mapping[str, Callable[[], Any]]:
+        """Return the signals of what is believed, by name."""
+        return memory_signals(self.owner, beliefs)
+
+    @property
+    def missing_signals(self) -> Mapping[str, str]:
+        """The signals of what others believe, and why they are not there."""
+        return missing_signals(self.owner)
+
+    def _make_beliefs(self, state: Any, best: Estimate | None = None) -> Beliefs:
+        kind = OwnBeliefs if self.owner == "own" else CoordinatorBeliefs
+        return kind(self.task, state, self.states or Shadows(), best)
+
+    def _sensed(self, states: Shadows, noise: Array) -> Shadows:
         system, remembering = self.task.system, self.task.shadow or self.task.system
         result = Shadows()
-        if shadows.every is not None:
-            result.every = remembering.sense(shadows.every, noise)
-        if shadows.own is not None or shadows.alone is not None:
+        if states.every is not None:
+            result.every = remembering.sense(states.every, noise)
+        if states.own is not None or states.alone is not None:
             noise = np.tile(noise, self.task.sensors)
-        if shadows.own is not None:
-            result.own = remembering.sense(shadows.own, noise)
-        if shadows.alone is not None:
-            result.alone = system.sense(shadows.alone, noise)
+        if states.own is not None:
+            result.own = remembering.sense(states.own, noise)
+        if states.alone is not None:
+            result.alone = system.sense(states.alone, noise)
         return result
 
-    def beliefs(self, state: Any, shadows: Shadows, best: Estimate | None = None) -> Beliefs:
-        """What is believed before anything is sent; computed when it is first looked at.
-
-        ``best`` is x*, where it is known already.
-        """
-        kind = OwnBeliefs if self.owner == "own" else CoordinatorBeliefs
-        return kind(self.task, state, shadows, best)
-
-    def deliver(self, beliefs: Beliefs, granted: NDArray[np.bool_]) -> Shadows:
-        """After the network's answer (sensors, N): its own is remembered, others' packets heard."""
-        result, shadows = Shadows(), beliefs.shadows
-        if shadows.every is not None:
+    def _delivered(self, states: Shadows, beliefs: Beliefs, granted: NDArray[np.bool_]) -> Shadows:
+        result, itself = Shadows(), np.eye(self.task.sensors, dtype=np.bool_)
+        # Each sensor's own packet in its own runs (sensors, sensors · N).
+        itself = np.repeat(itself, granted.shape[-1], axis=-1)
+        if states.every is not None:
             result.every = beliefs.remembered
-        if shadows.own is not None:
+        if states.own is not None:
             result.own = beliefs.remembered
             if self.task.broadcast == "packets":
-                itself, system = self._own(granted), self.task.shadow
+                system = self.task.shadow
                 assert system is not None
-                heard = np.tile(granted, self.task.sensors) | itself
-                result.own = system.deliver(arriving(system, shadows.own, itself), heard)
-        if shadows.alone is not None:
-            sent = np.tile(granted, self.task.sensors) & self._own(granted)
-            result.alone = self.task.system.deliver(shadows.alone, sent)
+                received = np.tile(granted, self.task.sensors) | itself
+                result.own = system.deliver(arriving(system, states.own, itself), received)
+        if states.alone is not None:
+            sent = np.tile(granted, self.task.sensors) & itself
+            result.alone = self.task.system.deliver(states.alone, sent)
         return result
-
-    def take(self, shadows: Shadows, runs: NDArray[np.int64], num_envs: int) -> Shadows:
-        """Those of the given runs, in this order and possibly again and again."""
-        many = self._places(runs, num_envs)
-        return Shadows(
-            every=take_runs(shadows.every, runs),
-            own=take_runs(shadows.own, many),
-            alone=take_runs(shadows.alone, many),
-        )
-
-    def merge(self, old: Shadows, new: Shadows, runs: NDArray[np.int64], num_envs: int) -> Shadows:
-        """The shadows of ``num_envs`` runs with those of the given runs replaced."""
-        many = self._places(runs, num_envs)
-        return Shadows(
-            every=merge_runs(old.every, new.every, runs),
-            own=merge_runs(old.own, new.own, many),
-            alone=merge_runs(old.alone, new.alone, many),
-        )
 
     def _places(self, runs: NDArray[np.int64], num_envs: int) -> NDArray[np.int64]:
         """Where the runs (R,) of every sensor stand, (sensors · R,)."""
         return (np.arange(self.task.sensors)[:, None] * num_envs + runs).ravel()
-
-    def _own(self, granted: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Each sensor's own packet in its own runs (sensors, sensors · N)."""
-        return np.repeat(self._itself, granted.shape[-1], axis=-1)

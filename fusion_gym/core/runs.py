@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, take_runs
 from fusion_gym.core.access import access_mask, first_request
-from fusion_gym.core.beliefs import Beliefs, Estimate, Shadows
+from fusion_gym.core.beliefs import Beliefs, Estimate
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import Network, ObservationLayout
-from fusion_gym.core.signals import memory_signals, missing_signals
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import Grants
@@ -48,13 +47,11 @@ class Outcome(NamedTuple):
 class Position(NamedTuple):
     """Where N runs are, after sensing: all that moves with them.
 
-    The system's ``state`` and the ``shadows`` beside it, ``tokens`` and ``price`` (N,), ``steps``
-    taken and the ``limit`` at which the episode ends (N,), and who is ``admitted`` in the coming
-    step (sensors, N) bool.
+    The system's ``state``, ``tokens`` and ``price`` (N,), ``steps`` taken and the ``limit`` at
+    which the episode ends (N,), and who is ``admitted`` in the coming step (sensors, N) bool.
     """
 
     state: Any
-    shadows: Shadows | None
     tokens: Array
     price: Array
     steps: NDArray[np.int64]
@@ -66,12 +63,11 @@ class Runs:
     """N runs of a :class:`~fusion_gym.core.task.Task` at one time, after sensing.
 
     ``state`` is the system's after sensing, ``delivered`` its state after the last delivery,
-    for metrics and figures; ``shadows`` is what is remembered, or ``None``; ``tokens``, ``price``
-    of a token and ``steps`` taken are (N,).
+    for metrics and figures; ``memory`` moves along beside them; ``tokens``, ``price`` of a token
+    and ``steps`` taken are (N,).
     """
 
     state: Any
-    shadows: Shadows | None
     tokens: Array
     price: Array
     steps: NDArray[np.int64]
@@ -80,7 +76,6 @@ class Runs:
     def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
         self.task, self.memory, self.layout = task, memory, layout
         self.delivered: Any = None
-        self._beliefs: Beliefs | None = None
 
     @property
     def channels(self) -> int:
@@ -91,15 +86,11 @@ class Runs:
         """The first half of a step: answer the requests (sensors, N), update, fuse, reward."""
         task, system = self.task, self.task.system
         granted, spent, tokens = self.answer(requests)
-        state = system.deliver(self.state, granted)
-        if task.packet == "estimate":
-            state = self._adopted(state, np.asarray(granted.any(0)))
+        state = self.memory.deliver(self.state, system.deliver(self.state, granted), granted)
         mean, covariance = system.fused(state)
         error = system.truth(state) - mean
         squared_error = error * error
         reward_error, reward_communication = task.reward.terms(error, covariance, spent, self.price)
-        if self.shadows is not None:
-            self.shadows = self.memory.deliver(self.beliefs(), granted)
         self.delivered, self.tokens, self.steps = state, tokens, self.steps + 1
         return Outcome(
             reward=reward_error + reward_communication,
@@ -128,31 +119,16 @@ class Runs:
     def sense(self, noise: Array) -> None:
         """The second half: the plant moves, the sensors measure, with noise (channels, N)."""
         noise = noise[: self.task.system.noise_channels]
-        if self.shadows is not None:
-            self.shadows = self.memory.sense(self.shadows, noise)
+        self.memory.sense(noise)
         self.state = self.task.system.sense(self.delivered, noise)
-        self._beliefs = None
 
     def branch(self, runs: NDArray[np.int64] | None = None) -> Branch:
         """The given runs (all by default), in this order and possibly again and again, apart.
 
         Runs that are finished go on from their continued state.
         """
-        if runs is None:
-            position = Position(
-                self.state,
-                self.shadows,
-                self.tokens.copy(),
-                self.price.copy(),
-                self.steps.copy(),
-                self._limit.copy(),
-                self.admitted(),
-            )
-            return Branch(self.task, self.memory, self.layout, position, self._beliefs)
-        shadows = self.shadows
-        if shadows is not None:
-            shadows = self.memory.take(shadows, runs, len(self.steps))
-        return Branch(self.task, self.memory, self.layout, self._position(runs, shadows))
+        memory = self.memory.branch(runs, len(self.steps))
+        return Branch(self.task, memory, self.layout, self._position(runs))
 
     def remembering(self, runs: NDArray[np.int64]) -> Branch:
         """As :meth:`branch`, of a coordinator's runs whose x* is known and no longer computed.
@@ -160,15 +136,22 @@ class Runs:
         What a coordinator remembers does not depend on what is sent: x* after a step is that of
         the runs that these were taken from, and has to be given to :meth:`Branch.step`.
         """
-        best = take_runs(self.beliefs().best, runs)
-        position = self._position(runs, None)
-        beliefs = self.memory.beliefs(position.state, Shadows(), best)
-        return Branch(self.task, self.memory, self.layout, position, beliefs)
+        position = self._position(runs)
+        memory = self.memory.with_best(position.state, take_runs(self.beliefs().best, runs))
+        return Branch(self.task, memory, self.layout, position)
 
-    def _position(self, runs: NDArray[np.int64], shadows: Shadows | None) -> Position:
+    def _position(self, runs: NDArray[np.int64] | None) -> Position:
+        if runs is None:
+            return Position(
+                self.state,
+                self.tokens.copy(),
+                self.price.copy(),
+                self.steps.copy(),
+                self._limit.copy(),
+                self.admitted(),
+            )
         return Position(
             take_runs(self.state, runs),
-            shadows,
             self.tokens[runs],
             self.price[runs],
             self.steps[runs],
@@ -184,9 +167,7 @@ class Runs:
 
     def beliefs(self) -> Beliefs:
         """What the owner of the memory believes before anything is sent."""
-        if self._beliefs is None:
-            self._beliefs = self.memory.beliefs(self.state, self.shadows or Shadows())
-        return self._beliefs
+        return self.memory.beliefs(self.state)
 
     def admitted(self) -> NDArray[np.bool_]:
         """The sensors (sensors, N) that the network's access rule admits in the coming step."""
@@ -225,19 +206,12 @@ class Runs:
             "observation": self.observe,
             "model": lambda: system.visible(state),
         }
-        owner = self.memory.owner
-        values |= memory_signals(owner, self.beliefs)
-        return Signals(values, self.task.hidden_signals, missing_signals(owner))
+        values |= self.memory.signals(self.beliefs)
+        return Signals(values, self.task.hidden_signals, self.memory.missing_signals)
 
     def _lottery(self) -> Array | None:
         """The standard normals (N,) that decide random access; None with another rule."""
         return None
-
-    def _adopted(self, state: Any, arrived: NDArray[np.bool_]) -> Any:
-        """The delivered state whose centre goes on from x* where a packet arrived, (N,) bool."""
-        best = self.beliefs().best
-        system: Any = self.task.system
-        return system.adopt(state, best.mean[0], best.covariance[0], arrived)
 
 
 class Branch(Runs):
@@ -252,12 +226,10 @@ class Branch(Runs):
         memory: Memory,
         layout: ObservationLayout,
         position: Position,
-        beliefs: Beliefs | None = None,
     ) -> None:
         super().__init__(task, memory, layout)
-        self._beliefs = beliefs
-        self.state, self.shadows, self.tokens, self.price = position[:4]
-        self.steps, self._limit, self._admitted = position[4:]
+        self.state, self.tokens, self.price = position[:3]
+        self.steps, self._limit, self._admitted = position[3:]
 
     def step(
         self, requests: NDArray[np.bool_], noise: Array, best: Estimate | None = None
@@ -269,7 +241,7 @@ class Branch(Runs):
         outcome = self.deliver(requests)
         self.sense(noise)
         if best is not None:
-            self._beliefs = self.memory.beliefs(self.state, Shadows(), best)
+            self.memory = self.memory.with_best(self.state, best)
         return outcome
 
     def sense(self, noise: Array) -> None:

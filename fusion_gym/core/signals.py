@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from fusion_gym.core.beliefs import Beliefs
-from fusion_gym.core.memory import Owner
+from fusion_gym.core.beliefs import Beliefs, Owner
 from fusion_gym.core.system import Signal
 
 # Knowledge as in a task with memory; without it these need no more than "coordinator" and "own".

@@ -5,16 +5,20 @@ Who knows what is one order, for signals, observations, policies and fair compar
 
 from __future__ import annotations
 
+import functools
 import itertools
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, TypeVar, get_args, runtime_checkable
+from types import FunctionType
+from typing import Any, ClassVar, Generic, Literal, TypeVar, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.nature import AS_ASSUMED, Nature
 
 Knowledge = Literal[
     "clock", "centre", "own", "coordinator", "own_memory", "coordinator_memory"
@@ -79,6 +83,39 @@ class Signal:
     knowledge: Knowledge
     axes: str
     meaning: str
+
+
+# The signals of every system, and what they are where the system does not say otherwise.
+_COMMON: tuple[tuple[str, Knowledge, str], ...] = (
+    ("measurement", "own", "the new measurement"),
+    ("innovation", "own", "measurement minus its expectation"),
+    ("held", "centre", "the last delivered measurement"),
+    ("age", "centre", "steps since the last delivery"),
+    ("expected_measurement", "centre", "expectation of the measurement"),
+    ("innovation_deviation", "centre", "predicted standard deviation of the innovation"),
+    ("prior_mean", "centre", "prediction of the fused estimate"),
+    ("prior_covariance", "centre", "covariance of that prediction"),
+    ("silent_variance", "centre", "weighted trace of the fused covariance without a delivery"),
+    ("variance_reduction", "centre", "fall of that trace if this sensor alone transmits"),
+)
+_COMMON_AXES = {
+    "age": "(sensors, N)",
+    "prior_mean": "(n, N)",
+    "prior_covariance": "(n, n, N)",
+    "silent_variance": "(N,)",
+    "variance_reduction": "(sensors, N)",
+}
+
+
+def common_signals(axes: str = "(sensors, m, N)", **meanings: str) -> tuple[Signal, ...]:
+    """Return the signals that every system offers.
+
+    ``axes`` are those of a measurement; ``meanings`` replace the general ones by name.
+    """
+    return tuple(
+        Signal(name, known, _COMMON_AXES.get(name, axes), meanings.get(name, meaning))
+        for name, known, meaning in _COMMON
+    )
 
 
 @dataclass(frozen=True)
@@ -208,185 +245,180 @@ class Signals(Mapping[str, SignalArray]):
         return sum(1 for _ in self)
 
 
-class System(Protocol[StateT]):
+# What a system may have beside what every system has.
+CAPABILITIES = (
+    *("adopt", "arrival_probability", "arriving", "covariance_cycle", "error_covariance"),
+    *("fused_alone", "imagination_channels", "imagine", "with_actual_covariance"),
+)
+
+
+class System(ABC, Generic[StateT]):
     """A networked estimation system, for N runs at once (batch axis last).
 
     A state is a dataclass of arrays whose last axis is the batch; no method changes one in place.
+    ``state_names`` names the plant's n states, ``signals`` declares what :meth:`read` returns, and
+    ``nature`` says how the truth departs from the model. ``extensions`` lists the public methods
+    that a class has beyond those of its bases.
+
+    Raises:
+        TypeError: (on subclassing) a public method that is neither a base's nor in ``extensions``.
     """
 
+    state_names: tuple[str, ...]
+    signals: tuple[Signal, ...]
+    nature: Nature = AS_ASSUMED
+    extensions: ClassVar[tuple[str, ...]] = ()
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        known = set(cls.extensions).union(*(vars(base) for base in cls.__mro__[1:]))
+        methods = (FunctionType, property, functools.cached_property, classmethod, staticmethod)
+        for name, value in vars(cls).items():
+            if name[0] != "_" and isinstance(value, methods) and name not in known:
+                raise TypeError(
+                    f"{cls.__name__}.{name} is not allowed: it must override a method of a base "
+                    "class, begin with '_', or be listed in extensions"
+                )
+
+    def offers(self, capability: str) -> bool:
+        """Return whether this system has an optional capability, one of ``CAPABILITIES``.
+
+        Raises:
+            ValueError: an unknown capability.
+        """
+        if capability not in CAPABILITIES:
+            raise ValueError(f"capability = {capability!r} is not allowed: see CAPABILITIES")
+        return getattr(type(self), capability) is not getattr(System, capability)
+
     @property
+    @abstractmethod
     def sensor_count(self) -> int:
         """Number of sensors."""
-        ...
 
     @property
-    def state_names(self) -> tuple[str, ...]:
-        """Names of the plant's states, n of them."""
-        ...
-
-    @property
+    @abstractmethod
     def noise_channels(self) -> int:
         """Standard normals that :meth:`sense` consumes."""
-        ...
 
     @property
+    @abstractmethod
     def start_channels(self) -> int:
-        """Standard normals that :meth:`start` consumes."""
-        ...
+        """Standard normals that :meth:`start` consumes, the last ones by ``nature``."""
 
     @property
-    def signals(self) -> tuple[Signal, ...]:
-        """The signals that :meth:`read` offers."""
-        ...
-
-    @property
+    @abstractmethod
     def observation(self) -> tuple[Block, ...]:
         """The blocks of an agent's observation, in their order."""
-        ...
 
+    @abstractmethod
     def start(self, noise: Array) -> StateT:
-        """Time 0 from standard normals (start_channels, N)."""
-        ...
+        """Return time 0 from standard normals (start_channels, N)."""
 
+    @abstractmethod
     def sense(self, state: StateT, noise: Array) -> StateT:
-        """The plant moves and the sensors measure, with standard normals (noise_channels, N)."""
-        ...
+        """Move the plant and measure, with standard normals (noise_channels, N)."""
 
+    @abstractmethod
     def deliver(self, state: StateT, granted: NDArray[np.bool_]) -> StateT:
-        """The nodes update with what was granted (sensors, N), the centre fuses."""
-        ...
+        """Update the nodes with what was granted (sensors, N), and fuse."""
 
+    @abstractmethod
     def read(self, state: StateT) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
-        """The signals after :meth:`sense`."""
-        ...
+        """Return the signals after :meth:`sense`."""
 
+    @abstractmethod
     def visible(self, state: StateT) -> StateT:
-        """The state without what no policy may know, for policies that plan with the model.
+        """Return the state without what no policy may know, for policies that plan.
 
         The truth and all that is not yet measured are not a number, coming losses are taken out:
         :meth:`deliver` lets every grant arrive.
         """
-        ...
+
+    @abstractmethod
+    def local_means(self, state: StateT) -> Array:
+        """Return the nodes' means (sensors, n, N) after :meth:`deliver`, before any feedback."""
+
+    @abstractmethod
+    def open_loop(self, horizon: int) -> Array:
+        """Return the mean error variance (n,) over t = 1..horizon without any delivery."""
 
     def truth(self, state: StateT) -> Array:
-        """The plant's state (n, N): for the reward and for metrics, never for a policy."""
-        ...
+        """Return the plant's state (n, N): for the reward and for metrics, never for a policy."""
+        truth: Array = cast(Any, state).truth
+        return truth
 
     def fused(self, state: StateT) -> tuple[Array, Array]:
-        """The centre's mean (n, N) and covariance (n, n, N) after :meth:`deliver`."""
-        ...
+        """Return the centre's mean (n, N) and covariance (n, n, N) after :meth:`deliver`."""
+        delivered = cast(Any, state)
+        return delivered.mean, delivered.covariance
 
-    def local_means(self, state: StateT) -> Array:
-        """The nodes' means (sensors, n, N) after :meth:`deliver`, before any feedback."""
-        ...
+    def fused_mean(self, state: StateT) -> Array:
+        """Return the mean of :meth:`fused` (n, N); override it where the covariance is large."""
+        return self.fused(state)[0]
 
-    def open_loop(self, horizon: int) -> Array:
-        """Mean error variance (n,) over t = 1..horizon of a centre that never receives."""
-        ...
+    @property
+    def censored_beyond(self) -> Mapping[int, tuple[float, float]]:
+        """Lowest and highest value that is seen of a state, by its number, for pictures."""
+        return {}
 
+    def arrival_probability(self, state: StateT) -> Array:
+        """Return the probability (sensors, N) that a packet sent after this sensing arrives.
 
-@runtime_checkable
-class LossySystem(System[StateT], Protocol[StateT]):
-    """A system whose channel may lose what was granted. Optional: others lose nothing."""
-
-    def arrival_probability(self, state: StateT) -> Array | None:
-        """Probability (sensors, N) that a packet sent after this sensing arrives, or None: surely.
-
-        From what is known before anything is sent.
+        From what is known before anything is sent. Offered where the channel may lose packets.
         """
-        ...
+        raise self._missing("arrival_probability")
 
     def arriving(self, state: StateT, packets: NDArray[np.bool_]) -> StateT:
-        """The state in which these packets (sensors, N), if they are sent now, are not lost."""
-        ...
-
-
-@runtime_checkable
-class AdoptingSystem(System[StateT], Protocol[StateT]):
-    """A system whose centre can go on from an estimate that a packet brings. Optional."""
+        """Return the state in which these packets (sensors, N), if sent now, are not lost."""
+        raise self._missing("arriving")
 
     def adopt(
         self, state: StateT, mean: Array, covariance: Array, runs: NDArray[np.bool_]
     ) -> StateT:
-        """A delivered state with the centre's estimate (n, N), (n, n, N) replaced in ``runs``."""
-        ...
+        """Replace the centre's estimate (n, N), (n, n, N) of a delivered state in ``runs`` (N,)."""
+        raise self._missing("adopt")
 
+    def fused_alone(self, state: StateT) -> tuple[Array, Array]:
+        """Return means (sensors, n, N) and covariances (sensors, n, n, N) after single deliveries.
 
-@runtime_checkable
-class TryingSystem(System[StateT], Protocol[StateT]):
-    """A system that tells what each packet alone would make of the estimate. Optional."""
-
-    def fused_alone(self, state: StateT) -> tuple[Array, Array] | None:
-        """The centre's means (sensors, n, N) and covariances (sensors, n, n, N) after a delivery.
-
-        The i-th is :meth:`fused` of what :meth:`deliver` makes of the packet of sensor i alone;
-        ``None`` where one after another costs no more. Of a system that loses nothing.
+        Entry i is :meth:`fused` after :meth:`deliver` of sensor i's packet alone. Offered where
+        all together cost less than one after another, and no packet is lost.
         """
-        ...
-
-
-@runtime_checkable
-class ManyStatesSystem(System[StateT], Protocol[StateT]):
-    """A system whose covariances are large, and are left alone where means will do. Optional."""
-
-    def fused_mean(self, state: StateT) -> Array:
-        """The mean (n, N) of :meth:`fused`, without its covariance."""
-        ...
-
-
-@runtime_checkable
-class ImaginableSystem(System[StateT], Protocol[StateT]):
-    """A system that can put what could be in the place of all that is hidden. Optional.
-
-    For policies that simulate what may come, from what is believed and not from the truth.
-    """
+        raise self._missing("fused_alone")
 
     @property
-    def imagination_channels(self) -> int | None:
-        """Standard normals that :meth:`imagine` consumes; None where there is nothing to draw."""
-        ...
+    def imagination_channels(self) -> int:
+        """Standard normals that :meth:`imagine` consumes."""
+        raise self._missing("imagination_channels")
 
     def imagine(self, state: StateT, mean: Array, covariance: Array, noise: Array) -> StateT:
-        """The state after :meth:`sense` with all that :meth:`visible` hides drawn anew.
+        """Draw all that :meth:`visible` hides in a state after :meth:`sense`.
 
-        The truth by what is believed of it, N(mean, covariance) of shapes (n, N) and (n, n, N);
-        the rest by its law, as each system says; what has been measured stays. Two systems of one
-        plant draw the same from the same ``noise`` (imagination_channels, N).
+        The truth follows N(mean, covariance) of shapes (n, N) and (n, n, N), the rest its law;
+        what has been measured stays. Two systems of one plant draw the same from the same
+        ``noise`` (imagination_channels, N).
         """
-        ...
-
-
-@runtime_checkable
-class PredictableSystem(System[StateT], Protocol[StateT]):
-    """A system that says whether its covariances follow from what is delivered alone.
-
-    Optional: a system without ``covariance_cycle`` counts as one whose covariances need the data.
-    """
+        raise self._missing("imagine")
 
     @property
-    def covariance_cycle(self) -> int | None:
-        """Steps after which the covariances' recursion repeats itself (1 if it is always the same).
+    def covariance_cycle(self) -> int:
+        """Steps after which the recursion of the covariances repeats itself.
 
-        None where the data enter the covariances, or where deliveries do not.
+        Offered where the covariances follow from the deliveries alone, whatever is measured.
         """
-        ...
+        raise self._missing("covariance_cycle")
 
-
-@runtime_checkable
-class ConservativeSystem(PredictableSystem[StateT], Protocol[StateT]):
-    """A predictable system that claims a bound and can tell the actual covariance beside it.
-
-    Optional, as above.
-    """
-
-    def with_actual_covariance(self) -> ConservativeSystem[StateT]:
-        """The same system, its states carrying what :meth:`error_covariance` needs."""
-        ...
+    def with_actual_covariance(self) -> System[StateT]:
+        """Return the same system with states that carry what :meth:`error_covariance` needs."""
+        raise self._missing("with_actual_covariance")
 
     def error_covariance(self, state: StateT) -> Array:
-        """Actual covariance (n, n, N) of the fused error after :meth:`deliver`.
+        """Return the actual covariance (n, n, N) of the fused error after :meth:`deliver`.
 
         After a start with zeros for noise it is the mean over all episodes. Deliveries must not
         depend on the noise.
         """
-        ...
+        raise self._missing("error_covariance")
+
+    def _missing(self, capability: str) -> NotImplementedError:
+        return NotImplementedError(f"{type(self).__name__} does not offer {capability!r}")

@@ -12,7 +12,8 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.access import ACCESS_RULES
 from fusion_gym.core.communication import communication
-from fusion_gym.core.options import CommonOptions, Nature, Scenario, nature_of, plain
+from fusion_gym.core.nature import Nature
+from fusion_gym.core.options import CommonOptions, Scenario, plain
 from fusion_gym.core.reward import Price, Reward, bounded_open_loop
 from fusion_gym.core.system import Knowledge, System, covers, least_covering
 from fusion_gym.core.token_bucket import TokenBucket
@@ -110,7 +111,11 @@ class Task:
             ConfigurationError: a value that is not allowed.
         """
         chosen, system = scenario.options, scenario.system
-        if nature_of(system) != (nature := Nature.create(chosen)):
+        if not isinstance(system, System):
+            raise validation.refusal(
+                "system", system, "an instance of fusion_gym.core.system.System"
+            )
+        if system.nature != (nature := Nature.create(chosen)):
             nature.refuse("here", f"the truth of {type(system).__name__} is its model")
         horizon = validation.horizon(chosen.horizon)
         reward = Reward.create(

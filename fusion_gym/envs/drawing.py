@@ -151,7 +151,7 @@ class Film:
             )
         )  # fmt: skip
         self._curves: list[list[Any]] = []
-        limits = getattr(self.task.system, "censored_beyond", {})
+        limits = self.task.system.censored_beyond
         for place, (name, axis) in enumerate(zip(self._shown, self._axes, strict=False)):
             (truth,) = axis.plot([], [], color=_TRUTH, lw=1.4, label="state")
             (mean,) = axis.plot([], [], color=_ESTIMATE, lw=1.4, label="fused estimate")

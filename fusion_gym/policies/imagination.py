@@ -12,7 +12,7 @@ from fusion_gym.core.beliefs import Shadows
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Branch, Position
-from fusion_gym.core.system import ImaginableSystem, Signals, System
+from fusion_gym.core.system import Signals, System
 from fusion_gym.core.task import Task
 from fusion_gym.policies.believing import beliefs_of
 from fusion_gym.validation import ConfigurationError
@@ -28,12 +28,12 @@ class Imagination:
     def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
         self._task, self._memory, self._layout = task, memory, layout
         for system in (task.system, task.shadow or task.system):
-            if not isinstance(system, ImaginableSystem) or system.imagination_channels is None:
+            if not system.offers("imagine"):
                 raise ConfigurationError(
                     f"{type(system).__name__} cannot be imagined here: what is hidden in it, the "
                     "truth and what comes, has no law by which it is drawn in each episode"
                 )
-        self._first: int = _imaginable(task.system).imagination_channels or 0
+        self._first = task.system.imagination_channels
         self._each = task.system.noise_channels + (task.access == "random")
 
     def channels(self, steps: int) -> int:
@@ -53,25 +53,19 @@ class Imagination:
 
         def imagined(system: System[Any], state: Any) -> Any:
             seen = system.visible(take_runs(state, runs))
-            return _imaginable(system).imagine(seen, mean, covariance, first)
+            return system.imagine(seen, mean, covariance, first)
 
-        shadows, every = None, beliefs.shadows.every
+        states, every = None, beliefs.shadows.every
         if every is not None:
-            shadows = Shadows(every=imagined(task.shadow or task.system, every))
+            states = Shadows(every=imagined(task.shadow or task.system, every))
         steps = signals["step"][runs]
         position = Position(
             imagined(task.system, signals["model"]),
-            shadows,
             signals["tokens"][runs],
             signals["price"][runs],
             steps,
             np.full_like(steps, task.horizon),
             signals["admitted"][:, runs],
         )
-        branch = Branch(task, self._memory, self._layout, position)
+        branch = Branch(task, self._memory.with_states(states), self._layout, position)
         return branch, rest.reshape(-1, self._each, len(runs))
-
-
-def _imaginable(system: Any) -> ImaginableSystem[Any]:
-    assert isinstance(system, ImaginableSystem), "checked when it was made"
-    return system

@@ -11,7 +11,7 @@ import numpy as np
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import ConservativeSystem, Knowledge, Signals, System
+from fusion_gym.core.system import Knowledge, Signals, System
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests
 from fusion_gym.policies.schedule_file import (
@@ -178,9 +178,9 @@ class _Still:
     def __init__(self, system: System[Any], schedules: Patterns) -> None:
         self._covariance: Callable[[Any], Array] = lambda state: system.fused(state)[1]
         self._system, self._schedules, self._step = system, schedules, 0
-        if isinstance(system, ConservativeSystem):
-            self._system = actual = system.with_actual_covariance()
-            self._covariance = actual.error_covariance
+        if system.offers("error_covariance"):
+            self._system = system.with_actual_covariance()
+            self._covariance = self._system.error_covariance
         runs = schedules.shape[-1]
         self._still = np.zeros((system.noise_channels, runs))
         self._state = self._system.start(np.zeros((system.start_channels, runs)))
@@ -218,12 +218,11 @@ def _search(system: System[Any], packets: int, period: int, steps: int | None) -
 
 
 def _cycle(system: System[Any]) -> int:
-    cycle = getattr(system, "covariance_cycle", None)
-    if cycle is None:
+    if not system.offers("covariance_cycle"):
         raise ConfigurationError(
             f"policy 'periodic_optimum' is not allowed with {type(system).__name__}: it must be a "
             "system whose covariances do not depend on the data but on what is delivered, such as "
             "MarkovJumpTracking-v0 with filter='local' or 'centralised', CorrelatedTracking-v0, "
             "or UnknownInput-v0 with filter='random_walk' or 'predict'"
         )
-    return int(cycle)
+    return system.covariance_cycle

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.beliefs import silent_path
-from fusion_gym.core.system import LossySystem, Signals
+from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import Grants
 from fusion_gym.policies.believing import beliefs_of
@@ -53,7 +52,7 @@ class Model:
         self._beliefs = beliefs_of(signals, own=False) if task.memory else None
         system = task.system
         self.arrival: Array | None = None
-        if isinstance(system, LossySystem):
+        if system.offers("arrival_probability"):
             self.arrival = system.arrival_probability(self._state)
 
     @property
@@ -74,11 +73,11 @@ class Model:
         After that nothing is transmitted and no noise acts: the expectation of a linear system.
         With ``packet="estimate"`` they bring the best estimate there is.
         """
-        system: Any = self._task.system
+        system = self._task.system
         delivered = system.deliver(self._state, arriving)
         if self._task.packet == "estimate" and self._beliefs is not None:
             mean, covariance = self._beliefs.best
-            delivered = system.adopt(delivered, mean[0], covariance[0], arriving.any(0))
+            delivered = system.adopt(delivered, mean[0], covariance[0], np.asarray(arriving.any(0)))
         return silent_path(system, delivered, steps)
 
     def best_means(self, steps: int) -> Array:

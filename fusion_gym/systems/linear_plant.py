@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import true_motion
+from fusion_gym.core.nature import true_motion
 
 
 def covariance_factor(matrix: Array) -> Array:

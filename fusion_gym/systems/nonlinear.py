@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -12,30 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
+from fusion_gym.core.system import Block, SignalArray, System, age_block, common_signals, numbered
 from fusion_gym.systems.linear_plant import covariance_factor
 
 _RUNS = 1000  # that tell what happens without transmissions
 _SEED = 20_240_229  # of their noise
 _RANGE = 5.0  # whitened quantities and logarithms of variance ratios are clipped here
-_COMPONENTS = "(sensors, m, N)"
-SIGNALS = (
-    Signal("measurement", "own", _COMPONENTS, "the new measurement"),
-    Signal("innovation", "own", _COMPONENTS, "measurement minus its expectation"),
-    Signal("held", "centre", _COMPONENTS, "the last delivered measurement"),
-    Signal("age", "centre", "(sensors, N)", "steps since the last delivery"),
-    Signal("expected_measurement", "centre", _COMPONENTS, "measurement of the prediction"),
-    Signal("innovation_deviation", "centre", _COMPONENTS, "the innovation's predicted deviation"),
-    Signal("prior_mean", "centre", "(n, N)", "the centre's prediction"),
-    Signal("prior_covariance", "centre", "(n, n, N)", "its covariance"),
-    Signal("silent_variance", "centre", "(N,)", "trace of the covariance if nobody transmits"),
-    Signal(
-        "variance_reduction",
-        "centre",
-        "(sensors, N)",
-        "how far that trace falls if this sensor alone transmits what is expected of it",
-    ),
-)
 
 
 @dataclass(slots=True)
@@ -57,7 +39,7 @@ class FilteredState:
     covariance: Array
 
 
-class NonlinearSystem(ABC):
+class NonlinearSystem(System[FilteredState]):
     """A plant, its sensors and a filter at the centre, of which four methods are to be written.
 
     :meth:`move` and :meth:`measure` are the truth, :meth:`predict` and :meth:`update` the filter.
@@ -77,7 +59,8 @@ class NonlinearSystem(ABC):
         ConfigurationError: a wrong shape, or a covariance that is not positive definite.
     """
 
-    signals = SIGNALS
+    signals = common_signals()
+    extensions = ("move", "measure", "predict", "update")
 
     def __init__(
         self,
@@ -91,7 +74,7 @@ class NonlinearSystem(ABC):
     ) -> None:
         self.state_names = tuple(state_names)
         size = len(self.state_names)
-        self.sensor_count = validation.integer("sensors", sensors, at_least=1)
+        self._sensors = validation.integer("sensors", sensors, at_least=1)
         self.channels = validation.integer("channels", channels, at_least=1)
         self.process_channels = validation.integer("process_channels", process_channels, at_least=0)
         self.initial_mean = validation.array("initial_mean", initial_mean, (size,))
@@ -116,6 +99,11 @@ class NonlinearSystem(ABC):
         self, mean: Array, covariance: Array, sensor: int, measurement: Array
     ) -> tuple[Array, Array]:
         """The filter's estimate (n, N), (n, n, N) after a sensor's measurement (m, N)."""
+
+    @property
+    def sensor_count(self) -> int:
+        """Number of sensors."""
+        return self._sensors
 
     @property
     def noise_channels(self) -> int:
@@ -252,14 +240,6 @@ class NonlinearSystem(ABC):
             mean=np.where(runs, mean, state.mean),
             covariance=np.where(runs, covariance, state.covariance),
         )
-
-    def truth(self, state: FilteredState) -> Array:
-        """The plant's state (n, N)."""
-        return state.truth
-
-    def fused(self, state: FilteredState) -> tuple[Array, Array]:
-        """The centre's mean (n, N) and covariance (n, n, N)."""
-        return state.mean, state.covariance
 
     def local_means(self, state: FilteredState) -> Array:
         """The centre's mean for every sensor, (l, n, N): there are no nodes."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import CommonOptions, Scenario
-from fusion_gym.core.system import Block, Signal, SignalArray, age_block
+from fusion_gym.core.system import Block, Signal, SignalArray, System, age_block
 
 OWN_ID = "mine/RandomWalk-v0"
 
@@ -29,7 +29,7 @@ class WalkState:
 
 
 @dataclass(frozen=True)
-class RandomWalk:
+class RandomWalk(System[WalkState]):
     """x' = x + w, y = x + v, w ~ N(0, q), v ~ N(0, r): a Kalman filter at the centre."""
 
     q: float

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.core.options import CommonOptions, Nature, Scenario
+from fusion_gym.core.nature import Nature
+from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.reward import equal_weights
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.correlated.filters import JointErrorCovariance, RobustKalmanFilter

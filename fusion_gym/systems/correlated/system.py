@@ -16,8 +16,15 @@ from scipy.special import ndtr
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import AS_ASSUMED, Nature, true_noise
-from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
+from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
+from fusion_gym.core.system import (
+    Block,
+    SignalArray,
+    System,
+    age_block,
+    common_signals,
+    numbered,
+)
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.systems.correlated.filters import (
     JointErrorCovariance,
@@ -59,28 +66,11 @@ class CorrelatedTrackingState:
     departure: Array | None = None
 
 
-_COMPONENTS = "(sensors, m, N)"
-SIGNALS = (
-    Signal("measurement", "own", _COMPONENTS, "the new measurement"),
-    Signal("innovation", "own", _COMPONENTS, "measurement minus the node's expectation"),
-    Signal("held", "centre", _COMPONENTS, "the last delivered measurement"),
-    Signal("age", "centre", "(sensors, N)", "steps since the last delivery"),
-    Signal("expected_measurement", "centre", _COMPONENTS, "the node's expectation"),
-    Signal("innovation_deviation", "centre", _COMPONENTS, "the innovation's deviation (bound)"),
-    Signal("prior_mean", "centre", "(n, N)", "prediction of the fused estimate"),
-    Signal("prior_covariance", "centre", "(n, n, N)", "its conservative covariance"),
-    Signal("silent_variance", "centre", "(N,)", "weighted fused trace if nobody transmits"),
-    Signal(
-        "variance_reduction",
-        "centre",
-        "(sensors, N)",
-        "how far that trace falls if this sensor alone transmits, whatever it measured",
-    ),
-)
+SIGNALS = common_signals(prior_covariance="conservative covariance of that prediction")
 
 
 @dataclass(frozen=True)
-class CorrelatedTrackingSystem:
+class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
     """Joins a plant, sensors that share its noise, robust local filters, and a fusion rule.
 
     ``plant.process_factor`` is Γ Q^½, so that the plant's normals are the sensors' too.
@@ -100,6 +90,8 @@ class CorrelatedTrackingSystem:
     reference: Array
     joint: JointErrorCovariance | None = None
     nature: Nature = AS_ASSUMED
+    signals = SIGNALS
+    extensions = ("actual_covariance",)
 
     @property
     def sensor_count(self) -> int:
@@ -120,11 +112,6 @@ class CorrelatedTrackingSystem:
     def covariance_cycle(self) -> int:
         """1: all covariances follow from the deliveries, by a recursion that never changes."""
         return 1
-
-    @property
-    def signals(self) -> tuple[Signal, ...]:
-        """The signals that :meth:`read` offers."""
-        return SIGNALS
 
     @property
     def observation(self) -> tuple[Block, ...]:
@@ -297,10 +284,6 @@ class CorrelatedTrackingSystem:
         means[0] = np.where(runs, mean, means[0])
         covariances[0] = np.where(runs, covariance, covariances[0])
         return replace(state, mean=means, covariance=covariances)
-
-    def truth(self, state: CorrelatedTrackingState) -> Array:
-        """The plant's state (n, N)."""
-        return state.truth
 
     def fused(self, state: CorrelatedTrackingState) -> tuple[Array, Array]:
         """The centre's mean (n, N) and conservative covariance (n, n, N)."""

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import AS_ASSUMED, Nature, true_noise
+from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.reward import equal_weights
-from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
+from fusion_gym.core.system import Block, SignalArray, System, age_block, common_signals, numbered
 from fusion_gym.systems.markov_jump.centralised_linear import (
     Belief,
     CentralisedLinearFilter,
@@ -29,6 +29,7 @@ from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedMode
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
 from fusion_gym.systems.markov_jump.state import (
+    OF_FAMILY,
     imagination_channels,
     imagined,
     move,
@@ -65,38 +66,19 @@ class MarkovJumpCentralState:
     departure: Array | None = None
 
 
-_SCALAR = "(sensors, 1, N)"
-_PER_SENSOR = "(sensors, N)"
 CENTRAL_SIGNALS = (
-    Signal("measurement", "own", _SCALAR, "the new one; held where the sensor does not sample"),
-    Signal("innovation", "own", _SCALAR, "that minus the centre's expectation, 0 if no sample"),
-    Signal("held", "centre", _SCALAR, "the last delivered measurement"),
-    Signal("age", "centre", _PER_SENSOR, "steps since the last delivery"),
-    Signal("expected_measurement", "centre", _SCALAR, "the centre's expectation of a sample"),
-    Signal("innovation_deviation", "centre", _SCALAR, "the innovation's deviation, given a sample"),
-    Signal("prior_mean", "centre", "(n, N)", "the centre's prediction"),
-    Signal("prior_covariance", "centre", "(n, n, N)", "its covariance"),
-    Signal("silent_variance", "centre", "(N,)", "its weighted trace"),
-    Signal(
-        "variance_reduction",
-        "centre",
-        _PER_SENSOR,
-        "how far that trace falls by the best linear use of this sensor's sample, 0 without one",
+    *common_signals(
+        "(sensors, 1, N)",
+        measurement="the new measurement, or the held one if the sensor does not sample",
+        innovation="measurement minus its expectation, 0 if the sensor does not sample",
+        variance_reduction="fall of that trace by the best linear use of this sensor's sample",
     ),
-    Signal("centre_variance", "centre", "(N,)", "the plain trace if nobody transmits"),
-    Signal(
-        "greedy_variance",
-        "centre",
-        _PER_SENSOR,
-        "that trace if only the sensors before this one in the greedy order transmit, 0 if no "
-        "sample",
-    ),
-    Signal("sampled", "centre", _PER_SENSOR, "whether the sensor samples at this step"),
+    *OF_FAMILY,
 )
 
 
 @dataclass(frozen=True)
-class MarkovJumpCentralSystem:
+class MarkovJumpCentralSystem(System[MarkovJumpCentralState]):
     """Joins the plant, its sensors and one filter at the centre.
 
     A packet carries the sensor's new measurement. A request of a sensor that does not sample
@@ -117,6 +99,8 @@ class MarkovJumpCentralSystem:
     reference: Array
     scale: Array
     nature: Nature = AS_ASSUMED
+    signals = CENTRAL_SIGNALS
+    extensions = ("create",)
 
     @classmethod
     def create(
@@ -165,17 +149,16 @@ class MarkovJumpCentralSystem:
         """Normals of a start: the state, the mode, the first process noise, nature's."""
         return self.plant.size + 1 + self.plant.noise_channels + self.nature.channels
 
-    @property
-    def covariance_cycle(self) -> int | None:
-        """Steps after which the sampling repeats itself; None if covariances depend on data."""
-        if isinstance(self.estimator, InteractingModels):
-            return None
-        return math.lcm(*self.sensors.period[:, 0].tolist())
+    def offers(self, capability: str) -> bool:
+        """See :class:`System`; covariances of interacting models depend on the data."""
+        if capability == "covariance_cycle":
+            return not isinstance(self.estimator, InteractingModels)
+        return super().offers(capability)
 
     @property
-    def signals(self) -> tuple[Signal, ...]:
-        """The signals that :meth:`read` offers."""
-        return CENTRAL_SIGNALS
+    def covariance_cycle(self) -> int:
+        """Steps after which the sampling repeats itself."""
+        return math.lcm(*self.sensors.period[:, 0].tolist())
 
     @property
     def observation(self) -> tuple[Block, ...]:
@@ -339,14 +322,6 @@ class MarkovJumpCentralSystem:
     ) -> MarkovJumpCentralState:
         """See :func:`~fusion_gym.systems.markov_jump.state.imagined`."""
         return imagined(self.plant, state, mean, covariance, noise)
-
-    def truth(self, state: MarkovJumpCentralState) -> Array:
-        """The plant's state (n, N)."""
-        return state.truth
-
-    def fused(self, state: MarkovJumpCentralState) -> tuple[Array, Array]:
-        """The centre's mean (n, N) and covariance (n, n, N)."""
-        return state.mean, state.covariance
 
     def local_means(self, state: MarkovJumpCentralState) -> Array:
         """The centre's estimate once for each sensor (sensors, n, N): nodes have no filters."""

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import true_noise
-from fusion_gym.core.system import Block, Signal, numbered
+from fusion_gym.core.nature import true_noise
+from fusion_gym.core.system import Block, Signal, common_signals, numbered
 from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagCovariances
 from fusion_gym.systems.markov_jump.linear_minimum_variance import Times
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes, draw
@@ -97,33 +97,28 @@ class MarkovJumpState:
     departure: Array | None = None
 
 
-_ESTIMATES = "(sensors, n, N)"
 _PER_SENSOR = "(sensors, N)"
-SIGNALS = (
-    Signal("measurement", "own", _ESTIMATES, "the node's new estimate: what it would send"),
-    Signal("innovation", "own", _ESTIMATES, "that minus the centre's copy of it"),
-    Signal("held", "centre", _ESTIMATES, "the last delivered estimate"),
-    Signal("age", "centre", _PER_SENSOR, "steps since the last delivery"),
-    Signal("expected_measurement", "centre", _ESTIMATES, "the centre's copy, predicted"),
-    Signal("innovation_deviation", "centre", _ESTIMATES, "the innovation's deviation"),
-    Signal("prior_mean", "centre", "(n, N)", "fused estimate if nobody transmits"),
-    Signal("prior_covariance", "centre", "(n, n, N)", "its covariance"),
-    Signal("silent_variance", "centre", "(N,)", "its weighted trace"),
-    Signal(
-        "variance_reduction",
-        "centre",
-        _PER_SENSOR,
-        "how far that trace falls if this sensor alone transmits, whatever it measured",
-    ),
-    Signal("centre_variance", "centre", "(N,)", "the plain trace if nobody transmits"),
+# What both systems of the family offer beside the common signals.
+OF_FAMILY = (
+    Signal("centre_variance", "centre", "(N,)", "plain trace of the covariance without a delivery"),
     Signal(
         "greedy_variance",
         "centre",
         _PER_SENSOR,
         "that trace if only the sensors before this one in the greedy order transmit",
     ),
-    Signal("local_variance", "centre", _PER_SENSOR, "the plain trace of the node's covariance"),
     Signal("sampled", "centre", _PER_SENSOR, "whether the sensor samples at this step"),
+)
+SIGNALS = (
+    *common_signals(
+        "(sensors, n, N)",
+        measurement="the node's new estimate, which it would send",
+        innovation="that estimate minus the centre's copy",
+        held="the last delivered estimate",
+        expected_measurement="the centre's copy, predicted",
+    ),
+    *OF_FAMILY,
+    Signal("local_variance", "centre", _PER_SENSOR, "plain trace of the node's covariance"),
 )
 
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import AS_ASSUMED, Nature, true_noise
+from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.reward import equal_weights
-from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
+from fusion_gym.core.system import Block, SignalArray, System, age_block, numbered
 from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
 from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagRecursion
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
@@ -38,7 +38,7 @@ _FLOOR = 1e-9  # least deviation of a lag, relative to open loop: it is zero rig
 
 
 @dataclass(frozen=True)
-class MarkovJumpSystem:
+class MarkovJumpSystem(System[MarkovJumpState]):
     """Joins the plant, its sensors, the nodes' filters, the joint recursion and a fusion rule.
 
     ``state_weights`` (n,) weigh the traces among the signals, ``magnitude`` (n,) divides observed
@@ -56,6 +56,8 @@ class MarkovJumpSystem:
     magnitude: Array
     reference: Array
     nature: Nature = AS_ASSUMED
+    signals = SIGNALS
+    extensions = ("create", "full_rate_traces")
 
     @classmethod
     def create(
@@ -106,11 +108,6 @@ class MarkovJumpSystem:
     def covariance_cycle(self) -> int:
         """Steps after which the sampling repeats itself; covariances depend on no data."""
         return self.filters.period
-
-    @property
-    def signals(self) -> tuple[Signal, ...]:
-        """The signals that :meth:`read` offers."""
-        return SIGNALS
 
     @property
     def observation(self) -> tuple[Block, ...]:
@@ -286,14 +283,6 @@ class MarkovJumpSystem:
     ) -> MarkovJumpState:
         """See :func:`~fusion_gym.systems.markov_jump.state.imagined`."""
         return imagined(self.plant, state, mean, covariance, noise)
-
-    def truth(self, state: MarkovJumpState) -> Array:
-        """The plant's state (n, N)."""
-        return state.truth
-
-    def fused(self, state: MarkovJumpState) -> tuple[Array, Array]:
-        """The centre's mean (n, N) and covariance (n, n, N)."""
-        return state.mean, state.covariance
 
     def local_means(self, state: MarkovJumpState) -> Array:
         """The nodes' estimates (sensors, n, N); nothing is fed back to them."""

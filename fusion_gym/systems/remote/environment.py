@@ -16,7 +16,8 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.access import ACCESS_RULES
 from fusion_gym.core.channel import CHANNELS, INITIAL_STATES, Channel
-from fusion_gym.core.options import CommonOptions, Nature, Scenario
+from fusion_gym.core.nature import Nature
+from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.task import make_bucket
 from fusion_gym.systems.remote.system import RemoteEstimationSystem
 from fusion_gym.validation import ConfigurationError
@@ -84,6 +85,7 @@ def build(chosen: RemoteEstimationOptions) -> Scenario:
     deviation = validation.positive("noise_deviation", chosen.noise_deviation, (sensors,))
     coefficient = validation.spread("coefficient", chosen.coefficient, (sensors,))
     system = RemoteEstimationSystem(
+        state_names=tuple(f"x{i + 1}" for i in range(len(coefficient))),
         coefficient=coefficient,
         deviation=deviation,
         initial_deviation=validation.not_negative(

@@ -14,8 +14,16 @@ from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.channel import STATES, Channel
-from fusion_gym.core.options import AS_ASSUMED, Nature, true_motion, true_noise
-from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
+from fusion_gym.core.nature import AS_ASSUMED, Nature, true_motion, true_noise
+from fusion_gym.core.system import (
+    Block,
+    Signal,
+    SignalArray,
+    System,
+    age_block,
+    common_signals,
+    numbered,
+)
 
 _RANGE = 5.0  # scaled errors are clipped here
 _FLOOR = 1e-12  # variance after a delivery, in process variances: zero could not be inverted
@@ -45,29 +53,26 @@ class RemoteEstimationState:
     departure: Array | None = None
 
 
-_ONE = "(sensors, 1, N)"
 SIGNALS = (
-    Signal("measurement", "own", _ONE, "the source's value"),
-    Signal("innovation", "own", _ONE, "the error that silence leaves: value minus prediction"),
-    Signal("held", "centre", _ONE, "the last delivered value"),
-    Signal("age", "centre", "(sensors, N)", "steps since the last delivery"),
-    Signal("expected_measurement", "centre", _ONE, "the centre's prediction"),
-    Signal("innovation_deviation", "centre", _ONE, "the innovation's deviation by age"),
-    Signal("channel_state", "centre", "(sensors, N)", "channel at the step before: 0 bad, 1 good"),
-    Signal("prior_mean", "centre", "(n, N)", "prediction of the sources"),
-    Signal("prior_covariance", "centre", "(n, n, N)", "its covariance by age"),
-    Signal("silent_variance", "centre", "(N,)", "its weighted trace"),
+    *common_signals(
+        "(sensors, 1, N)",
+        measurement="the source's value",
+        innovation="error without a delivery: value minus prediction",
+        innovation_deviation="standard deviation of the innovation by age",
+        prior_covariance="covariance of that prediction by age",
+        variance_reduction="expected fall of that trace if this sensor alone transmits",
+    ),
     Signal(
-        "variance_reduction",
+        "channel_state",
         "centre",
         "(sensors, N)",
-        "how far that trace is expected to fall if this sensor alone transmits",
+        "state of the channel at the step before: 0 bad, 1 good",
     ),
 )
 
 
 @dataclass(frozen=True)
-class RemoteEstimationSystem:
+class RemoteEstimationSystem(System[RemoteEstimationState]):
     """n independent sources x(t+1) = a x(t) + w(t), w ~ N(0, σ²), and the optimal estimator.
 
     x̂ = x on a delivery, a x̂ otherwise: optimal under every rule that is symmetric in the error.
@@ -80,6 +85,7 @@ class RemoteEstimationSystem:
     source moves by c a in the place of a, for I + c (a - I) would let a random walk be.
     """
 
+    state_names: tuple[str, ...]
     coefficient: Array
     deviation: Array
     initial_deviation: Array
@@ -87,16 +93,12 @@ class RemoteEstimationSystem:
     error_scale: Array
     state_weights: Array
     nature: Nature = AS_ASSUMED
+    signals = SIGNALS
 
     @property
     def sensor_count(self) -> int:
         """Number of sensors, one a source."""
         return len(self.coefficient)
-
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """One name a source."""
-        return tuple(f"x{i + 1}" for i in range(self.sensor_count))
 
     @property
     def noise_channels(self) -> int:
@@ -109,10 +111,11 @@ class RemoteEstimationSystem:
         """Normals of a start: x(0), the channel's state, nature's."""
         return self.sensor_count * (1 + (self.channel.states > 1)) + self.nature.channels
 
-    @property
-    def signals(self) -> tuple[Signal, ...]:
-        """The signals that :meth:`read` offers."""
-        return SIGNALS
+    def offers(self, capability: str) -> bool:
+        """See :class:`System`; without losses every packet arrives."""
+        if capability == "arrival_probability":
+            return self.channel.loses
+        return super().offers(capability)
 
     @property
     def observation(self) -> tuple[Block, ...]:
@@ -236,19 +239,15 @@ class RemoteEstimationSystem:
         following, lost = self._coming(state.channel, noise)
         return replace(state, next_channel=following, lost=lost, departure=None)
 
-    def arrival_probability(self, state: RemoteEstimationState) -> Array | None:
+    def arrival_probability(self, state: RemoteEstimationState) -> Array:
         """Probability (sensors, N) that a packet sent now arrives, given the channel before."""
-        return self._arrival_probability(state.channel) if self.channel.loses else None
+        return self._arrival_probability(state.channel)
 
     def arriving(
         self, state: RemoteEstimationState, packets: NDArray[np.bool_]
     ) -> RemoteEstimationState:
         """The state in which these packets (sensors, N), if they are sent now, are not lost."""
         return replace(state, lost=state.lost & ~packets)
-
-    def truth(self, state: RemoteEstimationState) -> Array:
-        """The sources (n, N)."""
-        return state.truth
 
     def fused(self, state: RemoteEstimationState) -> tuple[Array, Array]:
         """The centre's mean (n, N) and covariance by age (n, n, N).

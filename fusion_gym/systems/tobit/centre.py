@@ -54,7 +54,12 @@ class Centre(Protocol):
     @property
     def predictable(self) -> bool:
         """Whether its covariances follow from the deliveries alone, whatever is measured."""
-        ...
+        return False
+
+    @property
+    def separable(self) -> bool:
+        """Whether :meth:`alone` is there, and costs less than one update after another."""
+        return False
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> Prediction:
         """Expectations under the centre's prediction (n, N), (n, n, N)."""
@@ -73,10 +78,10 @@ class Centre(Protocol):
 
     def alone(
         self, mean: Array, covariance: Array, prediction: Prediction, measurement: Array
-    ) -> tuple[Array, Array] | None:
+    ) -> tuple[Array, Array]:
         """Posterior means (sensors, n, N) and covariances (sensors, n, n, N), one sensor granted.
 
-        Those of as many calls of :meth:`update`; ``None`` where all together cost no less.
+        Those of as many calls of :meth:`update`.
         """
         ...
 
@@ -144,7 +149,7 @@ class Feedback:
 
 
 @dataclass(frozen=True)
-class FeedbackCentre:
+class FeedbackCentre(Centre):
     """A node filter for each sensor, fusion, and the result fed back to the nodes.
 
     Source: tobit_token_bucket, equations (20)-(23), (29)-(37), (50), (51); round_robin_tobit,
@@ -164,6 +169,11 @@ class FeedbackCentre:
     def predictable(self) -> bool:
         """See :class:`Centre`: with Kalman filters, where nothing is censored."""
         return isinstance(self.filter, KalmanFilter) and self.sensors.unlimited
+
+    @property
+    def separable(self) -> bool:
+        """See :class:`Centre`: where informations add up."""
+        return isinstance(self.fusion, InformationFusion)
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> Prediction:
         """See :class:`Centre`."""
@@ -203,11 +213,10 @@ class FeedbackCentre:
 
     def alone(
         self, mean: Array, covariance: Array, prediction: Prediction, measurement: Array
-    ) -> tuple[Array, Array] | None:
+    ) -> tuple[Array, Array]:
         """See :class:`Centre`: informations of all nodes but one stay what they are in silence."""
-        if not isinstance(self.fusion, InformationFusion):
-            return None
         outcomes = _outcomes(prediction)
+        assert isinstance(self.fusion, InformationFusion)
         return self.fusion.fuse_each(
             outcomes.silent_mean,
             outcomes.silent_information,
@@ -226,7 +235,7 @@ class FeedbackCentre:
 
 
 @dataclass(frozen=True)
-class SequentialCentre:
+class SequentialCentre(Centre):
     """The centre itself takes the delivered measurements one after another; there are no nodes."""
 
     filter: AssumedDensityFilter
@@ -235,11 +244,6 @@ class SequentialCentre:
     def sensors(self) -> CensoredSensors:
         """The sensors."""
         return self.filter.sensors
-
-    @property
-    def predictable(self) -> bool:
-        """See :class:`Centre`: what is censored changes the covariance."""
-        return False
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> Prediction:
         """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
@@ -262,9 +266,9 @@ class SequentialCentre:
 
     def alone(
         self, mean: Array, covariance: Array, prediction: Prediction, measurement: Array
-    ) -> tuple[Array, Array] | None:
-        """See :class:`Centre`."""
-        return None
+    ) -> tuple[Array, Array]:
+        """See :class:`Centre`: not separable."""
+        raise NotImplementedError("one update after another costs no more")
 
     def variances(
         self, mean: Array, covariance: Array, prediction: Prediction, weights: Array

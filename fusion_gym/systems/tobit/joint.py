@@ -45,6 +45,11 @@ class JointCentre:
         """See :class:`Centre`."""
         return self.sensors.unlimited
 
+    @property
+    def separable(self) -> bool:
+        """See :class:`Centre`."""
+        return True
+
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> Prediction:
         """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
         expectation = KalmanFilter(self.sensors).expect(mean)
@@ -85,7 +90,7 @@ class JointCentre:
 
     def alone(
         self, mean: Array, covariance: Array, prediction: Prediction, measurement: Array
-    ) -> tuple[Array, Array] | None:
+    ) -> tuple[Array, Array]:
         """See :class:`Centre`: by the sensor's own channels, up to rounding."""
         outcomes = self._each(mean, covariance, prediction)
         innovation = measurement - prediction.expectation.value

@@ -8,7 +8,8 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from fusion_gym.core.options import CommonOptions, Nature, plain
+from fusion_gym.core.nature import Nature
+from fusion_gym.core.options import CommonOptions, plain
 from fusion_gym.errors import ConfigurationError, shown
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.linear_plant import LinearPlant

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import true_limits
+from fusion_gym.core.nature import true_limits
 from fusion_gym.validation import ConfigurationError
 
 # In units of the resolution: beyond it, differences of covariances have too few digits left.

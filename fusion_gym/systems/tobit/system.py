@@ -16,8 +16,16 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import AS_ASSUMED, Nature, true_noise
-from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
+from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
+from fusion_gym.core.system import (
+    Block,
+    Signal,
+    SignalArray,
+    System,
+    age_block,
+    common_signals,
+    numbered,
+)
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.centre import Centre, Prediction
 
@@ -53,28 +61,14 @@ class CensoredState:
 _OF_CENSORING = ("censored", "uncensored_probability")
 _COMPONENTS = "(sensors, m, N)"
 SIGNALS = (
-    Signal("measurement", "own", _COMPONENTS, "the new censored measurement"),
-    Signal("innovation", "own", _COMPONENTS, "measurement minus its expectation"),
+    *common_signals(_COMPONENTS, measurement="the new censored measurement"),
     Signal("censored", "own", _COMPONENTS, "whether the component is at its threshold"),
-    Signal("held", "centre", _COMPONENTS, "the last delivered measurement"),
-    Signal("age", "centre", "(sensors, N)", "steps since the last delivery"),
-    Signal("expected_measurement", "centre", _COMPONENTS, "the measurement's expectation"),
-    Signal("innovation_deviation", "centre", _COMPONENTS, "the innovation's predicted deviation"),
     Signal("uncensored_probability", "centre", _COMPONENTS, "predicted, from 0 to 1"),
-    Signal("prior_mean", "centre", "(n, N)", "the centre's prediction"),
-    Signal("prior_covariance", "centre", "(n, n, N)", "its covariance"),
-    Signal("silent_variance", "centre", "(N,)", "weighted fused trace if nobody transmits"),
-    Signal(
-        "variance_reduction",
-        "centre",
-        "(sensors, N)",
-        "how far that trace falls if this sensor alone transmits, whatever it measured",
-    ),
 )
 
 
 @dataclass(frozen=True)
-class CensoredSystem:
+class CensoredSystem(System[CensoredState]):
     """Joins a plant, censored sensors, and a centre with or without nodes.
 
     ``model`` is the plant that the filters believe in; the true one is ``plant``, from which
@@ -94,6 +88,8 @@ class CensoredSystem:
     scale: Array
     reference: Array
     nature: Nature = AS_ASSUMED
+    signals = SIGNALS
+    extensions = ("state_weights",)
 
     @property
     def sensor_count(self) -> int:
@@ -116,19 +112,22 @@ class CensoredSystem:
         own = 2 * self.plant.size + self.centre.sensors.noise_channels
         return own + self.nature.channels
 
-    @property
-    def covariance_cycle(self) -> int | None:
-        """1 where covariances follow from the deliveries: Kalman filters, and nothing censored.
+    def offers(self, capability: str) -> bool:
+        """See :class:`System`; Kalman filters without censoring have a covariance cycle.
 
-        With federated fusion, or one filter at the centre, they are then the actual ones, if
-        ``model`` is the plant; with covariance intersection they are bounds.
+        With federated fusion, or one filter at the centre, the covariances are then the actual
+        ones, if ``model`` is the plant; with covariance intersection they are bounds.
         """
-        return 1 if self.centre.predictable else None
+        if capability == "covariance_cycle":
+            return self.centre.predictable
+        if capability == "fused_alone":
+            return self.centre.separable
+        return super().offers(capability)
 
     @property
-    def signals(self) -> tuple[Signal, ...]:
-        """The signals that :meth:`read` offers."""
-        return SIGNALS
+    def covariance_cycle(self) -> int:
+        """1: the recursion never changes."""
+        return 1
 
     @property
     def observation(self) -> tuple[Block, ...]:
@@ -258,8 +257,8 @@ class CensoredSystem:
             covariance=posterior.covariance,
         )
 
-    def fused_alone(self, state: CensoredState) -> tuple[Array, Array] | None:
-        """See :class:`~fusion_gym.core.system.TryingSystem`."""
+    def fused_alone(self, state: CensoredState) -> tuple[Array, Array]:
+        """See :class:`System`."""
         return self.centre.alone(
             state.prior_mean, state.prior_covariance, _prediction(state), state.measurement
         )
@@ -317,14 +316,6 @@ class CensoredSystem:
             covariance=np.where(runs, covariance, state.covariance),
             local_mean=np.where(runs, mean, state.local_mean),
         )
-
-    def truth(self, state: CensoredState) -> Array:
-        """The plant's state (n, N)."""
-        return state.truth
-
-    def fused(self, state: CensoredState) -> tuple[Array, Array]:
-        """The centre's mean (n, N) and covariance (n, n, N)."""
-        return state.mean, state.covariance
 
     def local_means(self, state: CensoredState) -> Array:
         """The nodes' posterior means (sensors, n, N) before the feedback."""

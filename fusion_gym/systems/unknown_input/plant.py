@@ -14,7 +14,7 @@ from scipy.special import ndtr
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import true_motion
+from fusion_gym.core.nature import true_motion
 from fusion_gym.systems.linear_plant import covariance_factor
 from fusion_gym.systems.unknown_input.signals import InputSignal
 

@@ -17,8 +17,8 @@ from scipy.special import ndtr
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import AS_ASSUMED, Nature, true_noise
-from fusion_gym.core.system import Block, Signal, SignalArray, age_block, numbered
+from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
+from fusion_gym.core.system import Block, SignalArray, System, age_block, common_signals, numbered
 from fusion_gym.systems.unknown_input.nodes import Estimates, Nodes, Prediction, RunNodes
 from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
 from fusion_gym.systems.unknown_input.signals import InputSignal
@@ -49,38 +49,16 @@ class UnknownInputState:
     departure: Array | None = None
 
 
-_COMPONENTS = "(sensors, m, N)"
-SIGNALS = (
-    Signal("measurement", "own", _COMPONENTS, "the new measurement"),
-    Signal("innovation", "own", _COMPONENTS, "measurement minus the node's expectation"),
-    Signal("held", "centre", _COMPONENTS, "the last delivered measurement"),
-    Signal("age", "centre", "(sensors, N)", "sampling instants since the last delivery"),
-    Signal(
-        "expected_measurement",
-        "centre",
-        _COMPONENTS,
-        "the node's expectation, its last input estimate carried on",
-    ),
-    Signal("innovation_deviation", "centre", _COMPONENTS, "the innovation's predicted deviation"),
-    Signal("prior_mean", "centre", "(n, N)", "prediction of the fused state"),
-    Signal(
-        "prior_covariance",
-        "centre",
-        "(n, n, N)",
-        "its covariance, as if state and input estimates were uncorrelated",
-    ),
-    Signal("silent_variance", "centre", "(N,)", "weighted fused trace if nobody transmits"),
-    Signal(
-        "variance_reduction",
-        "centre",
-        "(sensors, N)",
-        "how far that trace falls if this sensor alone transmits, whatever it measured",
-    ),
+SIGNALS = common_signals(
+    age="sampling instants since the last delivery",
+    expected_measurement="the node's expectation, its last input estimate carried on",
+    prior_mean="prediction of the fused state",
+    prior_covariance="its covariance, as if state and input estimates were uncorrelated",
 )
 
 
 @dataclass(frozen=True)
-class UnknownInputSystem:
+class UnknownInputSystem(System[UnknownInputState]):
     """Joins a plant, its input signal, and nodes with a fusion centre.
 
     What is estimated is [x(k); d(k - 1)]: the input is seen only once it has acted. One step is
@@ -96,6 +74,7 @@ class UnknownInputSystem:
     magnitude: Array
     reference: Array
     nature: Nature = AS_ASSUMED
+    signals = SIGNALS
 
     @property
     def sensor_count(self) -> int:
@@ -115,21 +94,24 @@ class UnknownInputSystem:
         own = self.plant.start_channels + self.nodes.sensors.noise_channels
         return own + self.signal.start_channels + self.nature.channels
 
-    @property
-    def covariance_cycle(self) -> int | None:
-        """1 where covariances follow from the deliveries: nodes that predict while nothing arrives.
+    def offers(self, capability: str) -> bool:
+        """See :class:`System`.
 
-        None with the paper's filter and with a hold variance, whose covariances do not show how
-        old the held measurement is. The covariances are claims under the filter's model of the
-        input, not the actual ones.
+        Covariances follow from the deliveries where nodes predict while nothing arrives: not with
+        the paper's filter, nor with a hold variance, which do not show how old the held measurement
+        is. They are claims under the filter's model of the input, not the actual ones. A signal
+        that is not drawn cannot be imagined.
         """
-        nodes = self.nodes
-        return 1 if isinstance(nodes, RunNodes) and nodes.hold_variance is None else None
+        if capability == "covariance_cycle":
+            return isinstance(self.nodes, RunNodes) and self.nodes.hold_variance is None
+        if capability in ("imagine", "imagination_channels"):
+            return self.signal.start_channels > 0
+        return super().offers(capability)
 
     @property
-    def signals(self) -> tuple[Signal, ...]:
-        """The signals that :meth:`read` offers."""
-        return SIGNALS
+    def covariance_cycle(self) -> int:
+        """1: the recursion never changes."""
+        return 1
 
     @property
     def observation(self) -> tuple[Block, ...]:
@@ -261,10 +243,8 @@ class UnknownInputSystem:
         )
 
     @property
-    def imagination_channels(self) -> int | None:
-        """For the states and for ``_IMAGINED`` signals; None if the input is not drawn at all."""
-        if self.signal.start_channels == 0:
-            return None
+    def imagination_channels(self) -> int:
+        """For the states and for ``_IMAGINED`` signals."""
         signal = self.signal.noise_channels + _IMAGINED * (self.signal.start_channels + 1)
         return self.plant.size + signal
 
@@ -300,10 +280,6 @@ class UnknownInputSystem:
             signal=self.signal.advance(memory, moving),
             departure=None,
         )
-
-    def truth(self, state: UnknownInputState) -> Array:
-        """State and the input that has just acted, (n + q, N)."""
-        return state.truth
 
     def fused(self, state: UnknownInputState) -> tuple[Array, Array]:
         """The centre's mean (n + q, N) and covariance (n + q, n + q, N) of both."""

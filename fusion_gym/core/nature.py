@@ -1,0 +1,148 @@
+"""How the truth departs from the model that filters and policies assume."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtr
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.errors import ConfigurationError, refusal
+
+# The rows of a departure, by the options that they come from, with what an environment must have.
+DEPARTURES = {
+    "true_process_noise": "the plant has no process noise",
+    "true_measurement_noise": "the sensors measure without noise",
+    "true_threshold_shift": "no sensor is censored",
+    "true_transition": "the plant stays where noise and input put it",
+}
+_SHIFT = "true_threshold_shift"
+_MODEL = (1.0, 1.0, 0.0, 1.0)  # no departure at all
+_FACTORS = (1e-3, 1e3)
+_LARGEST_GROWTH = 1e24  # of the plant's second moment over an episode
+
+
+@dataclass(frozen=True)
+class Nature:
+    """By how much the truth departs from the model that filters and policies assume.
+
+    A departure (4, N) is what N runs have of it: the factors on the deviations of process and of
+    measurement noise, what is added to the limits of the sensors, and the factor c of the motion,
+    which takes the plant from x to x + c (f(x) - x) where the model says f(x). ``None`` stands for
+    none. Each episode draws its own between ``low`` and ``high`` (4,), factors evenly in the
+    logarithm, the shift evenly; where both are equal nothing is drawn.
+    """
+
+    low: tuple[float, ...] = _MODEL
+    high: tuple[float, ...] = _MODEL
+
+    @classmethod
+    def create(cls, chosen: object, absent: Collection[str] = ()) -> Nature:
+        """Of the options; ``absent`` are those of them that can change nothing here.
+
+        Raises:
+            ConfigurationError: neither a number nor a pair (low, high) that rises, a factor outside
+                0.001 to 1000, or an option that can change nothing and is asked to.
+        """
+        pairs = [_span(name, getattr(chosen, name)) for name in DEPARTURES]
+        nature = cls(*(tuple(ends) for ends in zip(*pairs, strict=True)))
+        for name in nature.departing:
+            if name in absent:
+                model = _MODEL[list(DEPARTURES).index(name)]
+                raise refusal(
+                    name, getattr(chosen, name), f"{model:g} here, for {DEPARTURES[name]}"
+                )
+        return nature
+
+    @property
+    def departing(self) -> tuple[str, ...]:
+        """The options in which the truth is not the model."""
+        ends = zip(DEPARTURES, self.low, self.high, _MODEL, strict=True)
+        return tuple(name for name, low, high, model in ends if not low == high == model)
+
+    @property
+    def channels(self) -> int:
+        """Standard normals at the end of a start's: one for each option that is drawn."""
+        return sum(low < high for low, high in zip(self.low, self.high, strict=True))
+
+    def begin(self, noise: Array) -> tuple[Array, Array | None]:
+        """A start's own normals, and the departure (4, N) that the :attr:`channels` last draw."""
+        if not self.departing:
+            return noise, None
+        own, last = np.split(noise, (len(noise) - self.channels,))
+        uniform = iter(ndtr(last))
+        departure = np.empty((len(self.low), noise.shape[-1]))
+        for row, (name, low, high) in enumerate(zip(DEPARTURES, self.low, self.high, strict=True)):
+            if low == high:
+                departure[row] = low
+            elif name == _SHIFT:
+                departure[row] = low + (high - low) * next(uniform)
+            else:
+                departure[row] = low * (high / low) ** next(uniform)
+        return own, departure
+
+    def check_growth(self, radius: Callable[[float], float], horizon: int) -> None:
+        """Whether the plant stays within bounds, of a spectral radius that follows from c.
+
+        Raises:
+            ConfigurationError: it does not.
+        """
+        ends = {self.low[-1], self.high[-1]} - {_MODEL[-1]}
+        largest = max((radius(end) for end in ends), default=0.0)
+        if 2.0 * horizon * np.log10(max(largest, 1.0)) > np.log10(_LARGEST_GROWTH):
+            raise ConfigurationError(
+                f"true_transition = {self._given('true_transition')} is not allowed with horizon = "
+                f"{horizon}: the true plant's spectral radius would be {largest:.4g}, and its "
+                f"square may grow by {_LARGEST_GROWTH:g} at most in an episode"
+            )
+
+    def refuse(self, where: str, why: str = "that holds where the truth is as assumed") -> None:
+        """Refuse any departure.
+
+        Raises:
+            ConfigurationError: the truth departs from the model; says where and why it must not.
+        """
+        for name in self.departing:
+            raise ConfigurationError(
+                f"{name} = {self._given(name)} is not allowed {where}: it must be "
+                f"{_MODEL[list(DEPARTURES).index(name)]:g}, for {why}"
+            )
+
+    def _given(self, name: str) -> str:
+        row = list(DEPARTURES).index(name)
+        low, high = self.low[row], self.high[row]
+        return f"{low:g}" if low == high else f"[{low:g}, {high:g}]"
+
+
+AS_ASSUMED = Nature()
+
+
+def _span(name: str, value: Any) -> tuple[float, float]:
+    """Both ends of what an option draws from, equal for a number."""
+    low, high = validation.spread(name, value, (2,)).tolist()
+    least, most = (-np.inf, np.inf) if name == _SHIFT else _FACTORS
+    if not (least <= low and high <= most and (np.ndim(value) == 0 or low < high)):
+        limits = "" if name == _SHIFT else f" from {least:g} to {most:g}"
+        raise refusal(name, value, f"a number{limits}, or a pair of such (low, high), low < high")
+    return low, high
+
+
+def true_noise(departure: Array | None, process: Array, measurement: Array) -> tuple[Array, Array]:
+    """Noises (…, N) of process and measurement as they really are, of those of the model."""
+    if departure is None:
+        return process, measurement
+    return departure[0] * process, departure[1] * measurement
+
+
+def true_motion(departure: Array | None, state: Array, moved: Array) -> Array:
+    """Where x (n, N) really goes, x + c (f(x) - x), where the model has it ``moved`` to f(x)."""
+    return moved if departure is None else moved + (departure[3] - 1.0) * (moved - state)
+
+
+def true_limits(departure: Array | None, limit: Array) -> Array:
+    """The limits (…, 1) of the model's sensors as they really are, (…, N)."""
+    return limit if departure is None else limit + departure[2]
