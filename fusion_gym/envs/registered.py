@@ -11,8 +11,8 @@ from typing import Any
 
 from gymnasium.vector import AutoresetMode
 
-from fusion_gym.envs.pages import page
 from fusion_gym.envs.option_text import options_in
+from fusion_gym.envs.pages import page
 from fusion_gym.envs.registration import ENVIRONMENTS, class_name, make_task, options_of
 from fusion_gym.envs.single import FusionEnv
 from fusion_gym.envs.vector import FusionVectorEnv
