@@ -17,7 +17,6 @@ from fusion_gym import validation
 _NAMES = {name: type(name, (), {}) for name in ("ArrayLike", "Array")}
 
 
-@functools.cache
 def hints(kind: type) -> dict[str, Any]:
     """Return the types of a dataclass's fields, none where a name in them is unknown."""
     try:
@@ -26,7 +25,6 @@ def hints(kind: type) -> dict[str, Any]:
         return {}
 
 
-@functools.cache
 def meanings(kind: type) -> dict[str, str]:
     """Return the docstrings of a dataclass's fields, inherited ones included."""
     result = {}
@@ -69,13 +67,16 @@ def type_text(hint: Any) -> str:
     return re.sub(r"[\w.]+\.(?=\w)", "", text)
 
 
+_hints_of = functools.cache(hints)  # for every object of options is checked
+
+
 def check(options: Any) -> None:
     """Check the options that are declared as ``Literal`` or ``bool``.
 
     Raises:
         ConfigurationError: a value that the type does not have.
     """
-    for name, hint in hints(type(options)).items():
+    for name, hint in _hints_of(options.__class__).items():
         value, parts = getattr(options, name), _parts(hint)
         if (value is None and NoneType in parts) or get_origin(hint) is Annotated:
             continue
