@@ -97,9 +97,10 @@ lint: $(STAMP)  ## ruff and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-format: $(STAMP)  ## let ruff mend what it can
+format: $(STAMP)  ## let ruff mend what it can, and write the tables of docs/
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+	$(BIN)/python -m fusion_gym.envs.pages docs/*.md
 
 # Beside the other packages, for the tutorials train agents. Warnings end it (strict, in mkdocs.yml).
 $(VENV)/.docs: $(STAMP)

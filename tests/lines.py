@@ -1,7 +1,10 @@
-"""Count code lines: without blanks, comments and docstrings (``make lines``)."""
+"""Count code lines: without blanks, comments and docstrings (``make lines``).
+
+The string below an option of an environment is the option's docstring (PEP 257)."""
 
 import ast
 import io
+import itertools
 import subprocess
 import tokenize
 from collections import Counter
@@ -23,8 +26,17 @@ def code_lines(source: str) -> int:
             lines.update(range(token.start[0], token.end[0] + 1))
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, DOCUMENTED) and ast.get_docstring(node) is not None:
-            lines -= set(range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1))
+            lines -= _lines_of(node.body[0])
+        if isinstance(node, ast.ClassDef) and node.name.endswith("Options"):
+            for field, below in itertools.pairwise(node.body):
+                match field, below:
+                    case ast.AnnAssign(), ast.Expr(value=ast.Constant(value=str())):
+                        lines -= _lines_of(below)
     return len(lines)
+
+
+def _lines_of(node: ast.stmt) -> set[int]:
+    return set(range(node.lineno, (node.end_lineno or 0) + 1))
 
 
 def main() -> None:

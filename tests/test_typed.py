@@ -89,9 +89,11 @@ def test_the_specification_lists_every_option(env_id: str) -> None:
     assert text is not None
     lines = [line.strip() for line in text.splitlines()]
     assert lines[0] == f"id={env_id}"
-    for field in fields(kind):
-        assert options[field.name].type == field.type
-        assert f"{field.name}: {field.type} = {short(getattr(kind(), field.name))}" in lines
+    for name in own:
+        place = lines.index(f"{name}: {options[name].type} = {short(getattr(kind(), name))}")
+        assert lines[place + 1] == options[name].meaning
+    assert options["access"].type == "'any' | 'single' | 'round_robin' | 'random'"
+    assert options["price_range"].type == "ArrayLike | None"
     for ending in ("Env", "VectorEnv"):  # what an editor shows of the class, and help
         shown = inspect.signature(getattr(registered, class_name(env_id) + ending)).parameters
         for name in own:

@@ -8,9 +8,8 @@ import sys
 from collections.abc import Sequence
 
 import fusion_gym
-from fusion_gym.core.options import CommonOptions
 from fusion_gym.core.task import Task
-from fusion_gym.envs.option_text import options_in, short
+from fusion_gym.envs.option_text import short
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 from fusion_gym.envs.vector import reset_infos
 from fusion_gym.envs.views import make_view
@@ -58,7 +57,7 @@ def at_a_glance(env_id: str) -> str:
 
 
 def tables(env_id: str) -> str:
-    """Actions, reward, info and options, made from the code."""
+    """Actions, reward and info, made from the code."""
     task = fusion_gym.make_task(env_id)
     name = env_id.split("/")[1]
     parts = [
@@ -68,8 +67,6 @@ def tables(env_id: str) -> str:
         _table(("", "by default"), _reward(task)),
         f"### Info of {name}",
         _table(("entry", "type", "shape", "meaning"), _infos(task)),
-        f"### Options of {name}",
-        _table(("option", "type", "default"), _options(options_of(env_id))),
     ]
     return "\n\n".join(parts)
 
@@ -147,23 +144,6 @@ def _infos(task: Task) -> Sequence[tuple[str, ...]]:
             shape = "number" if value.ndim == 1 else f"({', '.join(map(str, value.shape[1:]))},)"
             found.append((f"`{key}`", str(value.dtype), shape, MEANINGS[key]))
     return found
-
-
-def _options(kind: type[CommonOptions]) -> Sequence[tuple[str, ...]]:
-    return [
-        (f"`{name}`", _words(option.type), f"`{_cut(short(option.default))}`")
-        for name, option in options_in(kind).items()
-    ]
-
-
-def _words(annotation: str) -> str:
-    known = {"ArrayLike": "number or array", "str": "word", "float": "number"}
-    known["int"] = "whole number"
-    return " or ".join(known.get(part, part) for part in annotation.split(" | "))
-
-
-def _cut(text: str) -> str:
-    return text if len(text) <= 60 else f"{text[:57]}…"
 
 
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from fusion_gym.arrays import Array
 
-ACCESS_RULES = ("any", "single", "round_robin", "random")
+AccessRule = Literal["any", "single", "round_robin", "random"]
+ACCESS_RULES: tuple[str, ...] = get_args(AccessRule)
 
 
 def access_mask(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,9 +13,8 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.validation import ConfigurationError
 
-CHANNELS = ("perfect", "independent", "gilbert_elliott")
 STATES = ("bad", "good")  # of a Gilbert-Elliott channel, in the order of its matrices
-INITIAL_STATES = ("stationary", *STATES)
+InitialState = Literal["stationary", "bad", "good"]
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,7 @@ class Channel:
                 "rows of probabilities that sum to 1"
             )
         drop = _probabilities("drop_probability", drop_probability, (2,))
-        name = validation.choice("initial_channel", initial, INITIAL_STATES)
-        if name == "stationary":
+        if initial == "stationary":
             leaves = matrix[[0, 1], [1, 0]]
             if leaves.sum() == 0.0:
                 raise ConfigurationError(
@@ -84,7 +83,7 @@ class Channel:
                 )
             start = leaves[::-1] / leaves.sum()
         else:
-            start = np.eye(2)[STATES.index(name)]
+            start = np.eye(2)[STATES.index(initial)]
         return cls(matrix, np.repeat(drop[:, None], sensors, axis=1), start)
 
     @property

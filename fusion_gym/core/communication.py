@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 from fusion_gym import validation
-from fusion_gym.core.options import Scenario
+from fusion_gym.core.options import Broadcast, Feature, Scenario
 from fusion_gym.core.system import System
 from fusion_gym.validation import ConfigurationError
 
-PACKETS = ("measurement", "estimate")
-BROADCASTS = ("none", "estimate", "packets")
-FEATURES = ("difference", "value")
+BROADCASTS: tuple[str, ...] = get_args(Broadcast)
+FEATURES: tuple[str, ...] = get_args(Feature)
 
 
 class Communication(NamedTuple):
@@ -34,8 +33,7 @@ def communication(scenario: Scenario) -> Communication:
         ConfigurationError: a value that is not allowed, alone or with the others.
     """
     chosen = scenario.options
-    remembers = validation.boolean("memory", chosen.memory)
-    packet = validation.choice("packet", chosen.packet, PACKETS)
+    remembers, packet = chosen.memory, chosen.packet
     shadow = scenario.memory_system
     if shadow is None and not scenario.nodes_remember:
         shadow = scenario.system
@@ -82,13 +80,12 @@ def _broadcast(scenario: Scenario) -> str:
     given = scenario.options.broadcast
     if given is None:
         return "estimate" if scenario.feedback else "none"
-    broadcast = validation.choice("broadcast", given, BROADCASTS)
-    if broadcast == "none" and scenario.feedback:
+    if given == "none" and scenario.feedback:
         raise ConfigurationError(
             "broadcast = 'none' is not allowed here: it must be 'estimate' or 'packets', for the "
             "nodes get the centre's estimate back"
         )
-    return broadcast
+    return given
 
 
 def _features(value: Any, remembers: bool) -> tuple[str, ...]:

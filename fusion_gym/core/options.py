@@ -4,51 +4,120 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym.arrays import Array
+from fusion_gym.core import declaration
+from fusion_gym.core.access import AccessRule
+from fusion_gym.core.reward import ErrorKind
 from fusion_gym.core.system import System
+from fusion_gym.core.token_bucket import SharingRule
+from fusion_gym.errors import refusal
 from fusion_gym.importing import name_of
+
+Tokens = Literal["limited", "unlimited"]
+Broadcast = Literal["none", "estimate", "packets"]
+Feature = Literal["difference", "value"]
+Action = Literal["binary", "discrete"]
 
 
 @dataclass(frozen=True)
 class CommonOptions:
     """The options that every environment has; each gives them its own defaults.
 
-    Network, access and token bucket; what a packet holds and who hears what; memory; episode,
-    observation, action and reward; how far the truth departs from what everybody assumes.
+    A field is the declaration of an option: type, default, and the docstring below it. Validation,
+    ``help``, the specification and the tables of the documentation read it. A value that a type
+    ``Literal`` or ``bool`` does not have is refused when the object is made.
     """
 
-    access: str = "any"
-    tokens: str = "limited"
+    access: AccessRule = "any"
+    """Rule of medium access. ``"any"`` admits all requests, ``"single"`` grants one request a step.
+    ``"round_robin"`` admits one sensor a step in turn, ``"random"`` one at random. With
+    ``"single"`` the action is ``Discrete(sensors + 1)``: 0 for nobody, m for sensor m - 1."""
+    tokens: Tokens = "limited"
+    """``"limited"`` applies the token bucket. ``"unlimited"`` grants every request and still counts
+    the tokens spent."""
     token_rate: float = 5.0
+    """Tokens g that the bucket gains per step (tobit_token_bucket, equation (17))."""
     token_capacity: float = 30.0
+    """Largest number b of tokens in the bucket (tobit_token_bucket, equation (17))."""
     initial_tokens: float = 10.0
+    """Tokens ξ₀ at the start of an episode."""
     token_cost: ArrayLike = 3.0
-    sharing: str = "rotating"
-    packet: str = "measurement"
-    broadcast: str | None = None
+    """Tokens c that a transmission costs: one number, or one per sensor."""
+    sharing: SharingRule = "rotating"
+    """How simultaneous requests share the tokens. ``"equal"`` gives each sensor the same share: ξ/l
+    ≥ c (tobit_token_bucket, equations (16) and (18)). ``"fixed"`` grants in the order of the
+    sensors while tokens last. ``"rotating"`` starts that order one sensor later in each step."""
+    packet: Literal["measurement", "estimate"] = "measurement"
+    """Content of a packet: the sensor's measurement as in the paper, or the centralised scheduler's
+    estimate with its covariance. ``"estimate"`` needs ``memory=True``."""
+    broadcast: Broadcast | None = None
+    """What every node receives besides tokens and price: nothing, the fusion centre's prediction
+    with its covariance, or every delivered packet. By default as in the paper."""
     memory: bool = False
+    """Whether measurements that were not sent are remembered, by the centralised scheduler or by
+    each sensor."""
     memory_filter: str | None = None
-    belief_features: Sequence[str] | bool | None = None
+    """Filter of the memory, a value of the option ``filter``. By default the fusion centre's, or a
+    better one where that filter minimises a bound."""
+    belief_features: Sequence[Feature] | bool | None = None
+    """What the observation shows of the memory's estimate: its difference from the fusion centre's
+    estimate, and the value of a transmission. ``True`` stands for both, the default with memory."""
     horizon: int = 100
+    """Steps of an episode. The horizon also sets the open-loop level that scales reward and
+    observation."""
     clock: bool = False
-    information: str = "sensors"
+    """Whether the observation shows the steps left; the end of an episode is then a termination."""
+    information: Literal["sensors", "centre"] = "sensors"
+    """What the observation shows: the new measurements of all sensors, or only what the fusion
+    centre knows before anything is sent."""
     own_number: bool = True
-    action: str = "binary"
-    reward: str = "scalar"
-    error: str | Callable[[Array, Array], Any] = "squared"
+    """Whether a decentralised sensor observes its own number. Without it, sensors of one kind learn
+    together."""
+    action: Action = "binary"
+    """Action space: one bit per sensor, or the bits as one number with sensor 0 the lowest."""
+    reward: Literal["scalar", "vector"] = "scalar"
+    """``"scalar"`` pays the sum of the reward's two terms, ``"vector"`` both terms."""
+    error: ErrorKind | str | Callable[[Array, Array], Any] = "squared"
+    """Error term of the reward: the squared errors, the diagonal of the claimed covariance, or the
+    largest weighted squared error. Or a function of errors and covariances, or its
+    ``"module:name"``."""
     error_weight: float = 1.0
-    cost_weight: float | str = 0.01
+    """Weight of the reward's error term."""
+    cost_weight: float | Literal["random"] = 0.01
+    """Price of a token in the reward. ``"random"`` draws it from ``price_range`` for each episode,
+    evenly in its logarithm."""
     price_range: ArrayLike | None = None
+    """Pair (low, high) of prices. With it the observation shows the price."""
     state_weights: ArrayLike | None = None
+    """Weights of the states' squared errors in the reward. By default never transmitting costs
+    about 1 a step."""
     true_process_noise: ArrayLike = 1.0
+    """Factor of the true deviation of the process noise. The filters assume 1. A pair (low, high)
+    is drawn from for each episode."""
     true_measurement_noise: ArrayLike = 1.0
+    """Factor of the true deviation of the measurement noise. The filters assume 1. A pair
+    (low, high) is drawn from for each episode."""
     true_threshold_shift: ArrayLike = 0.0
+    """Shift of the true limits at which sensors are censored. The filters assume 0. A pair
+    (low, high) is drawn from for each episode."""
     true_transition: ArrayLike = 1.0
+    """Factor c of the true motion, from x to x + c (f(x) - x). The filters assume f(x). A pair
+    (low, high) is drawn from for each episode."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.information, str) and self.information == "local":
+            raise refusal(
+                "information",
+                "local",
+                "'sensors' or 'centre'; decentralised sensors are fusion_gym.parallel_env(id) and "
+                "make_sb3_vec_env(id, n, local=True)",
+            )
+        declaration.check(self)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +16,8 @@ from fusion_gym.importing import name_of, named
 from fusion_gym.validation import ConfigurationError
 
 Cost = Callable[[Array, Array], Any]  # of errors (n, N) and covariances (n, n, N)
-ERROR_KINDS = ("squared", "trace", "maximum")
+ErrorKind = Literal["squared", "trace", "maximum"]
+ERROR_KINDS: tuple[str, ...] = get_args(ErrorKind)
 TRAINING_ERRORS = ("squared", "excess", "mismatch")
 _LARGEST = 1e32  # of squares on average: rewards are also handed on as float32
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -13,15 +13,14 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.access import ACCESS_RULES
 from fusion_gym.core.communication import communication
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import CommonOptions, Scenario, plain
+from fusion_gym.core.options import Action, CommonOptions, Scenario, plain
 from fusion_gym.core.reward import Price, Reward, bounded_open_loop
 from fusion_gym.core.system import Knowledge, System, covers, least_covering
 from fusion_gym.core.token_bucket import TokenBucket
 
 # What a policy of each information mode may know.
 INFORMATION_MODES: dict[str, Knowledge] = {"sensors": "coordinator", "centre": "centre"}
-ACTION_KINDS = ("binary", "discrete")
-REWARDS = ("scalar", "vector")  # the sum of its two terms, or both
+ACTION_KINDS: tuple[str, ...] = get_args(Action)
 # Signals beside the system's own that only who sees the sensors may have.
 SENSORS_ONLY = (
     "model", "beliefs", "belief_difference", "transmission_value", "own_beliefs",
@@ -73,14 +72,6 @@ class Task:
 
     def __post_init__(self) -> None:
         validation.horizon(self.horizon)
-        if isinstance(self.information, str) and self.information == "local":
-            raise validation.ConfigurationError(
-                "information = 'local' is not allowed here: it must be one of "
-                f"{', '.join(map(repr, INFORMATION_MODES))}; sensors that decide by themselves are "
-                "fusion_gym.parallel_env(id) and make_sb3_vec_env(id, n, local=True)"
-            )
-        validation.boolean("clock", self.clock)
-        validation.boolean("own_number", self.own_number)
         validation.choice("information", self.information, INFORMATION_MODES)
         validation.choice("action", self.action, ACTION_KINDS)
         validation.choice("access", self.access, ACCESS_RULES)
@@ -142,7 +133,7 @@ class Task:
             feedback=scenario.feedback,
             clock=chosen.clock,
             own_number=chosen.own_number,
-            vector_reward=validation.choice("reward", chosen.reward, REWARDS) == "vector",
+            vector_reward=chosen.reward == "vector",
             settings=plain(asdict(chosen)),
             policy_defaults=scenario.policy_defaults,
         )
@@ -194,7 +185,6 @@ def make_bucket(chosen: CommonOptions, sensors: int) -> TokenBucket:
     Raises:
         ConfigurationError: a value that is not allowed.
     """
-    unlimited = validation.choice("tokens", chosen.tokens, ("limited", "unlimited"))
     return TokenBucket.create(
         rate=chosen.token_rate,
         capacity=chosen.token_capacity,
@@ -202,5 +192,5 @@ def make_bucket(chosen: CommonOptions, sensors: int) -> TokenBucket:
         cost=chosen.token_cost,
         sensors=sensors,
         sharing=chosen.sharing,
-        unlimited=unlimited == "unlimited",
+        unlimited=chosen.tokens == "unlimited",
     )

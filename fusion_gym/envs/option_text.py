@@ -1,53 +1,63 @@
-"""Options as text: what each is called, of which type it is, and what it is by default."""
+"""Options as text: name, type with its values, default, and meaning."""
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterator, Mapping
-from dataclasses import Field, fields
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from fusion_gym.core.declaration import choices, hints, meanings, type_text
 from fusion_gym.core.options import CommonOptions, plain
 
 
 class Option(NamedTuple):
-    """Type, as it is annotated, and default of an option."""
+    """An option as its field declares it; ``choices`` are all its values where they are few."""
 
     type: str
     default: Any
+    meaning: str = ""
+    choices: tuple[str, ...] = ()
 
 
 # What every environment takes beside the fields of its options.
-FOR_ALL = {"system": Option("str | None", None), "max_episode_steps": Option("int | None", None)}
+FOR_ALL = {
+    "system": Option("str | None", None, "Path of a YAML file of options."),
+    "max_episode_steps": Option(
+        "int | None",
+        None,
+        "Steps after which an episode is truncated, without change of any scale.",
+    ),
+}
 
 
 def options_in(kind: type[CommonOptions]) -> dict[str, Option]:
-    """Every option by its name: the environment's own, then those that all have."""
-    chosen, common = kind(), {field.name for field in fields(CommonOptions)}
-    ordered = sorted(fields(kind), key=lambda field: field.name in common)
-    found = {field.name: Option(_type(field), getattr(chosen, field.name)) for field in ordered}
-    return found | {name: option for name, option in FOR_ALL.items() if name not in found}
+    """Return every option by its name: the environment's own, then those that all have."""
+    given, common = kind(), {field.name for field in fields(CommonOptions)}
+    types, texts = hints(kind), meanings(kind)
+    result = {}
+    for field in sorted(fields(kind), key=lambda field: field.name in common):
+        name, hint = field.name, types.get(field.name, field.type)
+        text = hint if isinstance(hint, str) else type_text(hint)
+        result[name] = Option(text, getattr(given, name), texts.get(name, ""), choices(hint))
+    return result | {name: option for name, option in FOR_ALL.items() if name not in result}
 
 
 def listed(options: Mapping[str, Option], given: Mapping[str, Any] | None = None) -> Iterator[str]:
-    """A line for each option; of one that is ``given`` what it is, and its default behind it."""
-    for name, (kind, default) in options.items():
+    """Yield the lines of each option; of one that is ``given`` its value, then its default."""
+    for name, option in options.items():
+        default = short(option.default)
         if given is not None and name in given:
-            yield f"{name}: {kind} = {short(given[name])}  (default: {short(default)})"
+            yield f"{name}: {option.type} = {short(given[name])}  (default: {default})"
         else:
-            yield f"{name}: {kind} = {short(default)}"
+            yield f"{name}: {option.type} = {default}"
+        yield f"    {option.meaning}"
 
 
 def short(value: Any) -> str:
-    """A value as it would be written, its numbers with four digits."""
+    """Return a value as it would be written, its numbers with four digits."""
     value = plain(value)
     if isinstance(value, list):
         return f"({', '.join(map(short, value))}{',' if len(value) == 1 else ''})"
     return f"{value:.4g}" if isinstance(value, float) and np.isfinite(value) else repr(value)
-
-
-def _type(field: Field[Any]) -> str:
-    kind: Any = field.type
-    return kind if isinstance(kind, str) else inspect.formatannotation(kind)

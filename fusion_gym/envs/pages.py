@@ -1,8 +1,9 @@
 """An environment's page, made from what the code declares: options, blocks, spaces.
 
-``python -m fusion_gym.envs.pages docs/*.md`` writes the observation tables of these files anew. A
-table stands between ``<!-- observation: ID name=value -->`` and ``<!-- end -->``; after a semicolon
-follow other options, and what they add is marked so.
+``python -m fusion_gym.envs.pages docs/*.md`` writes the tables of these files. A table stands
+between ``<!-- observation: ID name=value -->`` and ``<!-- end -->``; after a semicolon follow other
+options, and the entries that they add are marked. ``<!-- options: ID ID name name -->`` is a table
+of the options of these environments, of all without a name.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import inspect
 import re
 import shlex
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -93,7 +94,9 @@ _BELIEFS: dict[Owner, str] = {
     "own": "only with `memory=True` or `belief_features`, for a sensor by itself",
 }
 _SEES = {"own": "its own", "told": "all", "hidden": "none"}
-_MARKED = re.compile(r"(<!-- observation: (.*?) -->\n).*?(<!-- end -->)", re.DOTALL)
+_MARKED = re.compile(r"(<!-- (observation|options): (.*?) -->\n).*?(<!-- end -->)", re.DOTALL)
+_WORDS = {"ArrayLike": "number or array", "float": "number", "int": "whole number", "str": "word"}
+_LONGEST = 60  # characters of a default in a table
 
 
 def page(env_id: str, task: Task | None = None) -> str:
@@ -123,7 +126,7 @@ def page(env_id: str, task: Task | None = None) -> str:
         open_loop=f"{float(weights @ system.open_loop(task.horizon)):.3g}",
         horizon=task.horizon,
         options=kind.__name__,
-        arguments="\n".join(f"    {line}" for line in listed(options_in(kind))),
+        arguments="\n".join(f"    {_plain(line)}" for line in listed(options_in(kind))),
         history="\n".join(f"- {text}" for text in ["v0: first version.", *versions]),
     )
 
@@ -150,6 +153,25 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
     return _table(("entries", "range", "a sensor sees", "meaning"), rows.values())
 
 
+def option_table(words: Sequence[str]) -> str:
+    """Return the options of environments that have the same ones as a Markdown table.
+
+    ``words`` are ids, and the names of the options in the table; without a name all are.
+
+    Raises:
+        ConfigurationError: an id that is not registered.
+    """
+    every = [options_in(options_of(word)) for word in words if "/" in word]
+    names = [word for word in words if "/" not in word] or list(every[0])
+    rows = []
+    for name in names:
+        types = (_WORDS.get(part, f"`{part}`") for part in every[0][name].type.split(" | "))
+        defaults = dict.fromkeys(f"`{short(options[name].default)}`" for options in every)
+        cells = " or ".join(types), "; ".join(d if len(d) < _LONGEST else "…" for d in defaults)
+        rows.append((f"`{name}`", *map(_double, cells), _plain(every[0][name].meaning)))
+    return _table(("option", "type", "default", "meaning"), rows)
+
+
 def documented(text: str) -> str:
     """The text with all its marked tables made anew.
 
@@ -158,7 +180,9 @@ def documented(text: str) -> str:
     """
 
     def anew(match: re.Match[str]) -> str:
-        first, *others = match[2].split(";")
+        if match[2] == "options":
+            return f"{match[1]}{option_table(match[3].split())}\n{match[4]}"
+        first, *others = match[3].split(";")
         env_id, *options = shlex.split(first)
         tasks = [
             (_listed(words), make_task(env_id, **_options(words)))
@@ -169,7 +193,7 @@ def documented(text: str) -> str:
         states = ", ".join(f"`{name}`" for name in task.system.state_names)
         last = f"With {given or 'the defaults'} these are {count} numbers; states: {states}."
         table = observation_table(task, *rest)
-        return f"{match[1]}{LEGEND}\n\n{table}\n\n{last}\n{match[3]}"
+        return f"{match[1]}{LEGEND}\n\n{table}\n\n{last}\n{match[4]}"
 
     return _MARKED.sub(anew, text)
 
@@ -230,7 +254,12 @@ def _options(words: list[str]) -> dict[str, Any]:
 
 def _listed(words: list[str]) -> str:
     shown = (f"{name}={value!r}" for name, value in _options(words).items())
-    return ", ".join(f"`{text}`" for text in shown).replace("'", '"')
+    return _double(", ".join(f"`{text}`" for text in shown))
+
+
+def _double(text: str) -> str:
+    """Words in the quotes of the documentation."""
+    return text.replace("'", '"')
 
 
 def main(paths: list[str]) -> None:

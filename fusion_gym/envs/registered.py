@@ -11,15 +11,11 @@ from typing import Any
 
 from gymnasium.vector import AutoresetMode
 
+from fusion_gym.envs.option_text import options_in
 from fusion_gym.envs.pages import page
 from fusion_gym.envs.registration import ENVIRONMENTS, class_name, make_task, options_of
 from fusion_gym.envs.single import FusionEnv
 from fusion_gym.envs.vector import FusionVectorEnv
-
-# What every environment takes beside its options: the path of a file that holds some of them.
-_SYSTEM = inspect.Parameter(
-    "system", inspect.Parameter.KEYWORD_ONLY, default=None, annotation="str | None"
-)
 
 
 class _Page:
@@ -68,10 +64,10 @@ def _vector(env_id: str) -> type:
 def _made(env_id: str, base: type, init: Any) -> type:
     """A class whose signature shows every option with its default."""
     own = list(inspect.signature(init).parameters.values())[:-1]
-    options = inspect.signature(options_of(env_id)).parameters.values()
-    named = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
-    if "system" not in [option.name for option in named]:
-        named.append(_SYSTEM)
+    named = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+        for name, (kind, default, *_) in options_in(options_of(env_id)).items()
+    ]
     init.__signature__ = inspect.Signature([*own, *named])
     body = {"__init__": init, "__module__": __name__, "__doc__": _Page(env_id)}
     return type(base.__name__, (base,), body)

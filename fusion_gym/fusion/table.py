@@ -88,6 +88,11 @@ class Structure:
     holds: tuple[Assumption, ...] = ()
     prediction: bool = False
 
+    @property
+    def offered(self) -> tuple[str, ...]:
+        """Names of the rules that are sound for these estimates."""
+        return tuple(name for name, rule in RULES.items() if self.refusal(rule) is None)
+
     def refusal(self, rule: Rule) -> str | None:
         """Why the rule is not for these estimates, or ``None``."""
         if rule.assumes in self.holds or rule.assumes not in REASONS:
@@ -108,7 +113,7 @@ def choose_rule(
             order for a rule that has none, or one that is no permutation of the sensors 0 to
             l - 1.
     """
-    offered = [key for key, rule in RULES.items() if structure.refusal(rule) is None]
+    offered = structure.offered
     if isinstance(name, str) and name in RULES and name not in offered:
         raise ConfigurationError(
             f"fusion = {name!r} is not allowed: it must be one of "

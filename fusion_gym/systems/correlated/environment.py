@@ -8,13 +8,14 @@ Section 6.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.core.options import CommonOptions, Scenario, Tokens
 from fusion_gym.core.reward import equal_weights
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.correlated.filters import JointErrorCovariance, RobustKalmanFilter
@@ -46,32 +47,49 @@ class CorrelatedTrackingOptions(CommonOptions):
     the reward.
     """
 
-    # Plant, equations (1) and (64): position, velocity, acceleration
     transition: ArrayLike = ((1.0, _T, _T * _T / 2), (0.0, 1.0, _T), (0.0, 0.0, 1.0))
+    """Φ of equations (1) and (64), (n, n)."""
     process_gain: ArrayLike = ((_T * _T / 2,), (_T,), (1.0,))
+    """Γ of equations (1) and (64), (n, noises)."""
     process_variance: ArrayLike = 0.16
+    """Bound σ_w² of the process noise's variance, equation (4): one number, or one per noise."""
     initial_mean: ArrayLike = (0.3, 0.1, 0.2)
+    """Mean μ₀ of x₀, (n,)."""
     initial_covariance: ArrayLike = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    # Sensors, equations (2), (3) and (64)
+    """Bound P₀ of the covariance of x₀, (n, n)."""
     measurement_matrices: ArrayLike = (((1.0, 0.0, 0.0),), ((0.0, 1.0, 0.0),), ((0.0, 0.0, 1.0),))
+    """H of each sensor, equations (2) and (64), (sensors, components, n)."""
     measurement_variance: ArrayLike = (0.64, 0.36, 0.49)
+    """Bound σ_η² of each sensor's own noise, equation (4): one number, one per sensor, or (sensors,
+    components)."""
     noise_coupling: ArrayLike = (0.2, 0.4, 0.1)
-    # Actual variances over their bounds, equation (4)
-    noise_scale: float | str = 1.0
-    # Network
-    tokens: str = "unlimited"
+    """β of equation (3), the share of the process noise in a measurement's noise: one number, one
+    per sensor, or (sensors, components, noises)."""
+    noise_scale: float | Literal["random"] = 1.0
+    """Actual variances over their bounds, equation (4): a number in (0, 1]. ``"random"`` draws it
+    for each episode, evenly in [0.4, 1]."""
+    tokens: Tokens = "unlimited"
     token_rate: float = 3.0
-    # Fusion, equations (37)-(57)
-    fusion: str = "sici"
+    fusion: Annotated[str, _STRUCTURE.offered] = "sici"
+    """Rule that joins the estimates. ``"sici"`` is sequential inverse covariance intersection
+    (47)-(54), the most accurate. ``"sci"`` is sequential covariance intersection (37)-(42), whose
+    covariance is a bound. ``"ci"`` joins all at once with a bound. ``"ici"`` needs one sensor."""
     order: ArrayLike | None = None
+    """Order of arrival under the sequential rules: a permutation of the sensors."""
     track_actual: bool = False
-    # Adaptive innovation trigger, equations (9)-(11): the defaults of the policy
+    """Whether the system tracks the actual covariances of equations (23), (28), (43) and (55), for
+    ``task.system.actual_covariance(state)``."""
     trigger_threshold: ArrayLike = 0.6
+    """a of the policy ``adaptive_innovation``, equations (9)-(11): one number, or one per
+    sensor."""
     trigger_offset: ArrayLike = 0.2
+    """b of the policy ``adaptive_innovation``, equations (9)-(11): one number, or one per
+    sensor."""
     trigger_sensitivity: ArrayLike = 0.9
-    # Episode and reward
+    """c of the policy ``adaptive_innovation``, equations (9)-(11): one number, or one per
+    sensor."""
     horizon: int = 200
-    cost_weight: float = 0.001
+    cost_weight: float | Literal["random"] = 0.001
 
 
 def build(chosen: CorrelatedTrackingOptions) -> Scenario:
@@ -89,10 +107,9 @@ def build(chosen: CorrelatedTrackingOptions) -> Scenario:
         if chosen.state_weights is None
         else validation.not_negative("state_weights", chosen.state_weights, open_loop.shape)
     )
-    track = validation.boolean("track_actual", chosen.track_actual)
     nature = Nature.create(chosen, (*plant.unmoved, "true_threshold_shift"))
     nature.check_growth(plant.true_radius, horizon)
-    if track:
+    if chosen.track_actual:
         nature.refuse("with track_actual=True")
     system = CorrelatedTrackingSystem(
         plant=plant,
@@ -103,7 +120,7 @@ def build(chosen: CorrelatedTrackingOptions) -> Scenario:
         state_weights=weights,
         magnitude=typical_magnitude(plant, horizon, random_start=False),
         reference=open_loop,
-        joint=JointErrorCovariance.create(plant, sensors) if track else None,
+        joint=JointErrorCovariance.create(plant, sensors) if chosen.track_actual else None,
         nature=nature,
     )
     trigger = _trigger(chosen, sensors.count)

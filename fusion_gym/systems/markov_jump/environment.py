@@ -7,13 +7,14 @@ systems with correlated noises and fading measurements), Section 6.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.core.options import CommonOptions, Scenario, Tokens
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.markov_jump.central_system import MarkovJumpCentralSystem
@@ -23,7 +24,6 @@ from fusion_gym.systems.markov_jump.system import MarkovJumpSystem
 from fusion_gym.validation import ConfigurationError
 
 _T = 0.5  # the paper's sampling time in seconds
-FILTERS = ("local", "centralised", "imm")
 _ESTIMATES_ALREADY = "packets carry the nodes' estimates already, which remember every measurement"
 _STRUCTURE = Structure(common="all contain the same process noise", holds=("joint covariance",))
 
@@ -54,34 +54,46 @@ class MarkovJumpTrackingOptions(CommonOptions):
     token bucket (the paper has none, hence ``tokens="unlimited"``) and the reward.
     """
 
-    # Plant, equation (1): position, velocity; one Φ and Γ a mode
     transitions: ArrayLike = (((0.8, 0.2 * _T), (0.0, 0.6)), ((1.0, _T), (0.0, _T)))
+    """Φ of each mode, equation (1), (modes, n, n). The plant must be mean-square stable."""
     process_gains: ArrayLike = (((1.5,), (0.6,)), ((0.5 * _T * _T,), (_T,)))
+    """Γ of each mode, equation (1), (modes, n, r)."""
     process_covariance: ArrayLike = 0.64
+    """Covariance Q_w of the process noise w, equation (1): (r, r) or one number."""
     mode_transition: ArrayLike = ((0.65, 0.35), (0.35, 0.65))
+    """Probabilities p of a mode (row) followed by a mode (column), (modes, modes)."""
     initial_probabilities: ArrayLike = (0.5, 0.5)
+    """Probabilities of the modes at time 0, (modes,)."""
     initial_mean: ArrayLike = (0.0, 0.0)
+    """Mean of x₀, (n,)."""
     initial_covariance: ArrayLike = ((0.1, 0.0), (0.0, 0.1))
-    # Sensors, equation (2): one H a sensor and mode, fading, noise α w + η
+    """Covariance of x₀, (n, n)."""
     measurement_matrices: ArrayLike = (
         ((1.0, 1.0), (0.4, 1.0)),
         ((1.0, 0.6), (1.0, 0.2)),
         ((0.5, 1.0), (2.0, 0.5)),
     )
+    """H of each sensor and mode, equation (2), (sensors, modes, n): measurements are scalar."""
     sampling_periods: ArrayLike = (1, 2, 3)
+    """Steps n_i between two samples of each sensor, whole numbers."""
     fading_values: ArrayLike = ((0.25, 0.5, 1.0), (0.2, 0.4, 0.8), (0.3, 0.6, 0.9))
+    """Values from 0 to 1 of the fading β_i of each sensor, equation (2), (sensors, values)."""
     fading_probabilities: ArrayLike = ((0.2, 0.4, 0.4), (0.45, 0.35, 0.2), (0.7, 0.1, 0.2))
+    """Probabilities of these values, (sensors, values)."""
     noise_coupling: ArrayLike = (0.2, 0.4, 0.3)
+    """α of the measurement noise α w + η, Section 6: one per sensor, or (sensors, r)."""
     measurement_variance: ArrayLike = (0.49, 0.36, 0.9)
-    # Network
-    tokens: str = "unlimited"
+    """Variance R_η of η, Section 6: one number, or one per sensor."""
+    tokens: Tokens = "unlimited"
     token_rate: float = 3.0
-    # Filters at the nodes, equations (12)-(22), and fusion, (55)-(57); or references at the centre
-    filter: str = "local"
-    fusion: str | None = None
-    # Episode and reward
-    horizon: int = 100
-    cost_weight: float = 0.01
+    filter: Literal["local", "centralised", "imm"] = "local"
+    """``"local"`` is the paper's filter at each node, equations (12)-(22): packets carry estimates.
+    ``"centralised"`` and ``"imm"`` are one filter at the centre: packets carry measurements."""
+    memory_filter: Literal["local", "centralised", "imm"] | None = None
+    fusion: Annotated[str | None, _STRUCTURE.offered] = None
+    """Rule that joins the copies, with ``filter="local"`` only. The default ``"matrix"`` has matrix
+    weights (55)-(57). ``"ci"`` is covariance intersection, ``"ici"`` its inverse form for two
+    sensors. ``"sci"`` and ``"sici"`` join two copies at a time."""
 
 
 def build(chosen: MarkovJumpTrackingOptions) -> Scenario:
@@ -91,7 +103,6 @@ def build(chosen: MarkovJumpTrackingOptions) -> Scenario:
         ConfigurationError: a value that is not allowed.
     """
     horizon = validation.horizon(chosen.horizon)
-    where = validation.choice("filter", chosen.filter, FILTERS)
     plant = MarkovJumpPlant.create(
         chosen.transitions,
         chosen.process_gains,
@@ -117,11 +128,10 @@ def build(chosen: MarkovJumpTrackingOptions) -> Scenario:
     )
     nature = Nature.create(chosen, (*plant.unmoved, "true_threshold_shift"))
     nature.check_growth(plant.true_radius, horizon)
-    system = _system(where, chosen.fusion, plant, sensors, weights, horizon, nature)
+    system = _system(chosen.filter, chosen.fusion, plant, sensors, weights, horizon, nature)
     remembering = None
-    if chosen.memory_filter is not None:
-        kind = validation.choice("memory_filter", chosen.memory_filter, FILTERS)
-        fusion = chosen.fusion if kind == where else None
+    if (kind := chosen.memory_filter) is not None:
+        fusion = chosen.fusion if kind == chosen.filter else None
         remembering = _system(kind, fusion, plant, sensors, weights, horizon, nature)
     defaults, refusal = {}, None
     if isinstance(system, MarkovJumpSystem):

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.access import ACCESS_RULES
-from fusion_gym.core.channel import CHANNELS, INITIAL_STATES, Channel
+from fusion_gym.core.channel import Channel, InitialState
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.core.options import CommonOptions, Scenario, Tokens
 from fusion_gym.core.task import make_bucket
 from fusion_gym.systems.remote.system import RemoteEstimationSystem
 from fusion_gym.validation import ConfigurationError
@@ -40,28 +40,36 @@ class RemoteEstimationOptions(CommonOptions):
     error plus ``cost_weight`` for each transmission.
     """
 
-    # Sources
     sensors: int = 1
+    """Number of sources, each with one sensor."""
     coefficient: ArrayLike = 1.0
+    """Coefficient a of a source: one number, or one per source."""
     noise_deviation: ArrayLike = 1.0
+    """Deviation σ of a source's noise: one number, or one per source."""
     initial_deviation: ArrayLike = 0.0
-    # Channel: a pair (bad, good) of losses where it is "gilbert_elliott", which has its own default
-    channel: str = "perfect"
+    """Deviation of x(0) about 0: one number, or one per source."""
+    channel: Literal["perfect", "independent", "gilbert_elliott"] = "perfect"
+    """Model of losses. ``"independent"`` loses every packet with one probability,
+    ``"gilbert_elliott"`` with that of the channel's state."""
     drop_probability: ArrayLike | None = None
+    """Probability of a loss. Independent: one number, or one per sensor, by default 0.2.
+    Gilbert-Elliott: the pair (bad, good), by default (0.7, 0.2)."""
     channel_transition: ArrayLike | None = None
-    initial_channel: str = "stationary"
-    # Observation
+    """Probabilities from the last state (row; bad, good) to the next of a Gilbert-Elliott channel.
+    By default ((0.7, 0.3), (0.1, 0.9))."""
+    initial_channel: InitialState = "stationary"
+    """State of a Gilbert-Elliott channel at time 0; ``"stationary"`` draws it from the stationary
+    law."""
     error_scale: ArrayLike | None = None
-    # Network
-    tokens: str = "unlimited"
+    """Divisor of the observed errors: one number, or one per source. By default about the optimal
+    threshold of a random walk at a price of 5, or at the rate that the tokens allow."""
+    tokens: Tokens = "unlimited"
     token_rate: float = 0.25
     token_capacity: float = 5.0
     initial_tokens: float = 1.0
     token_cost: ArrayLike = 1.0
-    # Episode and reward
     horizon: int = 200
-    cost_weight: float | str = 5.0
-    state_weights: ArrayLike | None = None
+    cost_weight: float | Literal["random"] = 5.0
 
 
 _USUAL_PRICE = 5.0  # of a packet, in squared deviations of the noise
@@ -115,8 +123,7 @@ def _nature(chosen: RemoteEstimationOptions, coefficient: Array) -> Nature:
 
 
 def _channel(chosen: RemoteEstimationOptions, sensors: int) -> Channel:
-    kind = validation.choice("channel", chosen.channel, CHANNELS)
-    validation.choice("initial_channel", chosen.initial_channel, INITIAL_STATES)
+    kind = chosen.channel
     if kind != "gilbert_elliott" and chosen.channel_transition is not None:
         raise ConfigurationError(
             f"channel_transition = {validation.shown(chosen.channel_transition)} is not allowed "
@@ -147,12 +154,11 @@ def _error_scale(chosen: RemoteEstimationOptions, deviation: Array) -> Array:
     if chosen.error_scale is not None:
         return validation.positive("error_scale", chosen.error_scale, (sensors,))
     bucket = make_bucket(chosen, sensors)
-    access = validation.choice("access", chosen.access, ACCESS_RULES)
     if bucket.unlimited:
         alone = (6.0 * _USUAL_PRICE) ** 0.25
-        shared = math.sqrt(sensors) if access != "any" else 1.0
+        shared = math.sqrt(sensors) if chosen.access != "any" else 1.0
         return deviation * max(alone, shared)
     steps = float(bucket.cost.sum()) / max(bucket.rate, 1e-3)
-    if access != "any":
+    if chosen.access != "any":
         steps = max(steps, float(sensors))
     return deviation * math.sqrt(max(steps, 1.0))

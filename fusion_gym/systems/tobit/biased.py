@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.options import Scenario
+from fusion_gym.core.access import AccessRule
+from fusion_gym.core.options import Scenario, Tokens
 from fusion_gym.core.reward import equal_weights
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.tobit.options import (
@@ -57,31 +59,47 @@ class BiasedOscillatorOptions(FeedbackOptions):
     ``information_shares`` (equal) and the reward.
     """
 
-    # Plant and bias, equations (1) and (3)
     transition: ArrayLike = ((_COS, -_SIN), (_SIN, _COS))
+    """A of equation (1), (n, n)."""
     process_covariance: ArrayLike = ((0.0025, 0.0), (0.0, 0.0025))
+    """Covariance Q of the process noise ω, equation (1), (n, n)."""
     initial_mean: ArrayLike = (5.0, 0.0)
+    """Mean of x₀, (n,)."""
     initial_covariance: ArrayLike = ((0.1, 0.0), (0.0, 0.1))
+    """Covariance of x₀, (n, n)."""
     bias_gain: ArrayLike = ((0.1,), (0.15,))
+    """B of equation (1), (n, biases)."""
     bias_transition: ArrayLike = ((1.0,),)
+    """H of equation (3), (biases, biases)."""
     bias_noise_covariance: ArrayLike = ((0.25,),)
+    """Covariance Ξ of the bias's noise ε, equation (3), (biases, biases)."""
     bias_initial_mean: ArrayLike = (0.0,)
+    """Mean of b₀, (biases,)."""
     bias_initial_covariance: ArrayLike = ((0.1,),)
+    """Covariance of b₀, (biases, biases)."""
     random_start: bool = False
-    # Sensors, equations (2) and (6)
+    """Whether the initial mean has a random direction, which the filters know."""
     measurement_matrices: ArrayLike = (((1.0, 0.0),), ((0.0, 1.0),))
+    """C of each sensor on x, equation (2), (sensors, components, n)."""
     measurement_variance: ArrayLike = 0.6
+    """Variance R of the measurement noise, equation (2): one number or (sensors, components)."""
     censoring_threshold: ArrayLike = -5.0
+    """Lower limit τ of equation (6): one number or (sensors, components). Minus infinity never
+    censors."""
     censoring_upper: ArrayLike = 5.0
-    # Network: one sensor a step, equations (4) and (5); the bucket is open unless limited
-    access: str = "single"
-    tokens: str = "unlimited"
+    """Upper limit υ of equation (6): one number or (sensors, components). Infinity never
+    censors."""
+    access: AccessRule = "single"
+    tokens: Tokens = "unlimited"
     token_rate: float = 1.0
     token_capacity: float = 15.0
     initial_tokens: float = 6.0
-    # Filters, equations (18)-(25)
-    filter: str = "paper"
+    filter: Annotated[str, _FILTERS] = "paper"
+    """Filter of the nodes. ``"paper"`` is the Tobit Kalman filter of equations (18)-(25),
+    corrected. ``"kalman"`` ignores censoring. ``"adf"`` is one assumed-density filter at the
+    centre. ``"stochastic"`` is the Kalman filter for the policy ``stochastic_event``."""
     bias_aware: bool = True
+    """Whether the filters know that the bias acts on x."""
 
 
 @dataclass(frozen=True)
@@ -130,10 +148,8 @@ def build_tracking(chosen: BiasedTrackingOptions) -> Scenario:
 
 def _build(chosen: BiasedOscillatorOptions) -> Scenario:
     horizon = validation.horizon(chosen.horizon)
-    random_start = validation.boolean("random_start", chosen.random_start)
     plant, states = _augmented(chosen, aware=True)
-    aware = validation.boolean("bias_aware", chosen.bias_aware)
-    model = plant if aware else _augmented(chosen, aware=False)[0]
+    model = plant if chosen.bias_aware else _augmented(chosen, aware=False)[0]
     matrices = validation.array(
         "measurement_matrices", chosen.measurement_matrices, (None, None, states)
     )
@@ -149,10 +165,10 @@ def _build(chosen: BiasedOscillatorOptions) -> Scenario:
         plant=plant,
         model=model,
         centre=make_centre(chosen.filter, _FILTERS, chosen, sensors),
-        random_start=random_start,
+        random_start=chosen.random_start,
         state_names=tuple(f"x{i + 1}" for i in range(states))
         + (("b",) if biases == 1 else tuple(f"b{i + 1}" for i in range(biases))),
-        scale=typical_magnitude(plant, horizon, random_start),
+        scale=typical_magnitude(plant, horizon, chosen.random_start),
         reference=plant.open_loop(min(horizon, _REFERENCE_HORIZON)),
         nature=true_nature(chosen, plant, sensors, horizon),
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,19 +49,12 @@ class LinearFusionOptions(FeedbackOptions):
     sensor is censored, the centre takes what arrives in an assumed-density filter of its own. At
     every step the policy requests transmissions, and the token bucket grants or denies them.
 
-    ``measurement_matrices`` has a matrix (channels, states) for each sensor, or a row of as many
-    numbers as states for a sensor of one channel. ``measurement_covariances`` has a covariance for
-    each sensor, or a variance; one number is the variance of all channels. A sensor whose
-    covariance is not diagonal reports R^(-1/2) y, which holds the same. ``censoring_threshold``
-    and ``censoring_upper`` have a number for all channels, one for each sensor, or a list of one
-    for each channel of each sensor.
+    A sensor whose covariance R is not diagonal reports R^(-1/2) y, which holds the same.
 
     Noises of different sensors are independent, unless ``joint_measurement_covariance`` stands in
     the place of ``measurement_covariances``: the covariance of all channels of all sensors, one
     sensor after another. The centre then takes what arrives in one filter (``"joint"``), or the
     nodes' estimates are joined by covariance intersection.
-
-    ``state_names`` are words for tables and figures.
 
     Starting state: x₀ ~ N(``initial_mean``, ``initial_covariance``), by default zero and the
     identity. The first measurement is known to the centre free of charge.
@@ -70,27 +63,39 @@ class LinearFusionOptions(FeedbackOptions):
     one sensor measures its position in metres, one its velocity in metres a second.
     """
 
-    # Plant: x(t+1) = A x(t) + w(t), w ~ N(0, W)
     transition: ArrayLike = ((1.0, _STEP), (0.0, 1.0))
+    """A of x(t+1) = A x(t) + w(t), (n, n)."""
     process_covariance: ArrayLike = (
         (_STEP**3 / 3.0, _STEP**2 / 2.0),
         (_STEP**2 / 2.0, _STEP),
     )
+    """Covariance W of the process noise w, (n, n)."""
     initial_mean: ArrayLike | None = None
+    """Mean of x₀, (n,). By default 0."""
     initial_covariance: ArrayLike | None = None
+    """Covariance of x₀, (n, n). By default I."""
     state_names: Sequence[str] | None = None
-    # Sensors: y = clip(C x + v, τ, υ), v ~ N(0, R)
+    """Names of the states in tables, figures and the observation. By default x1, x2, …"""
     measurement_matrices: Sequence[ArrayLike] = ((1.0, 0.0), (0.0, 1.0))
+    """C of each sensor, y = clip(C x + v, τ, υ): a matrix (channels, n), or one row (n,)."""
     measurement_covariances: ArrayLike | Sequence[ArrayLike] = 0.25
+    """Covariance R of each sensor's noise v: a matrix or a variance per sensor, or one variance for
+    all channels."""
     joint_measurement_covariance: ArrayLike | None = None
+    """Covariance of all channels of all sensors, in place of ``measurement_covariances``, where
+    noises of different sensors are correlated."""
     censoring_threshold: ArrayLike | Sequence[ArrayLike] = -np.inf
+    """Lower limit τ: one number, one per sensor, or a list for each sensor with one per channel."""
     censoring_upper: ArrayLike | Sequence[ArrayLike] = np.inf
-    # Network
+    """Upper limit υ: one number, one per sensor, or a list for each sensor with one per channel."""
     token_rate: float = 1.0
     token_capacity: float = 15.0
     initial_tokens: float = 6.0
-    # Filters
-    filter: str | None = None
+    filter: Annotated[str | None, _FILTERS] = None
+    """Filter of the nodes, by default ``"kalman"``. With correlated noises the default is
+    ``"joint"``, one Kalman filter at the centre. With censored sensors it is ``"adf"``, one
+    assumed-density filter at the centre. ``"tobit"`` is the Tobit Kalman filter. ``"stochastic"``
+    is the Kalman filter for the policy ``stochastic_event``."""
 
 
 def build(chosen: LinearFusionOptions) -> Scenario:

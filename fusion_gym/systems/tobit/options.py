@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 from numpy.typing import ArrayLike
 
@@ -28,17 +28,20 @@ _STRUCTURE = Structure(
 
 @dataclass(frozen=True)
 class FeedbackOptions(CommonOptions):
-    """How the nodes are joined; ``None`` is the default of the filter and the rule.
+    """Options of the fusion and its feedback; ``None`` is the default of the filter or the rule."""
 
-    ``fusion`` is "federated" (with ``information_shares``, equal by default) or a form of
-    covariance intersection, the sequential ones with an ``order`` of arrival.
-    ``stochastic_weight`` belongs to ``filter="stochastic"`` and its policy.
-    """
-
-    fusion: str | None = None
+    fusion: Annotated[str | None, _STRUCTURE.offered] = None
+    """Rule that joins the nodes' estimates, by default ``"federated"`` (tobit_token_bucket,
+    equations (50) and (51)). ``"ci"`` is covariance intersection, ``"ici"`` its inverse form for
+    two sensors. ``"sci"`` and ``"sici"`` join two estimates at a time."""
     information_shares: ArrayLike | None = None
+    """Shares w of the information that each node gets back under ``"federated"``, with the sum 1.
+    Equal by default (tobit_token_bucket, equation (51))."""
     order: ArrayLike | None = None
+    """Order of arrival under ``"sci"`` and ``"sici"``: a permutation of the sensors."""
     stochastic_weight: ArrayLike | None = None
+    """Weight Z of the policy ``stochastic_event``: one number > 0, or one per sensor, in the
+    inverse squared unit of the measurement. ``filter="stochastic"`` needs it."""
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.core.options import Scenario
+from fusion_gym.core.token_bucket import SharingRule
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.tobit.bound_filter import BoundConstants, BoundTobitFilter, EventError
 from fusion_gym.systems.tobit.options import (
@@ -41,6 +42,13 @@ _SMALLEST_EPSILON = 1e-9
 _LARGEST_EVENT_ERROR = 1e120  # its square must be a float64
 _HELD = "the silent filter goes on from the last delivered measurement (silent='hold')"
 _IDENTITY = ((1.0, 0.0), (0.0, 1.0))
+_FILTERS = {
+    "paper": Filter(
+        lambda chosen, sensors: feedback_centre(chosen, _bound_filter(chosen, sensors))
+    ),
+    "tobit": at_the_nodes(TobitKalmanFilter),
+    **FILTERS,
+}
 
 
 @dataclass(frozen=True)
@@ -63,31 +71,53 @@ class TobitOscillatorOptions(FeedbackOptions):
     are repeated in turn for other numbers of sensors.
     """
 
-    # Plant, equation (1)
     transition: ArrayLike = ((_COS, _SIN), (-_SIN, _COS))
-    process_noise: str = "scalar"
+    """A of equation (1), (n, n). By default a rotation by 0.052 π."""
+    process_noise: Literal["scalar", "full"] = "scalar"
+    """Covariance W of the process noise: ``"scalar"`` is ``process_variance`` · B Bᵀ, ``"full"`` is
+    ``process_variance`` · I."""
     process_gain: ArrayLike = (0.16, 0.18)
+    """B of equation (1), (n,)."""
     process_variance: float = 0.05
+    """Variance of the process noise, equation (1)."""
     initial_mean: ArrayLike = (5.0, 0.0)
+    """Mean of x₀, (n,)."""
     initial_covariance: ArrayLike = ((0.1, 0.0), (0.0, 0.1))
+    """Covariance of x₀, (n, n)."""
     random_start: bool = False
-    # Sensors, equations (1) and (2)
+    """Whether the initial mean has a random direction, which the filters know."""
     measurement_matrices: ArrayLike = (_IDENTITY, _IDENTITY, _IDENTITY)
+    """C of each sensor, equation (1), (sensors, components, n)."""
     measurement_variance: ArrayLike = 0.5
+    """Variance R of the measurement noise, equation (1): one number or (sensors, components)."""
     censoring_threshold: ArrayLike = 0.0
-    # Network, equations (16)-(18)
-    sharing: str = "equal"
-    # Filters, equations (21)-(37)
-    filter: str = "paper"
-    silent: str | None = None
+    """Threshold τ of equation (2), below which a sensor reports τ: one number or (sensors,
+    components). Minus infinity never censors."""
+    sharing: SharingRule = "equal"
+    filter: Annotated[str, _FILTERS] = "paper"
+    """Filter of the nodes. ``"paper"`` minimises the bound of equations (30) and (37). ``"tobit"``
+    is the Tobit Kalman filter. ``"kalman"`` ignores censoring. ``"adf"`` is one assumed-density
+    filter at the centre. ``"stochastic"`` is the Kalman filter for the policy
+    ``stochastic_event``."""
+    silent: Literal["hold", "predict"] | None = None
+    """Update of the paper's filter without a delivery: with the last measurement (``"hold"``, its
+    default), or none. The other filters always predict."""
     event_error: bool | None = None
+    """Whether the paper's filter adds κ₆ Ξ to the noise of a delivery, by default ``True``."""
     bound_epsilon: ArrayLike = (0.05,) * 5 + (0.7,) * 8 + (1.0,)
+    """ε₁, …, ε₁₄ of the bound, below equation (30)."""
     bound_young: tuple[float, float] = (1.5, 2.0)
-    # Dynamic event trigger, equations (11)-(15): the defaults of the policy, and Ξ of the filter
+    """Factors (d, e) of Young's inequality in the bound, equations (33) and (34)."""
     trigger_threshold: ArrayLike | None = None
+    """σ of the policy ``dynamic_event`` and of Ξ, equations (11)-(15). By default 0.1, 0.2, 0.3 in
+    turn."""
     trigger_decay: ArrayLike | None = None
+    """λ of the policy ``dynamic_event`` and of Ξ, equations (11)-(15). By default 0.1, 0.2, 0.1 in
+    turn."""
     trigger_divisor: ArrayLike = 5.0
+    """χ of the policy ``dynamic_event`` and of Ξ, equations (11)-(15)."""
     trigger_initial: ArrayLike = 1.5
+    """η₀ of the policy ``dynamic_event`` and of Ξ, equations (11)-(15)."""
 
 
 def build(chosen: TobitOscillatorOptions) -> Scenario:
@@ -104,7 +134,6 @@ def build(chosen: TobitOscillatorOptions) -> Scenario:
         chosen.censoring_threshold,
         plant.size,
     )
-    random_start = validation.boolean("random_start", chosen.random_start)
     trigger = _trigger(chosen, sensors.count)
     centre = _centre(chosen, sensors)
     holds = chosen.filter == "paper" and chosen.silent != "predict"
@@ -115,9 +144,9 @@ def build(chosen: TobitOscillatorOptions) -> Scenario:
         plant=plant,
         model=plant,
         centre=centre,
-        random_start=random_start,
+        random_start=chosen.random_start,
         state_names=tuple(f"x{i + 1}" for i in range(plant.size)),
-        scale=typical_magnitude(plant, horizon, random_start),
+        scale=typical_magnitude(plant, horizon, chosen.random_start),
         reference=plant.open_loop(horizon),
         nature=true_nature(chosen, plant, sensors, horizon),
     )
@@ -136,8 +165,7 @@ def _plant(chosen: TobitOscillatorOptions) -> LinearPlant:
     transition = validation.array("transition", chosen.transition, (None, None))
     size = len(transition)
     variance = validation.number("process_variance", chosen.process_variance, above=0.0)
-    reading = validation.choice("process_noise", chosen.process_noise, ("scalar", "full"))
-    if reading == "scalar":
+    if chosen.process_noise == "scalar":
         gain = validation.array("process_gain", chosen.process_gain, (size,))
         covariance = variance * np.outer(gain, gain)
     else:
@@ -170,10 +198,6 @@ def _bound_filter(chosen: TobitOscillatorOptions, sensors: CensoredSensors) -> B
         )
     trigger = _trigger(chosen, sensors.count)
     error = EventError.create(**trigger, young=chosen.bound_young, sensors=sensors.count)
-    if chosen.silent is not None:
-        validation.choice("silent", chosen.silent, ("hold", "predict"))
-    if chosen.event_error is not None:
-        validation.boolean("event_error", chosen.event_error)
     with_error = chosen.event_error is None or chosen.event_error
     hold = chosen.silent != "predict"
     if with_error and chosen.filter == "paper":
@@ -192,15 +216,6 @@ def _refuse_explosion(chosen: TobitOscillatorOptions, error: EventError) -> None
             f"{listed} are not allowed together: the bound of the event error must stay below "
             f"{_LARGEST_EVENT_ERROR:g}; use a smaller decay, a larger divisor or event_error=False"
         )
-
-
-_FILTERS = {
-    "paper": Filter(
-        lambda chosen, sensors: feedback_centre(chosen, _bound_filter(chosen, sensors))
-    ),
-    "tobit": at_the_nodes(TobitKalmanFilter),
-    **FILTERS,
-}
 
 
 def _trigger(chosen: TobitOscillatorOptions, sensors: int) -> dict[str, tuple[float, ...]]:

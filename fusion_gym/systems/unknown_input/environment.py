@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import CommonOptions, Scenario
+from fusion_gym.core.options import CommonOptions, Scenario, Tokens
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.unknown_input.bound_filter import BoundTables
 from fusion_gym.systems.unknown_input.examples import EXAMPLES
@@ -38,7 +38,7 @@ from fusion_gym.systems.unknown_input.system import UnknownInputSystem
 from fusion_gym.validation import ConfigurationError
 
 _STRUCTURE = Structure(common="all contain the same process noise", holds=("tracked weights",))
-SIGNALS = ("sinusoids", "steps", "random_walk")
+Signal = Literal["sinusoids", "steps", "random_walk"]
 
 
 @dataclass(frozen=True)
@@ -60,38 +60,68 @@ class UnknownInputOptions(CommonOptions):
     :mod:`fusion_gym.systems.unknown_input.examples` lists; a number that is given goes before it.
     """
 
-    example: str = "two_carts"
-    # Plant, equation (1)
+    example: Annotated[str, EXAMPLES] = "two_carts"
+    """Example that gives the numbers of all options that are ``None``."""
     transition: ArrayLike | None = None
+    """A of one small step, equation (1), (n, n)."""
     input_matrix: ArrayLike | None = None
+    """B of one small step, equation (1), (n, q)."""
     process_covariance: ArrayLike | None = None
+    """Covariance W of the process noise of one small step, equation (1), (n, n)."""
     sampling_period: int = 2
+    """Small steps a ≥ 1 of a sampling interval."""
     initial_mean: ArrayLike | None = None
+    """Mean of x₀ that the filters assume, (n,)."""
     initial_covariance: ArrayLike | None = None
+    """Covariance of x₀ that the filters assume, (n, n)."""
     initial_half_width: ArrayLike | None = None
-    # The unknown input
-    input_signal: str | ArrayLike = "sinusoids"
+    """Half width of a uniform law of x₀ about its mean; without it x₀ is normal. The example's does
+    not hold beside a ``transition`` or an ``initial_mean``."""
+    input_signal: Signal | ArrayLike = "sinusoids"
+    """Unknown input. ``"steps"`` is a level that jumps with the probability 1/period,
+    ``"random_walk"`` reverts to its mean with the correlation time period. An array
+    (horizon + 1, q) is the same in every episode."""
     input_amplitude: ArrayLike | None = None
+    """Amplitudes of the sinusoids: one number, (terms,) or (q, terms). Of steps and random walk:
+    the standard deviation, one number, or one per input."""
     input_period: ArrayLike | None = None
+    """Period in sampling instants, in the shape of the amplitude."""
     input_phase: ArrayLike | str | None = None
-    # Sensors, equation (2)
+    """Phases of the sinusoids at time 0 in radians. ``"random"`` draws them in every episode."""
     measurement_matrices: ArrayLike | None = None
+    """C of each sensor, equation (2), (sensors, m, n). Every C_i ℬ must have the rank q."""
     measurement_covariance: ArrayLike | None = None
-    # Nodes and fusion, equations (8)-(25)
-    filter: str | None = None
+    """Covariance V of the measurement noise, equation (2): one number, one per sensor, variances
+    (sensors, m), or matrices (sensors, m, m)."""
+    filter: Annotated[str | None, FILTERS] = None
+    """Filter of the nodes. ``"random_walk"`` models the input as a random walk, ``"predict"``
+    leaves it open. ``"paper"`` is the paper's, equations (8)-(20)."""
     young_factor: ArrayLike | None = None
+    """ε of the paper's filter: one number, or one per sensor. The spectral radius of √(1+ε)
+    (I - N C) 𝒜 must be below 1."""
     input_memory: ArrayLike | None = None
+    """r of the random walk d(k) = r d(k-1) + η that a filter assumes: one number, or one per
+    input."""
     input_change: ArrayLike | None = None
+    """Deviation of η: one number, or one per input."""
     input_deviation: ArrayLike | None = None
+    """Standard deviation of the input for a filter without any measurement."""
     hold_variance: ArrayLike | None = None
-    fusion: str = "ci"
-    # Adaptive threshold trigger, equations (5)-(7)
+    """h of ``filter="random_walk"``: one number, or one per sensor. With it a silent node updates
+    with the last measurement and the added variance h."""
+    fusion: Annotated[str, _STRUCTURE.offered] = "ci"
+    """Rule that joins the nodes' estimates. ``"ci"`` is equations (24) and (25). ``"sci"`` joins
+    two estimates at a time. ``"sici"`` and, for two sensors, ``"ici"`` are no bounds."""
     rho_bar: ArrayLike | None = None
+    """ρ̄ of the policy ``adaptive_threshold`` and of the paper's filter, equations (5)-(7): one
+    number, or one per sensor."""
     rho_initial: ArrayLike | None = None
+    """ρ₀ of the policy ``adaptive_threshold``, equations (5)-(7): one number, or one per sensor."""
     adaptation: ArrayLike | None = None
-    # Network, episode and reward
-    tokens: str = "unlimited"
+    """λ of the policy ``adaptive_threshold``, equations (5)-(7): one number, or one per sensor."""
+    tokens: Tokens = "unlimited"
     input_weight: float = 1.0
+    """Weight of an input's error in the reward, where a state's is 1."""
 
 
 def build(chosen: UnknownInputOptions) -> Scenario:
@@ -167,7 +197,7 @@ def _with_example(chosen: UnknownInputOptions) -> UnknownInputOptions:
     numbers = {name: value for name, value in example.items() if name != "signals"}
     kind = chosen.input_signal
     if isinstance(kind, str):
-        validation.choice("input_signal", kind, SIGNALS)
+        validation.choice("input_signal", kind, get_args(Signal))
         shape = zip(
             ("input_amplitude", "input_period", "input_phase"),
             example["signals"][kind],

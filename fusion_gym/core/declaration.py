@@ -1,0 +1,92 @@
+"""Declarations of options: a dataclass's field with its type, default and docstring (PEP 257)."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import inspect
+import itertools
+import re
+import textwrap
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from fusion_gym import validation
+
+# Shown by their names, for what they stand for fills a page.
+_NAMES = {name: type(name, (), {}) for name in ("ArrayLike", "Array")}
+
+
+def hints(kind: type) -> dict[str, Any]:
+    """Return the types of a dataclass's fields, none where a name in them is unknown."""
+    try:
+        return get_type_hints(kind, localns=_NAMES, include_extras=True)
+    except NameError:  # of a class inside a function
+        return {}
+
+
+def meanings(kind: type) -> dict[str, str]:
+    """Return the docstrings of a dataclass's fields, inherited ones included."""
+    result = {}
+    for owner in reversed(kind.__mro__):
+        try:
+            (source,) = ast.parse(textwrap.dedent(inspect.getsource(owner))).body
+        except (OSError, TypeError, SyntaxError):  # it has no source: built in, or made at run time
+            continue
+        for field, below in itertools.pairwise(getattr(source, "body", ())):
+            match field, below:
+                case (
+                    ast.AnnAssign(target=ast.Name(id=name)),
+                    ast.Expr(value=ast.Constant(value=str(text))),
+                ):
+                    result[name] = " ".join(text.split())
+    return result
+
+
+def choices(hint: Any) -> tuple[Any, ...]:
+    """Return all values of a type that has a few: those of a ``Literal``, or the names of a table.
+
+    ``Annotated[str, table]`` stands for the names in a table; ``None`` is not among the values.
+    """
+    if get_origin(hint) is Annotated:
+        return tuple(hint.__metadata__[0])
+    parts = [part for part in _parts(hint) if part is not NoneType]
+    return get_args(parts[0]) if len(parts) == 1 and get_origin(parts[0]) is Literal else ()
+
+
+def type_text(hint: Any) -> str:
+    """Return a type in words of Python, with all values that a ``Literal`` or a table has."""
+    if get_origin(hint) is Annotated:
+        names = " | ".join(map(repr, choices(hint)))
+        return " | ".join(names if part is str else type_text(part) for part in _parts(hint))
+    if len(parts := _parts(hint)) > 1:
+        return " | ".join(map(type_text, parts))
+    if get_origin(hint) is Literal:
+        return " | ".join(map(repr, get_args(hint)))
+    text = "None" if hint is NoneType else inspect.formatannotation(hint)
+    return re.sub(r"[\w.]+\.(?=\w)", "", text)
+
+
+_hints_of = functools.cache(hints)  # for every object of options is checked
+
+
+def check(options: Any) -> None:
+    """Check the options that are declared as ``Literal`` or ``bool``.
+
+    Raises:
+        ConfigurationError: a value that the type does not have.
+    """
+    for name, hint in _hints_of(options.__class__).items():
+        value, parts = getattr(options, name), _parts(hint)
+        if (value is None and NoneType in parts) or get_origin(hint) is Annotated:
+            continue
+        if allowed := choices(hint):
+            validation.choice(name, value, allowed)
+        elif set(parts) <= {bool, NoneType}:
+            validation.boolean(name, value)
+
+
+def _parts(hint: Any) -> tuple[Any, ...]:
+    """The members of a union, or the type itself."""
+    inner = hint.__origin__ if get_origin(hint) is Annotated else hint
+    return get_args(inner) if get_origin(inner) in (Union, UnionType) else (inner,)
