@@ -237,11 +237,7 @@ def measured(rows: dict[str, Workload], seconds: float) -> dict[str, list[float]
 
 def memory_table(seconds: float) -> Table:
     """What memory costs: the core's loop with it over without, the median of a turn's ratios."""
-    ways = {
-        "shadow": "shadow alone",
-        "values": "and values",
-        "own": "every sensor's own values",
-    }
+    ways = {"shadow": "shadow alone", "values": "and values", "own": "every sensor's own values"}
     table = Table(
         title=f"core's loop, 1,024 runs, requests at rate {RATE}: with memory over without",
         box=box.SIMPLE_HEAD,

@@ -24,8 +24,7 @@ def paper(name: str) -> Paper:
         ConfigurationError: there is none of this name.
     """
     module = importlib.import_module(f".{choice('paper', name, NAMES)}", __package__)
-    found: Paper = module.PAPER
-    return found
+    return module.PAPER
 
 
 def papers(names: tuple[str, ...]) -> list[Paper]:

@@ -118,8 +118,7 @@ def present(suite: Suite, setting: Setting, results: Path) -> dict[str, Any]:
         return {}
     found = read_envelopes(path)
     check_inputs(inputs_of(suite, setting), found["inputs"], repr(str(path)))
-    classes: dict[str, Any] = found["classes"]
-    return classes
+    return found["classes"]
 
 
 @dataclass(frozen=True)

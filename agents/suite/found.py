@@ -48,8 +48,7 @@ class Found:
     @property
     def classes(self) -> dict[str, Any]:
         """The classes that have agents."""
-        found: dict[str, Any] = self.verdict["classes"]
-        return found
+        return self.verdict["classes"]
 
     @property
     def optimal(self) -> bool:

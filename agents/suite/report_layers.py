@@ -32,11 +32,7 @@ LEFT = 0.04  # of the rate that always transmitting gets: where the figure begin
 DEEPEST = 0.3
 WIDEST = 0.4  # of the relative differences that are drawn
 MIXED = "found before"  # no family of one rule
-HEARS = {
-    "none": "hear nothing",
-    "estimate": "hear estimate",
-    "packets": "hear packets",
-}
+HEARS = {"none": "hear nothing", "estimate": "hear estimate", "packets": "hear packets"}
 
 
 def draw(folder: Path, found: Found) -> None:
@@ -236,5 +232,4 @@ def _least(hulls: Sequence[Sequence[EnvelopePoint]], rate: float) -> float:
 
 def _fine(found: Found) -> list[float]:
     always = found.verdict["always"]
-    rates: list[float] = np.geomspace(LEFT * always, always, FINE).tolist()
-    return rates
+    return np.geomspace(LEFT * always, always, FINE).tolist()

@@ -181,8 +181,7 @@ def envelope_of(shelf: Shelf, setting: Setting, of: Class) -> dict[str, Any]:
     if of.name not in found:
         path = str(path_of(shelf.results, setting.name))
         raise ConfigurationError(f"results: {path!r} has no class {of.name!r}: tune it first")
-    envelope: dict[str, Any] = found[of.name]
-    return envelope
+    return found[of.name]
 
 
 def rules_piece(

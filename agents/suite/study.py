@@ -97,8 +97,7 @@ class Study:
             ConfigurationError: there is none of that name.
         """
         classes = self.envelopes["classes"]
-        found: dict[str, Any] = classes[choice("class", name, classes)]
-        return found
+        return classes[choice("class", name, classes)]
 
     @property
     def classes(self) -> list[str]:

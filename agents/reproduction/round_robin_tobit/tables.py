@@ -86,8 +86,7 @@ def _rows() -> dict[str, dict[str, Any]]:
 
 
 def _row(kept: dict[str, Any], name: str) -> dict[str, Any]:
-    found: dict[str, Any] = kept["rows"]["interval 5" if name == "variance 0.6" else name]
-    return found
+    return kept["rows"]["interval 5" if name == "variance 0.6" else name]
 
 
 def _median(found: Array) -> dict[str, list[float]]:

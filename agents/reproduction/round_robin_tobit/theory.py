@@ -15,17 +15,7 @@ from fusion_gym.systems.tobit.tobit_filter import expect_censored
 
 from . import bounds
 from .readings import PrintedTobitFilter
-from .runs import (
-    FREE,
-    OSCILLATOR,
-    TRACKING,
-    armse,
-    censored,
-    round_robin,
-    scheduled,
-    squares,
-    walk,
-)
+from .runs import FREE, OSCILLATOR, TRACKING, armse, censored, round_robin, scheduled, squares, walk
 
 PLACES = (-7.0, -5.0, -4.0, 0.0, 4.5, 5.0, 6.0)  # true x1 at which Lemma 1 is tried
 _DRAWS = 200  # measurements an episode, at each of them

@@ -30,7 +30,7 @@ READINGS: dict[str, dict[str, Any]] = {
         "options": {
             "process_covariance": ((1e-6, 0.0), (0.0, 1e-6)),
             "measurement_covariance": 1e-6,
-        },
+        }
     },
     "everything transmitted": {"policy": "always"},
 }
@@ -112,8 +112,7 @@ def _pseudo_inverse(matrix: Array, cutoff: float) -> Array:
     left, values, right = np.linalg.svd(matrix)
     kept = values > cutoff
     inverted = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
-    found: Array = (right.swapaxes(1, 2) * inverted[:, None]) @ left.swapaxes(1, 2)
-    return found
+    return (right.swapaxes(1, 2) * inverted[:, None]) @ left.swapaxes(1, 2)
 
 
 def run(model: Model, held: Array, granted: NDArray[np.bool_], cutoff: float) -> dict[str, Array]:

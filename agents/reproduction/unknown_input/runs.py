@@ -43,8 +43,7 @@ class Record:
     def errors(self) -> Array:
         """Errors (H, l + 1, s, E), the fused estimate first."""
         every = np.concatenate((self.fused[:, None], self.local), axis=1)
-        found: Array = self.truth[:, None] - every
-        return found
+        return self.truth[:, None] - every
 
 
 def make(**options: Any) -> tuple[Task, UnknownInputSystem]:
@@ -85,8 +84,7 @@ def record(task: Task, policy: str, episodes: int, seed: int) -> Record:
 def halves(value: Array, states: int, axis: int) -> Array:
     """Sums over the states and over the inputs, stacked along ``axis`` in the place of both."""
     first, last = np.split(value, [states], axis=axis)
-    found: Array = np.stack((first.sum(axis), last.sum(axis)), axis=axis)
-    return found
+    return np.stack((first.sum(axis), last.sum(axis)), axis=axis)
 
 
 def leading(errors: Array, bounds: Array) -> Array:
@@ -99,5 +97,4 @@ def leading(errors: Array, bounds: Array) -> Array:
     z = root @ errors
     moment = np.einsum("hie,hje->ije", z, z) / len(z)
     direction = np.linalg.eigh(moment.mean(-1))[1][:, -1]
-    found: Array = np.einsum("i,ije,j->e", direction, moment, direction)
-    return found
+    return np.einsum("i,ije,j->e", direction, moment, direction)
