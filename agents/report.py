@@ -74,21 +74,9 @@ def text_of(found: dict[str, Found], command: str, second: str = "fusion-gym rep
 
 def overview_section(found: dict[str, Found]) -> list[str]:
     """All settings beside each other."""
+    text = Path(overview.__file__).with_suffix(".md").read_text(encoding="utf-8")
     return [
-        "## Overview",
-        "",
-        "![What knowing and learning are worth, setting by setting](overview.png)",
-        "",
-        "Each mark is a relative difference of the mean squared error at equal rate, with its 95 % "
-        "interval; left of the line at 0 is better. Four columns compare a class with one that "
-        "knows less, for its rules (circles) and its agents (triangles), with memory where there "
-        "is: a coordinator with memory and without; sensors alone that hear every packet, and that "
-        "hear what the environment tells by default; a coordinator, who sees what all measured, "
-        "and sensors alone that hear every packet; packets with the coordinator's estimate, and "
-        "with a measurement. The last column compares agents with rules that know as much.",
-        "",
-        "What knowing is worth:",
-        "",
+        *text.splitlines(),
         *overview.knowing_table(found),
         "What learning is worth, agents against the rules of the same class:",
         "",

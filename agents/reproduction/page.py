@@ -18,18 +18,7 @@ from .papers import NAMES
 from .shown import Claim, Number, Picture, Shown, Table
 
 OVERVIEW = "README.md"
-_ABOUT = """# The five papers, made anew
-
-Every figure and table of the simulation sections of five papers, by one command:
-
-```sh
-fusion-gym reproduce all
-```
-
-Beside each printed number stands ours with its 95 % interval; *agrees* means that it lies where
-95 % of such runs would. Every claim that simulation can touch has a verdict, and its evidence on
-the paper's page.
-"""
+_TEXTS = Path(__file__).parent
 
 
 def write_page(
@@ -42,7 +31,8 @@ def write_page(
     for shown in found.values():
         for picture in shown.pictures:
             _draw(picture, output / one.name)
-    lines = [f"# {one.title}", "", one.citation, "", one.introduction.strip(), ""]
+    introduction = (_TEXTS / one.name / "introduction.md").read_text(encoding="utf-8")
+    lines = [f"# {one.title}", "", one.citation, "", introduction.strip(), ""]
     claims = [claim for shown in found.values() for claim in shown.claims]
     lines += ["## Claims", "", *_claims(claims), ""]
     for piece in one.pieces:
@@ -66,7 +56,7 @@ def write_page(
 
 def write_overview(output: Path) -> None:
     """The page over all papers whose numbers are there."""
-    lines = [_ABOUT]
+    lines = [(_TEXTS / "overview.md").read_text(encoding="utf-8")]
     for name in NAMES:
         path = output / f"{name}.json"
         if not path.exists():

@@ -32,11 +32,9 @@ class Piece:
 
 @dataclass(frozen=True)
 class Paper:
-    """A paper: ``name`` is that of its page, ``citation`` as a list of references has it."""
+    """A paper: ``name`` is that of its page and its package, which has its ``introduction.md``."""
 
     name: str
     title: str
     citation: str
-    environments: Sequence[str]
-    introduction: str
     pieces: Sequence[Piece]

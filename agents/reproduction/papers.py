@@ -23,7 +23,7 @@ def paper(name: str) -> Paper:
     Raises:
         ConfigurationError: there is none of this name.
     """
-    module = importlib.import_module(f".{choice('paper', name, NAMES)}", __package__)
+    module = importlib.import_module(f".{choice('paper', name, NAMES)}.pieces", __package__)
     return module.PAPER
 
 

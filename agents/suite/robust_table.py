@@ -21,32 +21,6 @@ from .verdict import MIDDLE, Searches, judge
 
 Rules = Mapping[str, EpisodeResults]
 
-_TEXT = """\
-# What is left where the truth is not what everybody assumes
-
-Made by `{command}`; [docs/robustness.md](../../docs/robustness.md) says what the cases are. Rules
-and agents are as they were tuned and trained for the case "as assumed".
-
-- **rules' error**: the error of the envelope's rules, measured anew under the case, relative to
-  theirs as assumed, both at the middle rate of the case "as assumed": the geometric mean of 5 % and
-  50 % of the rate that transmitting always gets. Some of it no choice of transmissions could
-  change, for noise itself is larger.
-- **agents**: how far their error lies above (+) or below (-) that of the rules under the same case,
-  at the agents' own rates, over the middle of the front; a dash where they were not tried, or have
-  a rate in the middle at none of their prices.
-- **left of the gain**: the agents' gain over the rules under the case, as a share of their gain as
-  assumed; a dash where the interval of that holds nothing.
-- **trained over draws**: as "agents", of those whose training drew the perturbations anew in every
-  episode.
-
-Brackets hold 95 % intervals, over paired episodes, training seeds, rates and tuning seeds.
-
-## All cases but "as assumed", counted
-
-Better and worse are cases whose whole interval lies below and above the rules; left out are those
-in which no price leads to a rate in the middle.
-
-"""
 _HEAD = """
 ## {of}
 
@@ -138,7 +112,8 @@ def write_table(results: Path, titles: Mapping[str, str], command: str) -> Path:
     found: dict[str, list[dict[str, Any]]] = {}
     for report in reports:
         found.setdefault(report["class"], []).append(report)
-    parts = [_TEXT.format(command=command), "\n".join(summary(reports, titles))]
+    text = Path(__file__).with_suffix(".md").read_text(encoding="utf-8")
+    parts = [text.format(command=command), "\n".join(summary(reports, titles))]
     for of, reports in sorted(found.items()):
         counts = {report["episodes"] for report in reports}
         asked = " or ".join(str(count) for count in sorted(counts))
