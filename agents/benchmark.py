@@ -30,8 +30,8 @@ from .suite.classes import names_of, trained
 from .suite.committed import FOLDER, Shelf, complete
 from .suite.conclude import conclude
 from .suite.config import Setting, Suite, load_suite
-from .suite.envelopes import run_test
-from .suite.jobs import Folders, finished, jobs, rules_of, setting_task
+from .suite.envelopes import run_test, task_of
+from .suite.jobs import Folders, finished, jobs, rules_of
 from .suite.team import BackendName, Team
 from .suite.work import run
 from .suite.workers import Work, side_by_side
@@ -99,7 +99,7 @@ class Benchmark(Long):
             choice("classes", name, names_of(suite))
         classes = self.classes or names_of(suite)
         for setting in chosen:
-            setting_task(setting)
+            task_of(setting)
         with folders.alone():
             self._check_resumed(folders, chosen)
             writing(("finished pieces", folders.results), ("trainings and episodes", folders.work))

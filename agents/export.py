@@ -20,7 +20,7 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Command, Words, start
+from .command_line import Command, SetOptions, start
 from .input.environment import environment_of
 from .input.options import OutputFile
 from .output.files import replacing
@@ -40,9 +40,7 @@ class Export(Command):
     """Id of a registered environment, instead of the one that the agent was trained in."""
     config: str | None = None
     """Take environment and options from a training's YAML, or from a shipped config by its name."""
-    options: Annotated[
-        Words, tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE …")
-    ] = ()
+    options: SetOptions = ()
     """Options of gym.make for the environment; they go before all others."""
     trust: bool = False
     """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""

@@ -12,9 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from rich import box
-from rich.table import Table
-
 from fusion_gym.core.options import nature_of
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
@@ -62,9 +59,8 @@ class Solved(Long):
                 "be compared with it"
             )
         writing(("trainings and costs", self.output))
-        table = Table(title=f"{self.config}: {self.episodes} episodes", box=box.SIMPLE_HEAD)
-        for column in ("policy", "cost of an episode", "rate", "above the optimum [95 %]"):
-            table.add_column(column, justify="left" if column == "policy" else "right")
+        heads = ("policy", "cost of an episode", "rate", "above the optimum [95 %]")
+        table = tables.table(f"{self.config}: {self.episodes} episodes", heads)
         report: dict[str, Any] = {"config": self.config, "agents": {}}
         table.add_row("optimal", f"{-best.returns.mean():.4f}", f"{best.rate.mean():.4f}", "")
         for seed in self.seeds:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import signal
 import statistics
 import sys
 import time
@@ -25,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from fusion_gym.agents.output import tables
-from fusion_gym.agents.output.ending import told
+from fusion_gym.agents.output.ending import ended_like_by_ctrl_c, told
 from fusion_gym.agents.output.files import read_json, write, write_text
 from fusion_gym.agents.output.folders import alone_in
 from fusion_gym.agents.output.progress import quietly, writing
@@ -60,13 +59,9 @@ def main() -> None:
     given = parser.parse_args()
     words = [word for word in sys.argv[1:] if word != "--resume"]
     again = shlex.join(["python", "-m", "benchmarks.learning", *words, "--resume"])
-    with told(lambda: f"interrupted; go on with: {again}"), quietly(given.quiet):
-        # Ended from outside like by Ctrl-C: the workers stop too.
-        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-        try:
-            run(given)
-        finally:
-            signal.signal(signal.SIGTERM, before)
+    interrupted = f"interrupted; go on with: {again}"
+    with told(lambda: interrupted), quietly(given.quiet), ended_like_by_ctrl_c():
+        run(given)
 
 
 def run(given: argparse.Namespace) -> None:

@@ -10,6 +10,8 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
+from ..output.markup import share
+
 Report = Mapping[str, Any]
 _LABELS = {"front": "with credit and memory", "plain": "plain PPO"}
 _COLUMNS = (
@@ -46,12 +48,11 @@ def row(report: Report) -> list[str]:
         cells = [
             f"{len(found['above'])} of {found['compared']} above {course['allowed']:+.1%} "
             f"(rates {low:.3f} to {high:.3f})",
-            f"{_difference(worst['difference'])} (seed {worst['seed']}, price "
-            f"{worst['price']:.3g})",
+            f"{share(worst['difference'])} (seed {worst['seed']}, price {worst['price']:.3g})",
             ", ".join(
-                f"{share:.0%} to {name}"
-                for name, share in found["closed"].items()
-                if share is not None
+                f"{part:.0%} to {name}"
+                for name, part in found["closed"].items()
+                if part is not None
             )
             or "–",
         ]
@@ -80,10 +81,6 @@ def _span(form: str, found: Sequence[Mapping[str, Any]], name: str) -> str:
     low, high = (choose(one[name] for one in found) for choose in (min, max))
     texts = dict.fromkeys((form.format(low), form.format(high)))
     return " to ".join(texts)
-
-
-def _difference(found: Mapping[str, float]) -> str:
-    return f"{found['mean']:+.1%} [{found['low']:+.1%}, {found['high']:+.1%}]"
 
 
 def headline(reports: Sequence[Report]) -> list[str]:
@@ -143,7 +140,7 @@ def details(report: Report) -> Iterator[str]:
         mean = float(np.mean([p["difference"]["mean"] for p in points]))
         cells = [f"{np.mean([p[name] for p in points]):.4g}" for name in ("rate", *names)]
         inner = "" if report["inner"][place] else " (outer)"
-        cells = [f"{price:.3g}{inner}", *cells, f"{mean:+.1%}", _difference(worst)]
+        cells = [f"{price:.3g}{inner}", *cells, f"{mean:+.1%}", share(worst)]
         yield _joined([*cells, f"{above} of {len(points)}"])
     yield ""
 

@@ -14,6 +14,7 @@ from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import mean_interval
 
 from ..output.files import write_text
+from ..output.markup import NONE, share
 from .robust_pieces import RULES, Folders, Piece
 from .robust_summary import FOLDER, KINDS, is_gain, read_reports, summary
 from .robustness import NOMINAL
@@ -130,15 +131,8 @@ def _lines(report: Mapping[str, Any]) -> Iterator[str]:
         cells = (
             report["setting"],
             row["title"],
-            _percent(row["rules"]),
-            *(_percent(row.get(kind, {}).get("middle")) for kind in KINDS),
+            share(row["rules"]),
+            *(share(row.get(kind, {}).get("middle")) for kind in KINDS),
         )
-        share = "–" if left is None else f"{left:.0%}"
-        yield f"| {' | '.join((*cells[:4], share, cells[4]))} |"
-
-
-def _percent(found: Mapping[str, float] | None) -> str:
-    """Mean and ends of an interval in per cent."""
-    if found is None:
-        return "–"
-    return f"{found['mean']:+.1%} [{found['low']:+.1%}, {found['high']:+.1%}]"
+        kept = NONE if left is None else f"{left:.0%}"
+        yield f"| {' | '.join((*cells[:4], kept, cells[4]))} |"

@@ -32,7 +32,6 @@ from .jobs import (
     experiment_of,
     inputs_of,
     rules_of,
-    setting_task,
     training_of,
 )
 
@@ -78,7 +77,7 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders, shelf: Shelf) -> No
         curve = curves.setdefault(vertex["family"], {"knows": [], "policies": []})
         curve["knows"].append(policy.knowledge)
         curve["policies"].append(vertex["name"])
-    task = setting_task(setting)
+    task = task_of(setting)
     for name in setting.points:
         found |= _test(task, [name], suite)
         knows = [make_policy(name, task).knowledge]
@@ -107,14 +106,14 @@ def check_vertex(vertex: dict[str, Any], results: EpisodeResults) -> None:
 
 def _run_references(job: Job, suite: Suite, folders: Folders) -> None:
     """Test policies that were computed."""
-    task = setting_task(job.setting)
+    task = task_of(job.setting)
     found = _test(task, list(computed(job.setting, job.kind)), suite)
     _keep(job, folders, found, _header(job, suite, task))
 
 
 def _run_hindsight(job: Job, suite: Suite, folders: Folders) -> None:
     """Search a clairvoyant's schedules for the first test episodes."""
-    task, chosen = setting_task(job.setting), job.setting.hindsight
+    task, chosen = task_of(job.setting), job.setting.hindsight
     assert chosen is not None
     episodes = min(suite.hindsight_episodes, suite.episodes)
     found = {

@@ -13,21 +13,10 @@ PAPER = Paper(
         "innovation event-triggered mechanism for uncertain networked systems”, 2022."
     ),
     pieces=(
+        Piece("rates", "Thresholds and communication rates", rates.compute, rates.show, 45.0, 200),
         Piece(
-            name="rates",
-            title="Thresholds and communication rates",
-            compute=rates.compute,
-            show=rates.show,
-            weight=45.0,
-            usual=200,
-        ),
-        Piece(
-            name="fusion",
-            title="Errors, actual and conservative variances",
-            compute=errors.compute,
-            show=fusion.show,
-            weight=100.0,
-            usual=200,
+            "fusion", "Errors, actual and conservative variances",
+            errors.compute, fusion.show, 100.0, 200,
         ),
     ),
-)
+)  # fmt: skip

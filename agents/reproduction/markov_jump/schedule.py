@@ -202,9 +202,7 @@ def _of_the_traces(found: dict[str, Any]) -> list[Claim]:
         Claim(
             "A local filter's covariance is periodic with its own sampling period.",
             "Remark 2",
-            verdict(
-                period == int(due) for period, due in zip(own, found["periods"], strict=True)
-            ),
+            verdict(period == int(due) for period, due in zip(own, found["periods"], strict=True)),
             "Periods of nodes 1, 2, 3: "
             + ", ".join("none" if period is None else str(period) for period in own)
             + " steps.",
@@ -218,7 +216,7 @@ def _of_the_traces(found: dict[str, Any]) -> list[Claim]:
             + f". What counts for the mean square is the jump system's own radius, "
             f"{found['square_radius']:.4f} < 1.",
         ),
-    ]  # fmt: skip
+    ]
 
 
 SCHEDULE = Piece(

@@ -116,15 +116,15 @@ def _pictures(kept: dict[str, Any], name: str) -> list[Picture]:
     )
     return [
         Picture(
-            f"figure_7{suffix}", f"Figure 7: RMSE1 and RMSE2, local and fused ({which})",
+            f"figure_7{suffix}",
+            f"Figure 7: RMSE1 and RMSE2, local and fused ({which})",
             f"Means over time, sensors 1 and 2 beside the fused: {said}.",
-            partial(
-                figures.curves, panels=states, from_zero=True
-            ),
+            partial(figures.curves, panels=states, from_zero=True),
             (7.2, 4.8),
         ),
         Picture(
-            f"figure_8{suffix}", f"Figure 8: the bias, local and fused ({which})",
+            f"figure_8{suffix}",
+            f"Figure 8: the bias, local and fused ({which})",
             f"One run, that of Figures 2 to 4. {_EIGHT[name]}",
             partial(
                 figures.curves,
@@ -133,13 +133,11 @@ def _pictures(kept: dict[str, Any], name: str) -> list[Picture]:
             (7.2, 3.4),
         ),
         Picture(
-            f"figure_9{suffix}", f"Figure 9: RMSE3, local and fused ({which})",
+            f"figure_9{suffix}",
+            f"Figure 9: RMSE3, local and fused ({which})",
             "Root mean squared error of the bias over all runs"
             f"{', with 95 % bands' if name == 'alone' else '; the band is the 95 % of the fused'}.",
-            partial(
-                figures.curves, panels=[("RMSE3 (of b)", lines("rmse", 2))],
-                from_zero=True,
-            ),
+            partial(figures.curves, panels=[("RMSE3 (of b)", lines("rmse", 2))], from_zero=True),
             (7.2, 3.4),
         ),
-    ]  # fmt: skip
+    ]

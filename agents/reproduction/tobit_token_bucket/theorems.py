@@ -168,6 +168,4 @@ def _resilient(found: dict[str, Any]) -> Claim:
     )
 
 
-THEOREMS = Piece(
-    "theorems", "Theorems and failures of sensors", compute, show, 25.0, 2000
-)  # fmt: skip
+THEOREMS = Piece("theorems", "Theorems and failures of sensors", compute, show, 25.0, 2000)

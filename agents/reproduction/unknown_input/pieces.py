@@ -15,20 +15,9 @@ PAPER = Paper(
     ),
     pieces=(
         Piece(
-            name="filters",
-            title="The printed example beside two carts",
-            compute=filters.compute,
-            show=claims.show,
-            weight=20.0,
-            usual=1000,
+            "filters", "The printed example beside two carts",
+            filters.compute, claims.show, 20.0, 1000,
         ),
-        Piece(
-            name="printed",
-            title="The printed recursion itself",
-            compute=printed.compute,
-            show=readings.show,
-            weight=60.0,
-            usual=500,
-        ),
+        Piece("printed", "The printed recursion itself", printed.compute, readings.show, 60.0, 500),
     ),
-)
+)  # fmt: skip
