@@ -19,7 +19,6 @@ import statistics
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -129,10 +128,7 @@ def teach(studies: Sequence[Study], seeds: int, team: Team) -> None:
         taken = statistics.fmean(one["curve"][-1]["cpu_seconds"] for one in trained)
         budget = study.learning.plain.budget * taken
         count = min(seeds, study.learning.plain.seeds)
-        plain += [
-            replace(lesson, budget=budget)
-            for lesson in (Lesson(study, "plain", seed) for seed in range(count))
-        ]
+        plain += [Lesson(study, "plain", seed, budget) for seed in range(count)]
     _side_by_side(plain, seeds, team, "plain")
 
 

@@ -6,8 +6,7 @@ blue, agents orange, lighter without memory; what stands still is grey or black.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 
@@ -41,8 +40,7 @@ LARGE: Any = {
 }  # at half width still read
 
 
-@dataclass(frozen=True)
-class Style:
+class Style(NamedTuple):
     """How one kind of policy is drawn; legends list them by ``order``."""
 
     label: str

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from .papers import NAMES
 from .shown import Claim, Number, Picture, Shown, Table
 
 OVERVIEW = "README.md"
-_TEXTS = Path(__file__).parent
+TEXTS = Path(__file__).parent
 
 
 def write_page(
@@ -31,7 +30,7 @@ def write_page(
     for shown in found.values():
         for picture in shown.pictures:
             _draw(picture, output / one.name)
-    introduction = (_TEXTS / one.name / "introduction.md").read_text(encoding="utf-8")
+    introduction = (TEXTS / one.name / "introduction.md").read_text(encoding="utf-8")
     lines = [f"# {one.title}", "", one.citation, "", introduction.strip(), ""]
     claims = [claim for shown in found.values() for claim in shown.claims]
     lines += ["## Claims", "", *_claims(claims), ""]
@@ -56,7 +55,7 @@ def write_page(
 
 def write_overview(output: Path) -> None:
     """The page over all papers whose numbers are there."""
-    lines = [(_TEXTS / "overview.md").read_text(encoding="utf-8")]
+    lines = [(TEXTS / "overview.md").read_text(encoding="utf-8")]
     for name in NAMES:
         path = output / f"{name}.json"
         if not path.exists():
@@ -170,10 +169,10 @@ def _numbers(
             {
                 "piece": name,
                 "name": table.name,
-                "numbers": [asdict(n) | {"verdict": n.verdict} for n in table.numbers],
+                "numbers": [n._asdict() | {"verdict": n.verdict} for n in table.numbers],
             }
             for name, shown in found.items()
             for table in shown.tables
         ],
-        "claims": [asdict(claim) for shown in found.values() for claim in shown.claims],
+        "claims": [claim._asdict() for shown in found.values() for claim in shown.claims],
     }

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from .shown import Shown
 
@@ -12,8 +11,7 @@ from .shown import Shown
 Compute = Callable[[int, int], dict[str, Any]]
 
 
-@dataclass(frozen=True)
-class Piece:
+class Piece(NamedTuple):
     """A part of a simulation section: its runs, kept in the work folder, and what they show.
 
     ``compute(episodes, seed)`` returns numbers, texts, lists and arrays by name; ``show`` takes
@@ -30,8 +28,7 @@ class Piece:
     usual: int = 1000
 
 
-@dataclass(frozen=True)
-class Paper:
+class Paper(NamedTuple):
     """A paper: ``name`` is that of its page and its package, which has its ``introduction.md``."""
 
     name: str

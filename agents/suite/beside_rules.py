@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -141,8 +141,7 @@ def measure(test: Test, work: Path) -> None:
     run_test(test, work)
 
 
-@dataclass(frozen=True)
-class Trials:
+class Trials(NamedTuple):
     """What is run on the test episodes: an agent at its prices, and the rules of its classes."""
 
     ground: Ground

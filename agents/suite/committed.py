@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pydantic
 from pydantic import FiniteFloat
@@ -121,8 +120,7 @@ def present(suite: Suite, setting: Setting, results: Path) -> dict[str, Any]:
     return found["classes"]
 
 
-@dataclass(frozen=True)
-class Shelf:
+class Shelf(NamedTuple):
     """Where the envelopes are that agents are compared with, and the suite that made them."""
 
     suite: Suite

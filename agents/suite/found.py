@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fusion_gym.evaluation.envelope import EnvelopePoint, height
 from fusion_gym.validation import ConfigurationError
@@ -18,8 +17,7 @@ from .reports import VERDICT, Agent, Baselines, Tested, Verdict, read
 Points = list[tuple[float, float]]  # rate and error
 
 
-@dataclass(frozen=True)
-class Found:
+class Found(NamedTuple):
     """A setting's results.
 
     ``seeds[class]`` has a training seed's points, by price; ``ahead`` are the coordinator's

@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fusion_gym.core.task import Task
 from fusion_gym.validation import ConfigurationError
@@ -23,8 +22,7 @@ from .envelopes import Test, task_of
 VALIDATIONS = 2  # of a training
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """One piece of work; ``weight`` is about how long it takes, in seconds on one core.
 
     ``envelopes`` are the classes of committed envelopes that it depends on, with their hashes.
@@ -48,8 +46,7 @@ class Job:
         return f"{self.setting.name}/{self.name}"
 
 
-@dataclass(frozen=True)
-class Folders:
+class Folders(NamedTuple):
     """``results`` holds JSON for readers, ``work`` models and episodes."""
 
     results: Path

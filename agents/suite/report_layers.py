@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -53,9 +52,8 @@ def panels_of(found: Found) -> tuple[Panel, list[Panel]]:
     series = list(_series(found, coordinator, found.ahead))
     if found.rollout:
         points = [(point.rate, point.mse) for point in found.rollout]
-        style = replace(
-            ROLLOUT, label=f"improved by simulation\n({found.rollout_episodes} episodes)"
-        )
+        label = f"improved by simulation\n({found.rollout_episodes} episodes)"
+        style = ROLLOUT._replace(label=label)
         series.append(Series(style, [], points))
     genie = found.baselines.get("genie")
     level = ("everything arrives", float(genie["mse"]["mean"])) if genie and not bound else None
@@ -172,7 +170,7 @@ def _differences(found: Found, names: Sequence[str]) -> Iterator[Differences]:
 
 def _reference_style(found: Found, reference: Sequence[EnvelopePoint]) -> Style:
     style = SCHEDULES if reference is found.known else REFERENCE
-    return replace(style, label=reference_label(found, reference))
+    return style._replace(label=reference_label(found, reference))
 
 
 def reference_label(found: Found, reference: Sequence[EnvelopePoint]) -> str:

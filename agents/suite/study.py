@@ -6,7 +6,7 @@ import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -220,8 +220,7 @@ class Study:
                 )
 
 
-@dataclass(frozen=True)
-class Lesson:
+class Lesson(NamedTuple):
     """The training of one seed in a study; ``budget`` in processor seconds ends a plain one."""
 
     study: Study

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +22,7 @@ STEPS = 100
 TRIGGER = "adaptive_threshold"
 
 
-@dataclass(frozen=True)
-class Record:
+class Record(NamedTuple):
     """E episodes of H sampling instants, times first, episodes last.
 
     ``truth`` (H, s, E) of [x(k); d(k - 1)] · ``local`` (H, l, s, E) the nodes' estimates, ``fused``
@@ -64,7 +62,7 @@ def record(task: Task, policy: str, episodes: int, seed: int) -> Record:
     chosen = fusion_gym.make_policy(policy, task)
     batch = EpisodeBatch.seeded(task, episodes, seed)
     chosen.reset(episodes, seed)
-    rows: dict[str, list[NDArray[Any]]] = {name: [] for name in Record.__dataclass_fields__}
+    rows: dict[str, list[NDArray[Any]]] = {name: [] for name in Record._fields}
     for _ in range(task.horizon):
         apart = batch.state.measurement - batch.state.held
         outcome = batch.step(chosen(batch.signals()))
