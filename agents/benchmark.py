@@ -28,12 +28,11 @@ from .suite.agreement import agreement
 from .suite.beside_rules import SHIPPED
 from .suite.classes import names_of, trained
 from .suite.committed import FOLDER, Shelf, complete
-from .suite.conclude import conclude
 from .suite.config import Setting, Suite, load_suite
 from .suite.envelopes import run_test, task_of
 from .suite.jobs import Folders, finished, jobs, rules_of
 from .suite.team import BackendName, Team
-from .suite.work import run
+from .suite.work import conclude, run
 from .suite.workers import Work, side_by_side
 from .training.checked import parse
 

@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 INK = "#30343b"
 GREY = "#c9ccd1"
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
+BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
 AGENT = VERMILLION
 
 plt.rcParams.update(

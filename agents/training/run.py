@@ -28,8 +28,7 @@ from .checkpoint import Journal, read_journal, restore
 from .config import Experiment
 from .constraint import TargetRate, score
 from .diagnosis import Traffic
-from .mismatch import warn_of_cross_term
-from .models import make_env, make_model
+from .models import make_env, make_model, warn_of_cross_term
 from .monitor import Interrupt, Measure, Progress, Stop
 
 # Training seeds lie far from the validation's and from the small numbers that tests use.
