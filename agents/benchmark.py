@@ -10,8 +10,6 @@ what is there, if it was made from the same inputs, and goes on with trainings i
 whose checkpoints hold pickles. ``fusion-gym report`` makes tables and figures of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

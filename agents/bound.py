@@ -7,8 +7,6 @@ Rates are transmissions a sensor and step; ``docs/bounds.md`` has the proof and 
 not apply. There only what is left where everything is delivered is printed.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How every command reads its options, reports an error and ends."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import itertools

@@ -9,8 +9,6 @@ it; and it draws the agents over the rules. What is finished in the output folde
 and an interrupted training is gone on with.
 """
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Iterable, Mapping

@@ -7,8 +7,6 @@ Every policy runs on the same seeds, so that the same noise meets every policy. 
 written after each policy; with ``--resume`` the policies that it already holds are not run again.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from itertools import chain

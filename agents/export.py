@@ -6,8 +6,6 @@ The file has everything from the observation to the request, and says what the o
 checked against the agent on 10,000 observations of whole episodes, and not kept if it differs.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

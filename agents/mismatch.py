@@ -8,8 +8,6 @@ cross term, with x* the estimate that takes in every measurement. ``training.err
 right where the cross term is zero under every policy; ``docs/learning.md`` has the rest.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path

@@ -6,8 +6,6 @@ Reads the JSON in the results folder and writes ``README.md``, figures of all se
 of each, and ``report.html`` with the figures inside. What the JSON says is text there, no markup.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -9,8 +9,6 @@ they were tuned and trained, on the same test episodes. Every piece of work writ
 the table. With ``--trained`` agents are trained besides over draws of the perturbations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -6,8 +6,6 @@ Trainings go into ``runs/solved``; a finished one is not repeated, an interrupte
 with. Costs are compared on the same test seeds, paired.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

@@ -5,8 +5,6 @@
 Every row runs on the same seeds. ``--markdown`` prints the table as the documentation holds it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -16,8 +16,6 @@ A checkpoint holds pickles and is loaded by Stable-Baselines3's own loader: resu
 own alone, for a foreign folder runs whatever code is in it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path

@@ -7,8 +7,6 @@ Both meet the same noise, side by side and with the same axes: states and fused 
 claimed deviations, requests with their answers, tokens.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

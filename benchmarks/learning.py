@@ -11,8 +11,6 @@ table at the end. Trainings lie in the work folder, and their checkpoints hold p
 those of your own alone.
 """
 
-from __future__ import annotations
-
 import argparse
 import shlex
 import statistics

@@ -10,8 +10,6 @@ episodes under the same budget, with a floor that no policy undercuts: every sou
 at the price of a token that the budget has (weak duality).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

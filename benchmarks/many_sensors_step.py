@@ -8,8 +8,6 @@ are drawn at random, sensors and states are apart; on RemoteEstimation-v0 every 
 of its own. Writes ``step.json`` and a figure beside it.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

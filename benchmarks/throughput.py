@@ -8,8 +8,6 @@ DummyVecEnv, and in a second table what memory costs. The absolute figures belon
 the ratios to the code.
 """
 
-from __future__ import annotations
-
 import argparse
 import statistics
 import time

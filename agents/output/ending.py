@@ -1,7 +1,5 @@
 """How every command ends: with one line for what is no bug, and an exit status."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import io

@@ -1,7 +1,5 @@
 """Figures: the Pareto front, and one episode in the manner of the token-bucket paper."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple

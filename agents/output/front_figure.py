@@ -1,7 +1,5 @@
 """The figure of one learned front over the rules of its classes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Text of the reports: Markdown in which no mark is there by chance, and one HTML page."""
 
-from __future__ import annotations
-
 import base64
 import html
 import re

@@ -1,7 +1,5 @@
 """The figure of the overview: what knowing and learning are worth, a row a setting."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ From the palette of M. Okabe and K. Ito, which people who are colour-blind tell 
 blue, agents orange, lighter without memory; what stands still is grey or black.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import matplotlib

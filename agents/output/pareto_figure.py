@@ -1,7 +1,5 @@
 """The figure of a setting: errors against rates, a panel for each who decides by what they know."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Iterator, Sequence

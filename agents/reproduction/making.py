@@ -1,7 +1,5 @@
 """Pieces of a reproduction: simulated once, kept in the work folder, shown again from there."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from pathlib import Path

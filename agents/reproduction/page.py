@@ -1,7 +1,5 @@
 """The pages of a reproduction: one a paper, with its figures and numbers, and one over all."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A paper as pieces of work: what is simulated, and what is shown of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 

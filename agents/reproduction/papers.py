@@ -1,7 +1,5 @@
 """The papers that can be reproduced, by name."""
 
-from __future__ import annotations
-
 import importlib
 
 from fusion_gym.validation import ConfigurationError, choice

@@ -1,7 +1,5 @@
 """The quick benchmark's verdicts beside those of the full one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

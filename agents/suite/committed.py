@@ -1,7 +1,5 @@
 """The file of a setting's envelopes: made piece by piece, read with its hashes checked."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple

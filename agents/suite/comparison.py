@@ -1,7 +1,5 @@
 """One policy against the lower envelope of swept baselines: tables, files and a figure."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

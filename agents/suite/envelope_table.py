@@ -1,7 +1,5 @@
 """The table of the committed envelopes: what the strongest rules do, before agents exist."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

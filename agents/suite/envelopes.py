@@ -4,8 +4,6 @@ What is tuned and what is tested lies in the work folder under names that hold a
 it was made from; ``envelopes/SETTING.json`` in the results folder holds the classes.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence

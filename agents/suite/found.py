@@ -1,7 +1,5 @@
 """What the results folder holds of a setting, read and checked before anything is made of it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tables of how fast agents learn, for the terminal and in Markdown."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any

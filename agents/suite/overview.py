@@ -1,7 +1,5 @@
 """What knowing and learning are worth, setting by setting: the rows of the overview."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """What the figure of a setting shows: its panels, made of the results."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any

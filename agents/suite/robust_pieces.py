@@ -3,8 +3,6 @@
 All that is taken from the benchmark's own work is taken here: its tasks, trainings and envelopes.
 """
 
-from __future__ import annotations
-
 import glob
 import hashlib
 from collections.abc import Mapping, Sequence

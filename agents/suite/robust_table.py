@@ -1,7 +1,5 @@
 """What perturbed cases leave of the rules and of the agents' gain, judged and as a table."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

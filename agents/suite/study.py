@@ -1,7 +1,5 @@
 """What is trained in a setting, what it is compared with, and where all of that is."""
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Trainings side by side: a process and a bar of progress each, one interrupt for all."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import multiprocessing

@@ -1,7 +1,5 @@
 """Rules at full strength: Optuna searches their parameters, price by price, seed by seed."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple

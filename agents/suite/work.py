@@ -1,7 +1,5 @@
 """The benchmark's work: the envelopes' rules, references, hindsight, and one training each."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What the callbacks of a training have in common."""
 
-from __future__ import annotations
-
 from stable_baselines3.common.callbacks import BaseCallback
 
 from fusion_gym.envs.sb3 import FusionSB3VecEnv

@@ -1,7 +1,5 @@
 """Training to a given average rate: a Lagrange multiplier on the tokens spent."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

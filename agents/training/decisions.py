@@ -1,7 +1,5 @@
 """What could have been decided instead, as a learner needs it: probabilities, requests, values."""
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 import numpy as np

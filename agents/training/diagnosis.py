@@ -4,8 +4,6 @@
 it does not.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

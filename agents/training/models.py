@@ -1,7 +1,5 @@
 """New models of a config's algorithm, and with which policy they begin."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One training from config to summary; it can be ended at any moment and gone on with."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Callable

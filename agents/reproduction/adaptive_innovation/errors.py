@@ -1,7 +1,5 @@
 """Errors, actual and conservative covariances of both sequential fusions, under every setting."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Figures 4 to 9 of the adaptive innovation paper."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the errors and covariances of both fusions say about the paper's claims."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

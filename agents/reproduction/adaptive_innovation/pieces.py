@@ -1,7 +1,5 @@
 """Robust sequential fusion under the adaptive innovation trigger: Figures 3 to 9 and the rates."""
 
-from __future__ import annotations
-
 from ..paper import Paper, Piece
 from . import errors, fusion, rates
 

@@ -1,7 +1,5 @@
 """The adaptive innovation trigger: thresholds, communication rates, and readings of its text."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

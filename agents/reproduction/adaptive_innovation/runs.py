@@ -1,7 +1,5 @@
 """Runs of the tracking example side by side: several policies and noise scales on one noise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """What the Markov jump paper's trigger sends and what the covariances become: Figures 2 and 5."""
 
-from __future__ import annotations
-
 from functools import partial
 from itertools import pairwise
 from typing import Any

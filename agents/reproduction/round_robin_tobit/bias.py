@@ -1,7 +1,5 @@
 """Figures 2 to 6, 10 and 11 of round_robin_tobit: the bias in the filter, or ignored by it."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Figures 7 to 9 of round_robin_tobit: local filters and the fused one."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

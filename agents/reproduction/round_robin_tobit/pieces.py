@@ -1,7 +1,5 @@
 """The simulation section of round_robin_tobit: Figures 2 to 11, Tables II and III, the claims."""
 
-from __future__ import annotations
-
 from ..paper import Paper, Piece
 from . import bias, claims, nodes, tables, theory
 

@@ -1,7 +1,5 @@
 """Tables II and III of round_robin_tobit: censoring intervals and noise variances."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What Lemma 1, the theorems and the remarks of round_robin_tobit are judged by."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

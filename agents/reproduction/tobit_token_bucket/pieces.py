@@ -4,8 +4,6 @@ Source: tobit_token_bucket, X. Chen, F. Han, Y. Song and J. Zhang, Complex Engin
 2024.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Episodes of the token-bucket paper with everything that its figures show."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 

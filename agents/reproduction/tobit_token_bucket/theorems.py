@@ -1,7 +1,5 @@
 """The theorems of the token-bucket paper, and its claim of resilience."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

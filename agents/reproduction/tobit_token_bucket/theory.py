@@ -1,7 +1,5 @@
 """What the theorems of the token-bucket paper say, computed on recorded episodes."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

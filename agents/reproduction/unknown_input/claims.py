@@ -1,7 +1,5 @@
 """What both unknown-input examples say about the paper's claims."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from fusion_gym.arrays import Array

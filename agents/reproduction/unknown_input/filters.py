@@ -1,7 +1,5 @@
 """Both examples under the paper's filter and trigger, and other filters beside it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Joint input and state filters under an adaptive threshold: Figures 1 to 7 and the theorems."""
 
-from __future__ import annotations
-
 from ..paper import Paper, Piece
 from . import claims, filters, printed, readings
 

@@ -1,7 +1,5 @@
 """The paper's recursion (17)-(20) exactly as its text has it, on what the trigger delivered."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Runs of the unknown-input examples with all that the figures and claims need."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
