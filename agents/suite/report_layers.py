@@ -8,17 +8,7 @@ import numpy as np
 
 from fusion_gym.evaluation.envelope import EnvelopePoint, height, lower_hull
 
-from ..output import pareto_figure
-from ..output.palette import (
-    AGENTS,
-    AGENTS_MEMORY,
-    REFERENCE,
-    ROLLOUT,
-    RULES,
-    RULES_MEMORY,
-    SCHEDULES,
-    Style,
-)
+from ..output import palette, pareto_figure
 from ..output.pareto_figure import Differences, Limits, Panel, Series
 from .envelope_table import at_least
 from .found import Found
@@ -51,7 +41,7 @@ def panels_of(found: Found) -> tuple[Panel, list[Panel]]:
     if found.rollout:
         points = [(point.rate, point.mse) for point in found.rollout]
         label = f"improved by simulation\n({found.rollout_episodes} episodes)"
-        style = ROLLOUT._replace(label=label)
+        style = palette.ROLLOUT._replace(label=label)
         series.append(Series(style, [], points))
     genie = found.baselines.get("genie")
     level = ("everything arrives", float(genie["mse"]["mean"])) if genie and not bound else None
@@ -136,7 +126,7 @@ def _series(
     contents = shown(found)
     for name in sorted(names, key=lambda name: contents[name]["memory"]):
         hull, memory = found.hull(name), contents[name]["memory"]
-        style = RULES_MEMORY if memory else RULES
+        style = palette.RULES_MEMORY if memory else palette.RULES
         yield Series(style, list(_along(hull, _fine(found))), [(p.rate, p.mse) for p in hull])
     if reference:
         hull = lower_hull(reference)
@@ -147,7 +137,7 @@ def _series(
         )
     for name in sorted(names, key=lambda name: contents[name]["memory"]):
         if name in found.classes:
-            style = AGENTS_MEMORY if contents[name]["memory"] else AGENTS
+            style = palette.AGENTS_MEMORY if contents[name]["memory"] else palette.AGENTS
             points = found.classes[name]["points"]
             marks = [(point["rate"], point["mse"]) for point in points]
             yield Series(style, marks, marks, list(_band(found, name, marks)))
@@ -163,11 +153,13 @@ def _differences(found: Found, names: Sequence[str]) -> Iterator[Differences]:
                 for point in content["points"]
                 if "difference" in point
             ]
-            yield Differences(AGENTS_MEMORY if content["memory"] else AGENTS, sorted(points))
+            yield Differences(
+                palette.AGENTS_MEMORY if content["memory"] else palette.AGENTS, sorted(points)
+            )
 
 
-def _reference_style(found: Found, reference: Sequence[EnvelopePoint]) -> Style:
-    style = SCHEDULES if reference is found.known else REFERENCE
+def _reference_style(found: Found, reference: Sequence[EnvelopePoint]) -> palette.Style:
+    style = palette.SCHEDULES if reference is found.known else palette.REFERENCE
     return style._replace(label=reference_label(found, reference))
 
 
