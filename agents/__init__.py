@@ -1,7 +1,5 @@
 """The commands: train, evaluate, compare, tune, benchmark and more."""
 
-from __future__ import annotations
-
 
 def missing_extra(error: BaseException) -> str | None:
     """The line that says what to install, if the error is that a package is missing."""

@@ -1,7 +1,5 @@
 """All commands under one name: ``fusion-gym COMMAND``."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import sys

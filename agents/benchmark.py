@@ -10,8 +10,6 @@ what is there, if it was made from the same inputs, and goes on with trainings i
 whose checkpoints hold pickles. ``fusion-gym report`` makes tables and figures of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,12 +26,11 @@ from .suite.agreement import agreement
 from .suite.beside_rules import SHIPPED
 from .suite.classes import names_of, trained
 from .suite.committed import FOLDER, Shelf, complete
-from .suite.conclude import conclude
 from .suite.config import Setting, Suite, load_suite
-from .suite.envelopes import run_test
-from .suite.jobs import Folders, finished, jobs, rules_of, setting_task
+from .suite.envelopes import run_test, task_of
+from .suite.jobs import Folders, finished, jobs, rules_of
 from .suite.team import BackendName, Team
-from .suite.work import run
+from .suite.work import conclude, run
 from .suite.workers import Work, side_by_side
 from .training.checked import parse
 
@@ -99,7 +96,7 @@ class Benchmark(Long):
             choice("classes", name, names_of(suite))
         classes = self.classes or names_of(suite)
         for setting in chosen:
-            setting_task(setting)
+            task_of(setting)
         with folders.alone():
             self._check_resumed(folders, chosen)
             writing(("finished pieces", folders.results), ("trainings and episodes", folders.work))

@@ -7,15 +7,11 @@ Rates are transmissions a sensor and step; ``docs/bounds.md`` has the proof and 
 not apply. There only what is left where everything is delivered is printed.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
-from rich import box
 from rich.table import Table
 
 from fusion_gym.core.task import Task
@@ -25,7 +21,7 @@ from fusion_gym.policies.settings import parse_settings
 from fusion_gym.solvers.silence import SilenceBound, silence_bound, silence_model
 from fusion_gym.validation import choice
 
-from .command_line import Long, Words, start
+from .command_line import Long, SetOptions, start
 from .input.options import Between, Episodes, OutputFile, Seed, Whole
 from .output import tables
 from .output.files import write
@@ -40,9 +36,7 @@ class Bound(Long):
 
     env: str
     """Id of a registered environment."""
-    options: Annotated[
-        Words, tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE …")
-    ] = ()
+    options: SetOptions = ()
     """Options of gym.make for the environment."""
     rates: Annotated[tuple[float, ...], Between(0.0, 1.0)] = ()
     """Transmissions a sensor and step; without any, only what is left with everything delivered."""
@@ -125,25 +119,21 @@ def _reward_weights(task: Task) -> Any:
 
 
 def _floors(report: dict[str, Any]) -> Table:
-    table = Table(title=f"{report['env']}: floors", box=box.SIMPLE_HEAD)
-    table.add_column("everything delivered")
-    table.add_column("MSE, every state with 1", justify="right")
-    for name, found in report["everything_delivered"].items():
-        table.add_row(f"filter {name}", tables.number(found))
+    delivered = report["everything_delivered"].items()
+    rows = [(f"filter {name}", tables.number(found)) for name, found in delivered]
     if "floor" in report:
-        table.add_row("uncensored, Kalman filter: unavoidable", f"{report['floor']:.4g}")
-    return table
+        rows.append(("uncensored, Kalman filter: unavoidable", f"{report['floor']:.4g}"))
+    heads = ("everything delivered", "MSE, every state with 1")
+    return tables.table(f"{report['env']}: floors", heads, rows)
 
 
 def _table(report: dict[str, Any]) -> Table:
-    table = Table(title="no policy has less", box=box.SIMPLE_HEAD)
-    for column in ("rate", "error at least", "price of a packet", "gap at this price"):
-        table.add_column(column, justify="right")
-    for row in report["bounds"]:
-        table.add_row(
-            f"{row['rate']:.4g}", f"{row['bound']:.5g}", f"{row['price']:.3g}", f"{row['gap']:.2%}"
-        )
-    return table
+    rows = [
+        (f"{row['rate']:.4g}", f"{row['bound']:.5g}", f"{row['price']:.3g}", f"{row['gap']:.2%}")
+        for row in report["bounds"]
+    ]
+    heads = ("rate", "error at least", "price of a packet", "gap at this price")
+    return tables.table("no policy has less", heads, rows)
 
 
 def main() -> None:

@@ -1,7 +1,5 @@
 """How every command reads its options, reports an error and ends."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import itertools
@@ -11,7 +9,7 @@ import shlex
 import sys
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, fields
-from typing import ClassVar, TypeVar
+from typing import Annotated, ClassVar, TypeVar
 
 import tyro
 
@@ -22,6 +20,12 @@ from .output.ending import flush, told
 from .output.progress import quietly
 
 Words = tuple[tuple[str, ...], ...]  # of an option that may be given several times
+SetOptions = Annotated[
+    Words, tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE …")
+]
+PolicyNames = Annotated[
+    Words, tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME[:key=value,…] …")
+]
 _Kind = TypeVar("_Kind", bound="Command")
 
 

@@ -9,8 +9,6 @@ front. All policies run on the same seeds. Into the output folder go ``evaluatio
 policy), ``comparison.json`` (the verdict) and ``pareto.png``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

@@ -9,14 +9,12 @@ it; and it draws the agents over the rules. What is finished in the output folde
 and an interrupted training is gone on with.
 """
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from rich import box
@@ -48,8 +46,7 @@ SETTING = "tobit_oscillator"
 TEAM = Team(2)
 
 
-@dataclass(frozen=True)
-class Learner:
+class Learner(NamedTuple):
     """Who learns: the config that trains it, its title, and the classes of rules beside it.
 
     ``plain`` rules know what the agent does but what it remembers, ``remembering`` ones exactly as

@@ -9,8 +9,6 @@ with a SHA-256 of its content, which ``fusion-gym benchmark`` keeps with every a
 interrupted run goes on where it was.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

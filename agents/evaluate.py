@@ -7,15 +7,11 @@ Every policy runs on the same seeds, so that the same noise meets every policy. 
 written after each policy; with ``--resume`` the policies that it already holds are not run again.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
-
-import tyro
 
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
@@ -23,7 +19,7 @@ from fusion_gym.evaluation.metrics import paired_difference, robust_summary, sum
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Long, Words, start
+from .command_line import Long, PolicyNames, SetOptions, start
 from .input.environment import environment_of
 from .input.files import checked
 from .input.options import Episodes, OutputFile, Seed
@@ -37,17 +33,13 @@ from .suite.reports import Evaluation
 class Evaluate(Long):
     """Evaluate policies on paired episodes."""
 
-    policies: Annotated[
-        Words, tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME[:key=value,…] …")
-    ]
+    policies: PolicyNames
     """Rules and references by name, zoo:NAME, or model:PATH."""
     env: str | None = None
     """Id of a registered environment."""
     config: str | None = None
     """Take environment and options from a training's YAML, or from a shipped config by its name."""
-    options: Annotated[
-        Words, tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE …")
-    ] = ()
+    options: SetOptions = ()
     """Options of gym.make for the environment; they go before the config's."""
     episodes: Episodes = 1000
     """Episodes of each policy."""

@@ -6,8 +6,6 @@ The file has everything from the observation to the request, and says what the o
 checked against the agent on 10,000 observations of whole episodes, and not kept if it differs.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,7 +18,7 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Command, Words, start
+from .command_line import Command, SetOptions, start
 from .input.environment import environment_of
 from .input.options import OutputFile
 from .output.files import replacing
@@ -40,9 +38,7 @@ class Export(Command):
     """Id of a registered environment, instead of the one that the agent was trained in."""
     config: str | None = None
     """Take environment and options from a training's YAML, or from a shipped config by its name."""
-    options: Annotated[
-        Words, tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE …")
-    ] = ()
+    options: SetOptions = ()
     """Options of gym.make for the environment; they go before all others."""
     trust: bool = False
     """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""

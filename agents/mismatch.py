@@ -8,15 +8,11 @@ cross term, with x* the estimate that takes in every measurement. ``training.err
 right where the cross term is zero under every policy; ``docs/learning.md`` has the rest.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
-from rich import box
 from rich.table import Table
 
 from fusion_gym.envs.privileged import reference_system
@@ -24,7 +20,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.cross_term import CrossTerm, cross_terms, usual_policies, worst
 from fusion_gym.policies.registry import make_policy
 
-from .command_line import Long, Words, start
+from .command_line import Long, PolicyNames, SetOptions, start
 from .input.environment import environment_of
 from .input.options import OutputFile, Seed, Whole
 from .output import tables
@@ -40,15 +36,11 @@ class Mismatch(Long):
     """Id of a registered environment."""
     config: str | None = None
     """Take environment, options and filter from a training's YAML, or from a shipped config."""
-    options: Annotated[
-        Words, tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE …")
-    ] = ()
+    options: SetOptions = ()
     """Options of gym.make for the environment; they go before the config's."""
     filter: str | None = None
     """Filter that takes in every measurement; by default the config's, or that of a memory."""
-    policies: Annotated[
-        Words, tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME[:key=value,…] …")
-    ] = ()
+    policies: PolicyNames = ()
     """Policies to measure it under; by default random ones, always, and one on the value."""
     episodes: Annotated[int, Whole(2, 100_000_000)] = 500
     """Episodes of each policy."""
@@ -100,19 +92,18 @@ def summary(found: CrossTerm) -> dict[str, Any]:
 
 
 def _table(title: str, found: dict[str, CrossTerm]) -> Table:
-    table = Table(title=title, box=box.SIMPLE_HEAD, caption=_CAPTION)
-    table.add_column("policy", overflow="fold")
-    for column in ("rate", "error", "floor", "mismatch", "cross term", "may be zero"):
-        table.add_column(column, justify="right", no_wrap=True)
-    for name, part in found.items():
-        table.add_row(
+    rows = [
+        (
             name,
             f"{part.rate:.3f}",
             *(f"{value:.4g}" for value in (part.error, part.floor, part.mismatch)),
             part.shown,
             "yes" if part.compatible else "no",
         )
-    return table
+        for name, part in found.items()
+    ]
+    heads = ("policy", "rate", "error", "floor", "mismatch", "cross term", "may be zero")
+    return tables.table(title, heads, rows, _CAPTION)
 
 
 def _verdict(found: dict[str, CrossTerm]) -> str:

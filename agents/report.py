@@ -6,24 +6,24 @@ Reads the JSON in the results folder and writes ``README.md``, figures of all se
 of each, and ``report.html`` with the figures inside. What the JSON says is text there, no markup.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 from urllib.parse import quote
 
 from .command_line import Command, start
 from .input.files import read_text
 from .input.options import OutputFolder
 from .output.files import write_text
-from .output.markup import code, page_of, plain, table
+from .output.markup import code, page_of, plain, ranged, table
 from .suite import overview, report_layers
+from .suite.committed import FOLDER
 from .suite.found import Found, read_results
-from .suite.report_intro import how_to_read
 from .suite.report_pages import documented
 from .suite.report_tables import classes_table, rates_table, worth_table
 from .suite.report_words import caption, sentences
+from .suite.verdict import RATES
 
 TITLE = "Results of the benchmark"
 
@@ -72,23 +72,40 @@ def text_of(found: dict[str, Found], command: str, second: str = "fusion-gym rep
     return "\n".join(lines)
 
 
+def how_to_read(found: dict[str, Found]) -> list[str]:
+    """The report's first section."""
+    first = next(iter(found.values())).baselines
+    last = first["seed"] + first["episodes"] - 1
+    agents = [front["seeds"] for one in found.values() for front in one.classes.values()]
+    tuned = [one.envelopes["inputs"]["tuning"] for one in found.values() if one.envelopes]
+    validated = [one.validation for one in found.values() if one.validation]
+    seeds = [f"Test: {first['seed']:,} to {last:,}, the same noise for all."]
+    if tuned:
+        seeds.append(
+            f"Tuning: {_of(tuned, 'seeds')} searches of {_of(tuned, 'episodes')} episodes each, "
+            f"from {_of(tuned, 'seed')} on."
+        )
+    if validated:
+        seeds.append(
+            f"Validation, which chooses the moment of a training that is kept: "
+            f"{_of(validated, 'episodes')} episodes from {_of(validated, 'seed')} on."
+        )
+    number = f"{ranged(agents)} training seeds" if agents else "none so far"
+    seeds.append(f"Agents of a class: {number}.")
+    text = Path(overview.__file__).with_name("report_intro.md").read_text(encoding="utf-8")
+    text = text.format(folder=FOLDER, seeds=" ".join(seeds), rates=RATES)
+    return text.split("\n")
+
+
+def _of(every: Sequence[Mapping[str, Any]], key: str) -> str:
+    return ranged([one[key] for one in every])
+
+
 def overview_section(found: dict[str, Found]) -> list[str]:
     """All settings beside each other."""
+    text = Path(overview.__file__).with_suffix(".md").read_text(encoding="utf-8")
     return [
-        "## Overview",
-        "",
-        "![What knowing and learning are worth, setting by setting](overview.png)",
-        "",
-        "Each mark is a relative difference of the mean squared error at equal rate, with its 95 % "
-        "interval; left of the line at 0 is better. Four columns compare a class with one that "
-        "knows less, for its rules (circles) and its agents (triangles), with memory where there "
-        "is: a coordinator with memory and without; sensors alone that hear every packet, and that "
-        "hear what the environment tells by default; a coordinator, who sees what all measured, "
-        "and sensors alone that hear every packet; packets with the coordinator's estimate, and "
-        "with a measurement. The last column compares agents with rules that know as much.",
-        "",
-        "What knowing is worth:",
-        "",
+        *text.splitlines(),
         *overview.knowing_table(found),
         "What learning is worth, agents against the rules of the same class:",
         "",

@@ -8,8 +8,6 @@ Into the output folder go a page a paper (``PAPER.md``), its figures (PNG and SV
 folder as they are finished; ``--resume`` skips those, if they were made from the same inputs.
 """
 
-from __future__ import annotations
-
 import shlex
 import sys
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ they were tuned and trained, on the same test episodes. Every piece of work writ
 the table. With ``--trained`` agents are trained besides over draws of the perturbations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,17 +23,10 @@ from .input.options import Episodes, InputFolder, OutputFolder, Steps, Whole, wr
 from .output.ending import ended_like_by_ctrl_c
 from .output.folders import alone_in
 from .output.progress import writing
+from .suite import robust_pieces
 from .suite.classes import trained
 from .suite.committed import Shelf
 from .suite.config import Setting, Suite, load_suite
-from .suite.robust_pieces import (
-    Folders,
-    agents_of,
-    class_named,
-    envelope_of,
-    run_piece,
-    run_training,
-)
 from .suite.robust_summary import FOLDER
 from .suite.robust_table import write_table
 from .suite.robust_trial import Trial
@@ -87,7 +78,7 @@ class Robustness(Long):
 
     def _run(self) -> None:
         config = load_robustness(self.config)
-        folders = Folders(self.results, self.work)
+        folders = robust_pieces.Folders(self.results, self.work)
         trials = [self._trial(config, one, folders) for one in chosen(config, self.envs)]
         place = self.results / FOLDER
         writable_folder("results", place)
@@ -107,7 +98,7 @@ class Robustness(Long):
             trainings = [one for trial in trials for one in trial.trainings]
             if trainings:
                 work = [
-                    Work(30.0 + one.training.timesteps / 10_000, run_training, (one,))
+                    Work(30.0 + one.training.timesteps / 10_000, robust_pieces.run_training, (one,))
                     for one in trainings
                 ]
                 side_by_side(work, Team(self.workers), "trainings over draws")
@@ -128,7 +119,7 @@ class Robustness(Long):
         episodes = "" if self.episodes == Robustness.episodes else f" --episodes {self.episodes}"
         return trained + episodes
 
-    def _trial(self, config: Config, one: Perturbed, folders: Folders) -> Trial:
+    def _trial(self, config: Config, one: Perturbed, folders: robust_pieces.Folders) -> Trial:
         """A setting with its agents, everything checked."""
         suite = load_suite(config.suite)
         shelf = Shelf(suite, self.results)
@@ -136,19 +127,22 @@ class Robustness(Long):
         changed = {key: value for key, value in changed.items() if value is not None}
         suite = parse(Suite, suite.model_dump() | changed, "command line")
         setting = next(setting for setting in suite.settings if setting.name == one.setting)
-        of = class_named(setting, self.of or _usual_class(suite, setting))
-        agents = agents_of(setting, of, self.agents, self.models, USUAL)
+        of = robust_pieces.class_named(setting, self.of or _usual_class(suite, setting))
+        agents = robust_pieces.agents_of(setting, of, self.agents, self.models, USUAL)
+        envelope = robust_pieces.envelope_of(shelf, setting, of)
         return Trial.create(
-            suite, setting, one, config.cases_of(one), of, envelope_of(shelf, setting, of), agents,
+            suite, setting, one, config.cases_of(one), of, envelope, agents,
             self.trained, self.episodes, folders,
         )  # fmt: skip
 
-    def _work(self, trials: Sequence[Trial], kinds: tuple[str, ...], folders: Folders) -> None:
+    def _work(
+        self, trials: Sequence[Trial], kinds: tuple[str, ...], folders: robust_pieces.Folders
+    ) -> None:
         """Do what is not finished of some kinds."""
         pieces = [piece for trial in trials for piece in trial.pieces(kinds)]
         left = [piece for piece in pieces if not folders.finished(piece)]
         side_by_side(
-            [Work(piece.weight, run_piece, (piece, folders)) for piece in left],
+            [Work(piece.weight, robust_pieces.run_piece, (piece, folders)) for piece in left],
             Team(self.workers),
             " and ".join(kinds),
         )

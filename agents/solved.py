@@ -6,14 +6,9 @@ Trainings go into ``runs/solved``; a finished one is not repeated, an interrupte
 with. Costs are compared on the same test seeds, paired.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
-
-from rich import box
-from rich.table import Table
 
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
@@ -61,9 +56,8 @@ class Solved(Long):
                 "be compared with it"
             )
         writing(("trainings and costs", self.output))
-        table = Table(title=f"{self.config}: {self.episodes} episodes", box=box.SIMPLE_HEAD)
-        for column in ("policy", "cost of an episode", "rate", "above the optimum [95 %]"):
-            table.add_column(column, justify="left" if column == "policy" else "right")
+        heads = ("policy", "cost of an episode", "rate", "above the optimum [95 %]")
+        table = tables.table(f"{self.config}: {self.episodes} episodes", heads)
         report: dict[str, Any] = {"config": self.config, "agents": {}}
         table.add_row("optimal", f"{-best.returns.mean():.4f}", f"{best.rate.mean():.4f}", "")
         for seed in self.seeds:

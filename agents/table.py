@@ -5,13 +5,9 @@
 Every row runs on the same seeds. ``--markdown`` prints the table as the documentation holds it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from rich import box
-from rich import table as rich_table
 
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
@@ -52,14 +48,8 @@ class Table(Long):
             lines = [COLUMNS, ("---",) * len(COLUMNS), *rows]
             print("\n".join("| " + " | ".join(line) + " |" for line in lines))
             return
-        shown = rich_table.Table(
-            title=f"{self.episodes} episodes, seed {self.seed}", box=box.SIMPLE_HEAD
-        )
-        for column in COLUMNS:
-            shown.add_column(column, justify="left" if column == "setting" else "right")
-        for row in rows:
-            shown.add_row(*row)
-        tables.console().print(shown)
+        title = f"{self.episodes} episodes, seed {self.seed}"
+        tables.console().print(tables.table(title, COLUMNS, rows))
 
 
 def rows_of(

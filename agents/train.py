@@ -16,19 +16,15 @@ A checkpoint holds pickles and is loaded by Stable-Baselines3's own loader: resu
 own alone, for a foreign folder runs whatever code is in it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Long, Words, start
+from .command_line import Long, SetOptions, start
 from .input.options import Between, OutputFolder, Steps, TrainingSeed, writable_folder
 from .training.checked import load
 from .training.config import Experiment
@@ -41,9 +37,7 @@ class Train(Long):
 
     config: str
     """The experiment: a YAML file, or the name of a shipped config."""
-    options: Annotated[
-        Words, tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE …")
-    ] = ()
+    options: SetOptions = ()
     """Options of gym.make for the environment; they go before the config's."""
     timesteps: Steps = None
     """Steps of all runs together, instead of the config's."""

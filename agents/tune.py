@@ -15,8 +15,6 @@ together. What a trial tries then depends on who is first, and the trial of a pr
 is made anew.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import sqlite3

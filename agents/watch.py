@@ -7,8 +7,6 @@ Both meet the same noise, side by side and with the same axes: states and fused 
 claimed deviations, requests with their answers, tokens.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +21,7 @@ from fusion_gym.evaluation.watching import watch
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Long, Words, start
+from .command_line import Long, SetOptions, start
 from .input.environment import environment_of
 from .input.options import OutputFile, Seed, Whole
 from .output.films import checked_film, save_film
@@ -42,9 +40,7 @@ class Watch(Long):
     """Id of a registered environment."""
     config: str | None = None
     """Take environment and options from a training's YAML, or from a shipped config by its name."""
-    options: Annotated[
-        Words, tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE …")
-    ] = ()
+    options: SetOptions = ()
     """Options of gym.make for the environment; they go before the config's."""
     save: Annotated[Path | None, OutputFile()] = None
     """Write a film, .gif or .mp4, instead of showing a window."""

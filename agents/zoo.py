@@ -9,8 +9,6 @@ are there and are not chosen are removed. A model is kept as Stable-Baselines3 s
 what its optimiser remembers of gradients.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

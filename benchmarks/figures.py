@@ -13,8 +13,6 @@ the stored JSON and YAML files are used, so the same script serves both sides of
 point is compared bit by bit: both sides belong on one machine with the same packages.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import io

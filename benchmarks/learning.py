@@ -11,21 +11,17 @@ table at the end. Trainings lie in the work folder, and their checkpoints hold p
 those of your own alone.
 """
 
-from __future__ import annotations
-
 import argparse
 import shlex
-import signal
 import statistics
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from fusion_gym.agents.output import tables
-from fusion_gym.agents.output.ending import told
+from fusion_gym.agents.output.ending import ended_like_by_ctrl_c, told
 from fusion_gym.agents.output.files import read_json, write, write_text
 from fusion_gym.agents.output.folders import alone_in
 from fusion_gym.agents.output.progress import quietly, writing
@@ -60,13 +56,9 @@ def main() -> None:
     given = parser.parse_args()
     words = [word for word in sys.argv[1:] if word != "--resume"]
     again = shlex.join(["python", "-m", "benchmarks.learning", *words, "--resume"])
-    with told(lambda: f"interrupted; go on with: {again}"), quietly(given.quiet):
-        # Ended from outside like by Ctrl-C: the workers stop too.
-        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-        try:
-            run(given)
-        finally:
-            signal.signal(signal.SIGTERM, before)
+    interrupted = f"interrupted; go on with: {again}"
+    with told(lambda: interrupted), quietly(given.quiet), ended_like_by_ctrl_c():
+        run(given)
 
 
 def run(given: argparse.Namespace) -> None:
@@ -134,10 +126,7 @@ def teach(studies: Sequence[Study], seeds: int, team: Team) -> None:
         taken = statistics.fmean(one["curve"][-1]["cpu_seconds"] for one in trained)
         budget = study.learning.plain.budget * taken
         count = min(seeds, study.learning.plain.seeds)
-        plain += [
-            replace(lesson, budget=budget)
-            for lesson in (Lesson(study, "plain", seed) for seed in range(count))
-        ]
+        plain += [Lesson(study, "plain", seed, budget) for seed in range(count)]
     _side_by_side(plain, seeds, team, "plain")
 
 

@@ -10,8 +10,6 @@ episodes under the same budget, with a floor that no policy undercuts: every sou
 at the price of a token that the budget has (weak duality).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time
@@ -22,12 +20,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
+from fusion_gym.agents.output import tables
 from fusion_gym.agents.output.progress import progress_bar, quietly
 from fusion_gym.agents.training.checked import load, parse
 from fusion_gym.agents.training.config import Experiment
@@ -139,9 +137,8 @@ def exponent(sensors: Sequence[int], costs: Sequence[float]) -> float:
 
 def cost_table(sensors: Sequence[int]) -> tuple[Table, dict[str, Any]]:
     """A row a number of sensors and kind of agent, and the exponents below."""
-    table = Table(title="CPU microseconds of a training step of one run", box=box.SIMPLE_HEAD)
-    for column in ("agent", "sensors", *Cost._fields, "sum"):
-        table.add_column(column, justify="right")
+    heads = ("agent", "sensors", *Cost._fields, "sum")
+    table = tables.table("CPU microseconds of a training step of one run", heads)
     report: dict[str, Any] = {"sensors": list(sensors)}
     for local in (False, True):
         name = "local rows" if local else "coordinator, flips"
@@ -223,10 +220,8 @@ def comparison(
 
 def comparison_table(rows: Sequence[dict[str, Any]], least: float) -> Table:
     """Best first; above the floor is by how much a policy costs more."""
-    table = Table(title="forty sensors, one bucket", box=box.SIMPLE_HEAD)
-    table.add_column("policy", overflow="fold")
-    for column in ("return", "below the agent's", "above the floor", "rate", "requests", "MSE"):
-        table.add_column(column, justify="right", no_wrap=True)
+    heads = ("return", "below the agent's", "above the floor", "rate", "requests", "MSE")
+    table = tables.table("forty sensors, one bucket", ("policy", *heads))
     table.add_row("floor: no policy has more", f"{least:.2f}", "", "", "", "", "")
     for row in rows:
         mean, difference = row["return"]["mean"], row["to_agent"]

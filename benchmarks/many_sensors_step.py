@@ -8,8 +8,6 @@ are drawn at random, sensors and states are apart; on RemoteEstimation-v0 every 
 of its own. Writes ``step.json`` and a figure beside it.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time
@@ -19,10 +17,10 @@ from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from fusion_gym.agents.output import tables
 from fusion_gym.agents.output.figures import save
 from fusion_gym.agents.output.palette import BLUE, GREEN, INK, ORANGE, VERMILLION
 from fusion_gym.core.batch import EpisodeBatch
@@ -163,9 +161,8 @@ def exponents(costs: Sequence[Cost]) -> dict[str, dict[str, dict[str, float]]]:
 
 def table(costs: Sequence[Cost], fitted: dict[str, dict[str, dict[str, float]]]) -> Table:
     """A row a size, and below the exponents."""
-    result = Table(title="CPU microseconds of a step of one run", box=box.SIMPLE_HEAD)
-    for column in ("environment", "sensors", "states", *PARTS):
-        result.add_column(column, justify="right")
+    heads = ("environment", "sensors", "states", *PARTS)
+    result = tables.table("CPU microseconds of a step of one run", heads)
     rows: dict[tuple[str, int, int], list[str]] = {}
     for one in sorted(costs, key=lambda one: (one.env, one.states, one.sensors)):
         place = (one.env, one.sensors, 0 if one.env == REMOTE else one.states)

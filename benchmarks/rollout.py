@@ -8,8 +8,6 @@ the returns at that price to `OUTPUT/SETTING.json`. The base's own price is the 
 `--ratio`: a packet keeps its worth over several steps, and the rule counts one.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

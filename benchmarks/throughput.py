@@ -8,8 +8,6 @@ DummyVecEnv, and in a second table what memory costs. The absolute figures belon
 the ratios to the code.
 """
 
-from __future__ import annotations
-
 import argparse
 import statistics
 import time
@@ -19,12 +17,12 @@ from typing import Any
 import filterpy.kalman
 import gymnasium
 import numpy as np
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import fusion_gym
+from fusion_gym.agents.output import tables
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.memory import Owner
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
@@ -203,13 +201,9 @@ def main() -> None:
     figures = measured(rows, seconds)
     medians = {name: statistics.median(found) for name, found in figures.items()}
     names = list(rows)
-    table = Table(
-        title=f"steps per second, one thread, median of {TURNS} turns ({ENV} where not named)",
-        box=box.SIMPLE_HEAD,
-    )
-    table.add_column("what")
-    for column in ("steps/s", "least", "most", "to the FilterPy loop", "to DummyVecEnv"):
-        table.add_column(column, justify="right")
+    title = f"steps per second, one thread, median of {TURNS} turns ({ENV} where not named)"
+    heads = ("what", "steps/s", "least", "most", "to the FilterPy loop", "to DummyVecEnv")
+    table = tables.table(title, heads)
     for name, median in medians.items():
         found = figures[name]
         table.add_row(
@@ -237,18 +231,9 @@ def measured(rows: dict[str, Workload], seconds: float) -> dict[str, list[float]
 
 def memory_table(seconds: float) -> Table:
     """What memory costs: the core's loop with it over without, the median of a turn's ratios."""
-    ways = {
-        "shadow": "shadow alone",
-        "values": "and values",
-        "own": "every sensor's own values",
-    }
-    table = Table(
-        title=f"core's loop, 1,024 runs, requests at rate {RATE}: with memory over without",
-        box=box.SIMPLE_HEAD,
-    )
-    table.add_column("environment")
-    for column in ("steps/s without", *ways.values()):
-        table.add_column(column, justify="right")
+    ways = {"shadow": "shadow alone", "values": "and values", "own": "every sensor's own values"}
+    title = f"core's loop, 1,024 runs, requests at rate {RATE}: with memory over without"
+    table = tables.table(title, ("environment", "steps/s without", *ways.values()))
     for name, options in REMEMBERED.items():
         env_id = f"fusion_gym/{name.partition(',')[0]}-v0"
         rows = {how: remembering(env_id, options, how) for how in ("without", *ways)}

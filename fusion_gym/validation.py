@@ -13,13 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym.arrays import Array
-from fusion_gym.errors import (
-    ConfigurationError,
-    UnexpectedArgumentError,
-    nearest,
-    refusal,
-    shown,
-)
+from fusion_gym.errors import ConfigurationError, UnexpectedArgumentError, nearest, refusal, shown
 
 # Filters square what they are given and divide by it: from here to there float64 can hold that.
 SMALLEST, LARGEST = 1e-15, 1e15

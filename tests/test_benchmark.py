@@ -143,7 +143,7 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
     suite = load_suite(ROOT / "configs" / "benchmark.yaml")
     assert load_suite(ROOT / "configs" / "benchmark.yaml", quick=True).settings == suite.settings
     for setting in suite.settings:
-        task = jobs.setting_task(setting)
+        task = jobs.task_of(setting)
         optima = [name for name in setting.informed if name.startswith("optimal:")]
         for name in (*setting.points, *setting.informed, *setting.references):
             if name not in optima[1:]:

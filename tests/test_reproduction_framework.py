@@ -60,7 +60,7 @@ def a_paper(name: str, calls: Calls, drawn: bool) -> Paper:
         return show
 
     return Paper(
-        name, f"The paper {name}", f"A. Author, “{name}”, 2020.", ("an/Environment-v0",), "Words.",
+        name, f"The paper {name}", f"A. Author, “{name}”, 2020.",
         [Piece(one, f"Piece {one}", computing(one), showing(one), 1.0, USUAL) for one in PIECES],
     )  # fmt: skip
 
@@ -80,11 +80,16 @@ def drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calls:
 def put(monkeypatch: pytest.MonkeyPatch, folder: Path, drawn: bool) -> Calls:
     found: Calls = []
     for name in ("one", "two"):
-        module = types.ModuleType(f"fusion_gym.agents.reproduction.{name}")
+        texts = folder / "texts" / name
+        texts.mkdir(parents=True)
+        (texts / "introduction.md").write_text("Words.")
+        (texts.parent / "overview.md").write_text("# The papers\n")
+        module = types.ModuleType(f"fusion_gym.agents.reproduction.{name}.pieces")
         module.PAPER = a_paper(name, found, drawn)  # type: ignore[attr-defined]
         monkeypatch.setitem(sys.modules, module.__name__, module)
     for module in (papers, page):
         monkeypatch.setattr(module, "NAMES", ("one", "two"))
+    monkeypatch.setattr(page, "TEXTS", folder / "texts")
     monkeypatch.chdir(folder)
     return found
 

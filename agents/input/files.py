@@ -1,7 +1,5 @@
 """Files that a user names, and what they hold, or one line that says what is wrong."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, TypeVar
 

@@ -6,8 +6,6 @@
 ``None`` stands for an option that is not given; of a list every entry is checked.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import tempfile

@@ -1,13 +1,13 @@
 """How every command ends: with one line for what is no bug, and an exit status."""
 
-from __future__ import annotations
-
 import contextlib
+import functools
 import io
 import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from fusion_gym.validation import ConfigurationError
 
@@ -44,13 +44,17 @@ def told(interrupted: Callable[[], str] = lambda: "interrupted") -> Iterator[Non
 
 
 @contextlib.contextmanager
-def ended_like_by_ctrl_c() -> Iterator[None]:
-    """Ended from outside like by Ctrl-C, so that workers stop too."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+def on_signal(number: int, handler: Any) -> Iterator[None]:
+    """Handle a signal this way while the context is entered."""
+    before = signal.signal(number, handler)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(number, before)
+
+
+# Ended from outside like by Ctrl-C, so that workers stop too.
+ended_like_by_ctrl_c = functools.partial(on_signal, signal.SIGTERM, signal.default_int_handler)
 
 
 def flush() -> None:

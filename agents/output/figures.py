@@ -1,10 +1,8 @@
 """Figures: the Pareto front, and one episode in the manner of the token-bucket paper."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -17,8 +15,7 @@ from .files import replacing
 from .palette import AGENT, INK
 
 
-@dataclass(frozen=True)
-class Line:
+class Line(NamedTuple):
     """One curve of the Pareto figure: its label and its policies' results, in sweep order."""
 
     label: str

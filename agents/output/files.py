@@ -1,7 +1,5 @@
 """Files that are whole: each is written under another name and moved to its own at the end."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Films of frames that come one by one: GIF and MP4, by imageio."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Folders of results: one process at a time, and the inputs that a result was made from."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator, Mapping

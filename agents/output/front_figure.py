@@ -1,10 +1,8 @@
 """The figure of one learned front over the rules of its classes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -17,8 +15,7 @@ from .palette import AGENTS_MEMORY, BOUND, GREY, ROLLOUT, RULES, RULES_MEMORY
 Points = Sequence[tuple[float, float]]  # rate and error
 
 
-@dataclass(frozen=True)
-class Layers:
+class Layers(NamedTuple):
     """What is drawn, from back to front; what is empty is left out.
 
     ``single`` tuned rules, each by itself · ``plain`` and ``remembering`` rules of the committed

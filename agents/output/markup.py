@@ -1,10 +1,9 @@
 """Text of the reports: Markdown in which no mark is there by chance, and one HTML page."""
 
-from __future__ import annotations
-
 import base64
 import html
 import re
+import string
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote
@@ -65,12 +64,5 @@ def page_of(text: str, folder: Path, title: str) -> str:
         place = "/".join(quote(part) for part in path.relative_to(folder).parts)
         data = base64.b64encode(path.read_bytes()).decode()
         body = body.replace(f'src="{place}"', f'src="data:image/png;base64,{data}"')
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f"<title>{html.escape(title)}</title><style>"
-        "body{font:16px/1.5 sans-serif;max-width:72rem;margin:2rem auto;padding:0 1rem;"
-        "color:#30343b}img{max-width:100%}table{border-collapse:collapse;margin:1rem 0}"
-        "td,th{border:1px solid #ccd;padding:.2rem .6rem;text-align:right}"
-        "td:first-child,th:first-child{text-align:left}code{background:#f3f4f6}"
-        f"</style></head><body>\n{body}\n</body></html>\n"
-    )
+    text = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
+    return string.Template(text).substitute(title=html.escape(title), body=body)

@@ -1,12 +1,9 @@
 """The figure of the overview: what knowing and learning are worth, a row a setting."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import matplotlib.pyplot as plt
 import matplotlib.ticker
@@ -26,16 +23,14 @@ MARKS: dict[str, tuple[str, Literal["full", "none"]]] = {
 }
 
 
-@dataclass(frozen=True)
-class Dot:
+class Dot(NamedTuple):
     """A relative difference with its interval."""
 
     who: str
     interval: Mapping[str, float]
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """The dots of a setting, or why there are none."""
 
     dots: Sequence[Dot]

@@ -4,10 +4,7 @@ From the palette of M. Okabe and K. Ito, which people who are colour-blind tell 
 blue, agents orange, lighter without memory; what stands still is grey or black.
 """
 
-from __future__ import annotations
-
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 
@@ -17,7 +14,7 @@ import matplotlib.pyplot as plt
 INK = "#30343b"
 GREY = "#c9ccd1"
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
+BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
 AGENT = VERMILLION
 
 plt.rcParams.update(
@@ -41,8 +38,7 @@ LARGE: Any = {
 }  # at half width still read
 
 
-@dataclass(frozen=True)
-class Style:
+class Style(NamedTuple):
     """How one kind of policy is drawn; legends list them by ``order``."""
 
     label: str

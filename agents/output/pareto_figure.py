@@ -1,13 +1,10 @@
 """The figure of a setting: errors against rates, a panel for each who decides by what they know."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import matplotlib.ticker
@@ -23,8 +20,7 @@ Points = Sequence[tuple[float, float]]  # rate and error, by rate
 _STEPS = ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 5.0, 7.0))
 
 
-@dataclass(frozen=True)
-class Series:
+class Series(NamedTuple):
     """One kind of policy: a ``line`` through many points, ``marks`` on it, and a band around it.
 
     ``band`` has rates with the least and the greatest error there.
@@ -36,16 +32,14 @@ class Series:
     band: Sequence[tuple[float, float, float]] = ()
 
 
-@dataclass(frozen=True)
-class Differences:
+class Differences(NamedTuple):
     """Rates with the relative difference of agents to rules there, and its interval's ends."""
 
     style: Style
     points: Sequence[tuple[float, float, float, float]]
 
 
-@dataclass(frozen=True)
-class Panel:
+class Panel(NamedTuple):
     """One set of axes: its ``series`` over single rules in grey, the bound that none undercuts, and
     a ``level`` with its label. Below it stand ``differences`` of agents to the rules of their own
     class, with intervals."""
@@ -58,8 +52,7 @@ class Panel:
     differences: Sequence[Differences] = ()
 
 
-@dataclass(frozen=True)
-class Limits:
+class Limits(NamedTuple):
     """The axes, of all panels."""
 
     rates: tuple[float, float]
@@ -91,7 +84,7 @@ def draw(
             for place, panel in enumerate(small):
                 inner = figure.add_subplot(below[0, place], sharex=axes, sharey=axes)
                 strip = figure.add_subplot(below[1, place], sharex=axes, sharey=under)
-                _panel(inner, replace(panel, series=[bare(one) for one in panel.series]), limits)
+                _panel(inner, panel._replace(series=[bare(one) for one in panel.series]), limits)
                 _strip(strip, panel, limits)
                 for each, label in ((inner, "mean sq. error"), (strip, "agents\nto rules")):
                     each.tick_params(labelleft=place == 0)
@@ -106,7 +99,7 @@ def bare(series: Series) -> Series:
     """Rules without marks, agents with smaller ones: for small panels."""
     style = series.style
     marks = () if style.marker == "o" else series.marks
-    return replace(series, marks=marks, style=replace(style, size=0.75 * style.size))
+    return series._replace(marks=marks, style=style._replace(size=0.75 * style.size))
 
 
 def _panel(axes: Axes, panel: Panel, limits: Limits) -> None:
@@ -149,7 +142,7 @@ def _strip(axes: Axes, panel: Panel, limits: Limits) -> None:
             [end - mean for mean, end in zip(means, high, strict=True)],
         ]
         style = shown.style
-        mark = _mark(replace(style, size=0.75 * style.size))
+        mark = _mark(style._replace(size=0.75 * style.size))
         axes.errorbar(
             rates, means, yerr=spread, ls=style.line, color=style.colour, lw=1.2, elinewidth=1.6,
             zorder=4, **mark,

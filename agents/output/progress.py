@@ -8,8 +8,6 @@ All of it goes to stderr. On a terminal every piece of work has a bar; a file or
 now and then, without control characters; a closed stderr gets nothing.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys

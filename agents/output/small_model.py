@@ -1,7 +1,5 @@
 """A trained model's archive without what its optimiser remembers: a third of its size."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

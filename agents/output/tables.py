@@ -1,8 +1,6 @@
 """Tables for the terminal."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from rich import box
@@ -16,6 +14,24 @@ def console() -> Console:
     """A console that keeps tables whole where the output is no terminal."""
     found = Console()
     return found if found.is_terminal else Console(width=150)
+
+
+def table(
+    title: str,
+    columns: Sequence[str],
+    rows: Iterable[Sequence[str]] = (),
+    caption: str | None = None,
+) -> Table:
+    """Return a table whose first column is folded text and whose others are numbers."""
+    result = Table(title=title, box=box.SIMPLE_HEAD, caption=caption)
+    for place, column in enumerate(columns):
+        if place:
+            result.add_column(column, justify="right", no_wrap=True)
+        else:
+            result.add_column(column, overflow="fold")
+    for row in rows:
+        result.add_row(*row)
+    return result
 
 
 def number(interval: Mapping[str, float]) -> str:
@@ -36,13 +52,9 @@ def evaluation_table(
     differences: Mapping[str, Interval],
 ) -> Table:
     """One row a policy; ``differences`` to a reference may be empty."""
-    table = Table(title=title, box=box.SIMPLE_HEAD, caption=_CAPTION)
-    table.add_column("policy", overflow="fold")
-    columns = ["MSE", "median", "rate", "requests", "tokens", "denied", "trace P", "NEES", "return"]
-    for column in columns:
-        table.add_column(column, justify="right", no_wrap=True)
-    if differences:
-        table.add_column("MSE - reference", justify="right", no_wrap=True)
+    columns = ["policy", "MSE", "median", "rate", "requests", "tokens", "denied"]
+    columns += ["trace P", "NEES", "return", *(["MSE - reference"] if differences else [])]
+    rows = []
     for name, found in policies.items():
         row = [
             name,
@@ -58,22 +70,15 @@ def evaluation_table(
         ]
         if differences:
             row.append(difference(differences[name]) if name in differences else "reference")
-        table.add_row(*row)
-    return table
+        rows.append(row)
+    return table(title, columns, rows, _CAPTION)
 
 
 def state_table(states: Sequence[str], policies: Mapping[str, Mapping[str, Any]]) -> Table:
     """Root mean square error of each state (and input, where there is one), a row a policy."""
-    table = Table(
-        title="root of the mean squared error over episodes, averaged over time",
-        box=box.SIMPLE_HEAD,
-    )
-    table.add_column("policy", overflow="fold")
-    for state in states:
-        table.add_column(state, justify="right")
-    for name, found in policies.items():
-        table.add_row(name, *(f"{error:.4g}" for error in found["armse"]))
-    return table
+    title = "root of the mean squared error over episodes, averaged over time"
+    rows = ([name, *(f"{e:.4g}" for e in found["armse"])] for name, found in policies.items())
+    return table(title, ["policy", *states], rows)
 
 
 _CAPTION = (

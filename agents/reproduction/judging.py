@@ -1,7 +1,5 @@
 """Verdicts from data, and the words in which their evidence is told."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

@@ -1,12 +1,9 @@
 """Pieces of a reproduction: simulated once, kept in the work folder, shown again from there."""
 
-from __future__ import annotations
-
 import json
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,8 +19,7 @@ from .shown import Shown
 _PLAIN = "plain"  # the entry that holds all that is no array, as JSON
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """A piece of a paper with its episodes and seed, and where it is kept."""
 
     paper: str

@@ -1,10 +1,7 @@
 """The pages of a reproduction: one a paper, with its figures and numbers, and one over all."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +15,7 @@ from .papers import NAMES
 from .shown import Claim, Number, Picture, Shown, Table
 
 OVERVIEW = "README.md"
-_ABOUT = """# The five papers, made anew
-
-Every figure and table of the simulation sections of five papers, by one command:
-
-```sh
-fusion-gym reproduce all
-```
-
-Beside each printed number stands ours with its 95 % interval; *agrees* means that it lies where
-95 % of such runs would. Every claim that simulation can touch has a verdict, and its evidence on
-the paper's page.
-"""
+TEXTS = Path(__file__).parent
 
 
 def write_page(
@@ -42,7 +28,8 @@ def write_page(
     for shown in found.values():
         for picture in shown.pictures:
             _draw(picture, output / one.name)
-    lines = [f"# {one.title}", "", one.citation, "", one.introduction.strip(), ""]
+    introduction = (TEXTS / one.name / "introduction.md").read_text(encoding="utf-8")
+    lines = [f"# {one.title}", "", one.citation, "", introduction.strip(), ""]
     claims = [claim for shown in found.values() for claim in shown.claims]
     lines += ["## Claims", "", *_claims(claims), ""]
     for piece in one.pieces:
@@ -66,7 +53,7 @@ def write_page(
 
 def write_overview(output: Path) -> None:
     """The page over all papers whose numbers are there."""
-    lines = [_ABOUT]
+    lines = [(TEXTS / "overview.md").read_text(encoding="utf-8")]
     for name in NAMES:
         path = output / f"{name}.json"
         if not path.exists():
@@ -180,10 +167,10 @@ def _numbers(
             {
                 "piece": name,
                 "name": table.name,
-                "numbers": [asdict(n) | {"verdict": n.verdict} for n in table.numbers],
+                "numbers": [n._asdict() | {"verdict": n.verdict} for n in table.numbers],
             }
             for name, shown in found.items()
             for table in shown.tables
         ],
-        "claims": [asdict(claim) for shown in found.values() for claim in shown.claims],
+        "claims": [claim._asdict() for shown in found.values() for claim in shown.claims],
     }

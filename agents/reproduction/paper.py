@@ -1,10 +1,7 @@
 """A paper as pieces of work: what is simulated, and what is shown of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from .shown import Shown
 
@@ -12,8 +9,7 @@ from .shown import Shown
 Compute = Callable[[int, int], dict[str, Any]]
 
 
-@dataclass(frozen=True)
-class Piece:
+class Piece(NamedTuple):
     """A part of a simulation section: its runs, kept in the work folder, and what they show.
 
     ``compute(episodes, seed)`` returns numbers, texts, lists and arrays by name; ``show`` takes
@@ -30,13 +26,10 @@ class Piece:
     usual: int = 1000
 
 
-@dataclass(frozen=True)
-class Paper:
-    """A paper: ``name`` is that of its page, ``citation`` as a list of references has it."""
+class Paper(NamedTuple):
+    """A paper: ``name`` is that of its page and its package, which has its ``introduction.md``."""
 
     name: str
     title: str
     citation: str
-    environments: Sequence[str]
-    introduction: str
     pieces: Sequence[Piece]

@@ -1,7 +1,5 @@
 """The papers that can be reproduced, by name."""
 
-from __future__ import annotations
-
 import importlib
 
 from fusion_gym.validation import ConfigurationError, choice
@@ -23,9 +21,8 @@ def paper(name: str) -> Paper:
     Raises:
         ConfigurationError: there is none of this name.
     """
-    module = importlib.import_module(f".{choice('paper', name, NAMES)}", __package__)
-    found: Paper = module.PAPER
-    return found
+    module = importlib.import_module(f".{choice('paper', name, NAMES)}.pieces", __package__)
+    return module.PAPER
 
 
 def papers(names: tuple[str, ...]) -> list[Paper]:

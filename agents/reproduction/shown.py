@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -14,8 +13,7 @@ from fusion_gym.evaluation.intervals import mean_interval
 Verdict = Literal["holds", "holds partly", "does not hold"]
 
 
-@dataclass(frozen=True)
-class Number:
+class Number(NamedTuple):
     """A number of ours, beside the printed one where there is one.
 
     ``low`` and ``high`` are the 95 % interval of ``mean``. ``spread`` is the standard deviation of
@@ -49,8 +47,7 @@ class Number:
         return "agrees" if abs(self.printed - self.mean) <= allowed else "differs"
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """Numbers under a title, ``note`` says what they are and how they were made.
 
     With ``columns`` the numbers, none of which is printed, stand row by row under these heads; each
@@ -64,8 +61,7 @@ class Table:
     columns: Sequence[str] = ()
 
 
-@dataclass(frozen=True)
-class Picture:
+class Picture(NamedTuple):
     """A figure of a paper: ``draw`` draws into an empty matplotlib Figure.
 
     ``name`` is that of its files (figure_5), ``title`` what the paper calls it (Figure 5: …), in
@@ -80,8 +76,7 @@ class Picture:
     size: tuple[float, float] = (7.2, 4.2)
 
 
-@dataclass(frozen=True)
-class Claim:
+class Claim(NamedTuple):
     """A claim of a paper that simulation can touch, where it stands, a verdict and its evidence."""
 
     text: str
@@ -90,8 +85,7 @@ class Claim:
     evidence: str
 
 
-@dataclass(frozen=True)
-class Shown:
+class Shown(NamedTuple):
     """All that is shown of a piece."""
 
     pictures: Sequence[Picture] = ()

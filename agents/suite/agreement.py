@@ -1,16 +1,14 @@
 """The quick benchmark's verdicts beside those of the full one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich import box
 from rich.table import Table
 
 from ..output.files import read_json
 from ..output.markup import share
+from ..output.tables import table
 from .reports import VERDICT
 
 
@@ -32,16 +30,12 @@ def agreement(quick: Path, full: Path, settings: Sequence[str]) -> Table | None:
     if not rows:
         return None
     agreeing = sum(row[-1] for row in rows)
-    table = Table(
-        title="agents against the rules of their class: the quick benchmark and the full one",
-        box=box.SIMPLE_HEAD,
-        caption=f"{agreeing} of {len(rows)} verdicts agree: their 95 % intervals overlap",
+    return table(
+        "agents against the rules of their class: the quick benchmark and the full one",
+        ("setting", "class", "quick", "full", "agree"),
+        [(*row[:2], share(row[2]), share(row[3]), "yes" if row[4] else "no") for row in rows],
+        f"{agreeing} of {len(rows)} verdicts agree: their 95 % intervals overlap",
     )
-    for column in ("setting", "class", "quick", "full", "agree"):
-        table.add_column(column, no_wrap=True)
-    for name, of, found, known, agrees in rows:
-        table.add_row(name, of, share(found), share(known), "yes" if agrees else "no")
-    return table
 
 
 def _middles(path: Path) -> dict[str, Mapping[str, float]]:

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from .committed import FOLDER, read_envelopes
 from .config import Setting, load_suite
 from .envelope_table import bound_of, measured
 from .envelopes import Test, inputs_of, run_test
+from .fronts import prices_of
 from .workers import Work
 
 # Beside the folder of the commands, in a clone as in an installed package.
@@ -94,15 +95,14 @@ class Ground:
 
     def agents(self, name: str, model: Path) -> list[Asked]:
         """An agent that belongs to a class, at prices over the whole range."""
-        low, high = self.setting.price_range
         digest = hashlib.sha256(model.read_bytes()).hexdigest()
         options = tuple(self.envelopes["classes"][name]["options"].items())
         return [
             Asked(
                 self.setting, options, f"agent at price {price:.4g}", self.episodes, self.seed,
-                model, digest, float(min(max(price, low), high)),
+                model, digest, price,
             )
-            for price in np.geomspace(low, high, PRICES)
+            for price in prices_of(self.setting.price_range, PRICES)
         ]  # fmt: skip
 
     def single(self, name: str) -> list[tuple[float, float]]:
@@ -141,8 +141,7 @@ def measure(test: Test, work: Path) -> None:
     run_test(test, work)
 
 
-@dataclass(frozen=True)
-class Trials:
+class Trials(NamedTuple):
     """What is run on the test episodes: an agent at its prices, and the rules of its classes."""
 
     ground: Ground

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 from fusion_gym.core.communication import FEATURES
 from fusion_gym.core.system import Knowledge, covers
@@ -23,8 +22,7 @@ HEARD: tuple[Broadcast, ...] = ("none", "estimate", "packets")  # each tells all
 Options = tuple[tuple[str, Any], ...]
 
 
-@dataclass(frozen=True)
-class Class:
+class Class(NamedTuple):
     """Who decides, whether it remembers, what a sensor by itself hears (else None), and what a
     packet holds.
 

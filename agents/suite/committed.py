@@ -1,11 +1,8 @@
 """The file of a setting's envelopes: made piece by piece, read with its hashes checked."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pydantic
 from pydantic import FiniteFloat
@@ -15,21 +12,9 @@ from fusion_gym.validation import ConfigurationError
 
 from ..output.files import write
 from ..output.folders import check_inputs
+from . import envelopes
 from .classes import Class, classes_of
 from .config import Setting, Suite
-from .envelopes import (
-    candidates_of,
-    chosen,
-    content_of,
-    curves_of,
-    digest,
-    inputs_of,
-    run_search,
-    run_test,
-    searches_of,
-    task_of,
-    tests_of,
-)
 from .reports import Interval, Shape, read
 from .team import Team
 from .workers import Work, side_by_side
@@ -99,7 +84,7 @@ def read_envelopes(path: Path) -> dict[str, Any]:
     """
     found = read(Envelopes, path, "envelopes")
     for name, content in found["classes"].items():
-        if digest(found["inputs"], name, content) != content["sha256"]:
+        if envelopes.digest(found["inputs"], name, content) != content["sha256"]:
             raise ConfigurationError(
                 f"envelopes = {str(path)!r}: classes.{name}.sha256 = {content['sha256'][:12]!r}… "
                 "is not that of what it holds: it was changed after it was written"
@@ -117,13 +102,11 @@ def present(suite: Suite, setting: Setting, results: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     found = read_envelopes(path)
-    check_inputs(inputs_of(suite, setting), found["inputs"], repr(str(path)))
-    classes: dict[str, Any] = found["classes"]
-    return classes
+    check_inputs(envelopes.inputs_of(suite, setting), found["inputs"], repr(str(path)))
+    return found["classes"]
 
 
-@dataclass(frozen=True)
-class Shelf:
+class Shelf(NamedTuple):
     """Where the envelopes are that agents are compared with, and the suite that made them."""
 
     suite: Suite
@@ -163,7 +146,7 @@ def complete(
         there = present(suite, setting, results)
         every = [c for c in classes_of(setting) if not names or c.name in names]
         missing[setting.name] = [c for c in every if c.name not in there]
-        for search in searches_of(suite, setting, missing[setting.name]):
+        for search in envelopes.searches_of(suite, setting, missing[setting.name]):
             search.check()
     for setting in settings:
         if missing[setting.name]:
@@ -173,29 +156,37 @@ def complete(
 def _complete(
     suite: Suite, setting: Setting, wanted: Sequence[Class], results: Path, work: Path, team: Team
 ) -> None:
-    searches = searches_of(suite, setting, wanted)
+    searches = envelopes.searches_of(suite, setting, wanted)
     left = [search for search in searches if not search.path(work).exists()]
     left.sort(key=lambda search: -len(search.family.parameters))  # the long ones first
     side_by_side(
-        [Work(10.0, run_search, (one, work)) for one in left], team, f"{setting.name}: tuning"
+        [Work(10.0, envelopes.run_search, (one, work)) for one in left],
+        team,
+        f"{setting.name}: tuning",
     )
     vertices = [
-        vertex for of in wanted for vertex in chosen(candidates_of(setting, of, searches, work)[0])
+        vertex
+        for of in wanted
+        for vertex in envelopes.chosen(envelopes.candidates_of(setting, of, searches, work)[0])
     ]
-    tests = {one.path(work): one for one in tests_of(suite, setting, vertices)}
+    tests = {one.path(work): one for one in envelopes.tests_of(suite, setting, vertices)}
     side_by_side(
-        [Work(2.0, run_test, (one, work)) for path, one in tests.items() if not path.exists()],
+        [
+            Work(2.0, envelopes.run_test, (one, work))
+            for path, one in tests.items()
+            if not path.exists()
+        ],
         team,
         f"{setting.name}: testing",
     )
     classes = present(suite, setting, results)
-    inputs = inputs_of(suite, setting)
+    inputs = envelopes.inputs_of(suite, setting)
     for of in wanted:
-        content = content_of(suite, setting, of, searches, work)
-        classes[of.name] = content | {"sha256": digest(inputs, of.name, content)}
-    task, path = task_of(setting), path_of(results, setting.name)
+        content = envelopes.content_of(suite, setting, of, searches, work)
+        classes[of.name] = content | {"sha256": envelopes.digest(inputs, of.name, content)}
+    task, path = envelopes.task_of(setting), path_of(results, setting.name)
     earlier = read_envelopes(path)["curves"] if path.exists() else []
-    curves = merged_curves(earlier, list(curves_of(searches, work)))
+    curves = merged_curves(earlier, list(envelopes.curves_of(searches, work)))
     always = next(one for one in curves if one["family"] == "always")
     order = [c.name for c in classes_of(setting)]
     report = {

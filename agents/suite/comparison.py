@@ -1,13 +1,10 @@
 """One policy against the lower envelope of swept baselines: tables, files and a figure."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
 from rich.table import Table
 
 from fusion_gym.core.task import Task
@@ -112,19 +109,19 @@ def comparison_table(
     found: Mapping[str, Comparison], learned: Mapping[str, EpisodeResults]
 ) -> Table:
     """The agent against the envelope, at its own rate at each of its prices."""
-    table = Table(title="the agent against the lower envelope at its own rate", box=box.SIMPLE_HEAD)
-    for name in ("rate", "agent's MSE", "envelope's MSE", "difference [95 %]", "relative"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("envelope between", overflow="fold")
+    rows = []
     for name, comparison in found.items():
         share = comparison.difference.mean / (comparison.envelope or np.nan)
-        table.add_row(
+        row = (
+            "\n".join(comparison.between),
             f"{learned[name].rate.mean():.4f}",
             f"{learned[name].mse.mean():.4f}",
             f"{comparison.envelope:.4f}",
             tables.difference(comparison.difference),
             # Whoever always transmits over a perfect channel has no error to compare with.
             "–" if np.isnan(share) else f"{share:+.1%}",
-            "\n".join(comparison.between),
         )
-    return table
+        rows.append(row)
+    heads = "rate", "agent's MSE", "envelope's MSE", "difference [95 %]", "relative"
+    title = "the agent against the lower envelope at its own rate"
+    return tables.table(title, ("envelope between", *heads), rows)

@@ -1,7 +1,5 @@
 """The table of the committed envelopes: what the strongest rules do, before agents exist."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -54,29 +52,8 @@ def text_of(results: Path, command: str) -> str:
     """
     files = sorted((results / FOLDER).glob("*.json"))
     found = [read_envelopes(path) for path in files]
-    lines = [
-        "# Envelopes of the tuned rules",
-        "",
-        f"Made by `{command}`; the JSON beside this file has every class with its policies, their "
-        "rates and errors on tuning and test seeds, the number of trials and a SHA-256 of its "
-        "content. Vertices are chosen on tuning seeds and measured on the test seeds: the envelope "
-        "is the line through all of them there, mixtures of two policies between them. A vertex "
-        "that lies above the line between its neighbours on the test seeds is kept "
-        '(`"convex": false`). A class contains the rules of every class that knows less, so on the '
-        "tuning seeds its envelope is nowhere higher; on the test seeds it may be, by noise.",
-        "",
-        "Who decides: `centre` by what it knows before anything is sent, `sensors` is a "
-        "coordinator that sees all new measurements, `local` is every sensor by itself, which "
-        "hears nothing (`none`), the centre's `estimate`, or every delivered packet (`packets`). "
-        "Where packets hold the coordinator's estimate, the class says so. "
-        "Mean squared error at some rates, 5, 10, 20 and 40 % of that of always transmitting: of "
-        "the rules that remember nothing, of those that do, of one improvement on the value of "
-        "information by simulation (rollout; in brackets the number of episodes, so few that "
-        "chance moves it by 5 to 15 %), and a lower bound; – where there is none.",
-        "",
-        "| setting | class | rate | without memory | with memory | rollout | bound |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    text = Path(__file__).with_suffix(".md").read_text(encoding="utf-8")
+    lines = text.format(command=command).splitlines()
     for envelopes in found:
         lines += rows_of(envelopes, results)
     lines += ["", "## The strongest rules", ""]

@@ -4,14 +4,12 @@ What is tuned and what is tested lies in the work folder under names that hold a
 it was made from; ``envelopes/SETTING.json`` in the results folder holds the classes.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,8 +32,7 @@ from .tuning import as_they_are, first_values, policy_text, tune
 Options = tuple[tuple[str, Any], ...]
 
 
-@dataclass(frozen=True)
-class Search:
+class Search(NamedTuple):
     """A family to tune in a setting with some options of its classes.
 
     With ``policies`` there is nothing to tune: these compete as they are.
@@ -191,8 +188,7 @@ def searches_of(suite: Suite, setting: Setting, wanted: Sequence[Class]) -> list
     return found
 
 
-@dataclass(frozen=True)
-class Candidate:
+class Candidate(NamedTuple):
     """A tuned policy, as a point of rate and error on all tuning episodes."""
 
     policy: str

@@ -1,12 +1,9 @@
 """What the results folder holds of a setting, read and checked before anything is made of it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fusion_gym.evaluation.envelope import EnvelopePoint, height
 from fusion_gym.validation import ConfigurationError
@@ -18,8 +15,7 @@ from .reports import VERDICT, Agent, Baselines, Tested, Verdict, read
 Points = list[tuple[float, float]]  # rate and error
 
 
-@dataclass(frozen=True)
-class Found:
+class Found(NamedTuple):
     """A setting's results.
 
     ``seeds[class]`` has a training seed's points, by price; ``ahead`` are the coordinator's
@@ -48,8 +44,7 @@ class Found:
     @property
     def classes(self) -> dict[str, Any]:
         """The classes that have agents."""
-        found: dict[str, Any] = self.verdict["classes"]
-        return found
+        return self.verdict["classes"]
 
     @property
     def optimal(self) -> bool:

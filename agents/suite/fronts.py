@@ -1,7 +1,5 @@
 """A learned front, rate and error at several prices, measured while it is trained."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

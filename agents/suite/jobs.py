@@ -5,12 +5,10 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fusion_gym.core.task import Task
-from fusion_gym.envs.registration import make_task
 from fusion_gym.validation import ConfigurationError
 
 from ..output.files import load_results, read_json
@@ -19,13 +17,12 @@ from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, Val
 from .classes import Class, classes_of, trained
 from .committed import Shelf, path_of
 from .config import Setting, Suite
-from .envelopes import Test
+from .envelopes import Test, task_of
 
 VALIDATIONS = 2  # of a training
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """One piece of work; ``weight`` is about how long it takes, in seconds on one core.
 
     ``envelopes`` are the classes of committed envelopes that it depends on, with their hashes.
@@ -49,8 +46,7 @@ class Job:
         return f"{self.setting.name}/{self.name}"
 
 
-@dataclass(frozen=True)
-class Folders:
+class Folders(NamedTuple):
     """``results`` holds JSON for readers, ``work`` models and episodes."""
 
     results: Path
@@ -144,11 +140,6 @@ def computed(setting: Setting, kind: str) -> tuple[str, ...]:
     return setting.informed if kind == "informed" else setting.references
 
 
-def setting_task(setting: Setting) -> Task:
-    """The setting's task, as it is."""
-    return make_task(setting.environment.id, **setting.environment.options)
-
-
 def agent_options(setting: Setting, of: Class) -> dict[str, Any]:
     """The options of the environment in which an agent of a class decides."""
     return setting.environment.options | of.information | setting.agent_options
@@ -156,7 +147,7 @@ def agent_options(setting: Setting, of: Class) -> dict[str, Any]:
 
 def agent_task(setting: Setting, of: Class) -> Task:
     """The task in which an agent of a class is tested: no price is drawn."""
-    return make_task(setting.environment.id, **agent_options(setting, of))
+    return task_of(setting, agent_options(setting, of).items())
 
 
 def training_of(experiment: Experiment) -> dict[str, Any]:

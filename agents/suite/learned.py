@@ -1,7 +1,5 @@
 """What a study has found so far: its JSON, made of the finished lessons."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,13 +1,14 @@
 """Tables of how fast agents learn, for the terminal and in Markdown."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich import box
 from rich.table import Table
+
+from ..output.markup import share
 
 Report = Mapping[str, Any]
 _LABELS = {"front": "with credit and memory", "plain": "plain PPO"}
@@ -45,12 +46,11 @@ def row(report: Report) -> list[str]:
         cells = [
             f"{len(found['above'])} of {found['compared']} above {course['allowed']:+.1%} "
             f"(rates {low:.3f} to {high:.3f})",
-            f"{_difference(worst['difference'])} (seed {worst['seed']}, price "
-            f"{worst['price']:.3g})",
+            f"{share(worst['difference'])} (seed {worst['seed']}, price {worst['price']:.3g})",
             ", ".join(
-                f"{share:.0%} to {name}"
-                for name, share in found["closed"].items()
-                if share is not None
+                f"{part:.0%} to {name}"
+                for name, part in found["closed"].items()
+                if part is not None
             )
             or "–",
         ]
@@ -81,10 +81,6 @@ def _span(form: str, found: Sequence[Mapping[str, Any]], name: str) -> str:
     return " to ".join(texts)
 
 
-def _difference(found: Mapping[str, float]) -> str:
-    return f"{found['mean']:+.1%} [{found['low']:+.1%}, {found['high']:+.1%}]"
-
-
 def headline(reports: Sequence[Report]) -> list[str]:
     """One row a setting, for the front page."""
     cells = (
@@ -103,32 +99,9 @@ def headline(reports: Sequence[Report]) -> list[str]:
 
 def text_of(reports: Sequence[Report], command: str) -> str:
     """All tables in Markdown, with how they are made."""
+    text = Path(__file__).with_suffix(".md").read_text(encoding="utf-8")
     lines = [
-        "# How fast agents learn",
-        "",
-        f"Made by `{command}`; the JSON beside this file has every measurement.",
-        "",
-        "A front is one policy at seven prices of a token. Seconds are the processor's, on all "
-        "threads, of environment, policy and updates; validations and measurements are none of "
-        "them. Steps per second are of the core's loop with 1,024 runs in the same run of the "
-        "command, by the processor's seconds: without memory, and with the value of every "
-        "transmission.",
-        "",
-        "**Below the rules without memory**: the first measurement (on validation seeds) at which "
-        "all seven points lie below the committed envelope of rules without memory at their own "
-        "rates, and mixtures of neighbours below each of its vertices between the lowest and the "
-        "highest rate. These differ by a factor of three at least, counted from 5 % of the rate "
-        "of always transmitting: next to nothing sent is as good as any rule. Plain PPO is the "
-        "benchmark's, without memory, as far as its budget of seconds.",
-        "",
-        "**Finished**: the fronts of all seeds on the test episodes, beside the committed envelope "
-        "of exactly the same information at the agent's own rate, or, by the cost of an episode at "
-        "a price, beside the optimum or the best of many periodic schedules there. A seed and "
-        "price is above where its whole paired 95 % interval lies above the share that is named; "
-        "all prices count beside an optimum, otherwise the inner 90 % of their range. The "
-        "envelope is taken as it is: intervals are over episodes alone. The gap is that between "
-        "the envelope and one improvement by simulation (`rollout`), or a lower `bound`.",
-        "",
+        *text.format(command=command).splitlines(),
         _joined(_COLUMNS),
         _joined(["---"] * len(_COLUMNS)),
         *(_joined(row(report)) for report in reports),
@@ -165,7 +138,7 @@ def details(report: Report) -> Iterator[str]:
         mean = float(np.mean([p["difference"]["mean"] for p in points]))
         cells = [f"{np.mean([p[name] for p in points]):.4g}" for name in ("rate", *names)]
         inner = "" if report["inner"][place] else " (outer)"
-        cells = [f"{price:.3g}{inner}", *cells, f"{mean:+.1%}", _difference(worst)]
+        cells = [f"{price:.3g}{inner}", *cells, f"{mean:+.1%}", share(worst)]
         yield _joined([*cells, f"{above} of {len(points)}"])
     yield ""
 

@@ -1,7 +1,5 @@
 """The pieces of work of a study: references on the test episodes, trainings with their curves."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path

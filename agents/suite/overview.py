@@ -1,11 +1,8 @@
 """What knowing and learning are worth, setting by setting: the rows of the overview."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..output import overview_figure
 from ..output.markup import plain, share, table
@@ -32,8 +29,7 @@ _REASONS = {
 }
 
 
-@dataclass(frozen=True)
-class Learned:
+class Learned(NamedTuple):
     """A column of what learning is worth: its head, and the classes that it may be, in order."""
 
     head: str

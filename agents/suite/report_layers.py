@@ -1,9 +1,6 @@
 """What the figure of a setting shows: its panels, made of the results."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +8,7 @@ import numpy as np
 
 from fusion_gym.evaluation.envelope import EnvelopePoint, height, lower_hull
 
-from ..output import pareto_figure
-from ..output.palette import (
-    AGENTS,
-    AGENTS_MEMORY,
-    REFERENCE,
-    ROLLOUT,
-    RULES,
-    RULES_MEMORY,
-    SCHEDULES,
-    Style,
-)
+from ..output import palette, pareto_figure
 from ..output.pareto_figure import Differences, Limits, Panel, Series
 from .envelope_table import at_least
 from .found import Found
@@ -32,11 +19,7 @@ LEFT = 0.04  # of the rate that always transmitting gets: where the figure begin
 DEEPEST = 0.3
 WIDEST = 0.4  # of the relative differences that are drawn
 MIXED = "found before"  # no family of one rule
-HEARS = {
-    "none": "hear nothing",
-    "estimate": "hear estimate",
-    "packets": "hear packets",
-}
+HEARS = {"none": "hear nothing", "estimate": "hear estimate", "packets": "hear packets"}
 
 
 def draw(folder: Path, found: Found) -> None:
@@ -57,9 +40,8 @@ def panels_of(found: Found) -> tuple[Panel, list[Panel]]:
     series = list(_series(found, coordinator, found.ahead))
     if found.rollout:
         points = [(point.rate, point.mse) for point in found.rollout]
-        style = replace(
-            ROLLOUT, label=f"improved by simulation\n({found.rollout_episodes} episodes)"
-        )
+        label = f"improved by simulation\n({found.rollout_episodes} episodes)"
+        style = palette.ROLLOUT._replace(label=label)
         series.append(Series(style, [], points))
     genie = found.baselines.get("genie")
     level = ("everything arrives", float(genie["mse"]["mean"])) if genie and not bound else None
@@ -144,7 +126,7 @@ def _series(
     contents = shown(found)
     for name in sorted(names, key=lambda name: contents[name]["memory"]):
         hull, memory = found.hull(name), contents[name]["memory"]
-        style = RULES_MEMORY if memory else RULES
+        style = palette.RULES_MEMORY if memory else palette.RULES
         yield Series(style, list(_along(hull, _fine(found))), [(p.rate, p.mse) for p in hull])
     if reference:
         hull = lower_hull(reference)
@@ -155,7 +137,7 @@ def _series(
         )
     for name in sorted(names, key=lambda name: contents[name]["memory"]):
         if name in found.classes:
-            style = AGENTS_MEMORY if contents[name]["memory"] else AGENTS
+            style = palette.AGENTS_MEMORY if contents[name]["memory"] else palette.AGENTS
             points = found.classes[name]["points"]
             marks = [(point["rate"], point["mse"]) for point in points]
             yield Series(style, marks, marks, list(_band(found, name, marks)))
@@ -171,12 +153,14 @@ def _differences(found: Found, names: Sequence[str]) -> Iterator[Differences]:
                 for point in content["points"]
                 if "difference" in point
             ]
-            yield Differences(AGENTS_MEMORY if content["memory"] else AGENTS, sorted(points))
+            yield Differences(
+                palette.AGENTS_MEMORY if content["memory"] else palette.AGENTS, sorted(points)
+            )
 
 
-def _reference_style(found: Found, reference: Sequence[EnvelopePoint]) -> Style:
-    style = SCHEDULES if reference is found.known else REFERENCE
-    return replace(style, label=reference_label(found, reference))
+def _reference_style(found: Found, reference: Sequence[EnvelopePoint]) -> palette.Style:
+    style = palette.SCHEDULES if reference is found.known else palette.REFERENCE
+    return style._replace(label=reference_label(found, reference))
 
 
 def reference_label(found: Found, reference: Sequence[EnvelopePoint]) -> str:
@@ -236,5 +220,4 @@ def _least(hulls: Sequence[Sequence[EnvelopePoint]], rate: float) -> float:
 
 def _fine(found: Found) -> list[float]:
     always = found.verdict["always"]
-    rates: list[float] = np.geomspace(LEFT * always, always, FINE).tolist()
-    return rates
+    return np.geomspace(LEFT * always, always, FINE).tolist()

@@ -1,7 +1,5 @@
 """The parts of README and docs that say who wins: made of the results, between two marks."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The tables of a setting: at equal rates, by class, and what each class knows more is worth."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from ..output.markup import NONE, code, number, plain, share, table

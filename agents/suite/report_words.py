@@ -1,7 +1,5 @@
 """What was found, in sentences that follow from the numbers by fixed rules."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

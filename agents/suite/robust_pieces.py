@@ -3,14 +3,11 @@
 All that is taken from the benchmark's own work is taken here: its tasks, trainings and envelopes.
 """
 
-from __future__ import annotations
-
 import glob
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -37,8 +34,7 @@ RULES = "rules"
 Options = tuple[tuple[str, Any], ...]
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """A policy with the options that it adds to those of the case.
 
     ``told`` stands for its text among the inputs where that is a file's path; one that is ``added``
@@ -52,8 +48,7 @@ class Entry:
     added: bool = False
 
 
-@dataclass(frozen=True)
-class Piece:
+class Piece(NamedTuple):
     """Some policies in a case: the rules of a class, or an agent at all its prices.
 
     ``setting`` is the setting as it is in the case.
@@ -95,8 +90,7 @@ class Piece:
         return task_of(self.setting, entry.options)
 
 
-@dataclass(frozen=True)
-class Folders:
+class Folders(NamedTuple):
     """``results`` holds JSON for readers, ``work`` models and episodes."""
 
     results: Path
@@ -181,8 +175,7 @@ def envelope_of(shelf: Shelf, setting: Setting, of: Class) -> dict[str, Any]:
     if of.name not in found:
         path = str(path_of(shelf.results, setting.name))
         raise ConfigurationError(f"results: {path!r} has no class {of.name!r}: tune it first")
-    envelope: dict[str, Any] = found[of.name]
-    return envelope
+    return found[of.name]
 
 
 def rules_piece(

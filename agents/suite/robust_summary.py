@@ -1,7 +1,5 @@
 """All perturbed cases of a setting in a line: in how many of them agents are ahead of the rules."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What perturbed cases leave of the rules and of the agents' gain, judged and as a table."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,6 +12,7 @@ from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import mean_interval
 
 from ..output.files import write_text
+from ..output.markup import NONE, share
 from .robust_pieces import RULES, Folders, Piece
 from .robust_summary import FOLDER, KINDS, is_gain, read_reports, summary
 from .robustness import NOMINAL
@@ -21,32 +20,6 @@ from .verdict import MIDDLE, Searches, judge
 
 Rules = Mapping[str, EpisodeResults]
 
-_TEXT = """\
-# What is left where the truth is not what everybody assumes
-
-Made by `{command}`; [docs/robustness.md](../../docs/robustness.md) says what the cases are. Rules
-and agents are as they were tuned and trained for the case "as assumed".
-
-- **rules' error**: the error of the envelope's rules, measured anew under the case, relative to
-  theirs as assumed, both at the middle rate of the case "as assumed": the geometric mean of 5 % and
-  50 % of the rate that transmitting always gets. Some of it no choice of transmissions could
-  change, for noise itself is larger.
-- **agents**: how far their error lies above (+) or below (-) that of the rules under the same case,
-  at the agents' own rates, over the middle of the front; a dash where they were not tried, or have
-  a rate in the middle at none of their prices.
-- **left of the gain**: the agents' gain over the rules under the case, as a share of their gain as
-  assumed; a dash where the interval of that holds nothing.
-- **trained over draws**: as "agents", of those whose training drew the perturbations anew in every
-  episode.
-
-Brackets hold 95 % intervals, over paired episodes, training seeds, rates and tuning seeds.
-
-## All cases but "as assumed", counted
-
-Better and worse are cases whose whole interval lies below and above the rules; left out are those
-in which no price leads to a rate in the middle.
-
-"""
 _HEAD = """
 ## {of}
 
@@ -138,7 +111,8 @@ def write_table(results: Path, titles: Mapping[str, str], command: str) -> Path:
     found: dict[str, list[dict[str, Any]]] = {}
     for report in reports:
         found.setdefault(report["class"], []).append(report)
-    parts = [_TEXT.format(command=command), "\n".join(summary(reports, titles))]
+    text = Path(__file__).with_suffix(".md").read_text(encoding="utf-8")
+    parts = [text.format(command=command), "\n".join(summary(reports, titles))]
     for of, reports in sorted(found.items()):
         counts = {report["episodes"] for report in reports}
         asked = " or ".join(str(count) for count in sorted(counts))
@@ -155,15 +129,8 @@ def _lines(report: Mapping[str, Any]) -> Iterator[str]:
         cells = (
             report["setting"],
             row["title"],
-            _percent(row["rules"]),
-            *(_percent(row.get(kind, {}).get("middle")) for kind in KINDS),
+            share(row["rules"]),
+            *(share(row.get(kind, {}).get("middle")) for kind in KINDS),
         )
-        share = "–" if left is None else f"{left:.0%}"
-        yield f"| {' | '.join((*cells[:4], share, cells[4]))} |"
-
-
-def _percent(found: Mapping[str, float] | None) -> str:
-    """Mean and ends of an interval in per cent."""
-    if found is None:
-        return "–"
-    return f"{found['mean']:+.1%} [{found['low']:+.1%}, {found['high']:+.1%}]"
+        kept = NONE if left is None else f"{left:.0%}"
+        yield f"| {' | '.join((*cells[:4], kept, cells[4]))} |"

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
@@ -23,8 +22,7 @@ from .robust_table import judged, with_shares
 from .robustness import NOMINAL, Case, Perturbed, drawn_world, world
 
 
-@dataclass(frozen=True)
-class Trial:
+class Trial(NamedTuple):
     """What is to be tried in a setting.
 
     ``worlds`` are the setting as it is in each case, by name and the nominal one first, with

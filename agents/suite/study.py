@@ -1,12 +1,10 @@
 """What is trained in a setting, what it is compared with, and where all of that is."""
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -97,8 +95,7 @@ class Study:
             ConfigurationError: there is none of that name.
         """
         classes = self.envelopes["classes"]
-        found: dict[str, Any] = classes[choice("class", name, classes)]
-        return found
+        return classes[choice("class", name, classes)]
 
     @property
     def classes(self) -> list[str]:
@@ -221,8 +218,7 @@ class Study:
                 )
 
 
-@dataclass(frozen=True)
-class Lesson:
+class Lesson(NamedTuple):
     """The training of one seed in a study; ``budget`` in processor seconds ends a plain one."""
 
     study: Study

@@ -1,7 +1,5 @@
 """Policies beside each other as typed YAML: a sweep of thresholds, or rows of settings."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pydantic

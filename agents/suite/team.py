@@ -5,8 +5,6 @@ as ray's tasks, for joblib's backend of it gives nothing back before all is done
 every path must be the same: the folders of results and work are shared.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 from collections.abc import Callable, Iterator, Sequence

@@ -1,13 +1,11 @@
 """Trainings side by side: a process and a bar of progress each, one interrupt for all."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -15,6 +13,7 @@ from typing import Any
 
 from fusion_gym.validation import ConfigurationError
 
+from ..output.ending import on_signal
 from ..output.progress import progress_bar
 from ..training.config import Experiment
 from ..training.monitor import shown
@@ -38,7 +37,7 @@ def train_beside(experiments: Mapping[str, Experiment]) -> dict[str, dict[str, A
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(len(experiments), spawn, end_with, (os.getpid(),)) as pool:
         try:
-            with _interrupts_ignored():  # by the new processes: this one tells them when to end
+            with on_signal(signal.SIGINT, signal.SIG_IGN):  # the new processes ignore it
                 running = {name: _begin(pool, one) for name, one in experiments.items()}
             _watch(experiments, set(running.values()))
             return {name: future.result() for name, future in running.items()}
@@ -88,12 +87,3 @@ def _last_validation(folder: Path) -> dict[str, Any] | None:
     except FileNotFoundError:
         return None
     return json.loads(lines[-1]) if lines else None
-
-
-@contextlib.contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -1,11 +1,8 @@
 """Rules at full strength: Optuna searches their parameters, price by price, seed by seed."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import optuna
@@ -29,8 +26,7 @@ _MOST = 3  # parameters of a rule that multiply its trials
 _WORST = 1e300  # the error of a policy whose error is no number
 
 
-@dataclass(frozen=True)
-class Trial:
+class Trial(NamedTuple):
     """A tried policy: its text, its parameters for the sampler, mean rate and error."""
 
     policy: str
@@ -39,8 +35,7 @@ class Trial:
     mse: float
 
 
-@dataclass(frozen=True)
-class Finalist:
+class Finalist(NamedTuple):
     """A policy on the episodes of all searches, and the numbers of those that found it."""
 
     policy: str

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,8 +19,7 @@ _PRICE = (1, 1, 1, 2)  # the axis of the prices in the arrays of a front
 Searches = Sequence[Sequence[tuple[float, float]]]
 
 
-@dataclass(frozen=True)
-class Front:
+class Front(NamedTuple):
     """An agent beside the envelope, at P prices.
 
     ``learned`` and ``envelope`` (seeds, P, E) are the agents' MSE and the envelope's at their own

@@ -1,7 +1,5 @@
 """The benchmark's work: the envelopes' rules, references, hindsight, and one training each."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +9,19 @@ import torch
 from fusion_gym.core.system import least_covering
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation.envelope import points_of
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.hindsight import run_hindsight
 from fusion_gym.evaluation.metrics import robust_summary, summarise
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-from ..output.files import save_results, write
+from ..output.files import load_results, read_json, save_results, write
 from ..output.folders import fingerprint
 from ..training.run import holds_training, train
+from .classes import names_of, trained
 from .committed import Shelf
-from .config import Suite
+from .config import Setting, Suite
 from .envelopes import run_test, task_of
 from .fronts import prices_of
 from .jobs import (
@@ -30,11 +30,15 @@ from .jobs import (
     agent_task,
     computed,
     experiment_of,
+    finished,
     inputs_of,
+    jobs,
     rules_of,
-    setting_task,
     training_of,
 )
+from .reports import VERDICT
+from .verdict import judge
+from .worth import Tested, at_rates, worths
 
 
 def run(job: Job, suite: Suite, folders: Folders, shelf: Shelf) -> None:
@@ -48,6 +52,59 @@ def run(job: Job, suite: Suite, folders: Folders, shelf: Shelf) -> None:
         _run_hindsight(job, suite, folders)
     else:
         _run_agent(job, suite, folders)
+
+
+def conclude(
+    suite: Suite, setting: Setting, folders: Folders, shelf: Shelf
+) -> dict[str, Any] | None:
+    """The verdict over whatever agents of a setting are finished, written as ``verdict.json``.
+
+    Raises:
+        ConfigurationError: results that are damaged or were made from other settings.
+    """
+    every = jobs(suite, [setting], names_of(suite), shelf)
+    pieces = [job for job in every if finished(job, suite, folders)]
+    reports = {job.name: read_json(folders.report(job), "results") for job in pieces}
+    found = {
+        job.name: load_results(folders.episodes(job), reports[job.name]["made_from"])
+        for job in pieces
+    }
+    if "baselines" not in found:
+        return None
+    rules, known = found["baselines"], found.get("references", {})
+    references = {"sensors": found.get("informed", {}) | known, "centre": known, "local": {}}
+    always = float(rules["always"].rate.mean())
+    committed, tested, classes = shelf.classes(setting), {}, {}
+    for of in trained(suite, setting):
+        own = committed[of.name]
+        envelope = {vertex["name"]: rules[vertex["name"]] for vertex in own["vertices"]}
+        done = [job.name for job in pieces if job.of == of]
+        agents = [list(found[job].values()) for job in done]
+        tested[of.name] = Tested(of, envelope, agents, own["searches"])
+        if done:
+            prices = reports[done[0]]["prices"]
+            clairvoyant = found.get("hindsight", {}) if of.packet == "measurement" else {}
+            ahead = references[of.mode] if of.packet == "measurement" else {}
+            classes[of.name] = {
+                **judge(agents, prices, envelope, ahead, always, clairvoyant, own["searches"]),
+                "at": at_rates(tested[of.name], always),
+                "mode": of.mode,
+                "memory": of.memory,
+                "broadcast": of.broadcast,
+                "packet": of.packet,
+                "knows": of.knows,
+                "sha256": own["sha256"],
+                "envelope": [point._asdict() for point in points_of(envelope)],
+            }
+    verdict = {
+        "setting": setting.name,
+        "title": setting.title,
+        "always": always,
+        "classes": classes,
+        "worth": worths(tested, always),
+    }
+    write(folders.results / setting.name / VERDICT, verdict)
+    return verdict
 
 
 def _test(task: Task, policies: list[str], suite: Suite) -> dict[str, EpisodeResults]:
@@ -78,7 +135,7 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders, shelf: Shelf) -> No
         curve = curves.setdefault(vertex["family"], {"knows": [], "policies": []})
         curve["knows"].append(policy.knowledge)
         curve["policies"].append(vertex["name"])
-    task = setting_task(setting)
+    task = task_of(setting)
     for name in setting.points:
         found |= _test(task, [name], suite)
         knows = [make_policy(name, task).knowledge]
@@ -107,14 +164,14 @@ def check_vertex(vertex: dict[str, Any], results: EpisodeResults) -> None:
 
 def _run_references(job: Job, suite: Suite, folders: Folders) -> None:
     """Test policies that were computed."""
-    task = setting_task(job.setting)
+    task = task_of(job.setting)
     found = _test(task, list(computed(job.setting, job.kind)), suite)
     _keep(job, folders, found, _header(job, suite, task))
 
 
 def _run_hindsight(job: Job, suite: Suite, folders: Folders) -> None:
     """Search a clairvoyant's schedules for the first test episodes."""
-    task, chosen = setting_task(job.setting), job.setting.hindsight
+    task, chosen = task_of(job.setting), job.setting.hindsight
     assert chosen is not None
     episodes = min(suite.hindsight_episodes, suite.episodes)
     found = {

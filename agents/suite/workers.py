@@ -1,7 +1,5 @@
 """Pieces of work, done by a team; processes that end with the process that they work for."""
 
-from __future__ import annotations
-
 import functools
 import os
 import threading

@@ -1,7 +1,5 @@
 """What a class of knowledge is worth: errors at a grid of rates, one class beside another."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Checked YAML: every key is known, and every value is allowed, before anything runs."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from pathlib import Path

@@ -8,8 +8,6 @@ Stable-Baselines3's loader and the states are pickles: a checkpoint is for going
 training, and is not to be taken from others.
 """
 
-from __future__ import annotations
-
 import json
 import pickle
 import random

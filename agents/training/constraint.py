@@ -1,20 +1,16 @@
 """Training to a given average rate: a Lagrange multiplier on the tokens spent."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
-from stable_baselines3.common.callbacks import BaseCallback
-
-from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from .callback import Callback
 
 STEP = 0.05  # of the multiplier's logarithm, for a rate that is twice the target
 LIMITS = (1e-6, 1e6)  # the multiplier stays within these factors of where it began
 TOLERANCE = 1.03  # a rate counts as kept up to this factor of the target
 
 
-class TargetRate(BaseCallback):
+class TargetRate(Callback):
     """Raises the price of a token while more is sent than ``target``, and lowers it otherwise.
 
     After each stretch of data the price λ becomes λ exp(step (rate/target - 1)): dual ascent on
@@ -33,19 +29,16 @@ class TargetRate(BaseCallback):
     def _on_training_start(self) -> None:
         if getattr(self.model, "token_price", None) is None:
             self.model.token_price = self.start  # type: ignore[attr-defined]
-        self._environment().set_price(self.price)
-        self._mark = self._environment().totals
+        self.environment.set_price(self.price)
+        self._mark = self.environment.totals
 
     @property
     def price(self) -> float:
         """The present multiplier, in reward per token."""
         return float(self.model.token_price)  # type: ignore[attr-defined]
 
-    def _on_step(self) -> bool:
-        return True
-
     def _on_rollout_end(self) -> None:
-        env = self._environment()
+        env = self.environment
         spent, steps = env.totals
         if steps <= self._mark[1]:
             return
@@ -59,11 +52,6 @@ class TargetRate(BaseCallback):
         env.set_price(self.price)
         self.logger.record("constraint/token_price", self.price)
         self.logger.record("constraint/rate", rate)
-
-    def _environment(self) -> FusionSB3VecEnv:
-        env = self.training_env.unwrapped
-        assert isinstance(env, FusionSB3VecEnv)
-        return env
 
 
 def score(record: dict[str, Any], target: float | None) -> tuple[float, float]:

@@ -71,11 +71,7 @@ class Counterfactual(OnPolicyAlgorithm):
     _decisions: Decisions
 
     def __init__(
-        self,
-        *args: Any,
-        alternatives: Kind | None = None,
-        path_credit: bool = True,
-        **kwargs: Any,
+        self, *args: Any, alternatives: Kind | None = None, path_credit: bool = True, **kwargs: Any
     ) -> None:
         self.alternatives, self.path_credit = alternatives, path_credit
         super().__init__(*args, **kwargs)
@@ -278,8 +274,7 @@ class CounterfactualMaskablePPO(Counterfactual, MaskablePPO):
     """MaskablePPO with counterfactual credit; what it saves are models of MaskablePPO."""
 
     def _masks(self, env: PrivilegedVecEnv) -> torch.Tensor | None:
-        found: torch.Tensor = self._decisions.by_run(torch.as_tensor(env.action_masks()))
-        return found
+        return self._decisions.by_run(torch.as_tensor(env.action_masks()))
 
 
 class _Step(NamedTuple):

@@ -1,7 +1,5 @@
 """What could have been decided instead, as a learner needs it: probabilities, requests, values."""
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 import numpy as np
@@ -99,8 +97,7 @@ class Decisions:
     def seen(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """What the sensors of runs see by themselves, (runs, sensors, entries of a row), from
         observations (runs, entries)."""
-        found: NDArray[np.float32] = self.by_run(self.view.rows(observation))
-        return found
+        return self.by_run(self.view.rows(observation))
 
     def actions(self, chosen: Chosen) -> NDArray[Any]:
         """The rows' actions of the space from the choices (runs, D)."""

@@ -4,23 +4,21 @@
 it does not.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
-from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.evaluation.episodes import EpisodeResults
+
+from .callback import Callback
 
 PARTS = 5  # of the range of prices, equal in the logarithm
 
 
-class Traffic(BaseCallback):
+class Traffic(Callback):
     """Logs the rates of a rollout, requested and granted, and the policy's entropy a sensor.
 
     Rates are per sensor and step. The entropy, in nats, is that of the update before the rollout,
@@ -28,28 +26,20 @@ class Traffic(BaseCallback):
     """
 
     def _on_rollout_start(self) -> None:
-        env = self._environment()
+        env = self.environment
         self._mark = env.requests, env.totals[1]
         lost = self.logger.name_to_value.get("train/entropy_loss")
         if lost is not None:
             deciding = 1 if env.num_envs > env.runs else env.task.sensors
             self.logger.record("train/entropy_per_sensor", -lost / deciding)
 
-    def _on_step(self) -> bool:
-        return True
-
     def _on_rollout_end(self) -> None:
-        env = self._environment()
+        env = self.environment
         (requested, granted), steps = self._mark
         chances = env.task.sensors * (env.totals[1] - steps)
         if chances > 0:
             self.logger.record_mean("rollout/requested", (env.requests[0] - requested) / chances)
             self.logger.record_mean("rollout/granted", (env.requests[1] - granted) / chances)
-
-    def _environment(self) -> FusionSB3VecEnv:
-        env = self.training_env.unwrapped
-        assert isinstance(env, FusionSB3VecEnv)
-        return env
 
 
 def prices_of(task: Task, episodes: int, seed: int) -> Array:

@@ -1,7 +1,5 @@
 """New models of a config's algorithm, and with which policy they begin."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -15,11 +13,19 @@ from fusion_gym.core.task import Task
 from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_system
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.envs.views import SensorView
+from fusion_gym.evaluation.cross_term import cross_terms, usual_policies, worst
 from fusion_gym.policies.model import tag_model
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError, refusal
 
+from ..output.progress import remark
 from .algorithms import TABLE
 from .config import EnvironmentConfig, Experiment
+
+# Of the warning of a cross term:
+_EPISODES = 150  # of each of two policies: a second or two in the slowest environment
+_SEED = 700_000_000  # far from the seeds of trainings, validations, tuning and tests
+_LEVEL = 0.99  # of the intervals together: one of a hundred settings is warned of for nothing
 
 
 def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
@@ -129,3 +135,24 @@ def _begin_at(model: BaseAlgorithm, env: FusionSB3VecEnv, rate: float) -> None:
         logits = np.stack((np.zeros_like(logits), logits), axis=1).ravel()
     with torch.no_grad():
         head.bias.add_(torch.as_tensor(logits, dtype=head.bias.dtype))
+
+
+def warn_of_cross_term(experiment: Experiment, env: FusionSB3VecEnv) -> None:
+    """Print the cross term, with its interval, if that says that it is not zero.
+
+    Two policies are measured: random requests at the rate at which the training begins, or to
+    which it goes, and the one of the greatest value that the environment knows.
+    """
+    task, reference = env.task, env.batch.reference
+    assert reference is not None  # the environment of such a training has one
+    begins = getattr(experiment.algorithm, "initial_rate", None)
+    rate = experiment.training.target_rate or begins or 0.5
+    usual = usual_policies(task, (rate,))
+    policies = {name: make_policy(name, task) for name in (usual[0], usual[-1])}
+    name, found = worst(cross_terms(task, reference, policies, _EPISODES, _SEED, _LEVEL))
+    if not found.compatible:
+        remark(
+            f"warning: training.error = 'mismatch' leaves out a cross term of {found.shown} of the "
+            f"error under {name} ({_EPISODES} episodes); error: excess has none, and the command "
+            "mismatch measures it under other policies and filters"
+        )

@@ -15,17 +15,16 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
-from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.model import ModelPolicy
 
 from ..output.files import replacing, write_text
 from ..output.progress import Bar
 from . import checkpoint
+from .callback import Callback
 from .checkpoint import Journal
 from .config import Experiment
 from .constraint import score
@@ -65,7 +64,7 @@ class Stop(Exception):
     """Ends a training between two rollouts, where the steps counted are the steps trained on."""
 
 
-class Progress(BaseCallback):
+class Progress(Callback):
     """Validation, best model, checkpoints, the progress bar and the split of the wall time."""
 
     def __init__(
@@ -108,13 +107,10 @@ class Progress(BaseCallback):
             self._due = False
             self.save()
             self._measure("validation")
-        self._env_mark = self._environment().seconds
-
-    def _on_step(self) -> bool:
-        return True
+        self._env_mark = self.environment.seconds
 
     def _on_rollout_end(self) -> None:
-        environment = self._environment().seconds - self._env_mark
+        environment = self.environment.seconds - self._env_mark
         self._measure("policy")
         self.journal.seconds["policy"] -= environment
         self.journal.seconds["environment"] += environment
@@ -212,12 +208,7 @@ class Progress(BaseCallback):
 
     def save(self) -> None:
         """Write the checkpoint."""
-        checkpoint.save(self.folder / "latest.zip", self.model, self._environment(), self.journal)
-
-    def _environment(self) -> FusionSB3VecEnv:
-        env = self.training_env.unwrapped
-        assert isinstance(env, FusionSB3VecEnv)
-        return env
+        checkpoint.save(self.folder / "latest.zip", self.model, self.environment, self.journal)
 
 
 def shown(record: dict[str, Any]) -> str:

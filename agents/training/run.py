@@ -1,7 +1,5 @@
 """One training from config to summary; it can be ended at any moment and gone on with."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Callable
@@ -28,8 +26,7 @@ from .checkpoint import Journal, read_journal, restore
 from .config import Experiment
 from .constraint import TargetRate, score
 from .diagnosis import Traffic
-from .mismatch import warn_of_cross_term
-from .models import make_env, make_model
+from .models import make_env, make_model, warn_of_cross_term
 from .monitor import Interrupt, Measure, Progress, Stop
 
 # Training seeds lie far from the validation's and from the small numbers that tests use.

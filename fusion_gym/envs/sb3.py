@@ -131,12 +131,7 @@ class FusionSB3VecEnv(VecEnv):
         if done.any():
             self._finish(np.flatnonzero(done), lengths, infos)
         reward = (self._reward(outcome) * scale).astype(np.float32)
-        result = (
-            self._observe(),
-            reward.repeat(self._rows),
-            done.repeat(self._rows),
-            infos,
-        )
+        result = (self._observe(), reward.repeat(self._rows), done.repeat(self._rows), infos)
         self.seconds += time.perf_counter() - began
         return result
 

@@ -275,9 +275,7 @@ def reset_infos(task: Task, num_envs: int) -> Infos:
 def _cleared(infos: Infos, runs: NDArray[np.bool_]) -> Infos:
     """The infos with zeros in the given runs, as after a reset."""
     return {
-        key: _cleared(value, runs)
-        if isinstance(value, dict)
-        else np.where(runs.reshape(-1, *[1] * (value.ndim - 1)), np.zeros((), value.dtype), value)
+        key: np.where(runs.reshape(-1, *[1] * (value.ndim - 1)), np.zeros((), value.dtype), value)
         for key, value in infos.items()
     }
 
@@ -286,7 +284,7 @@ def _with_mask(infos: Infos, mask: NDArray[np.bool_]) -> Infos:
     """Gymnasium's vector form: beside every key the mask of the runs for which it holds."""
     result: Infos = {}
     for key, value in infos.items():
-        result[key] = _with_mask(value, mask) if isinstance(value, dict) else value.copy()
+        result[key] = value.copy()
         result[f"_{key}"] = mask.copy()
     return result
 

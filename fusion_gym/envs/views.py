@@ -1,12 +1,14 @@
 """Who looks and decides: a coordinator of all sensors, or every sensor by itself.
 
 A view turns a batch's observations into rows, one for each decision of a policy, and the
-decisions into requests; the faces and saved agents hold one and never ask which it is.
+decisions into requests. It has ``names`` of a row's entries, the ``space`` of a row, float32, and
+that of its ``actions``, ``rows_per_run``, which stand together, the ``knowledge`` that a row shows,
+and the ``owner`` whose memory a batch keeps for it, where the task has memory.
 """
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -20,70 +22,6 @@ from fusion_gym.errors import ConfigurationError, shown
 
 Rows = NDArray[np.float32]
 Requests = NDArray[np.bool_]
-
-
-class View(Protocol):
-    """What a policy sees of N runs and how it answers, batch axis first."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """One name an entry of a row."""
-        ...
-
-    @property
-    def space(self) -> spaces.Box:
-        """The Box of a row, float32."""
-        ...
-
-    @property
-    def actions(self) -> spaces.MultiBinary | spaces.Discrete[Any]:
-        """The space of a row's decision."""
-        ...
-
-    @property
-    def rows_per_run(self) -> int:
-        """Rows that belong to one run; they stand together."""
-        ...
-
-    @property
-    def knowledge(self) -> Knowledge:
-        """What a row shows, in the one vocabulary."""
-        ...
-
-    @property
-    def owner(self) -> Owner | None:
-        """Whose memory a batch must keep for it, where the task has memory."""
-        ...
-
-    def rows(self, observation: Rows) -> Rows:
-        """From observations (N, coordinator's entries) to rows (N·rows_per_run, entries)."""
-        ...
-
-    def requests(self, actions: Any, runs: int | None) -> Requests:
-        """Requests (sensors, N) from the rows' actions, N ``runs``.
-
-        ``None`` stands for one run, whose action comes without an axis of runs.
-
-        Raises:
-            ValueError: actions of another shape, not finite, or outside the action space.
-        """
-        ...
-
-    def masks(self, allowed: Requests) -> NDArray[np.bool_]:
-        """Open choices (N·rows_per_run, choices) where sensors (sensors, N) may request.
-
-        In the layout of sb3-contrib's MaskablePPO.
-        """
-        ...
-
-
-def make_view(task: Task, local: bool = False) -> View:
-    """The coordinator's view of a task, or with ``local`` the one that every sensor has.
-
-    Raises:
-        ConfigurationError: a local view of a task that has none (:class:`SensorView`).
-    """
-    return SensorView(task) if local else CoordinatorView(task)
 
 
 class CoordinatorView:
@@ -114,7 +52,13 @@ class CoordinatorView:
         return observation
 
     def requests(self, actions: Any, runs: int | None) -> Requests:
-        """See :class:`View`: actions (N, sensors) of 0 and 1, or (N,) of whole numbers."""
+        """Return the requests (sensors, N) that actions (N, sensors) or (N,) stand for, N ``runs``.
+
+        ``None`` stands for one run, whose action comes without an axis of runs.
+
+        Raises:
+            ValueError: actions of another shape, not finite, or outside the action space.
+        """
         shape = self.actions.shape or ()
         given = _numbers(actions, shape if runs is None else (runs, *shape))
         if isinstance(self.actions, spaces.MultiBinary):
@@ -125,9 +69,10 @@ class CoordinatorView:
         return self._decoded(given.astype(np.int64).reshape(-1))
 
     def masks(self, allowed: Requests) -> NDArray[np.bool_]:
-        """See :class:`View`: two choices a sensor for ``MultiBinary``, silence and a request.
+        """Return the open choices (N, choices) where sensors (sensors, N) may request.
 
-        For ``Discrete`` one choice a number, closed if any of its requests is.
+        In the layout of sb3-contrib's MaskablePPO: two choices a sensor for ``MultiBinary``,
+        silence and a request; for ``Discrete`` a choice a number, closed if any of its requests is.
         """
         if isinstance(self.actions, spaces.Discrete):
             requested = self._decoded(np.arange(self.actions.n))
@@ -196,19 +141,31 @@ class SensorView:
         self.actions: spaces.Discrete[Any] = spaces.Discrete(2)
 
     def rows(self, observation: Rows) -> Rows:
-        """See :class:`View`: (N, coordinator's entries) to (N·sensors, entries)."""
+        """Turn observations (N, coordinator's entries) into rows (N·sensors, entries)."""
         seen = observation[:, self._columns]
         shared = np.broadcast_to(self._identity, (len(observation), *self._identity.shape))
         return np.concatenate((seen, shared), axis=-1).reshape(-1, len(self.names))
 
     def requests(self, actions: Any, runs: int | None) -> Requests:
-        """See :class:`View`: actions (N·sensors,), 1 for a request, run by run."""
+        """Return the requests (sensors, N) of actions (N·sensors,), 1 for a request, run by run."""
         given = _numbers(actions, ((1 if runs is None else runs) * self.rows_per_run,))
         return np.ascontiguousarray(_ones(given).reshape(-1, self.rows_per_run).T)
 
     def masks(self, allowed: Requests) -> NDArray[np.bool_]:
-        """See :class:`View`: silence, and a request, (N·sensors, 2)."""
+        """Return the open choices (N·sensors, 2), silence and a request."""
         return np.stack((np.ones(allowed.size, dtype=np.bool_), allowed.T.ravel()), axis=1)
+
+
+View = CoordinatorView | SensorView
+
+
+def make_view(task: Task, local: bool = False) -> View:
+    """The coordinator's view of a task, or with ``local`` the one that every sensor has.
+
+    Raises:
+        ConfigurationError: a local view of a task that has none (:class:`SensorView`).
+    """
+    return SensorView(task) if local else CoordinatorView(task)
 
 
 def heard(entry: Entry, broadcast: str) -> bool:

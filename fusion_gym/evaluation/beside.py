@@ -116,18 +116,15 @@ class _Part(Beliefs):
 
     @property
     def silent(self) -> Estimate:
-        estimate: Estimate = take_runs(self._whole.beliefs.silent, self._chosen)
-        return estimate
+        return take_runs(self._whole.beliefs.silent, self._chosen)
 
     @property
     def sent(self) -> Estimate:
-        estimate: Estimate = take_runs(self._whole.beliefs.sent, self._chosen)
-        return estimate
+        return take_runs(self._whole.beliefs.sent, self._chosen)
 
     @property
     def best(self) -> Estimate:
-        estimate: Estimate = take_runs(self._whole.beliefs.best, self._chosen)
-        return estimate
+        return take_runs(self._whole.beliefs.best, self._chosen)
 
     @property
     def remembered(self) -> Any:

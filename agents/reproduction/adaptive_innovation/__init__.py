@@ -1,5 +1,1 @@
 """Robust sequential fusion under the adaptive innovation trigger: Figures 3 to 9 and the rates."""
-
-from .pieces import PAPER
-
-__all__ = ["PAPER"]

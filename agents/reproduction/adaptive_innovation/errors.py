@@ -1,7 +1,5 @@
 """Errors, actual and conservative covariances of both sequential fusions, under every setting."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -11,16 +9,7 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
 
-from .runs import (
-    SCALES,
-    SENSORS,
-    STEPS,
-    Lane,
-    Step,
-    always,
-    of_other_episodes,
-    steps,
-)
+from .runs import SCALES, SENSORS, STEPS, Lane, Step, always, of_other_episodes, steps
 
 FUSIONS = ("sci", "sici")
 AT_BOUND, OTHERS, ALWAYS = "at the bounds", "requests of another episode", "always"
@@ -196,12 +185,10 @@ def _whitened(error: Array, claimed: Array) -> Array:
     """L⁻¹ e eᵀ L⁻ᵀ (n, n, N) of errors (n, N), with P = L Lᵀ."""
     root = np.linalg.cholesky(_first(claimed))
     z = np.linalg.solve(root, error.T[..., None])[..., 0].T
-    found: Array = z[:, None] * z[None]
-    return found
+    return z[:, None] * z[None]
 
 
 def top(whitened: Array) -> Array:
     """The sample (E,) along the leading eigenvector of the mean of (n, n, E)."""
     direction = np.linalg.eigh(whitened.mean(-1))[1][:, -1]
-    found: Array = np.einsum("i,ijk,j->k", direction, whitened, direction)
-    return found
+    return np.einsum("i,ijk,j->k", direction, whitened, direction)

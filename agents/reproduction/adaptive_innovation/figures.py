@@ -1,7 +1,5 @@
 """Figures 4 to 9 of the adaptive innovation paper."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -37,8 +35,7 @@ def pictures(found: dict[str, Any]) -> list[Picture]:
 
 
 def _lane(found: dict[str, Any], name: str) -> int:
-    place: int = found["lanes"].index(name)
-    return place
+    return found["lanes"].index(name)
 
 
 def _tracking(found: dict[str, Any]) -> Picture:
@@ -198,8 +195,7 @@ def _ellipses(found: dict[str, Any]) -> Picture:
     circle = np.stack((np.cos(around), np.sin(around)))
 
     def ellipse(covariance: Array) -> Array:
-        found: Array = np.linalg.cholesky(covariance[:2, :2]) @ circle
-        return found
+        return np.linalg.cholesky(covariance[:2, :2]) @ circle
 
     def draw(figure: Any) -> None:
         axes = figure.subplots(2, 2)
@@ -242,5 +238,4 @@ def _ellipses(found: dict[str, Any]) -> Picture:
 
 
 def _runs(found: dict[str, Any]) -> int:
-    episodes: int = found["sci_mse"].shape[-1]
-    return episodes
+    return found["sci_mse"].shape[-1]

@@ -1,7 +1,5 @@
 """What the errors and covariances of both fusions say about the paper's claims."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -27,13 +25,11 @@ class _Data:
         self.found = found
 
     def __call__(self, fusion: str, name: str, lane: str) -> Array:
-        found: Array = self.found[f"{fusion}_{name}"][self.found["lanes"].index(lane)]
-        return found
+        return self.found[f"{fusion}_{name}"][self.found["lanes"].index(lane)]
 
     def relative(self, fusion: str, lane: str) -> Array:
         """MSE over actual trace, minus 1, for each episode's MSE."""
-        found: Array = self(fusion, "mse", lane) / self(fusion, "actual", lane).mean() - 1.0
-        return found
+        return self(fusion, "mse", lane) / self(fusion, "actual", lane).mean() - 1.0
 
 
 def show(found: dict[str, Any]) -> Shown:
@@ -49,11 +45,7 @@ def show(found: dict[str, Any]) -> Shown:
 
 _AT_BOUND = {AT_BOUND: "trigger", OTHERS: "trigger's requests of another episode", ALWAYS: "always"}
 _BELOW = {lane: f"trigger, variances {lane.split()[1]} of the bounds" for lane in _SCALED}
-_QUANTITIES = {
-    "mse": "MSE",
-    "actual": "actual trace",
-    "conservative": "conservative trace",
-}
+_QUANTITIES = {"mse": "MSE", "actual": "actual trace", "conservative": "conservative trace"}
 
 
 def _traces(data: _Data, lanes: dict[str, str], name: str) -> Table:

@@ -1,7 +1,5 @@
 """The adaptive innovation trigger: thresholds, communication rates, and readings of its text."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -62,8 +60,7 @@ def _printed(last: Array, now: Array) -> Array:
 
 def _against_the_centre(signals: Signals) -> Array:
     matrix = np.array(CorrelatedTrackingOptions().measurement_matrices)[:, 0]
-    found: Array = signals["measurement"][:, 0] - matrix @ signals["prior_mean"]
-    return found
+    return signals["measurement"][:, 0] - matrix @ signals["prior_mean"]
 
 
 def _lanes() -> dict[str, Lane]:

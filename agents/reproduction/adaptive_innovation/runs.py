@@ -1,9 +1,8 @@
 """Runs of the tracking example side by side: several policies and noise scales on one noise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +26,7 @@ SCALES = (0.8, 0.6, 0.4)  # the three sets of actual variances, over their bound
 Ask = Callable[[Signals, NDArray[np.bool_]], NDArray[np.bool_]]
 
 
-@dataclass(frozen=True)
-class Lane:
+class Lane(NamedTuple):
     """A setting in which every episode is run: actual over bound variances, who requests.
 
     ``ask`` instead of the trigger's own requests; ``known_start`` puts x(0) at its mean.
@@ -61,8 +59,7 @@ class SideBySide(CorrelatedTrackingSystem):
         return replace(state, truth=truth)
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """A step of all lanes: ``state`` after the delivery, ``outcome`` the network's answer."""
 
     number: int

@@ -1,5 +1,1 @@
 """Fusion of event-triggered estimates of a Markov jump system: Section 6 anew, Figures 2 to 5."""
-
-from .pieces import PAPER
-
-__all__ = ["PAPER"]

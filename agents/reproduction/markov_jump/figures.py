@@ -1,7 +1,5 @@
 """The figures of the Markov jump paper, in our own drawing."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

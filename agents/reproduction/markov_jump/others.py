@@ -1,7 +1,5 @@
 """What else could be done with as many packets as the Markov jump paper's trigger sends."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ Source: markov_jump (event-triggered distributed fusion estimation for asynchron
 systems with correlated noises and fading measurements).
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 
@@ -144,16 +142,6 @@ PAPER = Paper(
         "“Event-triggered distributed fusion estimation for asynchronous Markov jump systems with "
         "correlated noises and fading measurements”."
     ),
-    environments=("fusion_gym/MarkovJumpTracking-v0",),
-    introduction="""
-Section 6 of the paper: a target that jumps between two motions, three sensors that fade and sample
-at every step, every second, every third. Each node filters by itself and sends its estimate where
-the trace of its own covariance is at least tr P_d + m; the centre fuses with matrix weights. The
-paper shows curves and prints no results. Its covariances depend on no data, so that its trigger is
-a schedule, the same in every run. The length of its curves is not told in the text; ours have 100
-steps. What it leaves open and what its text gets wrong is on the page of the
-[environment](../markov_jump.md).
-""",
     pieces=(
         SCHEDULE,
         Piece(

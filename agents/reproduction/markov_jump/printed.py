@@ -4,8 +4,6 @@ The environment carries the exact joint covariance instead. This stands beside i
 printed recursion holds.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 

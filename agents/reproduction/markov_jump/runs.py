@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,8 +49,7 @@ def run(task: Task, policy: str, episodes: int, seed: int) -> Run:
     return Run(truth, mean, local, sent, trace[:, 0])
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """E episodes of H steps, k = 1..H first.
 
     ``truth`` and ``mean`` (H, n, E), the fused estimate · ``local_error`` (H, l, n, E) · of the

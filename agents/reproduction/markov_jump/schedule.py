@@ -1,7 +1,5 @@
 """What the Markov jump paper's trigger sends and what the covariances become: Figures 2 and 5."""
 
-from __future__ import annotations
-
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -202,9 +200,7 @@ def _of_the_traces(found: dict[str, Any]) -> list[Claim]:
         Claim(
             "A local filter's covariance is periodic with its own sampling period.",
             "Remark 2",
-            verdict(
-                period == int(due) for period, due in zip(own, found["periods"], strict=True)
-            ),
+            verdict(period == int(due) for period, due in zip(own, found["periods"], strict=True)),
             "Periods of nodes 1, 2, 3: "
             + ", ".join("none" if period is None else str(period) for period in own)
             + " steps.",
@@ -218,7 +214,7 @@ def _of_the_traces(found: dict[str, Any]) -> list[Claim]:
             + f". What counts for the mean square is the jump system's own radius, "
             f"{found['square_radius']:.4f} < 1.",
         ),
-    ]  # fmt: skip
+    ]
 
 
 SCHEDULE = Piece(

@@ -1,7 +1,5 @@
 """The theorems of the Markov jump paper, held to the errors of simulated episodes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

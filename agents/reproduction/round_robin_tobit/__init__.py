@@ -1,5 +1,1 @@
 """The simulation section of round_robin_tobit: Figures 2 to 11, Tables II and III, the claims."""
-
-from .pieces import PAPER
-
-__all__ = ["PAPER"]

@@ -1,7 +1,5 @@
 """Figures 2 to 6, 10 and 11 of round_robin_tobit: the bias in the filter, or ignored by it."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 
@@ -217,10 +215,7 @@ def _states(
 def _bias(kept: dict[str, Any], name: str, title: str, label: str, step: str) -> Picture:
     found = kept["aware_rmse"][..., 2]
     bound = np.full(found.shape[1], kept["bias_deviation"])
-    lines = [
-        figures.aware(found),
-        figures.least(bound, "√Ξ: no filter lies below"),
-    ]
+    lines = [figures.aware(found), figures.least(bound, "√Ξ: no filter lies below")]
     caption = (
         f"The mean over time is {kept['aware_armse']['mean'][2]:.3g}; the dotted line is √Ξ = "
         f"{kept['bias_deviation']:.3g}, which the last step of the bias alone is worth, and the "

@@ -1,7 +1,5 @@
 """The bounds of Theorems 4 and 5 of round_robin_tobit, step by step beside the covariances."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The claims of Lemma 1, the theorems and the remarks of round_robin_tobit, and their numbers."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Drawings of Figures 2 to 11 of round_robin_tobit."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

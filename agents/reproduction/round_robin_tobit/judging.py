@@ -1,7 +1,5 @@
 """Verdicts about curves: one below another at every step, an estimate that tracks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from fusion_gym.arrays import Array

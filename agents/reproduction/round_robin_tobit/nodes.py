@@ -1,7 +1,5 @@
 """Figures 7 to 9 of round_robin_tobit: local filters and the fused one."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 
@@ -11,20 +9,8 @@ from fusion_gym.evaluation.intervals import Interval
 
 from ..judging import told, verdict
 from ..shown import Claim, Picture, Shown, Table
-from . import figures
+from . import figures, runs
 from .judging import always_below
-from .runs import (
-    OSCILLATOR,
-    Turn,
-    armse,
-    armse_number,
-    compared,
-    curve,
-    increase,
-    node_squares,
-    round_robin,
-    squares,
-)
 
 _EIGHT = {
     "alone": "A local filter by itself falls behind the bias where its sensor is clipped.",
@@ -36,22 +22,22 @@ _READINGS = {"alone": "by itself", "node": "node of Table I"}
 
 def compute(episodes: int, seed: int) -> dict[str, Any]:
     """Local filters by themselves and as nodes to which the fused estimate is fed back."""
-    task = fusion_gym.make_task(OSCILLATOR)
-    fused, local = node_squares(task, round_robin(task), episodes, seed)
-    run = record_episode(task, round_robin(task), seed)
+    task = fusion_gym.make_task(runs.OSCILLATOR)
+    fused, local = runs.node_squares(task, runs.round_robin(task), episodes, seed)
+    run = record_episode(task, runs.round_robin(task), seed)
     found = {
-        "truth": run.truth, "fused_mean": run.mean, "fused_rmse": curve(fused),
-        "fused_armse": armse(fused),
+        "truth": run.truth, "fused_mean": run.mean, "fused_rmse": runs.curve(fused),
+        "fused_armse": runs.armse(fused),
     }  # fmt: skip
     for sensor in range(2):
-        alone = squares(task, Turn(sensor), episodes, seed)
-        found[f"alone_{sensor}_mean"] = record_episode(task, Turn(sensor), seed).mean
+        alone = runs.squares(task, runs.Turn(sensor), episodes, seed)
+        found[f"alone_{sensor}_mean"] = record_episode(task, runs.Turn(sensor), seed).mean
         found[f"node_{sensor}_mean"] = run.local_mean[:, sensor]
         for name, other in (("alone", alone), ("node", local[:, :, sensor])):
-            found[f"{name}_{sensor}_rmse"] = curve(other)
-            found[f"{name}_{sensor}_armse"] = armse(other)
-            found[f"{name}_{sensor}_difference"] = compared(fused, other)
-            found[f"{name}_{sensor}_increase"] = increase(fused, other)
+            found[f"{name}_{sensor}_rmse"] = runs.curve(other)
+            found[f"{name}_{sensor}_armse"] = runs.armse(other)
+            found[f"{name}_{sensor}_difference"] = runs.compared(fused, other)
+            found[f"{name}_{sensor}_increase"] = runs.increase(fused, other)
     return found
 
 
@@ -62,7 +48,7 @@ def show(kept: dict[str, Any]) -> Shown:
         _outperforms(kept, "bias", range(2, 3), "Figs. 8 and 9", name) for name in _READINGS
     ]
     rows = [
-        armse_number(f"{label}: ARMSE{state + 1}", kept[f"{key}_armse"], state, None)
+        runs.armse_number(f"{label}: ARMSE{state + 1}", kept[f"{key}_armse"], state, None)
         for key, label in (
             ("fused", "FTKF-DB"),
             *((f"alone_{i}", f"LTKF-DB-S{i + 1} by itself") for i in range(2)),
@@ -116,15 +102,15 @@ def _pictures(kept: dict[str, Any], name: str) -> list[Picture]:
     )
     return [
         Picture(
-            f"figure_7{suffix}", f"Figure 7: RMSE1 and RMSE2, local and fused ({which})",
+            f"figure_7{suffix}",
+            f"Figure 7: RMSE1 and RMSE2, local and fused ({which})",
             f"Means over time, sensors 1 and 2 beside the fused: {said}.",
-            partial(
-                figures.curves, panels=states, from_zero=True
-            ),
+            partial(figures.curves, panels=states, from_zero=True),
             (7.2, 4.8),
         ),
         Picture(
-            f"figure_8{suffix}", f"Figure 8: the bias, local and fused ({which})",
+            f"figure_8{suffix}",
+            f"Figure 8: the bias, local and fused ({which})",
             f"One run, that of Figures 2 to 4. {_EIGHT[name]}",
             partial(
                 figures.curves,
@@ -133,13 +119,11 @@ def _pictures(kept: dict[str, Any], name: str) -> list[Picture]:
             (7.2, 3.4),
         ),
         Picture(
-            f"figure_9{suffix}", f"Figure 9: RMSE3, local and fused ({which})",
+            f"figure_9{suffix}",
+            f"Figure 9: RMSE3, local and fused ({which})",
             "Root mean squared error of the bias over all runs"
             f"{', with 95 % bands' if name == 'alone' else '; the band is the 95 % of the fused'}.",
-            partial(
-                figures.curves, panels=[("RMSE3 (of b)", lines("rmse", 2))],
-                from_zero=True,
-            ),
+            partial(figures.curves, panels=[("RMSE3 (of b)", lines("rmse", 2))], from_zero=True),
             (7.2, 3.4),
         ),
-    ]  # fmt: skip
+    ]

@@ -1,23 +1,7 @@
 """The simulation section of round_robin_tobit: Figures 2 to 11, Tables II and III, the claims."""
 
-from __future__ import annotations
-
 from ..paper import Paper, Piece
 from . import bias, claims, nodes, tables, theory
-from .runs import OSCILLATOR, TRACKING
-
-_INTRODUCTION = """
-Section IV anew. The oscillator's state, bias and measurements have no units in the paper; the
-target's are metres, metres a second and metres a second squared. The filters are those of
-Theorems 1 to 3 with the text's mistakes corrected: [the environment's page](../biased.md) says
-which. FTKF-DB is the filter of state and bias together, FTKF the one that believes that there is
-no bias. Figures have the paper's quantities, axes and order; what is judged is what its text says
-of them. Figure 1 is a block diagram and Table I pseudocode, which is not repeated here.
-
-Under heavy censoring the paper's filter is overconfident: where it holds an uncensored packet for
-next to impossible, one makes it jump far off. A few runs carry the mean errors, which is why the
-curves have jags and the intervals of its means are wide.
-"""
 
 PAPER = Paper(
     name="round_robin_tobit",
@@ -27,8 +11,6 @@ PAPER = Paper(
         "Filtering Fusion with Dead-Zone-Like Censoring and Dynamical Bias under the Round-Robin "
         "Protocol”, IEEE Transactions on Signal and Information Processing over Networks 7, 2021."
     ),
-    environments=(OSCILLATOR, TRACKING),
-    introduction=_INTRODUCTION,
     pieces=(
         Piece(
             "oscillator", "The oscillator: the bias in the filter, or ignored by it",

@@ -1,7 +1,5 @@
 """The equations of round_robin_tobit as they are printed, and other readings of its parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Runs of the biased oscillator and the biased target, and what is kept of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """Tables II and III of round_robin_tobit: censoring intervals and noise variances."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 
@@ -14,20 +12,9 @@ from fusion_gym.evaluation.intervals import mean_interval
 from ...output import palette
 from ..judging import verdict
 from ..shown import Claim, Number, Picture, Shown, Table
-from . import figures
+from . import figures, runs
 from .judging import listed
 from .readings import READINGS, task_of
-from .runs import (
-    OSCILLATOR,
-    PAPER_RUNS,
-    armse,
-    armse_number,
-    floor,
-    increase,
-    medians,
-    round_robin,
-    squares,
-)
 
 # Tables II and III of the paper: ARMSE1, ARMSE2, ARMSE3.
 TABLE_II = {
@@ -54,21 +41,21 @@ def compute(episodes: int, seed: int) -> dict[str, Any]:
     for name, options in _rows().items():
         row: dict[str, Any] = {}
         for filter_ in _FILTERS:
-            task = fusion_gym.make_task(OSCILLATOR, filter=filter_, **options)
-            found = squares(task, round_robin(task), episodes, seed)
+            task = fusion_gym.make_task(runs.OSCILLATOR, filter=filter_, **options)
+            found = runs.squares(task, runs.round_robin(task), episodes, seed)
             # Both tables begin with the interval [-5, 5] and R = 0.6.
             first = before.setdefault(f"first {filter_}", found)
             earlier = before.get(filter_, found) if name != "variance 0.1" else first
-            row[filter_] = armse(found) | _median(found) | {"rise": _rise(earlier, found)}
+            row[filter_] = runs.armse(found) | _median(found) | {"rise": _rise(earlier, found)}
             before[filter_] = found
         variance = {"measurement_variance": options["measurement_variance"]}
-        row["floor"] = floor(OSCILLATOR, **variance)
-        row["floor_all"] = floor(OSCILLATOR, access="any", **variance)
+        row["floor"] = runs.floor(runs.OSCILLATOR, **variance)
+        row["floor_all"] = runs.floor(runs.OSCILLATOR, access="any", **variance)
         rows[name] = row
-    task = fusion_gym.make_task(OSCILLATOR)
-    never = squares(task, fusion_gym.make_policy("never", task), episodes, seed)
+    task = fusion_gym.make_task(runs.OSCILLATOR)
+    never = runs.squares(task, fusion_gym.make_policy("never", task), episodes, seed)
     root = float(np.sqrt(np.asarray(task.settings["bias_noise_covariance"])[0, 0]))
-    return {"rows": rows, "silent": armse(never), "bias_deviation": root}
+    return {"rows": rows, "silent": runs.armse(never), "bias_deviation": root}
 
 
 def _rows() -> dict[str, dict[str, Any]]:
@@ -86,20 +73,19 @@ def _rows() -> dict[str, dict[str, Any]]:
 
 
 def _row(kept: dict[str, Any], name: str) -> dict[str, Any]:
-    found: dict[str, Any] = kept["rows"]["interval 5" if name == "variance 0.6" else name]
-    return found
+    return kept["rows"]["interval 5" if name == "variance 0.6" else name]
 
 
 def _median(found: Array) -> dict[str, list[float]]:
     """Median over runs of a run's RMSE of x1, with its interval."""
-    middle, drawn = medians(found)
+    middle, drawn = runs.medians(found)
     return {"median": [middle, *np.quantile(drawn, [0.025, 0.975]).tolist()]}
 
 
 def _rise(before: Array, after: Array) -> dict[str, Any]:
     """From one row to the next, of ARMSE1, 2, 3 and the median: ends of the paired intervals."""
-    found = increase(before, after)
-    middle = np.quantile(medians(after)[1] - medians(before)[1], [0.025, 0.975])
+    found = runs.increase(before, after)
+    middle = np.quantile(runs.medians(after)[1] - runs.medians(before)[1], [0.025, 0.975])
     return {end: [*found[end], float(middle[i])] for i, end in enumerate(("low", "high"))}
 
 
@@ -114,7 +100,7 @@ def show(kept: dict[str, Any]) -> Shown:
         ("table_3", third, "Table III: ARMSE for three noise variances, interval [-5, 5]"),
     ):
         numbers = [
-            armse_number(
+            runs.armse_number(
                 f"{label}, ARMSE{state + 1}", _row(kept, row)["paper"], state, values[state]
             )
             for (label, row), values in zip(rows.items(), printed[name], strict=True)
@@ -163,7 +149,7 @@ def _others(kept: dict[str, Any], rows: dict[str, str]) -> Table:
     for label, row in rows.items():
         found = _row(kept, row)
         numbers += [
-            armse_number(f"{label}: {head}", found["adf"], i, None)
+            runs.armse_number(f"{label}: {head}", found["adf"], i, None)
             for i, head in enumerate(_HEADS[:3])
         ]
         for filter_, head in zip(("adf", "paper"), _HEADS[3:], strict=True):
@@ -188,7 +174,8 @@ def _broken(kept: dict[str, Any]) -> str:
     ]
     # An RMSE of so many runs of a Gaussian error has this relative deviation at each time, and its
     # mean over time no larger one.
-    chance = 1.0 - 4.0 / np.sqrt(2.0 * PAPER_RUNS)
+    count = runs.PAPER_RUNS
+    chance = 1.0 - 4.0 / np.sqrt(2.0 * count)
     below = sum(value < chance * least for value, least, _ in entries)
     below_all = sum(value < chance * least for value, _, least in entries)
     bias = [values[2] for values in (TABLE_II[5.0], TABLE_III[0.1], TABLE_III[0.06])]
@@ -209,7 +196,7 @@ printed parameters.** The noise ε of (3) is independent of everything measured 
 bias's RMSE is at least √Ξ = {kept["bias_deviation"]:g} at every step; printed are
 {listed(bias, "g")}. The Kalman filter on the same packets *without* censoring has the least error
 of all filters, and clipping only takes information away: {below} of the {len(entries)} printed
-values lie below that by more than chance (four standard deviations of {PAPER_RUNS:,} runs), and
+values lie below that by more than chance (four standard deviations of {count:,} runs), and
 {below_all} even below what both sensors at every step would allow. In the two narrow intervals,
 {beyond} of the 6 printed values lie *above* the error without any measurements
 ({listed(silent, ".3f")}).
@@ -251,10 +238,10 @@ def compute_readings(episodes: int, seed: int) -> dict[str, Any]:
         for limit in (5.0, 0.5):
             task = task_of(reading, censoring_threshold=-limit, censoring_upper=limit)
             name = "always" if task.access == "any" else "round_robin"
-            errors = squares(task, fusion_gym.make_policy(name, task), episodes, seed)
+            errors = runs.squares(task, fusion_gym.make_policy(name, task), episodes, seed)
             roots = np.sqrt(errors.mean((1, 2)))
             far = mean_interval((roots > 10.0).astype(float))
-            found[f"{reading} {limit:g}"] = armse(errors) | {"far": list(far)}
+            found[f"{reading} {limit:g}"] = runs.armse(errors) | {"far": list(far)}
     return found
 
 

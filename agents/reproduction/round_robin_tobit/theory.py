@@ -1,7 +1,5 @@
 """What Lemma 1, the theorems and the remarks of round_robin_tobit are judged by."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -15,17 +13,7 @@ from fusion_gym.systems.tobit.tobit_filter import expect_censored
 
 from . import bounds
 from .readings import PrintedTobitFilter
-from .runs import (
-    FREE,
-    OSCILLATOR,
-    TRACKING,
-    armse,
-    censored,
-    round_robin,
-    scheduled,
-    squares,
-    walk,
-)
+from .runs import FREE, OSCILLATOR, TRACKING, armse, censored, round_robin, scheduled, squares, walk
 
 PLACES = (-7.0, -5.0, -4.0, 0.0, 4.5, 5.0, 6.0)  # true x1 at which Lemma 1 is tried
 _DRAWS = 200  # measurements an episode, at each of them

@@ -1,5 +1,1 @@
 """Tobit Kalman fusion filtering with a token bucket: Section 4 made anew, Figures 2 to 10."""
-
-from .pieces import PAPER
-
-__all__ = ["PAPER"]

@@ -1,7 +1,5 @@
 """What the token-bucket paper's Section 4 and introduction say of its figures, held to data."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

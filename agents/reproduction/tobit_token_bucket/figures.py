@@ -1,7 +1,5 @@
 """The figures of the token-bucket paper, in our own drawing."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

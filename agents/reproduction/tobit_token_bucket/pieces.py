@@ -4,8 +4,6 @@ Source: tobit_token_bucket, X. Chen, F. Han, Y. Song and J. Zhang, Complex Engin
 2024.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 
@@ -263,16 +261,6 @@ PAPER = Paper(
         "event-triggering protocol with token bucket specification”, Complex Engineering Systems "
         "4:19, 2024."
     ),
-    environments=("fusion_gym/TobitOscillator-v0",),
-    introduction="""
-Section 4 of the paper: an oscillator, three sensors that are censored at zero, a dynamic event
-trigger at each of them, and a token bucket. Each node runs the paper's Tobit Kalman filter, which
-minimises a bound of its error covariance; the centre fuses and feeds back. The paper shows curves
-of one episode and prints no numbers: what can be compared is the course of its curves and what
-its text says of them. One episode below is that of the first seed; everything else is a mean over
-episodes. What the paper leaves open, how we read it, and what its text gets wrong is on the page
-of the [environment](../tobit_oscillator.md).
-""",
     pieces=(
         Piece(
             "network", "Tokens, events and measurements (Figures 2 to 4)",

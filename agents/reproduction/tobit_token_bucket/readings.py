@@ -1,7 +1,5 @@
 """The token-bucket scheme under other readings of the text, and with other filters."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

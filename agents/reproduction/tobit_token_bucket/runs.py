@@ -1,9 +1,7 @@
 """Episodes of the token-bucket paper with everything that its figures show."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +19,7 @@ TRIGGER = "dynamic_event"
 SENSORS = 3
 
 
-@dataclass(frozen=True)
-class History:
+class History(NamedTuple):
     """E episodes of H steps; t = 1..H first, episodes last.
 
     ``truth`` (H, n, E) · ``measurement`` (H, l, m, E), censored · ``held`` (H, l, m, E), what the
@@ -113,7 +110,7 @@ def record(task: Task, episodes: int, seed: int, policy: Policy | None = None) -
     policy = fusion_gym.make_policy(TRIGGER, task) if policy is None else policy
     batch = EpisodeBatch.seeded(task, episodes, seed)
     policy.reset(episodes, seed)
-    rows: dict[str, list[NDArray[Any]]] = {field.name: [] for field in fields(History)}
+    rows: dict[str, list[NDArray[Any]]] = {name: [] for name in History._fields}
     for _ in range(task.horizon):
         before, tokens = batch.state, batch.tokens
         outcome = batch.step(policy(batch.signals()))

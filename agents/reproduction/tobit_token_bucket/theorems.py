@@ -1,7 +1,5 @@
 """The theorems of the token-bucket paper, and its claim of resilience."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -168,6 +166,4 @@ def _resilient(found: dict[str, Any]) -> Claim:
     )
 
 
-THEOREMS = Piece(
-    "theorems", "Theorems and failures of sensors", compute, show, 25.0, 2000
-)  # fmt: skip
+THEOREMS = Piece("theorems", "Theorems and failures of sensors", compute, show, 25.0, 2000)

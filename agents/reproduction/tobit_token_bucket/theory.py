@@ -1,9 +1,6 @@
 """What the theorems of the token-bucket paper say, computed on recorded episodes."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +15,7 @@ _UNCENSORED = 0.01  # q from which (37) is evaluated as printed: it holds 1/q wh
 _FLOOR = 1e-140  # of q where it divides and the ratio is squared
 
 
-@dataclass(frozen=True)
-class Terms:
+class Terms(NamedTuple):
     """(30) of a node and step as κ₁ (I - K q C) P (I - K q C)ᵀ + K S Kᵀ, in units of q.
 
     ``prior`` P (…, n, n) · ``seen`` C (…, m, n) · ``probability`` q (…, m) · ``noise`` q⁻¹ S q⁻¹

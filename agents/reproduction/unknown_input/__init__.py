@@ -1,5 +1,1 @@
 """Joint input and state filters under an adaptive threshold: Figures 1 to 7 and the theorems."""
-
-from .pieces import PAPER
-
-__all__ = ["PAPER"]

@@ -1,7 +1,5 @@
 """What both unknown-input examples say about the paper's claims."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from fusion_gym.arrays import Array
@@ -50,8 +48,7 @@ def show(found: dict[str, Any]) -> Shown:
 def _relative(found: dict[str, Any], example: str, block: int, setting: str = OURS) -> Array:
     """Fused squared errors (E,) over the mean square of what is estimated."""
     mse = found[f"{example}_mse"][found["settings"].index(setting), block]
-    relative: Array = mse / found[f"{example}_power"][block].mean()
-    return relative
+    return mse / found[f"{example}_power"][block].mean()
 
 
 def _tracking(found: dict[str, Any]) -> list[Claim]:
@@ -151,8 +148,7 @@ def _theorems(found: dict[str, Any]) -> list[Claim]:
 
 
 def _growth(steady: Array) -> Array:
-    ratio: Array = steady[1] / steady[0].mean()
-    return ratio
+    return steady[1] / steady[0].mean()
 
 
 def _saving(found: dict[str, Any]) -> list[Claim]:

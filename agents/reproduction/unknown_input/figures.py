@@ -1,7 +1,5 @@
 """Figures 1 to 7 of the unknown-input paper, its example beside the well-posed one."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

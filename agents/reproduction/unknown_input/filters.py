@@ -1,7 +1,5 @@
 """Both examples under the paper's filter and trigger, and other filters beside it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -10,17 +8,7 @@ import fusion_gym
 from fusion_gym.arrays import Array
 from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
 
-from .runs import (
-    EXAMPLES,
-    PRINTED,
-    TRIGGER,
-    Record,
-    halves,
-    leading,
-    make,
-    record,
-    tables,
-)
+from .runs import EXAMPLES, PRINTED, TRIGGER, Record, halves, leading, make, record, tables
 
 OURS, FIXED = "paper's filter and trigger", "paper's filter, fixed threshold ρ̄"
 WALK = "Kalman filter with a random-walk input, paper's trigger"
@@ -134,5 +122,4 @@ def _thresholds(rule: AdaptiveThreshold, square: Array) -> Array:
 def _settled(rho: Array, limit: Array) -> Array:
     """Judgements (E,) after which every threshold is at 99 % of ρ̄ at least."""
     below = rho < 0.99 * limit
-    found: Array = below.sum(0).max(0).astype(float)
-    return found
+    return below.sum(0).max(0).astype(float)

@@ -1,9 +1,6 @@
 """The paper's recursion (17)-(20) exactly as its text has it, on what the trigger delivered."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +27,13 @@ READINGS: dict[str, dict[str, Any]] = {
         "options": {
             "process_covariance": ((1e-6, 0.0), (0.0, 1e-6)),
             "measurement_covariance": 1e-6,
-        },
+        }
     },
     "everything transmitted": {"policy": "always"},
 }
 
 
-@dataclass(frozen=True)
-class Model:
+class Model(NamedTuple):
     """𝒜, ℬ, 𝒲 of the lifted plant and C, V of one node, ε, ρ̄, x(0) and Ξ(0); no batch axis."""
 
     transition: Array
@@ -112,8 +108,7 @@ def _pseudo_inverse(matrix: Array, cutoff: float) -> Array:
     left, values, right = np.linalg.svd(matrix)
     kept = values > cutoff
     inverted = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
-    found: Array = (right.swapaxes(1, 2) * inverted[:, None]) @ left.swapaxes(1, 2)
-    return found
+    return (right.swapaxes(1, 2) * inverted[:, None]) @ left.swapaxes(1, 2)
 
 
 def run(model: Model, held: Array, granted: NDArray[np.bool_], cutoff: float) -> dict[str, Array]:

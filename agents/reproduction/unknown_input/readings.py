@@ -1,7 +1,5 @@
 """What the text's own recursion does, and what was tried to make its example track."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

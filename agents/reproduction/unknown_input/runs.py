@@ -1,9 +1,6 @@
 """Runs of the unknown-input examples with all that the figures and claims need."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +20,7 @@ STEPS = 100
 TRIGGER = "adaptive_threshold"
 
 
-@dataclass(frozen=True)
-class Record:
+class Record(NamedTuple):
     """E episodes of H sampling instants, times first, episodes last.
 
     ``truth`` (H, s, E) of [x(k); d(k - 1)] · ``local`` (H, l, s, E) the nodes' estimates, ``fused``
@@ -43,8 +39,7 @@ class Record:
     def errors(self) -> Array:
         """Errors (H, l + 1, s, E), the fused estimate first."""
         every = np.concatenate((self.fused[:, None], self.local), axis=1)
-        found: Array = self.truth[:, None] - every
-        return found
+        return self.truth[:, None] - every
 
 
 def make(**options: Any) -> tuple[Task, UnknownInputSystem]:
@@ -65,7 +60,7 @@ def record(task: Task, policy: str, episodes: int, seed: int) -> Record:
     chosen = fusion_gym.make_policy(policy, task)
     batch = EpisodeBatch.seeded(task, episodes, seed)
     chosen.reset(episodes, seed)
-    rows: dict[str, list[NDArray[Any]]] = {name: [] for name in Record.__dataclass_fields__}
+    rows: dict[str, list[NDArray[Any]]] = {name: [] for name in Record._fields}
     for _ in range(task.horizon):
         apart = batch.state.measurement - batch.state.held
         outcome = batch.step(chosen(batch.signals()))
@@ -85,8 +80,7 @@ def record(task: Task, policy: str, episodes: int, seed: int) -> Record:
 def halves(value: Array, states: int, axis: int) -> Array:
     """Sums over the states and over the inputs, stacked along ``axis`` in the place of both."""
     first, last = np.split(value, [states], axis=axis)
-    found: Array = np.stack((first.sum(axis), last.sum(axis)), axis=axis)
-    return found
+    return np.stack((first.sum(axis), last.sum(axis)), axis=axis)
 
 
 def leading(errors: Array, bounds: Array) -> Array:
@@ -99,5 +93,4 @@ def leading(errors: Array, bounds: Array) -> Array:
     z = root @ errors
     moment = np.einsum("hie,hje->ije", z, z) / len(z)
     direction = np.linalg.eigh(moment.mean(-1))[1][:, -1]
-    found: Array = np.einsum("i,ije,j->e", direction, moment, direction)
-    return found
+    return np.einsum("i,ije,j->e", direction, moment, direction)

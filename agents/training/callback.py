@@ -1,0 +1,19 @@
+"""What the callbacks of a training have in common."""
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from fusion_gym.envs.sb3 import FusionSB3VecEnv
+
+
+class Callback(BaseCallback):
+    """A callback between rollouts, which knows the training's environment."""
+
+    @property
+    def environment(self) -> FusionSB3VecEnv:
+        """The environment itself, without wrappers."""
+        env = self.training_env.unwrapped
+        assert isinstance(env, FusionSB3VecEnv)
+        return env
+
+    def _on_step(self) -> bool:
+        return True
