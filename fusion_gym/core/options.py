@@ -86,8 +86,8 @@ class CommonOptions:
     """``"scalar"`` pays the sum of the reward's two terms, ``"vector"`` both terms."""
     error: ErrorKind | str | Callable[[Array, Array], Any] = "squared"
     """Error term of the reward: the squared errors, the diagonal of the claimed covariance (which a
-    policy may be able to game), or the largest weighted squared error. Or a function of errors and covariances, or its
-    ``"module:name"``."""
+    policy may be able to game), or the largest weighted squared error. Or a function of errors and
+    covariances, or its ``"module:name"``."""
     error_weight: float = 1.0
     """Weight of the reward's error term."""
     cost_weight: float | Literal["random"] = 0.01
