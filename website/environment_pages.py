@@ -1,4 +1,4 @@
-"""What the site adds to an environment's page: an overview and tables, made from the code."""
+"""What the site adds to an environment's page: an overview, and what ``help`` says."""
 
 from __future__ import annotations
 
@@ -8,38 +8,27 @@ import sys
 from collections.abc import Sequence
 
 import fusion_gym
-from fusion_gym.core.task import Task
-from fusion_gym.envs.option_text import short
+from fusion_gym.envs.pages import page
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
-from fusion_gym.envs.vector import reset_infos
 from fusion_gym.envs.views import make_view
 from website.parts import ALSO, FILTERS, PAGES_OF, offered
 from website.places import DOCS
 
-MEANINGS = {
-    "cost": "tokens spent in the step, never negative (the convention of constrained learning)",
-    "cost_tokens": "the same, by its name",
-    "reward_error": "the error's term of the reward",
-    "reward_cost": "the tokens' term of the reward",
-    "granted": "which requests the network granted",
-    "denied": "which requests it denied",
-    "squared_error": "squared error of the fused estimate, a number a state",
-    "diverged": "whether a squared error is above 100 times its open-loop mean, or not finite",
-}
+SECTIONS = ("Action space", "Reward", "Episode end", "Info")
 
 
-def of_page(page: str) -> list[str]:
+def of_page(name: str) -> list[str]:
     """Ids of the environments that a page tells of."""
-    return [env_id for env_id in ENVIRONMENTS if PAGES_OF.get(env_id) == page]
+    return [env_id for env_id in ENVIRONMENTS if PAGES_OF.get(env_id) == name]
 
 
 def at_a_glance(env_id: str) -> str:
     """A table of what the environment is, made from the code."""
     task = fusion_gym.make_task(env_id)
-    view = make_view(task)
+    view, kind = make_view(task), options_of(env_id)
     rows = [
         ("id", f"`{env_id}`"),
-        ("options", f"[`{options_of(env_id).__name__}`][{_place(options_of(env_id))}]"),
+        ("options", f"[`{kind.__name__}`][{kind.__module__}.{kind.__name__}]"),
         ("sensors", str(task.sensors)),
         ("states", ", ".join(f"`{name}`" for name in task.system.state_names)),
         ("observation", f"{len(view.names)} float32 numbers"),
@@ -56,28 +45,22 @@ def at_a_glance(env_id: str) -> str:
     return _table(("", env_id.split("/")[1]), rows)
 
 
-def tables(env_id: str) -> str:
-    """Actions, reward and info, made from the code."""
-    task = fusion_gym.make_task(env_id)
+def sections(env_id: str) -> str:
+    """Actions, reward, end and info: the sections of the page that ``help`` shows."""
     name = env_id.split("/")[1]
-    parts = [
-        f"### Actions of {name}",
-        _table(("with", "action space", "meaning"), _actions(env_id)),
-        f"### Reward of {name}",
-        _table(("", "by default"), _reward(task)),
-        f"### Info of {name}",
-        _table(("entry", "type", "shape", "meaning"), _infos(task)),
-    ]
-    return "\n\n".join(parts)
+    found = re.findall(r"^## (.+)\n((?:(?!## ).*\n)+)", page(env_id), re.MULTILINE)
+    return "\n\n".join(
+        f"### {head} of {name}\n\n{text.strip()}" for head, text in found if head in SECTIONS
+    )
 
 
-def with_tables(text: str, page: str) -> str:
-    """An environment's page with an overview before its sections, and tables at its end."""
-    every = of_page(page)
-    head, mark, sections = text.partition("\n## ")
+def with_tables(text: str, name: str) -> str:
+    """A page of environments with an overview of each before it, and ``help`` of each behind it."""
+    every = of_page(name)
+    head, mark, body = text.partition("\n## ")
     overview = "\n\n".join(at_a_glance(env_id) for env_id in every)
-    tail = "\n\n".join(["## From the code", *(tables(env_id) for env_id in every)])
-    return f"{head.strip()}\n\n{overview}\n{mark}{sections.strip()}\n\n{tail}\n"
+    tail = "\n\n".join(["## From the code", *(sections(env_id) for env_id in every)])
+    return f"{head.strip()}\n\n{overview}\n{mark}{body.strip()}\n\n{tail}\n"
 
 
 def _filter_link(env_id: str, name: str) -> str:
@@ -93,57 +76,6 @@ def _paper(env_id: str) -> str:
     module = inspect.getdoc(sys.modules[options_of(env_id).__module__]) or ""
     found = re.search(r"^Source: (\w+)", module, re.MULTILINE)
     return found[1] if found else ""
-
-
-def _place(kind: type) -> str:
-    return f"{kind.__module__}.{kind.__qualname__}"
-
-
-def _actions(env_id: str) -> Sequence[tuple[str, ...]]:
-    rows = []
-    for words, options, meaning in (
-        ("the defaults", {}, "a flag a sensor: 1 requests a transmission"),
-        (
-            '`action="discrete"`',
-            {"action": "discrete"},
-            "the flags as one number, sensor 0 the lowest",
-        ),
-        ('`access="single"`', {"access": "single"}, "0 for nobody, m for sensor m - 1"),
-    ):
-        space = make_view(fusion_gym.make_task(env_id, **options)).actions
-        if space.__class__.__name__ == "Discrete" and not options:
-            meaning = "0 for nobody, m for sensor m - 1"
-        rows.append((words, f"`{space}`", meaning))
-    alone = fusion_gym.parallel_env(env_id)
-    space = alone.action_space(alone.possible_agents[0])
-    rows.append(("a sensor by itself", f"`{space}`", "1 requests a transmission"))
-    return rows
-
-
-def _reward(task: Task) -> list[tuple[str, ...]]:
-    weights = task.reward.state_weights[:, 0]
-    open_loop = float(weights @ task.system.open_loop(task.horizon))
-    names = task.system.state_names
-    shown = ", ".join(f"`{n}` {w:.4g}" for n, w in zip(names, weights, strict=True))
-    return [
-        ("reward", "-(`error_weight` · Σ wᵢ eᵢ² + `cost_weight` · tokens spent)"),
-        ("weights w of the states", shown),
-        ("`error_weight`", f"{task.reward.error_weight:g}"),
-        ("`cost_weight`", short(task.reward.price.fixed)),
-        (
-            "error's term if nothing is ever sent",
-            f"about -{open_loop * task.reward.error_weight:.3g} a step",
-        ),
-    ]
-
-
-def _infos(task: Task) -> Sequence[tuple[str, ...]]:
-    found = []
-    for key, value in reset_infos(task, 1).items():
-        if not key.startswith("_"):
-            shape = "number" if value.ndim == 1 else f"({', '.join(map(str, value.shape[1:]))},)"
-            found.append((f"`{key}`", str(value.dtype), shape, MEANINGS[key]))
-    return found
 
 
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:

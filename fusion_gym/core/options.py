@@ -83,9 +83,9 @@ class CommonOptions:
     reward: Literal["scalar", "vector"] = "scalar"
     """``"scalar"`` pays the sum of the reward's two terms, ``"vector"`` both terms."""
     error: ErrorKind | str | Callable[[Array, Array], Any] = "squared"
-    """Error term of the reward: the squared errors, the diagonal of the claimed covariance, or the
-    largest weighted squared error. Or a function of errors and covariances, or its
-    ``"module:name"``."""
+    """Error term of the reward: the squared errors, the diagonal of the claimed covariance (which a
+    policy may be able to game), or the largest weighted squared error. Or a function of errors and
+    covariances, or its ``"module:name"``."""
     error_weight: float = 1.0
     """Weight of the reward's error term."""
     cost_weight: float | Literal["random"] = 0.01
@@ -110,13 +110,10 @@ class CommonOptions:
     (low, high) is drawn from for each episode."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.information, str) and self.information == "local":
-            raise refusal(
-                "information",
-                "local",
-                "'sensors' or 'centre'; decentralised sensors are fusion_gym.parallel_env(id) and "
-                "make_sb3_vec_env(id, n, local=True)",
-            )
+        if str(self.information) == "local":
+            calls = "fusion_gym.parallel_env(id) and make_sb3_vec_env(id, n, local=True)"
+            allowed = f"'sensors' or 'centre'; decentralised sensors are {calls}"
+            raise refusal("information", "local", allowed)
         declaration.check(self)
 
 

@@ -24,11 +24,7 @@ class Option(NamedTuple):
 # What every environment takes beside the fields of its options.
 FOR_ALL = {
     "system": Option("str | None", None, "Path of a YAML file of options."),
-    "max_episode_steps": Option(
-        "int | None",
-        None,
-        "Steps after which an episode is truncated, without change of any scale.",
-    ),
+    "max_episode_steps": Option("int | None", None, "Steps to truncation; all scales stay."),
 }
 
 

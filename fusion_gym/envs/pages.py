@@ -43,9 +43,8 @@ _PAGE = """\
 {description}
 
 ## Action space
-`{actions}`. Of a `MultiBinary(sensors)` a 1 is a request; with `action="discrete"` it is
-`Discrete(2**sensors)`, the bits as one number, sensor 0 the lowest; with `access="single"` it is
-`Discrete(sensors + 1)`, 0 for nobody, m for sensor m - 1.
+`{actions}`. Of a `MultiBinary(sensors)` a 1 is a request. The options `action` and `access` change
+the space.
 
 ## Observation space
 A `Box` of {entries} float32 numbers, clipped to their ranges; `env.unwrapped.observation_names`
@@ -58,14 +57,11 @@ names them in order. Sensors: {sensors}. States: {states}.
 ## Reward
 -(`error_weight` · Σ wᵢ eᵢ² + `cost_weight` · tokens spent), with e the error of the fused estimate
 at the time of the request. The weights w, the option `state_weights`, are here
-{weights}, so that never transmitting costs about {open_loop} a step.
-`error="trace"` puts the diagonal of the claimed covariance in the place of the squared errors,
-which a policy may be able to game. `cost_weight="random"` draws the price of a token from
-`price_range` for each episode, evenly in its logarithm.
+{weights}, so that never transmitting costs about {open_loop} a step. The options `error` and
+`cost_weight` have other terms.
 
 ## Episode end
-Truncation after `horizon` steps, here {horizon}; with `clock=True`, which shows the time that is
-left, it is a termination. `max_episode_steps` ends episodes earlier without changing any scale.
+Truncation after `horizon` steps, here {horizon}; with `clock=True` it is a termination.
 
 ## Info
 `cost` = `cost_tokens` (tokens spent, never negative), `reward_error` and `reward_cost` (the two
@@ -74,7 +70,7 @@ state), `diverged` (a squared error above 100 times its open-loop mean, or not f
 
 ## Arguments
 The fields of `{options}`, of which `fusion_gym.make_task` also takes an object, then what every
-environment takes: `system`, the path of a YAML file of options, where no field has that name.
+environment takes.
 
 {arguments}
 
