@@ -79,17 +79,17 @@ def drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calls:
 
 def put(monkeypatch: pytest.MonkeyPatch, folder: Path, drawn: bool) -> Calls:
     found: Calls = []
+    texts = folder.with_name(f"{folder.name}_texts")
     for name in ("one", "two"):
-        texts = folder / "texts" / name
-        texts.mkdir(parents=True)
-        (texts / "introduction.md").write_text("Words.")
-        (texts.parent / "overview.md").write_text("# The papers\n")
+        (texts / name).mkdir(parents=True)
+        (texts / name / "introduction.md").write_text("Words.")
         module = types.ModuleType(f"fusion_gym.agents.reproduction.{name}.pieces")
         module.PAPER = a_paper(name, found, drawn)  # type: ignore[attr-defined]
         monkeypatch.setitem(sys.modules, module.__name__, module)
     for module in (papers, page):
         monkeypatch.setattr(module, "NAMES", ("one", "two"))
-    monkeypatch.setattr(page, "TEXTS", folder / "texts")
+    (texts / "overview.md").write_text("# The papers\n")
+    monkeypatch.setattr(page, "TEXTS", texts)
     monkeypatch.chdir(folder)
     return found
 
@@ -217,12 +217,12 @@ def test_a_piece_that_fails_leaves_the_others(
     def fail(episodes: int, seed: int) -> dict[str, Any]:
         raise ConfigurationError("threshold = 3 is not allowed")
 
-    good = sys.modules["fusion_gym.agents.reproduction.one"].PAPER
+    good = sys.modules["fusion_gym.agents.reproduction.one.pieces"].PAPER
     first, second = good.pieces
     bad = Piece("second", second.title, fail, second.show, 1.0, USUAL)
-    broken = Paper(good.name, good.title, good.citation, (), "", [first, bad])
+    broken = Paper(good.name, good.title, good.citation, [first, bad])
     with monkeypatch.context() as patch:
-        patch.setattr(sys.modules["fusion_gym.agents.reproduction.one"], "PAPER", broken)
+        patch.setattr(sys.modules["fusion_gym.agents.reproduction.one.pieces"], "PAPER", broken)
         ended = call("reproduce", ["one", "--workers", "1", "--output", "pages", "--work", "work"])
         assert ended.status != 0
         assert "threshold = 3 is not allowed" in ended.err
@@ -353,7 +353,7 @@ def test_a_page_has_all_that_is_shown(drawn: Calls) -> None:
 def test_the_overview_counts_what_agrees(tmp_path: Path, calls: Calls) -> None:
     numbers = [Number("a", 1.0, 0.9, 1.1, printed) for printed in (1.0, 1.05, 2.0, None)]
     shown = {"piece": Shown(tables=[Table("t", "T", numbers)])}
-    one = Paper("one", "The paper one", "Cited.", (), "", [Piece("piece", "P", dict, Shown, 1.0)])  # type: ignore[arg-type]
+    one = Paper("one", "The paper one", "Cited.", [Piece("piece", "P", dict, Shown, 1.0)])  # type: ignore[arg-type]
     write_page(one, shown, {"piece": {"episodes": 2, "seed": 0}}, tmp_path)
     write_overview(tmp_path)
     assert "2 of 3 printed numbers agree" in (tmp_path / "README.md").read_text()
