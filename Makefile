@@ -57,8 +57,8 @@ wheel: $(STAMP)  ## build the wheel into dist/
 
 coverage: $(STAMP)  ## what the journeys reach: files by share, functions in runs/coverage/function_index.html
 	rm -rf runs/coverage && mkdir -p runs/coverage
-	cd runs/coverage && export COVERAGE_RCFILE=$(CURDIR)/pyproject.toml PATH="$(CURDIR)/$(BIN):$$PATH" && \
-		for journey in $(CURDIR)/tests/journeys/*.py; do coverage run --append $$journey || exit; done && \
+	cd runs/coverage && export PATH="$(CURDIR)/$(BIN):$$PATH" && for journey in $(CURDIR)/tests/journeys/*.py; do \
+		coverage run --append --source=$(CURDIR)/fusion_gym,$(CURDIR)/agents $$journey || exit; done && \
 		coverage report --sort=cover && coverage html --directory=.
 
 # One episode of every environment under its paper's rule, for the pages.
