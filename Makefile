@@ -11,7 +11,7 @@ QUICK  := tests/conformance/test_faces.py tests/test_bad_input.py tests/test_env
 	tests/test_benchmark.py::test_from_tuning_to_report_and_zoo
 
 .PHONY: help demo test test-all test-lowest wheel-test wheel films docs integrations integrations-tianshou integrations-rllib \
-	lines lint format bench clean
+	lines lint format bench clean coverage
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 23
@@ -54,6 +54,12 @@ wheel-test: $(STAMP)  ## the package outside the repository, and every block of 
 
 wheel: $(STAMP)  ## build the wheel into dist/
 	$(BIN)/python -m build --wheel
+
+coverage: $(STAMP)  ## what the journeys reach: files by share, functions in runs/coverage/function_index.html
+	rm -rf runs/coverage && mkdir -p runs/coverage
+	cd runs/coverage && export PATH="$(CURDIR)/$(BIN):$$PATH" && for journey in $(CURDIR)/tests/journeys/*.py; do \
+		coverage run --append --source=$(CURDIR)/fusion_gym,$(CURDIR)/agents $$journey || exit; done && \
+		coverage report --sort=cover && coverage html --directory=.
 
 # One episode of every environment under its paper's rule, for the pages.
 WATCH := $(BIN)/fusion-gym watch --steps 40 --fps 6 --env fusion_gym

@@ -45,6 +45,7 @@ def importable(code: str) -> bool:
     return all(importlib.util.find_spec(package) is not None for package in packages)
 
 
+JOURNEYS = [path.read_text() for path in (ROOT / "tests" / "journeys").glob("*.py")]
 BLOCKS = {
     path.name: blocks_of(path.relative_to(ROOT), path.read_text())
     for path in (ROOT / "README.md", *DOCS, ROOT / "CONTRIBUTING.md")
@@ -54,7 +55,9 @@ EXAMPLES = [
     for name, blocks in BLOCKS.items()
     for place, block in enumerate(blocks)
     # Those of libraries that are not here are run by `make integrations` and its sisters.
-    if block.language == "python" and (name != "other_libraries.md" or importable(block.text))
+    if block.language == "python"
+    and block.text not in JOURNEYS  # tests/test_journeys.py runs them
+    and (name != "other_libraries.md" or importable(block.text))
 ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import subprocess
 import sys
@@ -11,9 +12,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from command_runs import call
+from stable_baselines3.common.env_util import make_vec_env
 
 import fusion_gym
+from fusion_gym.agents.training.config import EnvironmentConfig
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.envs.one_batch import one_batch
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy, make_rule
 from fusion_gym.validation import ConfigurationError
@@ -82,15 +87,35 @@ def below(error, covariance):
 NUMBER = 3
 '''
 
+VARIANT = "own_variants:mine/Tobit-v0"
+VARIANTS = """
+import gymnasium as gym
+from gymnasium.envs.registration import WrapperSpec
+
+from fusion_gym.envs import registered
+
+ours = "fusion_gym.envs.registered:TobitOscillator"
+given = {"kwargs": {"filter": "tobit", "token_rate": 2.0}, "max_episode_steps": 7}
+gym.register("mine/Tobit-v0", f"{ours}Env", vector_entry_point=f"{ours}VectorEnv", **given)
+single, vector = registered.TobitOscillatorEnv, registered.TobitOscillatorVectorEnv
+gym.register("mine/OfClass-v0", single, vector_entry_point=vector, **given)
+gym.register("mine/Foreign-v0", "gymnasium.envs.classic_control.cartpole:CartPoleEnv")
+clipped = WrapperSpec("ClipAction", "gymnasium.wrappers:ClipAction", {})
+gym.register("mine/Wrapped-v0", f"{ours}Env", additional_wrappers=(clipped,))
+"""
+
 
 @pytest.fixture
 def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, registries: None) -> Path:
-    """A folder with the module ``own_names``, on Python's path."""
+    """A folder with the modules ``own_names`` and ``own_variants``, on Python's path."""
     (tmp_path / "own_names.py").write_text(MODULE)
+    (tmp_path / "own_variants.py").write_text(VARIANTS)
     (tmp_path / "broken_names.py").write_text("1 / 0")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    sys.modules.pop("own_names", None)  # it registers anew
+    for name in ("own_names", "own_variants"):
+        sys.modules.pop(name, None)  # it registers anew
+    importlib.import_module("own_variants")
     return tmp_path
 
 
@@ -149,6 +174,8 @@ def test_an_error_of_ones_own(own: Path) -> None:
         (lambda task: fusion_gym.make_task("own_names:me/Other-v0"), "me/Other-v0"),
         (lambda task: fusion_gym.make_task("absent_names:me/OwnCart-v0"), "'absent_names' cannot"),
         (lambda task: fusion_gym.make_task("broken_names:me/OwnCart-v0"), "ZeroDivisionError"),
+        (lambda task: fusion_gym.make_task("mine/Foreign-v0"), "cartpole:CartPoleEnv'; it must be"),
+        (lambda task: fusion_gym.make_task("mine/Wrapped-v0"), "additional wrappers; it must be"),
         (lambda task: make_policy("own_names:Absent", task), "has no 'Absent'"),
         (lambda task: make_policy("own_names:worst", task), "a class with knowledge"),
         (lambda task: make_policy("subprocess:Popen:args=true", task), "a class with knowledge"),
@@ -169,15 +196,75 @@ def test_what_cannot_be_had_is_told_in_one_line(own: Path, make: Any, told: str)
     assert "\n" not in str(caught.value)
 
 
+def command(folder: Path, *words: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "fusion_gym.agents", *words],
+        cwd=folder,
+        env={"PYTHONPATH": str(Path(__file__).parent.parent), "PATH": "/usr/bin:/bin", "HOME": "."},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def test_a_command_finds_the_module_beside_it(own: Path) -> None:
     words = ["--env", "own_names:me/OwnCart-v0", "--set", "error=own_names:worst", "horizon=10"]
     policies = ["--policies", "own_names:Oldest:steps=2", "always", "--episodes", "8"]
-    line = [sys.executable, "-c", "import fusion_gym.agents.__main__ as m; m.main()", "evaluate"]
-    root = Path(__file__).parent.parent
-    done = subprocess.run(
-        [*line, *words, *policies, "--json", "found.json"],
-        cwd=own, env={"PYTHONPATH": str(root), "PATH": "/usr/bin:/bin", "HOME": str(own)},
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    command(own, "evaluate", *words, *policies, "--json", "found.json")
     assert "own_names:Oldest" in (own / "found.json").read_text()
+
+
+def test_a_variant_is_its_environment_with_the_options_of_its_registration(own: Path) -> None:
+    options = {"filter": "tobit", "token_rate": 3.0, "max_episode_steps": 7}
+    expected = fusion_gym.make_task(TOBIT, **options)
+    for name in (VARIANT, "mine/OfClass-v0"):
+        single: Any = gym.make(name, token_rate=3.0)
+        vector: Any = gym.make_vec(name, 2, token_rate=3.0)
+        assert single.spec.max_episode_steps == vector.task.horizon == 7
+        assert single.unwrapped.task.settings == vector.task.settings == expected.settings
+        assert "token_rate: float = 3  (default: " in single.unwrapped.spec.pprint(True)
+        tasks = [
+            fusion_gym.make_task(name, token_rate=3.0),
+            fusion_gym.make_sb3_vec_env(name, 2, token_rate=3.0).task,
+            fusion_gym.parallel_env(name, token_rate=3.0).task,
+            one_batch(make_vec_env(name, 2, env_kwargs={"token_rate": 3.0})).task,
+        ]
+        for task in tasks:
+            assert (task.settings, task.horizon) == (expected.settings, 7)
+        assert fusion_gym.make_task(name, max_episode_steps=9).horizon == 9
+
+
+def test_a_registration_goes_before_a_file_of_options(own: Path) -> None:
+    """As Gymnasium joins the options: registered beneath given ones, a file beneath both."""
+    (own / "file.yaml").write_text("{filter: kalman, token_rate: 1.5, cost_weight: 0.2}")
+    given = {"system": "file.yaml", "token_rate": 3.0}
+    single: Any = gym.make(VARIANT, **given)
+    settings = single.unwrapped.task.settings
+    assert [settings[key] for key in ("filter", "token_rate", "cost_weight")] == ["tobit", 3.0, 0.2]
+    assert fusion_gym.make_task(VARIANT, **given).settings == settings
+    config = EnvironmentConfig(id=VARIANT, options=given)
+    assert "system" not in config.options
+    assert fusion_gym.make_task(VARIANT, **config.options).settings == settings
+
+
+def test_commands_train_and_evaluate_in_a_variant(own: Path) -> None:
+    (own / "training.yaml").write_text(
+        f"""
+        environment: {{id: "{VARIANT}", options: {{memory: true}}}}
+        algorithm: {{name: ppo, n_steps: 8, batch_size: 16}}
+        training: {{timesteps: 32, num_envs: 4}}
+        validation: {{every: 32, episodes: 4}}
+        output: trained
+        """
+    )
+    command(own, "train", "--config", "training.yaml")
+    policies = ["--policies", "always", "model:trained/best_model.zip", "--episodes", "8"]
+    command(own, "evaluate", "--config", "trained/config.yaml", *policies, "--json", "variant.json")
+    base = ["filter=tobit", "token_rate=2", "max_episode_steps=7", "memory=true"]
+    ended = call("evaluate", ["--env", TOBIT, "--set", *base, *policies, "--json", "base.json"])
+    assert ended.status == 0, ended.err
+    variant, same = (json.loads((own / f"{name}.json").read_text()) for name in ("variant", "base"))
+    assert variant.pop("env") == VARIANT
+    assert same.pop("env") == TOBIT
+    assert variant == same

@@ -7,7 +7,7 @@ from typing import Any
 
 import pydantic
 
-from fusion_gym.envs.registration import options_of
+from fusion_gym.envs.registration import make_task
 from fusion_gym.validation import ConfigurationError, choice
 
 from ..training.checked import Rate, Strict, load
@@ -92,9 +92,9 @@ def world(setting: Setting, case: Case) -> Setting:
         ConfigurationError: an option that is scaled and is no number.
     """
     environment, options = setting.environment, dict(setting.environment.options)
-    defaults = options_of(environment.id)()
+    defaults = make_task(environment.id).settings
     for name, factor in case.scaled.items():
-        value = options.get(name, getattr(defaults, name, None))
+        value = options.get(name, defaults.get(name))
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ConfigurationError(
                 f"scaled = {{{name!r}: {factor:g}}} of the case {case.name!r} is not allowed: "

@@ -13,7 +13,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from fusion_gym.core.options import plain
-from fusion_gym.envs.registration import ENVIRONMENTS
+from fusion_gym.envs.registration import base_of
 from fusion_gym.envs.sb3 import FusionSB3VecEnv, make_sb3_vec_env
 from fusion_gym.validation import ConfigurationError, shown
 
@@ -32,12 +32,9 @@ def one_batch(envs: VecEnv, **options: Any) -> FusionSB3VecEnv:
     """
     specs = envs.get_attr("spec")
     spec = specs[0]
-    if spec is None or spec.id not in ENVIRONMENTS:
-        name = None if spec is None else spec.id
-        raise ConfigurationError(
-            f"environments of {shown(name)} are not allowed in one batch: they must be made by "
-            "gym.make and be fusion-gym's"
-        )
+    if spec is None:
+        raise ConfigurationError("environments in one batch must be made by gym.make")
+    base, _ = base_of(spec.id)  # the options are in the specification too
     if any(_made_with(other) != _made_with(spec) for other in specs):
         raise ConfigurationError(
             f"different environments {shown([_made_with(other) for other in specs])} are not "
@@ -56,7 +53,7 @@ def one_batch(envs: VecEnv, **options: Any) -> FusionSB3VecEnv:
     (task,) = envs.get_attr("task", indices=0)
     if spec.max_episode_steps is not None and spec.max_episode_steps < task.horizon:
         made["max_episode_steps"] = spec.max_episode_steps  # a limit of gym.make
-    batch = make_sb3_vec_env(spec.id, envs.num_envs, **(options | made))
+    batch = make_sb3_vec_env(base, envs.num_envs, **(options | made))
     batch.seed(envs._seeds[0])
     envs.close()
     return batch

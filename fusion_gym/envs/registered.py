@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 
 from fusion_gym.envs.option_text import options_in
 from fusion_gym.envs.pages import page
-from fusion_gym.envs.registration import ENVIRONMENTS, class_name, make_task, options_of
+from fusion_gym.envs.registration import id_of, make_task, options_of
 from fusion_gym.envs.single import FusionEnv
 from fusion_gym.envs.vector import FusionVectorEnv
 
@@ -30,14 +30,13 @@ class _Page:
 
 def __getattr__(name: str) -> type:
     """The class of this name, made once."""
-    for env_id in ENVIRONMENTS:
-        prefix = class_name(env_id)
-        if name in (f"{prefix}Env", f"{prefix}VectorEnv"):
-            made = _vector(env_id) if name.endswith("VectorEnv") else _single(env_id)
-            made.__name__ = made.__qualname__ = name
-            globals()[name] = made
-            return made
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    env_id = id_of(name)
+    if env_id is None:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    made = _vector(env_id) if name.endswith("VectorEnv") else _single(env_id)
+    made.__name__ = made.__qualname__ = name
+    globals()[name] = made
+    return made
 
 
 def _single(env_id: str) -> type:

@@ -21,10 +21,12 @@ from fusion_gym.core.rehearsal import rehearse
 from fusion_gym.core.task import Task
 from fusion_gym.envs.option_file import read_options
 from fusion_gym.envs.option_text import Option, listed, options_in
-from fusion_gym.importing import imported
+from fusion_gym.importing import imported, name_of
 from fusion_gym.validation import ConfigurationError
 
 Build = Callable[[Any], Scenario]
+_REGISTERED = "fusion_gym.envs.registered"
+_CLASSES = ("Env", "VectorEnv")
 
 
 class FusionSpec(EnvSpec):
@@ -36,7 +38,9 @@ class FusionSpec(EnvSpec):
     @classmethod
     def of(cls, given: EnvSpec) -> EnvSpec:
         """A copy of what Gymnasium knows, of this kind where the environment is registered."""
-        if given.id not in ENVIRONMENTS:
+        try:
+            base_of(given.id)
+        except ConfigurationError:
             return copy.copy(given)
         known = {field.name: getattr(given, field.name) for field in fields(given) if field.init}
         return cls(**known)
@@ -107,24 +111,57 @@ def register(env_id: str | None = None, build: str | Build | None = None) -> Non
         ENVIRONMENTS[env_id] = build
     for name in ENVIRONMENTS:
         if name not in gymnasium.registry:
-            prefix = f"fusion_gym.envs.registered:{class_name(name)}"
-            single, vector = f"{prefix}Env", f"{prefix}VectorEnv"
+            single, vector = (f"{_REGISTERED}:{class_name(name)}{end}" for end in _CLASSES)
             gymnasium.register(name, entry_point=single, vector_entry_point=vector)
             gymnasium.registry[name] = FusionSpec(name, single, vector_entry_point=vector)
 
 
-def build_of(env_id: str) -> Build:
-    """The ``build`` function of an id; ``module:id`` imports a module first, which registers it.
+def id_of(name: str) -> str | None:
+    """The id whose class in :mod:`fusion_gym.envs.registered` has this name."""
+    classes = {f"{class_name(env_id)}{end}": env_id for env_id in ENVIRONMENTS for end in _CLASSES}
+    return classes.get(name)
+
+
+def base_of(env_id: str) -> tuple[str, dict[str, Any]]:
+    """Return the environment of this suite behind an id, and the options of its registration.
+
+    ``module:id`` imports a module first, which registers the id. ``gymnasium.register`` may give an
+    id to a class of :mod:`fusion_gym.envs.registered`: its ``kwargs`` and ``max_episode_steps`` are
+    the options.
 
     Raises:
-        ConfigurationError: an unknown id, or a module that cannot be imported.
+        ConfigurationError: an unknown id, a module that cannot be imported, an entry point that is
+            no such class, or additional wrappers.
     """
-    module, colon, own = env_id.rpartition(":")
+    module, colon, name = env_id.rpartition(":")
     if colon:
         imported("env", env_id, module)
-        env_id = own
-    validation.keys("environment", [env_id], ENVIRONMENTS)
-    entry = ENVIRONMENTS[env_id]
+    if name in ENVIRONMENTS or name not in gymnasium.registry:
+        validation.keys("environment", [name], ENVIRONMENTS)
+        return name, {}
+    spec = gymnasium.registry[name]
+    entry = spec.entry_point or spec.vector_entry_point
+    text = entry if isinstance(entry, str) else name_of(entry)
+    base = id_of(text.removeprefix(f"{_REGISTERED}:"))
+    if base is None or spec.additional_wrappers:
+        reason = "additional wrappers" if base else f"the entry point {text!r}"
+        raise ConfigurationError(
+            f"environment {name!r} is not allowed: it is registered with {reason}; it must be a "
+            f"class of {_REGISTERED} without wrappers"
+        )
+    options = {key: value for key, value in spec.kwargs.items() if key != "render_mode"}
+    if spec.max_episode_steps is not None:
+        options["max_episode_steps"] = spec.max_episode_steps
+    return base, options
+
+
+def build_of(env_id: str) -> Build:
+    """The ``build`` function behind an id.
+
+    Raises:
+        ConfigurationError: an id that :func:`base_of` does not know.
+    """
+    entry = ENVIRONMENTS[base_of(env_id)[0]]
     if not isinstance(entry, str):
         return entry
     module, _, name = entry.partition(":")
@@ -153,7 +190,8 @@ def options_of(env_id: str) -> type[CommonOptions]:
 def make_task(env: str | CommonOptions, **options: Any) -> Task:
     """The task of a registered environment, everything checked before anything runs.
 
-    ``env`` is an id, or ``module:id`` of one that a module registers, to which ``options`` and what
+    ``env`` is an id, or ``module:id`` of one that a module registers, also by
+    ``gymnasium.register`` with an environment's class of this suite; to it ``options`` and what
     every environment takes are added, or an options object such as
     :class:`~fusion_gym.systems.tobit.oscillator.TobitOscillatorOptions`. Every environment takes
     ``max_episode_steps``, and ``system``, the path of a YAML file of options, which those beside it
@@ -163,6 +201,9 @@ def make_task(env: str | CommonOptions, **options: Any) -> Task:
         ConfigurationError: an id that is not registered, an unknown option, or a value that is
             not allowed.
     """
+    if isinstance(env, str):
+        env, registered = base_of(env)
+        options = registered | options
     limit = options.pop("max_episode_steps", None)
     if limit is not None:
         limit = validation.integer("max_episode_steps", limit, at_least=1)
@@ -183,13 +224,17 @@ def make_task(env: str | CommonOptions, **options: Any) -> Task:
 def opened(env_id: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """The options of an environment with those of the file that ``system`` names, if it does.
 
+    What the id's own registration says goes before the file.
+
     Raises:
         ConfigurationError: an id that is not registered, or a file that cannot be read.
     """
-    if "system" not in options or "system" in {field.name for field in fields(options_of(env_id))}:
+    base, registered = base_of(env_id)
+    if "system" not in options or "system" in {field.name for field in fields(options_of(base))}:
         return dict(options)
     beside = {name: value for name, value in options.items() if name != "system"}
-    return read_options(options["system"]) | beside
+    content = read_options(options["system"])
+    return {name: content[name] for name in content if name not in registered} | beside
 
 
 def _checked(build: Build, chosen: CommonOptions, limit: int | None) -> Task:

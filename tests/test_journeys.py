@@ -1,0 +1,66 @@
+"""The journeys of a user: they run as they stand, and the pages show them so."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from page_blocks import blocks_of
+
+import fusion_gym
+
+ROOT = Path(__file__).parent.parent
+JOURNEYS = {path.stem: path.read_text() for path in (ROOT / "tests" / "journeys").glob("*.py")}
+PAGES = {
+    "step": "README.md",
+    "evaluate": "README.md",
+    "train": "README.md",
+    "pareto_front": "docs/training.md",
+    "own_plant": "docs/own_system.md",
+    "read_result": "docs/benchmark.md",
+}
+LIBRARIES = {"fusion_gym", "gymnasium", "numpy", "stable_baselines3"}
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_it_runs_in_an_empty_folder(name: str, tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(JOURNEYS[name])
+    done = subprocess.run(
+        [sys.executable, "-W", "error::UserWarning", script.name],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert any(letter.isdigit() for letter in done.stdout)
+    assert "nan" not in done.stdout
+
+
+def test_each_page_shows_its_journey() -> None:
+    assert JOURNEYS.keys() == PAGES.keys()
+    for name, page in PAGES.items():
+        blocks = blocks_of(Path(page), (ROOT / page).read_text())
+        assert JOURNEYS[name] in [block.text for block in blocks], (name, page)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_it_is_short_and_uses_public_names_alone(name: str) -> None:
+    assert len(JOURNEYS[name].splitlines()) <= 25
+    for node in ast.walk(ast.parse(JOURNEYS[name])):
+        if isinstance(node, ast.Import):
+            assert {alias.name for alias in node.names} <= LIBRARIES
+        elif isinstance(node, ast.ImportFrom):
+            assert node.module in LIBRARIES - {"fusion_gym"}
+        elif isinstance(node, ast.Attribute):
+            match node.value:
+                case ast.Name("fusion_gym"):
+                    assert node.attr in fusion_gym.__all__
+                case ast.Attribute(ast.Name("fusion_gym"), "evaluation"):
+                    assert node.attr in fusion_gym.evaluation.__all__
