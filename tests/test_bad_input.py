@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 
-import fusion_gym
 from fusion_gym import ConfigurationError, make_sb3_vec_env, make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy, make_rule
@@ -34,57 +33,25 @@ def refused(call: Callable[[], Any], kind: type[Exception], parts: tuple[str, ..
 
 # Options of the environment: what is handed in, and what the message must contain.
 BAD_OPTIONS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
-    ({"initial_covariance": ((1, 2), (2, 1))}, ("2.", "positive definite", "-1")),
-    ({"initial_covariance": ((1, 0), (0, 0))}, ("initial_covariance", "positive definite")),
     ({"initial_covariance": ((1, 0.5), (0.2, 1))}, ("0.5", "0.2", "symmetric")),
-    ({"initial_covariance": np.eye(3)}, ("(2, 2)", "(3, 3)")),
     ({"initial_covariance": ((np.nan, 0), (0, 1))}, ("nan", "finite")),
-    ({"transition": ((1, 0, 0), (0, 1, 0))}, ("(2, 2)", "(2, 3)")),
     ({"transition": "rotation"}, ("'rotation'", "numbers")),
-    ({"initial_mean": (1, 2, 3)}, ("(1, 2, 3)", "(3,)")),
-    ({"process_gain": (1, 2, 3)}, ("(1, 2, 3)", "(3,)")),
-    ({"process_variance": -0.1}, ("-0.1", "> 0")),
     ({"process_noise": "ful"}, ("'ful'", "did you mean 'full'")),
     ({"measurement_matrices": (((1, 0, 0),),)}, ("(any, any, 2)", "(1, 1, 3)")),
-    ({"measurement_variance": 0.0}, ("0.0", "> 0")),
-    ({"measurement_variance": (1, 2, 3)}, ("(1, 2, 3)", "(3, 2)")),
-    ({"censoring_threshold": np.nan}, ("nan", "finite")),
     ({"censoring_threshold": np.inf}, ("inf", "finite")),
-    ({"censoring_threshold": (0, 0, 0, 0)}, ("(0, 0, 0, 0)", "(3, 2)")),
-    ({"censoring_threshold": "low"}, ("'low'",)),
     ({"tokens": "many"}, ("'many'", "'limited', 'unlimited'")),
-    ({"token_rate": -1}, ("-1", ">= 0")),
-    ({"token_rate": "fast"}, ("'fast'", "number")),
-    ({"token_cost": -3.0}, ("-3.0", "> 0")),
     ({"token_cost": (3.0, 0.0, 3.0)}, ("(3.0, 0.0, 3.0)", "> 0")),
-    ({"token_cost": (3.0, 3.0)}, ("(3.0, 3.0)", "(3,)")),
     ({"token_capacity": 8.9}, ("8.9", "at least 9", "sharing='equal'", "costs up to 3")),
     (
         {"token_capacity": 2.5, "initial_tokens": 1.0, "sharing": "fixed"},
         ("2.5", "at least", "cost of a transmission, 3"),
     ),
     ({"initial_tokens": 31.0}, ("31.0", "<= 30")),
-    ({"sharing": "equl"}, ("'equl'", "did you mean 'equal'")),
-    ({"filter": "papr"}, ("'papr'", "did you mean 'paper'")),
     ({"silent": "hold", "filter": "tobit"}, ("'hold'", "filter='tobit'", "'paper'")),
     ({"event_error": True, "filter": "tobit"}, ("True", "filter='tobit'", "'paper'")),
-    ({"silent": "hld"}, ("'hld'", "did you mean 'hold'")),
-    ({"event_error": "yes"}, ("'yes'", "True or False")),
-    ({"bound_epsilon": (1, 2)}, ("(1, 2)", "(14)")),
     ({"information_shares": (0.5, 0.2, 0.2)}, ("[0.5, 0.2, 0.2]", "sum 1", "0.9")),
-    ({"information_shares": (0.0, 0.5, 0.5)}, ("[0.0, 0.5, 0.5]", "> 0")),
-    ({"information_shares": (0.5, 0.5)}, ("(0.5, 0.5)", "(3)")),
-    ({"trigger_threshold": (-1.0, 1.0, 1.0)}, ("(-1.0, 1.0, 1.0)", ">= 0")),
-    ({"trigger_divisor": 0.0}, ("0.0", "> 0")),
-    ({"random_start": 1}, ("1", "True or False")),
-    ({"horizon": 0}, ("0", "whole number >= 1")),
     ({"horizon": 10.0}, ("10.0", "whole number >= 1")),
     ({"information": "center"}, ("'center'", "did you mean 'centre'")),
-    ({"action": "continuous"}, ("'continuous'", "'binary', 'discrete'")),
-    ({"error": "square"}, ("'square'", "did you mean 'squared'")),
-    ({"error_weight": -1.0}, ("-1.0", ">= 0")),
-    ({"cost_weight": np.inf}, ("inf", "finite")),
-    ({"state_weights": (1.0, 1.0, 1.0)}, ("(1.0, 1.0, 1.0)", "(2,)")),
     ({"state_weights": (1.0, -1.0)}, ("(1.0, -1.0)", ">= 0")),
     # Two options that contradict each other, one of them a default
     ({"token_capacity": 10.0, "initial_tokens": 11.0}, ("token_capacity = 10", "11.0", "<= 10")),
@@ -93,25 +60,15 @@ BAD_OPTIONS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
     ({"transition": np.eye(3)}, ("process_gain", "(3)", "transition = [[1.0, 0.0, 0.0]")),
     ({"token_cost": (1, 2), "transition": np.eye(2)}, ("(1, 2)", "(3,)")),
     # Something else where a word, a number or a boolean belongs
-    ({"filter": np.ones((2, 2))}, ("[[1.0, 1.0], [1.0, 1.0]]", "'paper'")),
     ({"silent": [np.ones((2, 2))], "filter": "tobit"}, ("[[[1.0, 1.0]", "'hold', 'predict'")),
-    ({"event_error": np.ones(2)}, ("[1.0, 1.0]", "True or False")),
-    ({"information": np.array(["sensors", "centre"])}, ("['sensors', 'centre']", "'centre'")),
     ({"tokens": b"limited"}, ("b'limited'", "'limited', 'unlimited'")),
-    ({"random_start": {"yes": 1}}, ("{'yes': 1}", "True or False")),
     ({"error_weight": 10**400}, ("finite number",)),
-    ({"token_rate": None}, ("None", "number")),
     ({"process_variance": np.longdouble("1e4000")}, ("1e+4000", "finite")),
-    ({"trigger_decay": [np.ones((2, 2))] * 2}, ("[[[1.0, 1.0]", "(3,)")),
     ({"transition": np.ones((140, 140))}, ("(any, any)", "up to 100", "(140, 140)")),
     # Numbers that float64 cannot square, divide by or wait for
     ({"measurement_variance": 1e308}, ("1e+308", "at most 1e+15")),
-    ({"measurement_variance": 1e-320}, ("1e-320", "at least 1e-15")),
-    ({"token_rate": -1e308}, ("-1e+308", "at most 1e+15")),
-    ({"process_variance": 1e-320}, ("1e-320", "at least 1e-15")),
     ({"initial_covariance": np.diag([1e-32, 1e-32])}, ("1e-32", "positive definite")),
     ({"horizon": 10**9}, ("1000000000", "<= 50000")),
-    ({"horizon": 10**400}, ("<= 50000",)),
     ({"transition": ((1, 2), (3, 4))}, ("((1, 2), (3, 4))", "horizon = 100", "below 1e+32")),
     (
         {"error_weight": 1e15, "state_weights": (1e15, 1e15), "process_variance": 1e5},
@@ -153,21 +110,13 @@ def test_an_unknown_option() -> None:
 SINGULAR = ((0.0, 0.01, 5e-05), (0.0, 1.0, 0.01), (0.0, 0.0, 1.0))
 # Options of other environments.
 ELSEWHERE: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
-    ("RemoteEstimation", {"sensors": 10**9}, ("1000000000", "<= 1000")),
     ("RemoteEstimation", {"sensors": 17, "action": "discrete"}, ("'discrete'", "17 sensors")),
     ("RemoteEstimation", {"token_capacity": 0.5}, ("token_capacity = 0.5", "initial_tokens = 1.0")),
     ("RemoteEstimation", {"coefficient": 9.0}, ("coefficient = 9.0", "horizon = 200", "1e+32")),
     ("CorrelatedTracking", {"token_capacity": 3.5}, ("= 3.5", "initial_tokens = 10.0")),
-    ("CorrelatedTracking", {"noise_scale": np.ones(2)}, ("[1.0, 1.0]", "> 0")),
     ("CorrelatedTracking", {"transition": SINGULAR}, ("((0.0, 0.01, 5e-05)", "singular")),
-    ("CorrelatedTracking", {"order": [np.ones((2, 2))] * 2}, ("[[[1.0, 1.0]", "(3)")),
-    ("UnknownInput", {"input_change": 1e154}, ("1e+154", "at most 1e+15")),
-    ("UnknownInput", {"sampling_period": 10**6}, ("1000000", "<= 1000")),
     ("UnknownInput", {"input_amplitude": 0.0}, ("input_amplitude = 0.0", "nothing to estimate")),
-    ("UnknownInput", {"input_phase": np.ones(7)}, ("input_phase", "[1.0, 1.0")),
-    ("MarkovJumpTracking", {"transitions": np.zeros((1, 2, 2))}, ("process_gains", "[[[0.0, 0.0]")),
     ("BiasedOscillator", {"censoring_threshold": 1e9}, ("1000000000.0", "censoring_upper")),
-    ("BiasedTracking", {"measurement_matrices": [[[1, 0]]]}, ("[[[1, 0]]]", "(1, 1)")),
 ]
 
 
@@ -180,17 +129,6 @@ def test_options_elsewhere(name: str, options: dict[str, Any], parts: tuple[str,
     )
     assert "\n" not in message
     assert len(message) < 1000
-
-
-@pytest.mark.parametrize("render_mode", ["ansi", "rgb"])
-@pytest.mark.filterwarnings("ignore:.*render_mode")
-def test_render_mode(render_mode: str) -> None:
-    for make in (lambda **o: gymnasium.make(ENV_ID, **o), make_vector):
-        refused(
-            lambda make=make: make(render_mode=render_mode),
-            ConfigurationError,
-            ("render_mode", repr(render_mode), "None"),
-        )
 
 
 @pytest.mark.parametrize("num_envs", [0, -2, 2.0, "2", True, None], ids=repr)
@@ -235,26 +173,13 @@ def test_calls(call: Callable[[], Any], parts: tuple[str, ...]) -> None:
         ("randm", ("unknown policy 'randm'", "did you mean 'random'")),
         ("", ("unknown policy ''", "always, centre_variance")),
         ("random:rat=0.1", ("'rat'", "did you mean 'rate'")),
-        ("always:rate=1", ("'rate'", "'always'")),
         ("random:rate", ("'rate'", "key=value")),
         ("random:rate=0.1,rate=0.2", ("'rate'", "twice")),
         ("random:rate=1.5", ("rate = 1.5", "<= 1")),
-        ("random:rate=0.1/0.2", ("rate = (0.1, 0.2)", "(3,)")),
         ("random:rate=often", ("rate = 'often'", "number")),
-        ("send_on_delta:threshold=-1", ("threshold = -1", ">= 0")),
-        ("innovation_threshold:threshold=-1", ("threshold = -1", ">= 0")),
-        ("variance_threshold:threshold=-1", ("threshold = -1", ">= 0")),
-        ("information_gain:threshold=-1", ("threshold = -1", ">= 0")),
         ("dynamic_event:threshold=0.1/-1/0.3", ("threshold = (0.1, -1, 0.3)", ">= 0")),
-        ("dynamic_event:divisor=0", ("divisor = 0", "> 0")),
-        ("dynamic_event:scale=-1", ("scale = -1", ">= 0")),
-        ("dynamic_event:initial=nan", ("initial = nan", "finite")),
-        ("send_on_delta:threshold=0.1/0.2", ("threshold = (0.1, 0.2)", "(3,)")),
         ("information_gain:threshold=0.1/0.2/0.3,at_most=none", ("threshold = (0.1, 0.2, 0.3)",)),
-        ("variance_threshold:threshold=0.1/0.2/0.3,at_most=none", ("threshold = (0.1, 0.2",)),
-        ("innovation_threshold:whitened=1", ("whitened = 1", "True or False")),
         ("innovation_threshold:at_most=0", ("at_most = 0", "whole number >= 1")),
-        ("periodic:period=0", ("period = 0", "whole number >= 1")),
         ("round_robin:period=2.5", ("period = 2.5", "whole number >= 1")),
         ("model:", ("model ''", "no such file")),
         ("model:nowhere/agent.zip", ("'nowhere/agent.zip'", "no such file")),
@@ -265,38 +190,18 @@ def test_policies(spec: str, parts: tuple[str, ...]) -> None:
     refused(lambda: make_policy(spec, make_task(ENV_ID)), ConfigurationError, parts)
 
 
-def test_a_model_is_no_trigger() -> None:
-    refused(lambda: make_rule("model:agent.zip"), ConfigurationError, ("'model",))
-
-
-BAD_BINARY: list[tuple[Any, tuple[str, ...]]] = [
-    ([1, np.nan, 0], ("nan", "0 or 1")),
-    ([1, 0, np.inf], ("inf", "0 or 1")),
-    ([2, 0, 0], ("= 2", "0 or 1")),
-    ([0, -1, 0], ("= -1", "0 or 1")),
-    ([0, 0, 0.5], ("= 0.5", "0 or 1")),
-    (["up", "0", "1"], ("up",)),
-    ([1, 0], ("shape",)),
-    ([[1, 0, 1]], ("shape",)),
-    (1, ("shape",)),
-    (None, ("action",)),
-    (np.array([1, 0, 1], dtype=object), ("object",)),
-]
-BAD_DISCRETE: list[tuple[Any, tuple[str, ...]]] = [
-    (8, ("= 8", "0..7")),
-    (-1, ("= -1", "0..7")),
-    (2.5, ("= 2.5", "0..7")),
-    (np.nan, ("nan", "0..7")),
-    ([3], ("shape",)),
-    ("left", ("left",)),
-    (np.array(3, dtype=object), ("object",)),
+# Hostile actions of every kind: test_fuzz_actions.py.
+BAD_ACTIONS: list[tuple[str, Any, tuple[str, ...]]] = [
+    ("binary", [1, np.nan, 0], ("nan", "0 or 1")),
+    ("binary", [0, -1, 0], ("= -1", "0 or 1")),
+    ("binary", [[1, 0, 1]], ("shape",)),
+    ("discrete", 8, ("= 8", "0..7")),
+    ("discrete", np.array(3, dtype=object), ("object",)),
 ]
 
 
 @pytest.mark.parametrize(
-    ("kind", "action", "parts"),
-    [("binary", *case) for case in BAD_BINARY] + [("discrete", *case) for case in BAD_DISCRETE],
-    ids=lambda value: repr(value)[:40],
+    ("kind", "action", "parts"), BAD_ACTIONS, ids=lambda value: repr(value)[:40]
 )
 def test_actions(kind: str, action: Any, parts: tuple[str, ...]) -> None:
     """Nothing moves when an action is refused: the next good step is that of an untouched twin."""
@@ -317,14 +222,6 @@ def test_actions(kind: str, action: Any, parts: tuple[str, ...]) -> None:
     assert sb3.step(np.array([good]))[1] == pytest.approx(expected, rel=1e-6)
 
 
-def test_a_single_environment_speaks_of_its_own_shape() -> None:
-    env = gymnasium.make(ENV_ID).unwrapped
-    env.reset(seed=0)
-    refused(lambda: env.step([1, 0]), ValueError, ("(2,)", "must be (3,)"))
-    refused(lambda: env.step([1, 0, 7]), ValueError, ("action [2] = 7",))
-    refused(lambda: env.step([[1, 0], [1]]), ValueError, ("[[1, 0], [1]]", "(3,)"))
-
-
 def test_the_first_bad_action_of_a_batch_is_named() -> None:
     env = make_vector(4)
     env.reset(seed=0)
@@ -335,9 +232,7 @@ def test_the_first_bad_action_of_a_batch_is_named() -> None:
 
 
 @pytest.mark.parametrize(
-    "mask",
-    [[True, False, True], np.ones(2, bool), np.ones((3, 1), bool), np.ones(3), np.zeros(3, bool)],
-    ids=repr,
+    "mask", [[True, False, True], np.ones((3, 1), bool), np.zeros(3, bool)], ids=repr
 )
 def test_reset_masks(mask: Any) -> None:
     env = make_vector()
@@ -371,11 +266,6 @@ def test_a_reset_comes_first() -> None:
     refused(lambda: single.step(nothing[0]), ResetNeeded, ("reset",))
 
 
-def test_sb3_needs_a_reset_too() -> None:
-    env = make_sb3_vec_env(ENV_ID, 3)
-    refused(lambda: env.step(np.zeros((3, 3), dtype=np.int8)), ResetNeeded, ("reset",))
-
-
 def test_finished_runs_must_be_reset_when_autoreset_is_disabled() -> None:
     env = make_vector(3, autoreset_mode="Disabled", horizon=2)
     env.reset(seed=0)
@@ -386,7 +276,3 @@ def test_finished_runs_must_be_reset_when_autoreset_is_disabled() -> None:
     refused(lambda: env.step(nothing), ResetNeeded, ("[0, 2]", "reset_mask"))
     env.reset(options={"reset_mask": np.array([True, False, False])})
     refused(lambda: env.step(nothing), ResetNeeded, ("[2]",))
-
-
-def test_configuration_errors_are_value_errors() -> None:
-    assert issubclass(fusion_gym.ConfigurationError, ValueError)

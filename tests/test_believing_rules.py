@@ -209,19 +209,11 @@ def test_the_divergence_is_that_of_two_gaussians(own: bool, memory: bool) -> Non
     ("spec", "options", "message"),
     [
         ("value_of_information:threshold=0.1,price=0.1", {}, "price = 0.1 .*beside threshold"),
-        ("value_of_information:threshold=-1", {}, "threshold = -1"),
-        ("value_of_information:at_most=0", {}, "at_most = 0"),
-        ("value_of_information:steps=0", {}, "steps = 0"),
         ("value_of_information:own=true,at_most=2", {}, "at_most = 2 .*own=True"),
         ("value_of_information:own=true,steps=2", {}, "steps = 2 .*own=True"),
         ("estimate_difference:own=true,at_most=2", {}, "at_most = 2 .*own=True"),
-        ("estimate_difference:threshold=nan", {}, "threshold = nan"),
-        ("estimate_difference:whitened=1", {}, "whitened = 1"),
         ("kullback_leibler:own=true,at_most=3", {}, "at_most = 3 .*own=True"),
-        ("kullback_leibler:threshold=-0.1", {}, "threshold = -0.1"),
         ("value_of_information", {"information": "centre"}, "information = 'centre'"),
-        ("estimate_difference:own=true", {"information": "centre"}, "information = 'centre'"),
-        ("kullback_leibler", {"information": "centre"}, "information = 'centre'"),
     ],
 )
 def test_what_cannot_be_decided_is_refused(spec: str, options: Any, message: str) -> None:
@@ -235,8 +227,6 @@ def test_what_cannot_be_decided_is_refused(spec: str, options: Any, message: str
     [
         ("measurement", 200, (0.070, 0.006), (0.029, 0.002)),
         ("estimate", 200, (0.064, 0.006), (0.030, 0.003)),
-        pytest.param("measurement", 1000, (0.070, 0.003), (0.029, 0.002), marks=pytest.mark.slow),
-        pytest.param("estimate", 1000, (0.064, 0.003), (0.030, 0.002), marks=pytest.mark.slow),
     ],
 )
 def test_memory_halves_the_error_of_the_benchmarks_oscillator(

@@ -59,21 +59,6 @@ def test_a_vector_of_rewards_sums_to_the_reward() -> None:
         assert pair.tolist() == [info["reward_error"], info["reward_cost"]]
 
 
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_a_vector_environment_pays_both_terms(mode: str) -> None:
-    options: dict[str, Any] = {"filter": "tobit", "horizon": 4, "autoreset_mode": mode}
-    envs: Any = gym.make_vec(TOBIT, num_envs=3, reward="vector", **options)
-    plain: Any = gym.make_vec(TOBIT, num_envs=3, **options)
-    envs.reset(seed=0)
-    plain.reset(seed=0)
-    for _ in range(9):
-        action = plain.action_space.sample()
-        _, pairs, *_ = envs.step(action)
-        _, rewards, *_ = plain.step(action)
-        assert pairs.shape == (3, 2)
-        np.testing.assert_allclose(pairs.sum(1), rewards, rtol=1e-12)
-
-
 def test_faces_of_one_number_refuse_two() -> None:
     for make in (lambda **o: fusion_gym.make_sb3_vec_env(TOBIT, 2, **o),
                  lambda **o: fusion_gym.parallel_env(TOBIT, **o)):  # fmt: skip

@@ -125,16 +125,6 @@ def test_ray_gives_the_work_of_a_lost_worker_to_another(tmp_path: Path) -> None:
             list(team.done(is_wrong, [0]))
 
 
-@pytest.mark.slow
-def test_ray_finds_what_this_machine_finds(tmp_path: Path) -> None:
-    pytest.importorskip("ray")
-    suite = small_suite(tmp_path, timesteps=8_000, classes=["sensors"])
-    alone, many = tmp_path / "alone", tmp_path / "many"
-    subprocess.run(benchmark(suite, alone), cwd=ROOT, check=True)
-    subprocess.run(benchmark(suite, many, "--backend", "ray"), cwd=ROOT, check=True)
-    assert found(many) == found(alone)
-
-
 def test_a_team_that_is_not_there_is_refused() -> None:
     with pytest.raises(ConfigurationError, match=r"address = 'tcp://x' .*backend='loky'"):
         Team(2, "loky", "tcp://x")

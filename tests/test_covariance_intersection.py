@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from difficult_estimates import KINDS, Array, estimates, many, parts
+from difficult_estimates import KINDS, Array, estimates, parts
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -70,23 +70,6 @@ def test_the_trace_is_optimal_and_the_formulas_hold(rule: str, size: int, kind: 
         np.testing.assert_allclose(got, gain, atol=1e-6 * max(1.0, np.abs(gain).max()))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("rule", RULES)
-def test_gains_add_up_to_one_and_make_the_mean(rule: str, kind: str) -> None:
-    mean, covariance = estimates(kind, 2, 3, 40)
-    mean *= np.sqrt(covariance[0].diagonal().T)  # in the units of each state
-    fused = RULES[rule](mean[0], covariance[0], mean[1], covariance[1])
-    unit = np.sqrt(covariance[0].diagonal().T)
-    total = (fused.gains[0] + fused.gains[1]) / unit[:, None] * unit
-    np.testing.assert_allclose(total - np.eye(3)[:, :, None], 0.0, atol=1e-12)
-    first, second = (
-        np.einsum("ijN,jN->iN", gain, value) for gain, value in zip(fused.gains, mean, strict=True)
-    )
-    np.testing.assert_allclose(fused.mean / unit, (first + second) / unit, atol=1e-9)
-    same = RULES[rule](mean[0], covariance[0], mean[0], covariance[1])
-    assert np.array_equal(same.mean, mean[0])  # unbiased: what both say is kept
-
-
 @pytest.mark.parametrize("scale", [1e-16, 1.0, 1e16])
 @pytest.mark.parametrize("rule", RULES)
 def test_equal_covariances_are_kept_and_the_means_averaged(rule: str, scale: float) -> None:
@@ -123,23 +106,6 @@ def test_a_covariance_that_is_none_spoils_only_its_own_lane(rule: str) -> None:
     assert np.all(np.isnan(spoiled.covariance[..., 1]))
     for one, other in zip(parts(spoiled), parts(clean), strict=True):
         assert np.array_equal(one[..., [0, 2]], other[..., [0, 2]])
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_lane_is_the_same_alone_and_in_a_batch(kind: str) -> None:
-    mean, covariance = estimates(kind, 3, 3, 15)
-    for run in range(15):
-        one = slice(run, run + 1)
-        for rule in RULES.values():
-            alone = rule(
-                mean[0][:, one], covariance[0][..., one], mean[1][:, one], covariance[1][..., one]
-            )
-            batch = rule(mean[0], covariance[0], mean[1], covariance[1])
-            for single, batched in zip(parts(alone), parts(batch), strict=True):
-                np.testing.assert_allclose(single, batched[..., one], rtol=1e-9, atol=0.0)
-        single_many = many(mean[..., one], covariance[..., one])
-        for single, batched in zip(single_many, many(mean, covariance), strict=True):
-            np.testing.assert_allclose(single, batched[..., one], rtol=1e-9, atol=0.0)
 
 
 def actual(fused: Any, first: Array, second: Array, cross: Array) -> Array:
@@ -215,17 +181,6 @@ def test_inverse_covariance_intersection_is_no_bound_for_other_correlations() ->
     assert ici_ratio > 1.2
 
 
-def test_information_fusion_does_not_bound_a_shared_prior() -> None:
-    """Two copies of one estimate count twice; covariance intersection keeps what one says."""
-    mean, covariance = estimates("alike", 1, 3, 5)
-    twice_mean, twice = np.repeat(mean, 2, axis=0), np.repeat(covariance, 2, axis=0)
-    summed = InformationFusion().fuse(twice_mean, twice)
-    np.testing.assert_allclose(summed.covariance, covariance[0] / 2, rtol=1e-9)
-    np.testing.assert_allclose(summed.mean, mean[0], rtol=1e-9)
-    _, kept, _ = many(twice_mean, twice)
-    np.testing.assert_allclose(kept, covariance[0], rtol=1e-9)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_information_fusion_is_the_optimum_for_independent_errors(kind: str) -> None:
     """Three estimates as measurements of one state: weighted least squares says the same."""
@@ -258,18 +213,3 @@ def test_the_inverse_form_is_never_looser(size: int, kind: str) -> None:
     ]
     assert np.all(traces[1] <= traces[0] * (1 + 1e-6))
     assert np.any(traces[1] < 0.99 * traces[0]) == (kind != "dominated")
-
-
-def test_the_inverse_form_has_its_own_weight() -> None:
-    """With the weight that suits covariance intersection its trace is a good deal larger."""
-    mean, covariance = estimates("alike", 2, 3, 50)
-    ci, ici = (rule(mean[0], covariance[0], mean[1], covariance[1]) for rule in RULES.values())
-    loss = [
-        np.trace(
-            combined("ici", ci.weights[0, run], covariance[0, ..., run], covariance[1, ..., run])
-        )
-        / np.trace(ici.covariance[..., run])
-        for run in range(50)
-    ]
-    assert min(loss) >= 1 - 1e-6
-    assert np.median(loss) > 1.05

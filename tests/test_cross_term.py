@@ -125,13 +125,6 @@ def test_the_worst_is_one_that_is_told_from_zero() -> None:
     assert worst({"near": part(-0.2, 0.1), "far": part(-0.2, 0.4)})[0] == "far"
 
 
-def test_the_usual_policies_are_those_that_a_task_allows() -> None:
-    centre = make_task("fusion_gym/MarkovJumpTracking-v0", information="centre")
-    assert usual_policies(centre, (0.25,)) == ["random:rate=0.25", "always"]
-    drawn = make_task(OSCILLATOR, cost_weight="random", price_range=[0.01, 0.04])
-    assert usual_policies(drawn)[-1] == "value_of_information:price=0.02"
-
-
 # --- the command ----------------------------------------------------------------------------------
 
 
@@ -180,18 +173,6 @@ def test_a_training_on_the_mismatch_is_warned_once_where_that_is_not_the_error(
     assert len(told) == 1
     assert told[0].startswith("warning: training.error = 'mismatch' leaves out a cross term of -")
     train(experiment.changed(None, timesteps=256), resume=True)
-    assert "cross term" not in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("error", "filter", "quiet"), [
-    ("excess", "paper", False), ("mismatch", "tobit", False), ("mismatch", "paper", True),
-])  # fmt: skip
-def test_no_warning_where_nothing_is_wrong_or_nobody_reads_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], error: str, filter: str, quiet: bool
-) -> None:
-    experiment = mismatch_config(tmp_path, error)
-    training = experiment.training.model_copy(update={"error_filter": filter})
-    train(experiment.model_copy(update={"training": training}), quiet=quiet)
     assert "cross term" not in capsys.readouterr().err
 
 

@@ -98,13 +98,6 @@ def test_episodes_are_told_apart_by_their_price() -> None:
     }
 
 
-def test_the_ends_of_the_range_belong_to_its_parts() -> None:
-    task = make_task(ENV, **FRONT)
-    results = run_episodes(task, make_policy("never", task), 3, 0)
-    parts = by_price(task, np.array([0.01, 0.32, 0.16]), results)
-    assert [part["episodes"] for part in parts] == [1, 2]
-
-
 def test_a_fixed_price_has_no_parts(tmp_path: Path) -> None:
     trained(tmp_path, "ppo", cost_weight=0.02)
     assert all("prices" not in record for record in read_records(tmp_path / "run"))

@@ -8,12 +8,10 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass, fields
 from pathlib import Path
 
-import gymnasium as gym
 import pytest
-from page_blocks import blocks_of, imported, stray_commands
+from page_blocks import blocks_of, imported
 
 import fusion_gym
 from fusion_gym.agents import report
@@ -25,13 +23,10 @@ from fusion_gym.agents.suite.learning import load_learning
 from fusion_gym.agents.suite.report_pages import documented
 from fusion_gym.agents.suite.robust_table import write_table
 from fusion_gym.agents.suite.robustness import load_robustness
-from fusion_gym.core.options import Scenario
 from fusion_gym.envs import pages
 from fusion_gym.envs.option_text import options_in
-from fusion_gym.envs.registration import ENVIRONMENTS, class_name, options_of
-from fusion_gym.envs.vector import reset_infos
+from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 from fusion_gym.policies.registry import policy_names
-from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions, build
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -74,11 +69,6 @@ def test_python_examples_run(
     exec(compile(block.text, "example", "exec"), {})
 
 
-def test_commands_stand_in_shell_blocks() -> None:
-    pages = sorted((ROOT / "docs").rglob("*.md"))
-    assert not [line for path in pages for line in stray_commands(path, path.read_text())]
-
-
 def test_the_evaluation_command_runs(tmp_path: Path) -> None:
     words = next(
         words
@@ -108,10 +98,6 @@ def test_configs_that_the_texts_name_exist() -> None:
     assert configs
     missing = [name for name in configs if not (ROOT / f"configs/{name}.yaml").exists()]
     assert not missing
-
-
-def test_the_readme_stays_short() -> None:
-    assert len(README.splitlines()) < 150
 
 
 def test_files_and_names_of_the_library_that_the_texts_name_exist() -> None:
@@ -194,73 +180,6 @@ def test_every_option_and_entry_has_a_meaning_and_a_table(env_id: str) -> None:
 def test_tables_in_the_docs_are_those_of_the_code(path: Path) -> None:
     text = path.read_text()
     assert text == pages.documented(text), "run python -m fusion_gym.envs.pages docs/*.md"
-
-
-def test_a_table_marks_what_only_other_options_have() -> None:
-    text = pages.documented(
-        "<!-- observation: fusion_gym/RemoteEstimation-v0 access=random; channel=gilbert_elliott "
-        "-->\n<!-- end -->"
-    )
-    rows = {row.split("`")[1]: row for row in text.splitlines() if row.startswith("| `")}
-    assert 'only with `channel="gilbert_elliott"`' in rows["channel[sensor,bad/good]"]
-    assert "only with" not in rows["admitted[sensor]"]
-    assert "only with a `price_range`" in rows["price"]
-    starred = [name for name, row in rows.items() if "` *" in row]
-    assert starred[0] == "error[sensor]"
-    for name in starred[1:]:
-        assert "only with `memory=True` or `belief_features`" in rows[name]
-        assert ("| its own" in rows[name]) == name.startswith("own_")
-    assert len(starred) == 5
-
-
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
-def test_help_shows_the_whole_page(env_id: str) -> None:
-    prefix = f"fusion_gym.envs.registered.{class_name(env_id)}"
-    text = pydoc.plain(pydoc.render_doc(f"{prefix}Env"))
-    options = [field.name for field in fields(options_of(env_id))]
-    assert not [name for name in options if not re.search(rf"^.*    {name}: \S.* = \S", text, re.M)]
-    infos = reset_infos(fusion_gym.make_task(env_id), 1)
-    assert not [key for key in infos if f"`{key}`" not in text]
-    assert "Starting state: " in text
-    assert "- v0: first version." in text
-    assert pages.page(env_id).splitlines()[0] in pydoc.render_doc(f"{prefix}VectorEnv")
-
-
-def test_an_object_tells_of_its_own_observation() -> None:
-    name = "fusion_gym/MarkovJumpTracking-v0"
-    env, envs = gym.make(name, filter="imm").unwrapped, gym.make_vec(name, 2, horizon=7)
-    assert "`mode_probability[" in str(env.__doc__)
-    assert "`mode_probability[" not in str(type(env).__doc__)
-    assert "after `horizon` steps, here 7;" in str(envs.__doc__)
-
-
-def test_a_page_without_a_text_and_one_with_a_history(monkeypatch: pytest.MonkeyPatch) -> None:
-    @dataclass(frozen=True)
-    class Bare(TobitOscillatorOptions):
-        pass
-
-    def bare(chosen: Bare) -> Scenario:
-        return build(chosen)
-
-    @dataclass(frozen=True)
-    class Later(TobitOscillatorOptions):
-        """A title.
-
-        Some text of :class:`Later` and ``Later``.
-
-        v1: it changed.
-        """
-
-    def later(chosen: Later) -> Scenario:
-        return build(chosen)
-
-    bare.__annotations__["chosen"], later.__annotations__["chosen"] = Bare, Later
-    monkeypatch.setitem(ENVIRONMENTS, "test/Bare-v0", bare)
-    monkeypatch.setitem(ENVIRONMENTS, "test/Later-v1", later)
-    assert pages.page("test/Bare-v0").splitlines()[0] == "test/Bare-v0"
-    text = pages.page("test/Later-v1")
-    assert text.startswith("A title.\n\nSome text of `Later` and `Later`.\n\n## Action")
-    assert "- v0: first version.\n- v1: it changed.\n" in text
 
 
 def test_the_citation_is_of_this_version() -> None:

@@ -16,14 +16,12 @@ from fusion_gym.agents import envelope
 from fusion_gym.agents.suite.classes import Class, classes_of
 from fusion_gym.agents.suite.committed import merged_curves, read_envelopes
 from fusion_gym.agents.suite.config import Choices, Family, Range, Tuning, load_suite
-from fusion_gym.agents.suite.envelope_table import cell
 from fusion_gym.agents.suite.tuning import Trial, first_values, near_hull, policy_text, search
 from fusion_gym.core.system import covers
 from fusion_gym.evaluation.beside import run_beside
 from fusion_gym.evaluation.envelope import EnvelopePoint, chosen_mse, lower_hull
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.validation import ConfigurationError
 
 FAMILY = Family(
     label="x", policy="innovation_threshold",
@@ -54,13 +52,6 @@ def test_policies_beside_each_other_do_what_each_does_alone(
         alone = run_episodes(task, make_policy(name, task), 7, 3)
         np.testing.assert_array_equal(brief.mse, alone.mse)
         np.testing.assert_allclose(brief.rate, alone.rate.mean(-1), rtol=1e-12)
-
-
-def test_owners_of_beliefs_are_not_mixed() -> None:
-    task = fusion_gym.make_task(ENV, filter="tobit", memory=True, horizon=5)
-    made = [make_policy(f"value_of_information:own={own}", task) for own in ("true", "false")]
-    with pytest.raises(ConfigurationError, match="the same owner"):
-        run_beside(task, made, 2, 0)
 
 
 def test_a_search_begins_with_values_that_all_sensors_share() -> None:
@@ -219,14 +210,6 @@ def test_a_family_that_does_not_fit_is_told_before_anything_runs(
     assert "family = 'gap' is not allowed in small" in str(caught.value)
     assert "\n" not in str(caught.value)
     assert not list((tmp_path / "work").rglob("*.json"))
-
-
-def test_cells_of_the_table() -> None:
-    envelope = [EnvelopePoint("a", 0.0, 2.0), EnvelopePoint("b", 0.2, 1.0)]
-    assert [cell(envelope, rate) for rate in (0.1, 0.3)] == ["1.5", "1"]
-    computed = [EnvelopePoint("a", 0.1, 2.0), EnvelopePoint("b", 0.2, 1.0)]
-    assert [cell(computed, rate) for rate in (0.05, 0.15, 0.3)] == ["–", "1.5", "–"]
-    assert cell([], 0.1) == "–"
 
 
 def test_classes_that_are_added_take_no_curves_away() -> None:

@@ -44,16 +44,13 @@ def cheapest(task: Task, price: float, seed: int) -> float:
 @pytest.mark.parametrize(
     ("env_id", "options", "price"),
     [
-        (REMOTE, {"max_episode_steps": 9}, 1.0),
         (REMOTE, {"max_episode_steps": 9, "tokens": "limited", "token_rate": 0.3}, 0.5),
         (
             REMOTE,
             {"max_episode_steps": 5, "sensors": 2, "channel": "gilbert_elliott", "token_cost": 2.0},
             0.3,
         ),
-        (TRACKING, {"max_episode_steps": 5, "access": "any"}, 1e-3),
         (TRACKING, {"max_episode_steps": 5, "access": "single"}, 1e-3),
-        (TRACKING, {"max_episode_steps": 5, "access": "round_robin"}, 1e-3),
         (TRACKING, {"max_episode_steps": 5, "access": "random"}, 1e-3),
         (TRACKING, {"max_episode_steps": 5, "access": "any", "tokens": "limited"}, 3e-4),
         (TOBIT, {"max_episode_steps": 4, "filter": "tobit", "token_rate": 1.0}, 0.001),
@@ -154,16 +151,6 @@ def test_it_costs_less_than_policies_that_do_not_know_the_noise() -> None:
         difference = best + results.returns
         assert difference.mean() < -5 * difference.std() / np.sqrt(30), name
         assert best.mean() < -0.7 * results.returns.mean(), name
-
-
-@pytest.mark.slow
-def test_a_wider_beam_costs_less_and_a_higher_price_sends_less() -> None:
-    task = fusion_gym.make_task(TOBIT, **BENCHMARK)
-    costs = [find_schedules(task, 0.04, width, 20, seed=0).cost.mean() for width in (1, 8, 64)]
-    assert costs[1] < 0.95 * costs[0]
-    assert costs[2] < 0.98 * costs[1]
-    rates = [run_hindsight(task, price, 8, 20, seed=0).rate.mean() for price in (0.0, 0.04, 0.5)]
-    assert rates[0] > 1.3 * rates[1] > 2.0 * rates[2] > 0.0
 
 
 def test_what_cannot_be_is_refused() -> None:

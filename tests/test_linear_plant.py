@@ -44,13 +44,6 @@ def test_factor_has_the_rank_and_the_square(matrix: Any, rank: int) -> None:
     np.testing.assert_allclose(factor @ factor.T, matrix, rtol=1e-12, atol=1e-14 * matrix.max())
 
 
-def test_channels_count_the_rank_of_the_noise() -> None:
-    assert make().noise_channels == 1
-    assert make(process_covariance=0.05 * np.eye(2)).noise_channels == 2
-    assert make(process_covariance=np.zeros((2, 2))).noise_channels == 0
-    assert make().size == 2
-
-
 def monte_carlo_room(covariance: Any, draws: int) -> Any:
     """Five standard errors of each entry of an empirical covariance of normal draws."""
     variance = np.diagonal(covariance)
@@ -83,17 +76,6 @@ def test_full_noise_and_initial_state_have_their_covariances() -> None:
     assert np.all(np.abs(centred @ centred.T / draws - wanted) <= monte_carlo_room(wanted, draws))
 
 
-def test_the_monte_carlo_tolerance_would_notice_a_wrong_covariance() -> None:
-    room = monte_carlo_room(RANK_ONE, 200_000)
-    assert np.all(room < 0.02 * RANK_ONE)
-
-
-def test_without_noise_the_state_is_rotated_only() -> None:
-    state = np.array([[1.0, -2.0], [0.5, 3.0]])
-    moved = make().advance(state, np.zeros((1, 2)))
-    np.testing.assert_allclose(moved, TURN @ state, rtol=1e-15)
-
-
 def test_prediction_is_the_formula() -> None:
     generator = np.random.default_rng(3)
     mean, factor = generator.normal(size=(2, 5)), generator.normal(size=(2, 3, 5))
@@ -113,16 +95,6 @@ def test_open_loop_of_a_scalar_plant_is_a_geometric_sum() -> None:
     assert plant.open_loop(horizon) == pytest.approx([fixed + decaying / horizon], rel=1e-12)
 
 
-def test_open_loop_of_a_rotation_grows_with_the_noise() -> None:
-    # A rotation keeps traces: after t steps it is that of the start plus t times that of W.
-    angle = 0.052 * np.pi
-    rotation = [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
-    plant = make(transition=rotation, initial_covariance=0.1 * np.eye(2))
-    wanted = 0.2 + np.trace(RANK_ONE) * (100 + 1) / 2
-    assert plant.open_loop(100).sum() == pytest.approx(wanted, rel=1e-12)
-    assert plant.open_loop(100).sum() == pytest.approx(0.346, abs=5e-4)
-
-
 def test_open_loop_is_what_simulation_gives() -> None:
     plant, runs, horizon = make(), 50_000, 12
     generator = np.random.default_rng(5)
@@ -140,20 +112,9 @@ def test_open_loop_is_what_simulation_gives() -> None:
     ("change", "field", "reason"),
     [
         ({"transition": [[1.0, 0.0]]}, "transition", "shape"),
-        ({"transition": [1.0, 0.0]}, "transition", "shape"),
-        ({"transition": [[1.0, np.nan], [0.0, 1.0]]}, "transition", "finite"),
-        ({"transition": "rotation"}, "transition", "numbers"),
-        ({"process_covariance": np.eye(3)}, "process_covariance", "shape"),
-        ({"process_covariance": 0.05}, "process_covariance", "shape"),
         ({"process_covariance": [[1.0, 0.5], [0.0, 1.0]]}, "process_covariance", "symmetric"),
         ({"process_covariance": [[1.0, 2.0], [2.0, 1.0]]}, "process_covariance", "semi-definite"),
-        ({"process_covariance": [[-1.0, 0.0], [0.0, 1.0]]}, "process_covariance", "semi-definite"),
-        ({"process_covariance": np.diag([np.inf, 1.0])}, "process_covariance", "finite"),
         ({"initial_covariance": [[1.0, 1.0], [1.0, 1.0]]}, "initial_covariance", "definite"),
-        ({"initial_covariance": [[1.0, 2.0], [2.0, 1.0]]}, "initial_covariance", "definite"),
-        ({"initial_covariance": np.zeros((2, 2))}, "initial_covariance", "definite"),
-        ({"initial_mean": [5.0]}, "initial_mean", "shape"),
-        ({"initial_mean": [5.0, np.inf]}, "initial_mean", "finite"),
     ],
 )
 def test_bad_matrices_are_refused(change: dict[str, Any], field: str, reason: str) -> None:
@@ -163,10 +124,3 @@ def test_bad_matrices_are_refused(change: dict[str, Any], field: str, reason: st
     assert message.startswith(f"{field} = ")
     assert " is not allowed: it must be " in message
     assert reason in message
-
-
-def test_a_plant_does_not_share_memory_with_its_arguments() -> None:
-    transition = TURN.copy()
-    plant = make(transition=transition)
-    transition[:] = 0.0
-    assert np.array_equal(plant.transition[..., 0], TURN)

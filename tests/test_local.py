@@ -84,18 +84,3 @@ def test_a_shared_policy_is_trained_saved_and_evaluated(tmp_path: Path) -> None:
         action, _ = model.predict(SensorView(task).rows(batch.observe()), deterministic=True)
         rate += batch.step(action.reshape(3, 3).T.astype(np.bool_)).granted.T
     np.testing.assert_allclose(results.rate, rate / 10)
-
-
-def test_what_cannot_be_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="parallel_env"):
-        fusion_gym.make_task(TOBIT, information="local")
-    with pytest.raises(ConfigurationError, match="information = 'centre'"):
-        fusion_gym.parallel_env(TOBIT, information="centre")
-    env = fusion_gym.parallel_env(TOBIT)
-    with pytest.raises(Exception, match="call reset"):
-        env.step({})
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="one of each of"):
-        env.step({"sensor_0": 1})
-    with pytest.raises(ValueError, match=r"action \[0\] = 2 is not allowed: it must be 0 or 1"):
-        env.step(dict.fromkeys(env.agents, 2))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from benchmarks import many_sensors
-from benchmarks.many_sensors import comparison, cost, exponent, floor
+from benchmarks.many_sensors import comparison, cost, floor
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
@@ -27,10 +27,6 @@ def test_the_floor_of_sources_that_are_alike_is_that_of_all_together() -> None:
     assert found.returns.mean() < floor(task)
     with pytest.raises(ValueError, match="alike"):
         floor(task_of(noise_deviation=[1.0, 1.0, 1.5]))
-
-
-def test_the_exponent_is_that_of_a_power() -> None:
-    assert exponent([3, 6, 12], [18.0, 72.0, 288.0]) == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("local", [False, True])

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import many_sensors_step
-from benchmarks.many_sensors_step import LINEAR, PARTS, REMOTE, Cost, exponents, linear, remote
+from benchmarks.many_sensors_step import LINEAR, PARTS, REMOTE, Cost, exponents
 
 ROOT = Path(__file__).parent.parent
 
@@ -27,12 +27,6 @@ def test_exponents_are_those_of_powers() -> None:
     for part in PARTS:
         assert found[LINEAR][part] == pytest.approx({"sensors": 1.5, "states": 2.0})
         assert found[REMOTE][part] == pytest.approx({"sensors": 1.75})
-
-
-def test_tasks_have_the_sizes_that_are_asked_for() -> None:
-    task = linear(7, 4)
-    assert (task.sensors, len(task.system.state_names)) == (7, 4)
-    assert remote(9).sensors == len(remote(9).system.state_names) == 9
 
 
 def test_a_run_writes_figures_and_table(

@@ -103,19 +103,6 @@ def test_intersection_is_the_same_where_only_one_node_sends() -> None:
     np.testing.assert_allclose(same[0].squared_error, same[1].squared_error, rtol=2e-3)
 
 
-@pytest.mark.slow
-@pytest.mark.slow
-def test_larger_thresholds_send_less_and_err_more() -> None:
-    results = [run_episodes(build(), papers_trigger(m), 300, 4) for m in (0.2, 0.9, 1.3, 1.5)]
-    sent = [found.rate.sum(1).mean() for found in results]
-    assert (np.diff(sent) < 0.0).all()
-    assert (np.diff([found.bound_trace.mean() for found in results]) > 0.0).all()
-    assert (np.diff([found.mse.mean() for found in results]) > 0.0).all()
-    centre = [run_episodes(build(), CentreVariance(t), 300, 4) for t in (1.3, 2.0, 3.0)]
-    assert (np.diff([found.rate.sum(1).mean() for found in centre]) < 0.0).all()
-    assert (np.diff([found.mse.mean() for found in centre]) > 0.0).all()
-
-
 def agreement(policy: Policy, runs: int, steps: int, seed: int) -> tuple[Array, Array]:
     """Second moments of the fused error over all runs, and what the centre claims, by time."""
     task = build(horizon=steps)
@@ -156,17 +143,6 @@ def test_claimed_trace_of_other_models(seed: int) -> None:
     deviation = results.mse.std() / np.sqrt(6000)
     assert abs(results.mse.mean() - results.bound_trace.mean()) <= 4 * deviation
     assert results.mse.mean() == pytest.approx(results.bound_trace.mean(), rel=0.05)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["trigger", "random"])
-def test_claimed_trace_over_whole_episodes(kind: str) -> None:
-    policy = papers_trigger(0.9) if kind == "trigger" else Random((0.2, 0.3, 0.4))
-    results = run_episodes(build(), policy, 20_000, 1000)
-    deviation = results.mse.std() / np.sqrt(20_000)
-    assert abs(results.mse.mean() - results.bound_trace.mean()) <= 4 * deviation
-    assert results.mse.mean() == pytest.approx(results.bound_trace.mean(), rel=0.05)
-    assert results.nees.mean() == pytest.approx(1.0, abs=0.01)
 
 
 # --- headroom ------------------------------------------------------------------------------------

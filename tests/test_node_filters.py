@@ -9,17 +9,14 @@ import mpmath
 import numpy as np
 import pytest
 from filter_problems import (
-    PAPER_EPSILON,
     Array,
     Problem,
-    make_bound_filter,
     outcomes,
     random_problem,
 )
 from filterpy.kalman import KalmanFilter as FilterPyFilter
 
-from fusion_gym.systems.tobit.bound_filter import BoundConstants
-from fusion_gym.systems.tobit.filters import KalmanFilter, NodeFilter
+from fusion_gym.systems.tobit.filters import KalmanFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
@@ -37,23 +34,6 @@ def filterpy_filter(problem: Problem, sensor: int, lane: int) -> Any:
     other.H = problem.sensors.measurement_matrix[sensor, :, :, 0]
     other.R = np.diag(problem.sensors.variance[sensor, :, 0])
     return other
-
-
-@pytest.mark.parametrize("kind", [KalmanFilter, TobitKalmanFilter])
-@pytest.mark.parametrize(("size", "states"), [(1, 1), (1, 3), (2, 2), (2, 4), (3, 3), (3, 2)])
-def test_one_uncensored_update_is_filterpys(kind: Any, size: int, states: int) -> None:
-    problem = random_problem(size, size, states, lanes=20, threshold=NEVER_CENSORED)
-    mean, covariance, silent_mean, silent_covariance = outcomes(kind(problem.sensors), problem)
-    for sensor in range(2):
-        for lane in range(20):
-            other = filterpy_filter(problem, sensor, lane)
-            other.update(problem.value[sensor, :, lane])
-            np.testing.assert_allclose(mean[sensor, :, lane], other.x[:, 0], rtol=1e-10, atol=1e-10)
-            np.testing.assert_allclose(
-                covariance[sensor, :, :, lane], other.P, rtol=1e-10, atol=1e-10
-            )
-    assert np.array_equal(silent_mean, problem.mean)
-    assert np.array_equal(silent_covariance, problem.covariance)
 
 
 @pytest.mark.parametrize("kind", [KalmanFilter, TobitKalmanFilter])
@@ -164,14 +144,6 @@ def test_expectation_is_that_of_the_censored_normal(
     assert found["uncensored_probability"] == pytest.approx(float(inside), rel=1e-9, abs=0.0)
 
 
-def test_expectation_of_a_kalman_filter_is_that_of_no_threshold() -> None:
-    problem = random_problem(2, 2, 3, lanes=4, threshold=NEVER_CENSORED)
-    ignoring = KalmanFilter(problem.sensors).expect(problem.mean)
-    tobit = TobitKalmanFilter(problem.sensors).expect(problem.mean)
-    for name, value in ignoring._asdict().items():
-        np.testing.assert_allclose(value, getattr(tobit, name), rtol=1e-15, err_msg=name)
-
-
 # --- Joseph form -------------------------------------------------------------------------------
 
 
@@ -203,36 +175,3 @@ def test_posterior_equals_its_joseph_form(kind: Any) -> None:
             found = outcomes.delivered_covariance[sensor, :, :, lane]
             np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
             assert np.array_equal(found, found.T)
-
-
-@pytest.mark.parametrize("kind", ["kalman", "tobit", "paper"])
-def test_a_delivered_gain_is_the_best_one(kind: str) -> None:
-    """Any other gain has a larger bound: the posterior is at the minimum over the gains."""
-    problem = random_problem(14, 2, 2, lanes=1, threshold=0.0, count=1)
-    sensors, covariance = problem.sensors, problem.covariance[0, :, :, 0]
-    node_filter: NodeFilter = {
-        "kalman": KalmanFilter(sensors),
-        "tobit": TobitKalmanFilter(sensors),
-        "paper": make_bound_filter(sensors),
-    }[kind]
-    expectation = node_filter.expect(problem.mean)
-    outcomes = node_filter.outcomes(
-        problem.mean, problem.covariance, expectation, problem.held, np.ones(1)
-    )
-    correction, posterior = outcomes.correction[0, ..., 0], outcomes.delivered_covariance[0, ..., 0]
-    grow = BoundConstants.create(PAPER_EPSILON).kappa[0] if kind == "paper" else 1.0
-    q = expectation.uncensored_probability[0, :, 0]
-    weighted = q[:, None] * sensors.measurement_matrix[0, :, :, 0]
-    # From P' = κ₁ P - κ₁ P C̃ᵀ K: the total Φ behind the gain, and so the bound of any gain.
-    total = grow * np.linalg.lstsq(correction.T, covariance @ weighted.T, rcond=None)[0]
-    noise = total - grow * weighted @ covariance @ weighted.T
-    assert np.allclose(total, total.T, rtol=1e-8)
-    generator = np.random.default_rng(1)
-    for _ in range(20):
-        other = correction + 0.1 * generator.normal(size=correction.shape)
-        bound = joseph(other, weighted, grow * covariance, noise)
-        assert np.linalg.eigvalsh(bound - posterior).min() > -1e-10
-        assert np.trace(bound) > np.trace(posterior)
-    np.testing.assert_allclose(
-        joseph(correction, weighted, grow * covariance, noise), posterior, rtol=1e-8
-    )

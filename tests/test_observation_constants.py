@@ -10,7 +10,7 @@ import pytest
 import fusion_gym
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.observation import ObservationLayout, block_entries
+from fusion_gym.core.observation import block_entries
 from fusion_gym.core.system import Block, Signals
 from fusion_gym.envs.registration import ENVIRONMENTS
 
@@ -107,20 +107,6 @@ def test_entries_give_back_what_was_measured(env_id: str) -> None:
     words = {word for _, word in done}
     assert words & {"root mean square", "error_scale"}
     assert len(done) >= (3 if "Remote" in env_id else 5)
-
-
-@pytest.mark.parametrize("env_id", ENVIRONMENTS)
-@pytest.mark.parametrize("owner", ["coordinator", "own"])
-def test_constants_are_named_by_words_of_the_meaning(env_id: str, owner: Any) -> None:
-    task = fusion_gym.make_task(env_id, **COMMON, belief_features=True)
-    said = ""
-    for block in ObservationLayout(task, owner).blocks:
-        said = f"{said} {block.meaning}" if block.meaning.startswith("th") else block.meaning
-        for word, value in block.constants.items():
-            assert word in said, (block.name, word)
-            numbers = np.asarray(value, dtype=np.float64)
-            assert (numbers > 0.0).all(), (block.name, word)
-            assert np.isfinite(numbers).all(), (block.name, word)
 
 
 def test_the_clock_and_the_price_are_decoded() -> None:

@@ -10,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from pettingzoo.test.state_test import test_parallel_env as pettingzoos_check_of_states
-from pettingzoo.utils.conversions import parallel_to_aec
 
 import fusion_gym
 
@@ -135,29 +134,6 @@ def test_the_joint_state_is_what_all_agents_see_together(
         single = isinstance(coordinator.action_space, gym.spaces.Discrete)  # 0 is for nobody
         observation, *_ = coordinator.step(chosen + 1 if single else bits)
     assert not np.array_equal(state, env.state())
-
-
-def test_the_state_holds_nothing_of_the_truth() -> None:
-    env = fusion_gym.parallel_env(TOBIT)
-    env.reset(seed=0)
-    before = env.state()
-    hidden = env.batch.state
-    hidden.truth = hidden.truth + 100.0
-    np.testing.assert_array_equal(env.state(), before)
-    hidden.measurement = hidden.measurement + 0.1
-    assert not np.array_equal(env.state(), before)
-
-
-def test_agents_in_turn_see_the_state_too() -> None:
-    env = parallel_to_aec(fusion_gym.parallel_env(TOBIT, horizon=3))
-    env.reset(seed=0)
-    states = [env.state()]
-    for agent in env.agent_iter():
-        *_, terminated, truncated, _ = env.last()
-        over = terminated or truncated
-        env.step(None if over else env.action_space(agent).sample())
-        states.append(env.state())
-    assert len({state.tobytes() for state in states}) == 4
 
 
 @pytest.mark.parametrize("kind", ["single", "vector", "parallel"])

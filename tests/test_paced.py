@@ -7,14 +7,13 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from fusion_gym import ConfigurationError, make_task
+from fusion_gym import make_task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.registry import make_policy, make_rule
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.paced import Paced
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
@@ -79,14 +78,6 @@ def test_every_window_has_its_share_at_any_real_rate(
         assert widest_miss(row, Fraction(rate)) < 1 + Fraction(1, 10**9)
 
 
-@pytest.mark.parametrize("staggered", [True, False])
-@pytest.mark.parametrize("sensors", [1, 2, 3, 7])
-def test_the_ends(sensors: int, staggered: bool) -> None:
-    for first in (0, 10**7):
-        assert requests(Paced(1, staggered), sensors, first).all()
-        assert not requests(Paced(0.0, staggered), sensors, first).any()
-
-
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(sensors=st.integers(1, 6), numerator=st.integers(0, 120), denominator=st.integers(1, 120))
 def test_staggered_sensors_of_one_rate_are_even_together(
@@ -100,40 +91,9 @@ def test_staggered_sensors_of_one_rate_are_even_together(
     np.testing.assert_array_equal(at_once, np.broadcast_to(at_once[0], at_once.shape))
 
 
-@pytest.mark.parametrize("staggered", [True, False])
-@pytest.mark.parametrize("period", [1, 2, 3, 6, 7, 49, 100])
-def test_one_over_a_period_is_periodic_but_for_the_phase(period: int, staggered: bool) -> None:
-    sensors = 3
-    paced = requests(Paced(1 / period, staggered), sensors)
-    periodic = requests(make_rule(f"periodic:period={period},staggered={staggered}"), sensors)
-    for one, other in zip(paced, periodic, strict=True):
-        shift = (np.flatnonzero(other)[0] - np.flatnonzero(one)[0]) % period
-        kept = LENGTH - period
-        np.testing.assert_array_equal(one[:kept], other[shift : shift + kept])
-    if not staggered:
-        np.testing.assert_array_equal(paced[:, :-1], periodic[:, 1:])
-
-
 def test_the_rates_of_an_evaluation() -> None:
     """100 steps: the counts are exact where 100 r is whole, else within one."""
     task = make_task(ENV_ID, tokens="unlimited")
     results = run_episodes(task, make_policy("paced:rate=0.17/0.5/0.333", task), 3, seed=0)
     np.testing.assert_allclose(results.rate[:, :2], [[0.17, 0.5]] * 3, rtol=1e-12)
     assert np.all(np.abs(results.rate[:, 2] - 0.333) < 0.01)
-
-
-@pytest.mark.parametrize(
-    ("spec", "message"),
-    [
-        ("paced:rate=1.01", "rate = 1.01"),
-        ("paced:rate=0.2/-0.1/0.2", "rate = -0.1"),
-        ("paced:rate=often", "rate = 'often'"),
-        ("paced:staggered=2", "staggered = 2"),
-        ("paced:rate=0.1/0.2", "rate = "),
-        ("paced:period=2", "unknown parameter of policy 'paced' 'period'"),
-    ],
-)
-def test_bad_parameters_are_named(spec: str, message: str) -> None:
-    with pytest.raises(ConfigurationError) as caught:
-        make_policy(spec, make_task(ENV_ID))
-    assert message in str(caught.value)

@@ -154,9 +154,7 @@ def test_a_file_holds_what_was_found(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(json.loads(before)["periodic_optimum"]) == 2
 
 
-@pytest.mark.parametrize(
-    "text", ["", "{", "[]", "3", '{"other": 1}', '{"periodic_optimum": [1]}', "\x00\xff"]
-)
+@pytest.mark.parametrize("text", ["{", '{"periodic_optimum": [1]}', "\x00\xff"])
 def test_a_broken_or_foreign_file_is_replaced(tmp_path: Path, text: str) -> None:
     path = tmp_path / "schedules.json"
     path.write_text(text, encoding="latin-1")
@@ -169,14 +167,8 @@ def test_a_broken_or_foreign_file_is_replaced(tmp_path: Path, text: str) -> None
     "entry",
     [
         None,
-        7,
-        {},
         {"requests": [[1, 0, 0]], "trace": 1.0},
-        {"requests": [[1, 0, 0], [0, 1, 0]], "trace": 1.0},
-        {"requests": [[1, 0, 0], [0, 0]], "trace": 1.0},
         {"requests": [[0.5, 0.5, 0], [0, 0, 0]], "trace": 1.0},
-        {"requests": [[1, 0, 0], [0, 0, 0]], "trace": "low"},
-        {"requests": [["1", 0, 0], [0, 0, 0]], "trace": 1.0},
         {"requests": [[1, 0, 0], [0, 0, 0]], "trace": -1.0},
     ],
 )
@@ -202,15 +194,9 @@ def test_an_entry_that_cannot_be_true_is_found_anew(
 @pytest.mark.parametrize(
     ("spec", "options", "message"),
     [
-        ("packets=0", {}, "packets = 0"),
         ("packets=19", {}, "packets = 19 .* <= 18"),
-        ("packets=2.5", {}, "packets = 2.5"),
-        ("period=0", {}, "period = 0"),
-        ("period=none", {}, "period = None"),
         ("packets=12,period=8", {}, "packets = 12 .* 2704156 schedules"),
-        ("cache=3", {}, "cache = 3 .* path"),
         ("cache=/dev/null/schedules.json,packets=1,period=1", {}, "cache = .* written"),
-        ("phase=3", {}, "unknown parameter of policy 'periodic_optimum' 'phase'"),
         ("", {"access": "single"}, "access = 'single' .* 'any'"),
         ("", {"filter": "imm"}, "MarkovJumpCentralSystem.* not depend on the data"),
     ],
@@ -218,12 +204,6 @@ def test_an_entry_that_cannot_be_true_is_found_anew(
 def test_what_is_not_allowed(spec: str, options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         make_policy(f"periodic_optimum:{spec}" if spec else "periodic_optimum", markov(**options))
-
-
-@pytest.mark.parametrize("average", ["", "mean", None, 3])
-def test_averages_that_do_not_exist(average: Any) -> None:
-    with pytest.raises(ConfigurationError, match=r"average = .* 'steady', 'episode'"):
-        PeriodicOptimum(markov(), 1, 1, average=average)
 
 
 def test_systems_whose_covariances_depend_on_the_data_are_refused() -> None:

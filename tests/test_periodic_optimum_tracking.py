@@ -15,7 +15,7 @@ from fusion_gym import linalg
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies import periodic_optimum
-from fusion_gym.policies.periodic_optimum import PeriodicOptimum, episode_traces, steady_traces
+from fusion_gym.policies.periodic_optimum import PeriodicOptimum, episode_traces
 from fusion_gym.systems.correlated.system import CorrelatedTrackingSystem
 from fusion_gym.systems.unknown_input.system import UnknownInputSystem
 from fusion_gym.validation import ConfigurationError
@@ -215,19 +215,6 @@ def test_brute_force_of_uncensored_nodes(name: str) -> None:
     assert squared_by_impulses(task.system, best, 30) == pytest.approx(min(traces), rel=1e-9)
 
 
-@pytest.mark.slow
-def test_a_transient_is_part_of_an_episode() -> None:
-    """What is best in the end is not what is best over ten steps from the start."""
-    task = correlated(horizon=10)
-    steady, episode = PeriodicOptimum(task, 2, 2), PeriodicOptimum(task, 2, 2, average="episode")
-    both = np.stack((steady.schedule, episode.schedule), axis=-1)
-    mean, late = episode_traces(task.system, both, 10), steady_traces(task.system, both)
-    assert mean[1] == pytest.approx(episode.trace, rel=1e-9)
-    assert mean[1] < 0.95 * mean[0]
-    assert late[0] == pytest.approx(steady.trace, rel=1e-9)
-    assert late[0] < 0.5 * late[1]
-
-
 def test_actual_covariances_are_not_there_unless_tracked() -> None:
     system = correlated().system
     assert isinstance(system, CorrelatedTrackingSystem)
@@ -255,9 +242,3 @@ def test_actual_covariances_are_not_there_unless_tracked() -> None:
 def test_other_filters_of_the_same_systems_are_refused(task: Task) -> None:
     with pytest.raises(ConfigurationError, match=r"System.* not depend on the data"):
         PeriodicOptimum(task, 1, 1)
-
-
-@pytest.mark.parametrize("options", [{"filter": "predict"}, {"fusion": "exact_ci"}])
-def test_filters_that_predict_while_nothing_arrives_are_searched(options: Any) -> None:
-    policy = PeriodicOptimum(unknown(horizon=20, **options), 1, 2, average="episode")
-    assert policy.schedule.sum() == 1

@@ -36,20 +36,6 @@ def test_a_random_price_is_even_in_the_logarithm_and_observed() -> None:
     np.testing.assert_array_equal(batch.signals()["price"], batch.price)
 
 
-def test_the_price_shifts_no_noise() -> None:
-    plain = started(3)
-    priced = started(3, cost_weight="random", price_range=SPAN)
-    for _ in range(5):
-        requests = np.ones((3, 3), dtype=np.bool_)
-        before, after = plain.step(requests), priced.step(requests)
-        np.testing.assert_array_equal(before.squared_error, after.squared_error)
-        np.testing.assert_allclose(after.reward_communication, -priced.price * after.cost)
-    for batch in (plain, priced):
-        batch.reset(np.array([1]))
-    outcomes = [batch.step(np.ones((3, 3), dtype=np.bool_)) for batch in (plain, priced)]
-    np.testing.assert_array_equal(outcomes[0].squared_error, outcomes[1].squared_error)
-
-
 def test_every_episode_draws_its_own_price() -> None:
     batch = started(2, cost_weight="random", price_range=SPAN)
     first = batch.price.copy()
@@ -129,21 +115,12 @@ def test_rewards_of_a_training_over_prices_are_scaled_and_returns_are_not(local:
             FusionSB3VecEnv(task, 5, price_exponent=value)
 
 
-def test_one_price_has_no_scale() -> None:
-    price = fusion_gym.make_task(ENV_ID, cost_weight=0.2).reward.price
-    np.testing.assert_array_equal(price.scale(np.full(3, 0.2), 0.5), 1.0)
-
-
 @pytest.mark.parametrize(
     ("options", "parts"),
     [
         ({"cost_weight": "random"}, ("price_range", "0 < low < high")),
-        ({"cost_weight": "rand", "price_range": SPAN}, ("'rand'", "did you mean 'random'")),
         ({"price_range": (0.1, 0.001)}, ("[0.1, 0.001]", "0 < low < high")),
-        ({"price_range": (0.0, 0.1)}, ("price_range", "> 0")),
-        ({"price_range": 0.1}, ("price_range", "(2)")),
         ({"cost_weight": 0.5, "price_range": SPAN}, ("cost_weight = 0.5", "[0.001, 0.1]")),
-        ({"cost_weight": -0.1}, ("-0.1", ">= 0")),
     ],
 )
 def test_prices_that_cannot_be_are_refused(options: dict[str, Any], parts: tuple[str, ...]) -> None:

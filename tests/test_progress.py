@@ -6,11 +6,7 @@ import dataclasses
 import importlib
 import itertools
 import json
-import os
-import pty
-import re
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -23,11 +19,8 @@ from fusion_gym.agents import __main__ as everything
 from fusion_gym.agents import command_line, evaluate
 from fusion_gym.agents.command_line import Long
 from fusion_gym.agents.output import progress
-from fusion_gym.agents.output.progress import progress_bar, quietly, remark, writing
-from fusion_gym.agents.suite.team import Team
-from fusion_gym.agents.suite.workers import Work, side_by_side
+from fusion_gym.agents.output.progress import progress_bar, quietly, writing
 
-ROOT = Path(__file__).parent.parent
 EVALUATE = [
     *("--env", "fusion_gym/TobitOscillator-v0", "--set", "horizon=20"),
     *("--policies", "always", "never", "--episodes", "3"),
@@ -91,12 +84,6 @@ def test_where_nobody_watches_a_line_is_printed_now_and_then(
     assert capsys.readouterr() == ("", "evaluating: 100 %, 10,000/10,000 steps, 2:46:40, always\n")
 
 
-def test_work_that_was_done_before_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    with progress_bar(8, "evaluating", 8):
-        pass
-    assert capsys.readouterr() == ("", "")
-
-
 def test_quiet_says_nothing_and_ends(capsys: pytest.CaptureFixture[str]) -> None:
     with quietly(), quietly(False), progress_bar(3, "evaluating") as bar:
         writing(("results", "here"))
@@ -104,52 +91,6 @@ def test_quiet_says_nothing_and_ends(capsys: pytest.CaptureFixture[str]) -> None
     assert capsys.readouterr() == ("", "")
     writing(("results", "here"), ("episodes", "there"))
     assert capsys.readouterr().err == "writing results into here, episodes into there\n"
-
-
-def test_a_closed_stderr_gets_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stderr", None)
-    with progress_bar(2, "evaluating") as bar:
-        bar.update()
-        remark("heard by nobody")
-    assert bar.done == 1
-
-
-CHILD = """
-from fusion_gym.agents.output.progress import progress_bar, writing
-writing(("results", "here"))
-with progress_bar(700_000, "training a") as first, progress_bar(30, "b", unit="trials") as second:
-    first.say("MSE 0.1234")
-    first.reach(350_000)
-    print("a result")
-    second.reach(30)
-"""
-
-
-def test_a_terminal_gets_bars_and_stdout_none_of_them() -> None:
-    mine, theirs = pty.openpty()
-    environment = os.environ | {"TERM": "xterm", "COLUMNS": "100"}
-    words = [sys.executable, "-c", CHILD]
-    done = subprocess.run(
-        words, cwd=ROOT, env=environment, text=True, check=True, stdout=-1, stderr=theirs
-    )
-    os.close(theirs)
-    shown = os.read(mine, 100_000).decode()
-    os.close(mine)
-    assert done.stdout == "a result\n"
-    assert shown.startswith("writing results into here\r\n")
-    first, second = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", shown).splitlines()[-2:]
-    assert re.search(
-        r"training a ━{4,10}[╸╺ ]?━* 350,000/700,000 steps 0:0\d, 0:0\d left MSE", first
-    )
-    assert re.search(r"^b +━{8,20} 30/30 trials +0:0\d", second)
-
-
-def test_a_pipe_gets_whole_lines_and_quiet_nothing() -> None:
-    said = call("evaluate", EVALUATE)
-    assert not re.search(r"[\x00-\x09\x0b-\x1f]", said.err)
-    assert re.fullmatch(r"nothing is written.*\nevaluating: 100 %, .* 0:0\d, never\n", said.err)
-    quiet = call("evaluate", [*EVALUATE, "--quiet"])
-    assert (quiet.out, quiet.err) == (said.out, "")
 
 
 def test_every_long_command_can_be_quiet() -> None:
@@ -210,8 +151,3 @@ def test_an_interrupt_that_loses_all_says_so(monkeypatch: pytest.MonkeyPatch) ->
     )  # fmt: skip
     absent = call("train", ["--config", "tobit_oscillator_ppo", "--output", "absent", "--resume"])
     assert absent.err == "error: output = 'absent' holds no training: nothing to resume\n"
-
-
-def test_pieces_of_work_are_counted_and_weighed(capsys: pytest.CaptureFixture[str]) -> None:
-    side_by_side([Work(weight, len, ((),)) for weight in (1.0, 9.0)], Team(1), "pieces")
-    assert re.fullmatch(r"pieces: 100 %, 2/2 pieces, 0:0\d\n", capsys.readouterr().err)

@@ -9,7 +9,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import HumanRendering, RecordVideo
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecVideoRecorder
@@ -40,10 +39,6 @@ def test_every_environment_draws_its_episode(env_id: str) -> None:
     np.testing.assert_array_equal(two, env.render())
     env.reset(seed=0)
     np.testing.assert_array_equal(env.render(), empty)
-
-
-def test_gymnasiums_check_with_rendering() -> None:
-    check_env(gym.make(TOBIT, render_mode="rgb_array", horizon=4).unwrapped)
 
 
 def test_a_picture_shows_what_happened() -> None:

@@ -8,14 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_results import SETTING, small_results
+from small_results import small_results
 
 from fusion_gym.agents import report
 from fusion_gym.agents.suite.found import read_results
-from fusion_gym.agents.suite.overview import headline_count
 from fusion_gym.agents.suite.report_pages import documented
-from fusion_gym.agents.suite.report_words import sentences
-from fusion_gym.validation import ConfigurationError
 
 PAGE = """# A page
 
@@ -25,35 +22,6 @@ what was said before
 
 The rest stays. <!-- end -->
 """
-
-
-def test_a_setting_is_said_in_its_sentences(tmp_path: Path) -> None:
-    small_results(tmp_path)
-    found = read_results(tmp_path)
-    text = documented(PAGE.format(name=SETTING), found, tmp_path)
-    assert "what was said before" not in text
-    assert text.endswith("\nThe rest stays. <!-- end -->\n")
-    for sentence in sentences(found[SETTING]):
-        assert f"\n- {sentence}\n" in text
-    assert documented(text, found, tmp_path) == text, "made anew it is the same"
-
-
-def test_the_headline_counts_points_and_seeds(tmp_path: Path) -> None:
-    small_results(tmp_path, seeds=3)
-    found = read_results(tmp_path)
-    text = documented(PAGE.format(name="headline"), found, tmp_path)
-    count = headline_count(found)
-    assert f"{count[0].upper()}{count[1:]}; training seeds of a class: 3." in text
-    assert "| setting |" in text
-
-
-def test_settings_without_results(tmp_path: Path) -> None:
-    """One of the benchmark has none so far; what nobody knows is refused."""
-    small_results(tmp_path)
-    found = read_results(tmp_path)
-    assert "No agents" in documented(PAGE.format(name="markov_jump"), found, tmp_path)
-    with pytest.raises(ConfigurationError, match=r"results = 'tobit_osc' .*'tobit_oscillator'"):
-        documented(PAGE.format(name="tobit_osc"), found, tmp_path)
 
 
 def test_the_command_writes_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,6 @@ import math
 import re
 import sys
 import types
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ from scipy import stats
 
 from fusion_gym.agents.reproduction import page, papers
 from fusion_gym.agents.reproduction.making import Job, make
-from fusion_gym.agents.reproduction.page import write_overview, write_page
 from fusion_gym.agents.reproduction.paper import Paper, Piece
 from fusion_gym.agents.reproduction.shown import Claim, Number, Picture, Shown, Table
 from fusion_gym.validation import ConfigurationError
@@ -145,38 +143,21 @@ def test_resume_makes_anew_what_was_made_otherwise(calls: Calls, words: list[str
     assert pages() == first
 
 
-def truncated(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:-40])
-
-
-def emptied(path: Path) -> None:
-    path.write_bytes(b"")
-
-
-def overwritten(path: Path) -> None:
-    path.write_bytes(b"\x00\xff" * 500)
-
-
-def flipped(path: Path) -> None:
-    raw = bytearray(path.read_bytes())
-    with zipfile.ZipFile(path) as archive:
-        start = max(entry.header_offset for entry in archive.infolist())
-    for place in range(start, len(raw) - 30):
-        raw[place] ^= 0x5A
-    path.write_bytes(bytes(raw))
-
-
 def robbed(path: Path) -> None:
     with np.load(path) as arrays:
         kept = {name: arrays[name] for name in arrays.files if name != "plain"}
     np.savez(path, **kept)
 
 
-def removed(path: Path) -> None:
-    path.unlink()
+DAMAGES: dict[str, Callable[[Path], Any]] = {
+    "truncated": lambda path: path.write_bytes(path.read_bytes()[:-40]),
+    "overwritten": lambda path: path.write_bytes(b"\x00\xff" * 500),
+    "robbed": robbed,
+    "removed": lambda path: path.unlink(),
+}
 
 
-@pytest.mark.parametrize("damage", [truncated, emptied, overwritten, flipped, robbed, removed])
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
 def test_resume_makes_anew_what_is_damaged(calls: Calls, damage: Callable[[Path], None]) -> None:
     reproduce("all")
     before = pages()
@@ -247,13 +228,13 @@ def test_a_verdict_has_its_edge_where_it_says() -> None:
     assert Number("x", 2.0, 2.0, 2.0, 2.001).verdict == "differs"
 
 
-@pytest.mark.parametrize(("runs", "episodes"), [(1, 1000), (100, 1000), (1000, 1000), (1000, 100)])
+@pytest.mark.parametrize(("runs", "episodes"), [(1, 1000), (1000, 100)])
 def test_true_reprints_agree_in_95_of_100(runs: int, episodes: int) -> None:
-    """Gaussian papers with known deviation: the coverage is 95 %, 4.5 errors of 20,000 papers.
+    """Gaussian papers with known deviation: the coverage is 95 %, 4.5 errors of 5,000 papers.
 
     And a printed value that is off by four deviations of the difference agrees in 2.1 %.
     """
-    rng, count, deviation = np.random.default_rng(runs), 20_000, 1.7
+    rng, count, deviation = np.random.default_rng(runs), 5_000, 1.7
     ours = rng.normal(scale=deviation / np.sqrt(episodes), size=count)
     theirs = rng.normal(scale=deviation / np.sqrt(runs), size=count)
     half, spread = 1.96 * deviation / np.sqrt(episodes), deviation / np.sqrt(runs)
@@ -271,19 +252,6 @@ def test_true_reprints_agree_in_95_of_100(runs: int, episodes: int) -> None:
         assert agreed == pytest.approx(expected, abs=4.5 * error)
 
 
-@pytest.mark.parametrize("draw", ["normal", "exponential"])
-def test_numbers_of_samples_agree_as_often(draw: str) -> None:
-    """With interval and spread from the sample itself; 4.5 errors of 150 papers."""
-    rng, count, runs = np.random.default_rng(5), 150, 50
-    agreed = 0
-    for _ in range(count):
-        theirs = getattr(rng, draw)(size=runs).mean()
-        number = Number.of("x", getattr(rng, draw)(size=200), theirs, runs)
-        assert number.low < number.mean < number.high
-        agreed += number.verdict == "agrees"
-    assert agreed / count == pytest.approx(0.95, abs=4.5 * np.sqrt(0.95 * 0.05 / count))
-
-
 def test_numbers_of_a_sample_have_its_moments() -> None:
     sample = np.random.default_rng(0).normal(3.0, 2.0, size=2000)
     number = Number.of("x", sample, 3.0, 25, "m")
@@ -295,24 +263,6 @@ def test_numbers_of_a_sample_have_its_moments() -> None:
 
 
 # --- pages --------------------------------------------------------------------------------------
-
-
-def test_papers_do_not_disturb_each_other(drawn: Calls) -> None:
-    reproduce("one")
-    alone = pages("one")
-    overview = Path("pages/README.md").read_text()
-    assert "The paper one" in overview
-    assert "The paper two" not in overview
-    reproduce("two")
-    assert pages("one") == alone
-    overview = Path("pages/README.md").read_text()
-    assert overview.index("The paper one") < overview.index("The paper two")
-    both = pages()
-    reproduce("all")
-    assert pages() == both
-    reproduce("two", "--episodes", "9")
-    assert pages("one") == alone
-    assert pages("two") != {name: raw for name, raw in both.items() if name.startswith("two")}
 
 
 def test_pages_are_the_same_bytes_and_hold_no_path(drawn: Calls, tmp_path: Path) -> None:
@@ -350,15 +300,6 @@ def test_a_page_has_all_that_is_shown(drawn: Calls) -> None:
             assert len(re.findall(r"(?<!\\)\|", line)) == 5
 
 
-def test_the_overview_counts_what_agrees(tmp_path: Path, calls: Calls) -> None:
-    numbers = [Number("a", 1.0, 0.9, 1.1, printed) for printed in (1.0, 1.05, 2.0, None)]
-    shown = {"piece": Shown(tables=[Table("t", "T", numbers)])}
-    one = Paper("one", "The paper one", "Cited.", [Piece("piece", "P", dict, Shown, 1.0)])  # type: ignore[arg-type]
-    write_page(one, shown, {"piece": {"episodes": 2, "seed": 0}}, tmp_path)
-    write_overview(tmp_path)
-    assert "2 of 3 printed numbers agree" in (tmp_path / "README.md").read_text()
-
-
 # --- what is refused ----------------------------------------------------------------------------
 
 
@@ -367,13 +308,8 @@ def test_the_overview_counts_what_agrees(tmp_path: Path, calls: Calls) -> None:
     [
         (["three"], ["paper = 'three'", "one", "two", "all"]),
         (["one", "three"], ["paper = 'three'"]),
-        (["all", "three"], ["paper = 'three'"]),
-        (["One"], ["paper = 'One'"]),
         ([], ["papers", "one", "two", "all"]),
         (["one", "--episodes", "1"], ["episodes = 1", "2"]),
-        (["one", "--episodes", "-3"], ["episodes = -3"]),
-        (["one", "--seed", "-1"], ["seed = -1"]),
-        (["one", "--workers", "0"], ["workers = 0"]),
     ],
 )
 def test_one_clear_error_before_anything_runs(

@@ -1,45 +1,15 @@
-"""The page of the Markov jump paper against a fresh quick run, and its printed recursion."""
+"""The Markov jump paper's recorded runs, its schedule and its printed recursion."""
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pytest
-from reproduction_checks import check_claims, check_numbers, check_pictures, committed, quick
 
 import fusion_gym
-from fusion_gym.agents.reproduction.markov_jump import PAPER
 from fusion_gym.agents.reproduction.markov_jump.printed import covariances
 from fusion_gym.agents.reproduction.markov_jump.runs import THRESHOLDS, example, run, trigger
 from fusion_gym.agents.reproduction.markov_jump.schedule import period_of
-from fusion_gym.agents.reproduction.shown import Shown
 from fusion_gym.evaluation import run_episodes
-
-EPISODES = 30
-UNCERTAIN = (  # differences of a few per cent, which thirty episodes cannot tell
-    "The algorithm tracks",
-    "The tracking becomes worse",
-    "The RMSE curve",
-    "The trigger reduces",
-)
-
-
-@cache
-def fresh() -> dict[str, Shown]:
-    return quick(PAPER, EPISODES)
-
-
-def test_numbers_agree_with_the_page() -> None:
-    assert check_numbers(committed(PAPER.name), fresh(), EPISODES) > 50
-
-
-def test_claims_and_their_verdicts() -> None:
-    check_claims(committed(PAPER.name), fresh(), PAPER.name, UNCERTAIN)
-
-
-def test_figures_draw() -> None:
-    assert check_pictures(fresh(), PAPER.name) == 4
 
 
 def test_recorded_episodes_are_those_of_the_evaluation() -> None:

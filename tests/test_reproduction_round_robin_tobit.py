@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
-from reproduction_checks import SEED, check_claims, check_numbers, check_pictures, committed, quick
+from reproduction_checks import SEED
 from scipy import stats
 
 import fusion_gym
-from fusion_gym.agents.reproduction.round_robin_tobit import PAPER
 from fusion_gym.agents.reproduction.round_robin_tobit.bounds import Lower, Seen, Upper, below
 from fusion_gym.agents.reproduction.round_robin_tobit.judging import always_below, explained
 from fusion_gym.agents.reproduction.round_robin_tobit.readings import (
@@ -30,47 +28,7 @@ from fusion_gym.agents.reproduction.round_robin_tobit.runs import (
     round_robin,
     squares,
 )
-from fusion_gym.agents.reproduction.shown import Shown
 from fusion_gym.evaluation.episodes import run_episodes
-
-EPISODES = 24
-UNCERTAIN = (  # differences that so few episodes, or heavy tails, cannot tell
-    "FTKF-DB tracks",
-    "RMSE",
-    "The bias's RMSE",
-    "The fused",
-    "The narrower",
-    "The smaller",
-    "(12)",
-    "(13)",
-    "(9)",
-    "(21)",
-    "The local estimate",
-    "Censored observations",
-    "FTKF",
-)
-
-
-@cache
-def fresh() -> dict[str, Shown]:
-    """Without the readings, which have neither numbers nor claims nor figures of the page."""
-    pieces = [piece for piece in PAPER.pieces if piece.name != "readings"]
-    return quick(replace(PAPER, pieces=pieces), EPISODES)
-
-
-def test_numbers_agree_with_the_page() -> None:
-    assert check_numbers(committed(PAPER.name), fresh(), EPISODES) > 100
-
-
-def test_claims_and_their_verdicts() -> None:
-    check_claims(committed(PAPER.name), fresh(), PAPER.name, UNCERTAIN)
-
-
-def test_figures_draw() -> None:
-    assert check_pictures(fresh(), PAPER.name) == 15
-
-
-# --- the parts ----------------------------------------------------------------------------------
 
 
 def test_squared_errors_are_those_of_the_evaluation() -> None:

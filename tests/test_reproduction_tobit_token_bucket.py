@@ -2,46 +2,15 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pytest
-from reproduction_checks import check_claims, check_numbers, check_pictures, committed, quick
 
 import fusion_gym
 from fusion_gym.agents.reproduction.judging import below, percent, told, verdict
-from fusion_gym.agents.reproduction.shown import Shown
-from fusion_gym.agents.reproduction.tobit_token_bucket import PAPER
 from fusion_gym.agents.reproduction.tobit_token_bucket.runs import TRIGGER, Failing, record, scheme
 from fusion_gym.agents.reproduction.tobit_token_bucket.theory import claimed, perturbed, terms
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.evaluation.intervals import Interval
-
-EPISODES = 40
-UNCERTAIN = (  # differences of a few per cent, which forty episodes cannot tell
-    "Censoring makes the local",
-    "The fused estimate, fed back",
-    "In most cases",
-    "Fusion improves",
-    "Condition (42)",
-)
-
-
-@cache
-def fresh() -> dict[str, Shown]:
-    return quick(PAPER, EPISODES)
-
-
-def test_numbers_agree_with_the_page() -> None:
-    assert check_numbers(committed(PAPER.name), fresh(), EPISODES) > 60
-
-
-def test_claims_and_their_verdicts() -> None:
-    check_claims(committed(PAPER.name), fresh(), PAPER.name, UNCERTAIN)
-
-
-def test_figures_draw() -> None:
-    assert check_pictures(fresh(), PAPER.name) == 9
 
 
 def test_recorded_episodes_are_those_of_the_evaluation() -> None:

@@ -1,37 +1,12 @@
-"""The page of the unknown-input paper against a fresh quick run."""
+"""The unknown-input paper's bound and its printed gains."""
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pytest
-from reproduction_checks import check_claims, check_numbers, check_pictures, committed, quick
 
-from fusion_gym.agents.reproduction.shown import Shown
-from fusion_gym.agents.reproduction.unknown_input import PAPER
 from fusion_gym.agents.reproduction.unknown_input.printed import gains, models
 from fusion_gym.agents.reproduction.unknown_input.runs import CARTS, leading, make
-
-EPISODES = 24
-UNCERTAIN = ("Fusion by covariance intersection",)  # differences that need more episodes
-
-
-@cache
-def fresh() -> dict[str, Shown]:
-    return quick(PAPER, EPISODES)
-
-
-def test_numbers_agree_with_the_page() -> None:
-    assert check_numbers(committed(PAPER.name), fresh(), EPISODES) > 40
-
-
-def test_claims_and_their_verdicts() -> None:
-    check_claims(committed(PAPER.name), fresh(), PAPER.name, UNCERTAIN)
-
-
-def test_figures_draw() -> None:
-    assert check_pictures(fresh(), PAPER.name) == 7
 
 
 def test_errors_of_the_bound_itself_fill_it() -> None:

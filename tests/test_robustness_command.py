@@ -32,6 +32,7 @@ CASES = [
     {"name": "loud", "title": "measurement noise ×2", "options": {"true_measurement_noise": 2.0}},
     {"name": "poor", "title": "half the tokens", "scaled": {"token_rate": 0.5}},
 ]
+ODD = {"name": "odd", "title": "odd"}
 COMMON = ["--class", "sensors", "--workers", "1", "--episodes", "8"]
 
 
@@ -167,49 +168,30 @@ def test_change_is_the_ratio_of_the_errors() -> None:
     assert change({"always": before["always"]}, after, 0.5) is None
 
 
-class TestErrors:
-    def said(self, made: Path, tmp_path: Path, *more: str, **changes: Any) -> str:
-        results = with_envelopes(made, tmp_path)
-        config = write_config(tmp_path / "other.yaml", made / "suite.yaml", **changes)
-        words = words_of(made, results, *more)
-        words[words.index(str(made / "robust.yaml"))] = str(config)
-        ended = call("robustness", words)
-        assert (ended.status, ended.trace) == (1, "")
-        assert not list((results / "robustness").glob("*/*/*"))
-        return ended.err.splitlines()[-1]
-
-    def test_a_case_that_does_not_fit(self, made: Path, tmp_path: Path) -> None:
-        case = {"name": "odd", "title": "odd", "options": {"true_transition": -1.0}}
-        said = self.said(made, tmp_path, own=[case])
-        assert said.startswith("error: odd of small: true_transition = -1.0 is not allowed")
-
-    def test_a_scaled_word(self, made: Path, tmp_path: Path) -> None:
-        case = {"name": "odd", "title": "odd", "scaled": {"filter": 2.0}}
-        said = self.said(made, tmp_path, own=[case])
-        assert "scaled = {'filter': 2} of the case 'odd'" in said
-        assert "must be a number, and is 'tobit'" in said
-
-    def test_twice_the_same_case(self, made: Path, tmp_path: Path) -> None:
-        case = {"name": "loud", "title": "loud"}
-        assert "cases of small must differ" in self.said(made, tmp_path, own=[case])
-
-    def test_a_case_that_is_not_there(self, made: Path, tmp_path: Path) -> None:
-        assert "'silent' is none of ['loud']" in self.said(made, tmp_path, shared=["silent"])
-
-    def test_a_setting_that_is_not_there(self, made: Path, tmp_path: Path) -> None:
-        said = self.said(made, tmp_path, setting="large")
-        assert "setting = 'large' is not allowed: it must be one of 'small'" in said
-
-    def test_a_class_without_an_envelope(self, made: Path, tmp_path: Path) -> None:
-        said = self.said(made, tmp_path, "--class", "centre", "--agents", f"{made}/suite.yaml")
-        assert "has no class 'centre'" in said
-
-    def test_no_draws(self, made: Path, tmp_path: Path) -> None:
-        said = self.said(made, tmp_path, "--trained", drawn={})
-        assert "trained = True is not allowed with small" in said
-
-    def test_no_agents(self, made: Path, tmp_path: Path) -> None:
-        assert "agents = 'absent/*.zip'" in self.said(made, tmp_path, "--agents", "absent/*.zip")
+@pytest.mark.parametrize(
+    ("words", "changes", "said"),
+    [
+        ([], {"own": [ODD | {"options": {"true_transition": -1.0}}]},
+         "odd of small: true_transition = -1.0 is not allowed"),
+        ([], {"own": [ODD | {"scaled": {"filter": 2.0}}]}, "must be a number, and is 'tobit'"),
+        ([], {"own": [{"name": "loud", "title": "loud"}]}, "cases of small must differ"),
+        ([], {"shared": ["silent"]}, "'silent' is none of ['loud']"),
+        ([], {"setting": "large"}, "setting = 'large' is not allowed: it must be one of 'small'"),
+        (["--trained"], {"drawn": {}}, "trained = True is not allowed with small"),
+        (["--agents", "absent/*.zip"], {}, "agents = 'absent/*.zip'"),
+    ],
+)  # fmt: skip
+def test_what_is_not_allowed_is_told_before_anything_runs(
+    made: Path, tmp_path: Path, words: list[str], changes: dict[str, Any], said: str
+) -> None:
+    results = with_envelopes(made, tmp_path)
+    config = write_config(tmp_path / "other.yaml", made / "suite.yaml", **changes)
+    line = [str(config) if one == str(made / "robust.yaml") else one
+            for one in words_of(made, results, *words)]  # fmt: skip
+    ended = call("robustness", line)
+    assert (ended.status, ended.trace) == (1, "")
+    assert said in ended.err.splitlines()[-1]
+    assert not list((results / "robustness").glob("*/*/*"))
 
 
 def test_shipped_cases_fit_the_shipped_suite() -> None:

@@ -72,16 +72,6 @@ def test_published_costs(chain: tuple[float, float]) -> None:
     assert solution.ordered
 
 
-def test_published_costs_tell_the_cases_apart() -> None:
-    """Neighbouring cases differ by more than the tolerance, so that the comparison can fail."""
-    found = [solve_discounted(published_problem(*chain), 0.9).cost[0] for chain in PUBLISHED]
-    printed = np.array(list(PUBLISHED.values()))
-    order = np.argsort(printed)
-    far = np.diff(printed[order]) > 0.004 * printed[order][1:]
-    assert far.sum() >= 9
-    assert (np.diff(np.array(found)[order])[far] > 0).all()
-
-
 def test_discounted_cost_of_its_thresholds_by_simulation() -> None:
     """A loop written out for the order of events: error, decision, channel, loss, cost."""
     problem = published_problem(0.7, 0.1)
@@ -420,14 +410,9 @@ def test_a_channel_starts_in_its_stationary_law_unless_told() -> None:
 @pytest.mark.parametrize(
     ("settings", "field"),
     [
-        ({"deviation": 0.0}, "deviation"),
-        ({"price": -1.0}, "price"),
-        ({"error_weight": 0.0}, "error_weight"),
-        ({"drop": 1.2}, "drop"),
         ({"transition": [[0.5, 0.4], [0.1, 0.9]], "drop": 0.1}, "transition"),
         ({"transition": [[0.5, 0.5]], "drop": 0.1}, "transition"),
         ({"transition": np.eye(2), "drop": 0.1}, "initial = None"),
-        ({"initial": 0.5}, "initial"),
         ({"initial": (0.5, 0.4), "transition": np.eye(2), "drop": 0.1}, "initial"),
     ],
 )

@@ -28,7 +28,6 @@ FLOORS = {
     "policies": 5,
     "evaluation": 6,
 }
-TOOLS = {f"fusion_gym.{name}" for name, floor in FLOORS.items() if floor == 0}
 
 
 @functools.cache
@@ -90,10 +89,3 @@ def test_there_are_no_circles() -> None:
     for module in modules():
         for other in imports(module):
             assert module not in reached(other), f"{module} and {other} import each other"
-
-
-def test_a_newcomer_reads_few_files_for_the_oscillator() -> None:
-    files = reached("fusion_gym.systems.tobit.oscillator") - TOOLS
-    assert len(files) <= 16, sorted(files)
-    own = [name for name in files if name.startswith("fusion_gym.systems.tobit.")]
-    assert len(own) >= len(files) / 2

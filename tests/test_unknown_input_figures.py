@@ -104,12 +104,6 @@ def test_figures_of_the_random_walk_baseline() -> None:
     assert_rmse("event", event.state[2], 0.047, 0.001)
 
 
-def test_magnitudes_of_the_papers_example() -> None:
-    truth = run("event", example="paper").truth
-    assert math.sqrt((truth[:, :2] ** 2).sum(1).mean()) == pytest.approx(0.272, abs=0.001)
-    assert math.sqrt((truth[:, 2:] ** 2).sum(1).mean()) == pytest.approx(0.101, abs=0.0005)
-
-
 # --- claims --------------------------------------------------------------------------------------
 
 

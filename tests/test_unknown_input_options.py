@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,6 @@ from fusion_gym.policies.registry import make_rule
 from fusion_gym.validation import ConfigurationError
 
 build = partial(make_task, "fusion_gym/UnknownInput-v0")
-
-ROOT = Path(__file__).parents[1]
 
 
 def shape(n: int, q: int, sensors: int, m: int) -> dict[str, Any]:
@@ -79,14 +76,6 @@ def test_a_users_array_is_the_input() -> None:
         np.testing.assert_array_equal(batch.delivered.truth[4], np.repeat(values[k], 2))
 
 
-def test_episodes_differ_in_their_input() -> None:
-    for kind in ("sinusoids", "steps", "random_walk"):
-        batch = EpisodeBatch(build(input_signal=kind), 50)
-        batch.seed(np.arange(50), list(range(50)))
-        batch.reset()
-        assert batch.state.truth[4].std() > 0.4
-
-
 # Velocity and elongation: with the force unknown, a common drift of both carts is not seen.
 DRIFTING = (((0.0, 1.0, 0.0, 0.0), (-1.0, 0.0, 1.0, 0.0)),) * 3
 
@@ -94,7 +83,6 @@ DRIFTING = (((0.0, 1.0, 0.0, 0.0), (-1.0, 0.0, 1.0, 0.0)),) * 3
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"sampling_period": 0}, r"sampling_period = 0 .* >= 1"),
         ({"sampling_period": 1.5}, "sampling_period = 1.5"),
         ({"measurement_matrices": np.zeros((3, 2, 4))}, r"measurement_matrices\[0\].*rank"),
         (
@@ -114,37 +102,17 @@ DRIFTING = (((0.0, 1.0, 0.0, 0.0), (-1.0, 0.0, 1.0, 0.0)),) * 3
             },
             r"rank\(C B\) is 1 for 2 inputs",
         ),
-        ({"measurement_matrices": np.ones((3, 2, 3))}, "measurement_matrices"),
-        ({"measurement_covariance": -0.1}, "measurement_covariance"),
         ({"measurement_covariance": np.zeros((3, 2, 2))}, r"measurement_covariance\[0\]"),
-        ({"measurement_covariance": np.ones((2, 2))}, "measurement_covariance"),
-        ({"transition": np.ones((3, 4))}, "transition"),
         ({"transition": np.eye(3)}, "input_matrix"),
-        ({"input_matrix": np.ones(4)}, "input_matrix"),
-        ({"process_covariance": -np.eye(4)}, "process_covariance"),
-        ({"initial_covariance": np.zeros((4, 4))}, "initial_covariance"),
-        ({"initial_half_width": -0.1}, "initial_half_width"),
         ({"rho_bar": 0.05, "rho_initial": 0.1}, r"rho_initial = .* <= rho_bar"),
-        ({"rho_bar": 1.2}, r"rho_bar = .* <= 1"),
-        ({"rho_initial": -0.1}, "rho_initial"),
-        ({"adaptation": 0.0}, "adaptation"),
-        ({"rho_bar": (0.1, 0.2)}, "rho_bar"),
         ({"young_factor": 0.0}, "young_factor"),
         (
             {"filter": "paper", "measurement_matrices": DRIFTING},
             r"young_factor = .* sensor 0: .*radius",
         ),
-        ({"input_memory": 1.1}, "input_memory"),
-        ({"input_change": 0.0}, "input_change"),
-        ({"input_deviation": -1.0}, "input_deviation"),
         ({"hold_variance": 0.1, "filter": "predict"}, r"hold_variance = 0.1 .*random_walk"),
-        ({"hold_variance": -0.1}, "hold_variance"),
-        ({"filter": "kalman"}, r"filter = 'kalman' .*'random_walk'"),
         ({"fusion": "information"}, r"fusion = 'information' .* process noise"),
-        ({"fusion": "federated"}, r"fusion = 'federated'"),
         ({"fusion": "ici"}, r"fusion = 'ici' .* 3 sensors"),
-        ({"fusion": "cii"}, "did you mean"),
-        ({"input_signal": "sine"}, "input_signal = 'sine'"),
         ({"input_signal": np.ones((100, 1))}, r"input_signal .*\(101, 1\)"),
         ({"input_signal": np.zeros((101, 1))}, "input_signal"),
         (
@@ -157,17 +125,9 @@ DRIFTING = (((0.0, 1.0, 0.0, 0.0), (-1.0, 0.0, 1.0, 0.0)),) * 3
             "process_covariance = .* moved by the input",
         ),
         ({"input_signal": np.ones((101, 1)), "input_period": 3.0}, "input_period = 3.0"),
-        ({"input_amplitude": "large"}, "input_amplitude"),
-        ({"input_amplitude": np.ones((2, 2))}, "input_amplitude"),
-        ({"input_period": 0.0}, "input_period"),
         ({"input_signal": "steps", "input_period": 0.5}, r"input_period .* >= 1"),
         ({"input_signal": "steps", "input_phase": 0.0}, "input_phase = 0.0"),
         ({"input_phase": "drawn"}, "input_phase = 'drawn'"),
-        ({"example": "carts"}, r"example = 'carts' .*did you mean 'two_carts'"),
-        ({"input_weight": -1.0}, "input_weight"),
-        ({"state_weights": (1.0, 1.0)}, "state_weights"),
-        ({"horizon": 0}, "horizon = 0"),
-        ({"thresholds": 1.0}, "unknown option"),
     ],
 )
 def test_what_is_not_allowed_is_said_in_one_error(options: dict[str, Any], message: str) -> None:

@@ -95,29 +95,3 @@ def test_a_film_that_fails_leaves_nothing(tmp_path: Path) -> None:
         with pytest.raises(KeyboardInterrupt):
             save_film(broken(), tmp_path / name, 10)
     assert not list(tmp_path.iterdir())
-
-
-def test_the_command_shows_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    words = ["--env", TOBIT, "--policy", "always", "--set", "horizon=3", "--fps", "50"]
-    monkeypatch.setattr(sys, "argv", ["watch", *words])
-    command.main()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--save", "film.avi"], "save = 'film.avi' is not allowed: it must end with .gif or .mp4"),
-        (["--against", "always"], "against = 'always' is not allowed: it is the policy itself"),
-        (["--steps", "1000", "--save", "film.gif"], "steps = 1000"),
-        (["--fps", "0"], "fps = 0"),
-    ],
-)
-def test_what_is_not_allowed_is_said_in_one_line(
-    words: list[str], message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    given = ["--env", TOBIT, "--policy", "always", *words]
-    monkeypatch.setattr(sys, "argv", ["watch", *given])
-    with pytest.raises(SystemExit) as caught:
-        command.main()
-    assert str(caught.value.code).startswith(f"error: {message}")

@@ -11,28 +11,16 @@ import yaml
 from fusion_gym.agents.training.algorithms import TABLE
 
 ENV = "fusion_gym/TobitOscillator-v0"
+PPO = {"n_steps": 16, "batch_size": 128, "n_epochs": 1}
 SMALL: dict[str, dict[str, Any]] = {
-    "ppo": {"name": "ppo", "n_steps": 16, "batch_size": 128, "n_epochs": 1},
-    "maskable_ppo": {"name": "maskable_ppo", "n_steps": 16, "batch_size": 128, "n_epochs": 1},
-    "recurrent_ppo": {
-        "name": "recurrent_ppo",
-        "n_steps": 16,
-        "batch_size": 128,
-        "n_epochs": 1,
-        "memory": 8,
-    },
-    "counterfactual_ppo": {
-        "name": "counterfactual_ppo",
-        "n_steps": 16,
-        "batch_size": 128,
-        "n_epochs": 1,
-    },
+    "ppo": {"name": "ppo"} | PPO,
+    "maskable_ppo": {"name": "maskable_ppo"} | PPO,
+    "recurrent_ppo": {"name": "recurrent_ppo", "memory": 8} | PPO,
+    "counterfactual_ppo": {"name": "counterfactual_ppo"} | PPO,
     "counterfactual_maskable_ppo": {
         "name": "counterfactual_maskable_ppo",
-        "n_steps": 16,
-        "batch_size": 128,
-        "n_epochs": 1,
         "alternatives": "flips",
+        **PPO,
     },
     "a2c": {"name": "a2c", "n_steps": 8},
     "dqn": {

@@ -23,7 +23,6 @@ from pathlib import Path
 
 import yaml
 from page_blocks import Block, blocks_of, stray_commands
-from warm_python import Warm
 from wheel_environments import Absent, Environment, Wheel, build
 from wheel_smoke import copy
 
@@ -96,7 +95,6 @@ class Pages:
     failed: list[str] = field(default_factory=list)
     left: list[str] = field(default_factory=list)
     used: set[Listed] = field(default_factory=set)
-    warm: dict[Environment, Warm] = field(default_factory=dict)
     unread: list[tuple[str, str, list[str]]] = field(default_factory=list)
 
     def run(self, page: Path, text: str, folder: Path) -> None:
@@ -106,9 +104,9 @@ class Pages:
         stray = stray_commands(page, text)
         self.failed += [f"{one}: a command outside of a shell block" for one in stray]
         for place, block in enumerate(blocks):
-            began = self.seconds
+            began = seconds()
             said = self._run(block, blocks[place + 1 :], folder)
-            taken = self.seconds - began
+            taken = seconds() - began
             if said is None and taken > LIMIT:
                 said = f"takes {taken:.0f} s: it belongs into LISTED of {Path(__file__).name}"
             if said is not None:
@@ -133,7 +131,7 @@ class Pages:
         if block.language == "python":
             script = folder / (block.file or f"block_{block.line}.py")
             script.write_text(block.text)
-            return self._wrong(["run", script.name], environment, folder)
+            return _wrong([str(environment.programs / "python"), script.name], environment, folder)
         return self._wrong_shell(block, environment, folder)
 
     def _wrong_shell(self, block: Block, environment: Environment, folder: Path) -> str | None:
@@ -153,24 +151,7 @@ class Pages:
                 if words[0] == "fusion-gym":
                     self.unread.append((block.place, str(folder), words))
         script = "\n".join(["set -euo pipefail", *lines])
-        return self._wrong(["bash", "-c", script], environment, folder) if lines else None
-
-    def _wrong(self, words: list[str], environment: Environment, folder: Path) -> str | None:
-        """What a program said, if it did not end well."""
-        warm = self.warm.setdefault(environment, Warm(environment, _variables(environment)))
-        variables = _variables(environment, warm.programs)
-        assert warm.process
-        try:
-            done = _run(words, variables, folder)
-        except subprocess.TimeoutExpired:
-            warm.end()
-            return f"has not ended after {PATIENCE:.0f} s"
-        return None if done.returncode == 0 else f"{done.stdout[-1000:]}\n{done.stderr[-3000:]}"
-
-    @property
-    def seconds(self) -> float:
-        """Of the processor, of this process and of what has ended."""
-        return sum(os.times()[:4]) + sum(one.seconds for one in self.warm.values())
+        return _wrong(["bash", "-c", script], environment, folder) if lines else None
 
     def read(self) -> None:
         """Read and check the options of the commands that were not run, all at once."""
@@ -195,6 +176,20 @@ class Pages:
         return None if there else f"no program {words[0]}"
 
 
+def seconds() -> float:
+    """Of the processor, of this process and of what has ended."""
+    return sum(os.times()[:4])
+
+
+def _wrong(words: list[str], environment: Environment, folder: Path) -> str | None:
+    """What a program said, if it did not end well."""
+    try:
+        done = _run(words, _variables(environment), folder)
+    except subprocess.TimeoutExpired:
+        return f"has not ended after {PATIENCE:.0f} s"
+    return None if done.returncode == 0 else f"{done.stdout[-1000:]}\n{done.stderr[-3000:]}"
+
+
 def _wrong_yaml(block: Block, later: Sequence[Block]) -> str | None:
     """A file of the page has a name, which a later block uses."""
     yaml.safe_load(block.text)
@@ -205,10 +200,10 @@ def _wrong_yaml(block: Block, later: Sequence[Block]) -> str | None:
     return None
 
 
-def _variables(environment: Environment, *before: Path) -> dict[str, str]:
-    """Of a program in an environment, which finds others in the folders ``before`` first."""
+def _variables(environment: Environment) -> dict[str, str]:
+    """Of a program in an environment."""
     plain = {key: text for key, text in os.environ.items() if not key.startswith("PYTHON")}
-    path = os.pathsep.join(map(str, (*before, environment.programs, os.environ["PATH"])))
+    path = f"{environment.programs}{os.pathsep}{os.environ['PATH']}"
     # No window, and one thread, as the reference machine has them.
     return plain | {"PATH": path, "OMP_NUM_THREADS": "1", "SDL_VIDEODRIVER": "dummy"}
 
@@ -234,18 +229,14 @@ def run_pages(pages: Sequence[Path], wheel: Path | None) -> None:
         folder = Path(place)
         file = wheel or build(copy(folder / "source"), folder / "built")
         run = Pages(Wheel(file, folder), (ROOT / "Makefile").read_text())
-        try:
-            for number, page in enumerate(chosen):
-                own = page.resolve().is_relative_to(ROOT)
-                shown = page.resolve().relative_to(ROOT) if own else page
-                run.run(shown, page.read_text(), folder / f"page_{number}" / shown.stem)
-            run.read()
-        finally:
-            for warm in run.warm.values():
-                warm.end()
+        for number, page in enumerate(chosen):
+            own = page.resolve().is_relative_to(ROOT)
+            shown = page.resolve().relative_to(ROOT) if own else page
+            run.run(shown, page.read_text(), folder / f"page_{number}" / shown.stem)
+        run.read()
     for text in run.left:
         print(f"left to make integrations: {text}")
-    print(f"{run.seconds:.0f} s of the processor")
+    print(f"{seconds():.0f} s of the processor")
     useless = [one.begins for one in LISTED if one not in run.used] if not pages else []
     wrong = [*run.failed, *(f"LISTED: no page shows {begins!r}" for begins in useless)]
     if wrong:
