@@ -48,7 +48,7 @@ def test_an_episode_cut_short_is_worth_what_its_last_observation_is() -> None:
     """Not what the next episode begins with: there the age is less."""
     env = env_of(horizon=2, token_rate=0.0, initial_tokens=0.0)
     model: Any = CounterfactualPPO(
-        "MlpPolicy", env, n_steps=2, gamma=0.5, gae_lambda=0.0, batch_size=2
+        "MlpPolicy", env, alternatives="flips", n_steps=2, gamma=0.5, gae_lambda=0.0, batch_size=2
     )
     age = env.observation_names.index("age[0]")
     model._critic = lambda observation: 1e6 * observation[..., age]
