@@ -5,13 +5,13 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 LOWEST := .venv-lowest
 # A part of the tests that touches every dependency.
-QUICK  := tests/conformance/test_faces.py tests/test_bad_input.py tests/test_environment_api.py \
+QUICK  := tests/laws/test_interfaces.py tests/test_bad_input.py tests/test_environment_api.py \
 	tests/test_evaluation.py tests/test_model_files.py \
 	tests/test_agents.py::test_training_writes_its_results_and_resumes \
 	tests/test_benchmark.py::test_from_tuning_to_report_and_zoo
 
-.PHONY: help demo test test-all test-lowest wheel-test wheel films docs integrations integrations-tianshou integrations-rllib \
-	lines lint format bench clean coverage
+.PHONY: help demo test test-all test-lowest mutants coverage wheel-test wheel films docs integrations \
+	integrations-tianshou integrations-rllib lines lint format bench clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 23
@@ -44,6 +44,9 @@ $(LOWEST)/.installed: pyproject.toml constraints.txt
 		--resolution lowest-direct --overrides $(LOWEST)/torch.txt \
 		--requirements pyproject.toml --extra agents --extra test
 	touch $@
+
+mutants: $(STAMP)  ## tests that must fail, each on a known wrong variant of the code
+	$(BIN)/python tests/mutants/apply.py
 
 test-lowest: $(LOWEST)/.installed  ## quick tests with the lowest versions that pyproject.toml allows
 	$(LOWEST)/bin/python -m pytest -m "not slow" -n 2 $(QUICK)

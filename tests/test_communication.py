@@ -95,36 +95,6 @@ def test_a_sensor_that_overhears_has_kalmans_estimate_from_its_own_and_what_it_h
         batch.step(wanted)
 
 
-@pytest.mark.parametrize(
-    ("env_id", "options"),
-    [
-        (TOBIT, LINEAR),
-        (TOBIT, {"filter": "tobit", "memory_filter": "adf"}),
-        ("fusion_gym/BiasedOscillator-v0", {}),
-        (CORRELATED, {}),
-        (CORRELATED, {"fusion": "ci"}),
-    ],
-)
-def test_after_a_packet_with_the_estimate_the_centre_has_it(
-    env_id: str, options: dict[str, Any]
-) -> None:
-    """Mean and covariance, and where nothing was granted it goes on by itself."""
-    common = {"memory": True, "tokens": "unlimited", "packet": "estimate", "access": "any"}
-    task = fusion_gym.make_task(env_id, **options | common)
-    batch, met = EpisodeBatch.seeded(task, RUNS, 5), [0, 0]
-    for wanted in asked(batch, 0.1):
-        beliefs = batch.beliefs()
-        (best, silent), squared = (beliefs.best, beliefs.silent), beliefs.loss()[0]
-        np.testing.assert_array_equal(beliefs.value(), np.broadcast_to(squared, wanted.shape))
-        heard = batch.step(wanted).granted.any(0)
-        mean, covariance = task.system.fused(batch.delivered)
-        for place, (runs, estimate) in enumerate(((heard, best), (~heard, silent))):
-            np.testing.assert_array_equal(mean[:, runs], estimate.mean[0][:, runs])
-            np.testing.assert_array_equal(covariance[..., runs], estimate.covariance[0][..., runs])
-            met[place] += int(runs.sum())
-    assert min(met) > 5
-
-
 def test_with_the_estimate_nothing_is_lost_by_silence() -> None:
     batch = linear(packet="estimate")
     kalman, everything, met = Kalman(batch), np.ones((3, RUNS), dtype=np.bool_), 0

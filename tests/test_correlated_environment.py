@@ -90,37 +90,6 @@ def test_parameters_of_the_trigger_are_checked(name: str, value: Any) -> None:
 # --- the environment -----------------------------------------------------------------------------
 
 
-def test_existing_policies_work_on_its_signals() -> None:
-    for information in ("sensors", "centre"):
-        task = build(information=information, tokens="limited")
-        batch = EpisodeBatch(task, 6)
-        batch.reset()
-        axes_of = {
-            signal.name: len([axis for axis in signal.axes.strip("()").split(",") if axis])
-            for signal in task.system.signals
-        }
-        names = ["variance_threshold:threshold=0.001", "information_gain", "periodic", "random"]
-        if information == "sensors":
-            names += ["innovation_threshold", "send_on_delta", "dynamic_event"]
-        for name in names:
-            policy = make_rule(name)
-            policy.reset(6)
-            asked = 0
-            for _ in range(30):
-                found = policy(batch.signals())
-                assert found.shape == (3, 6)
-                assert found.dtype == np.bool_
-                asked += int(found.sum())
-                batch.step(found)
-            assert asked > 0, name
-        offered = batch.signals()
-        for name, axes in axes_of.items():
-            if name not in task.hidden_signals:
-                assert offered[name].ndim == axes, name
-    with pytest.raises(LookupError, match="withholds"):
-        AdaptiveInnovation()(batch.signals())
-
-
 def test_variance_signals_are_what_a_delivery_brings() -> None:
     for fusion in ("sici", "sci", "ci"):
         task = build(fusion=fusion)
@@ -227,19 +196,6 @@ def test_other_sizes_and_fusions_run() -> None:
             assert np.isfinite(linalg.cholesky(batch.delivered.covariance)).all()
         assert np.isfinite(batch.observe()).all()
         assert task.system.state_names == ("x1", "x2")
-
-
-def test_long_episodes_of_rare_deliveries() -> None:
-    horizon = 800
-    batch = EpisodeBatch(build(horizon=horizon), 4)
-    batch.reset()
-    policy = Random(0.01)
-    policy.reset(4)
-    for _ in range(horizon):
-        outcome = batch.step(policy(batch.signals()))
-        assert np.isfinite(outcome.reward).all()
-    assert outcome.ended.all()
-    assert np.isfinite(linalg.cholesky(batch.delivered.covariance)).all()
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,16 @@ def test_it_costs_no_more_than_its_base(
     assert better.mean() > gain - 2.0 * better.std() / np.sqrt(24)
 
 
+def test_only_the_ratio_of_price_and_error_weight_counts() -> None:
+    asked = []
+    for weight, price in ((1.0, 0.1), (10.0, 1.0)):
+        task = fusion_gym.make_task(REMOTE, sensors=2, error_weight=weight, cost_weight=price)
+        batch = EpisodeBatch.seeded(task, 30, 0)
+        asked.append(make_policy("rollout:samples=4,steps=2,base=never", task)(batch.signals()))
+    np.testing.assert_array_equal(*asked)
+    assert asked[0].any(0).sum() > 5
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_imagined_follows_what_is_believed(name: str) -> None:
     """Moments of the truth over many draws; system and shadow agree on everything hidden."""

@@ -16,7 +16,6 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.fusion.several import covariance_intersection_many
-from fusion_gym.policies.registry import make_rule
 from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
 from fusion_gym.policies.rules.constant import Always, Never
 from fusion_gym.policies.rules.random import Random
@@ -177,36 +176,6 @@ def test_larger_thresholds_give_fewer_transmissions_and_larger_errors() -> None:
         assert (np.diff(errors) > 0).all()
 
 
-def test_every_generic_policy_finds_its_signals() -> None:
-    for options in ({}, {"filter": "paper"}, {"filter": "predict", "fusion": "sci"}):
-        task = build(horizon=30, **options)
-        for spec in (
-            "innovation_threshold:threshold=1,whitened=true",
-            "send_on_delta",
-            "variance_threshold",
-            "information_gain:threshold=0.001",
-            "dynamic_event",
-            "adaptive_innovation",
-            "round_robin",
-        ):
-            found = run_episodes(task, make_rule(spec, task.policy_defaults), 3, 0)
-            assert 0.0 < found.rate.mean() <= 1.0, spec
-        batch = EpisodeBatch(task, 4)
-        batch.seed(np.arange(4), [1, 2, 3, 4])
-        batch.reset()
-        read = batch.signals()
-        for signal in task.system.signals:
-            axes = {"sensors": 3, "m": 2, "n": 4, "N": 4}
-            names = signal.axes.strip("()").replace(" ", "").split(",")
-            assert read[signal.name].shape == tuple(axes[a] for a in names if a), signal.name
-        for _ in range(20):
-            batch.step(np.random.default_rng(0).random((3, 4)) < 0.3)
-        reduction = batch.signals()["variance_reduction"]
-        assert (reduction.max(0) > 0).all()
-        if task.settings["filter"] != "predict":  # an update there forgets the input before
-            assert (reduction > -1e-6 * batch.signals()["silent_variance"]).all()
-
-
 def test_variance_reduction_is_what_a_delivery_brings() -> None:
     """Whatever is measured; the signals' traces have the reward's weights."""
     for options in ({"fusion": "exact_ci"}, {"fusion": "sci", "hold_variance": 0.1}):
@@ -244,18 +213,6 @@ def test_predicted_innovation_deviation_is_the_actual_one() -> None:
             squares.append((read["innovation"] / read["innovation_deviation"]) ** 2)
         batch.step(policy(read))
     np.testing.assert_allclose(np.mean(squares, axis=(0, 3)), 1.0, atol=0.04)
-
-
-def test_a_denied_request_changes_nothing_that_is_held() -> None:
-    task = build(tokens="limited", initial_tokens=0.0, token_rate=0.0)
-    batch = EpisodeBatch(task, 2)
-    batch.seed(np.arange(2), [0, 1])
-    batch.reset()
-    held = batch.state.held.copy()
-    outcome = batch.step(np.ones((3, 2), dtype=np.bool_))
-    assert not outcome.granted.any()
-    np.testing.assert_array_equal(batch.delivered.held, held)
-    assert (batch.delivered.age == 1).all()
 
 
 # --- reward and scales ---------------------------------------------------------------------------

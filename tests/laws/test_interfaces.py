@@ -1,4 +1,4 @@
-"""Gymnasium's, Stable-Baselines3's and PettingZoo's own checks, and what an id promises."""
+"""Laws of the interfaces: the other libraries' own checks, and what an id promises."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from cases import IDS, Case, actions, each_case, each_default, each_lasting, requests
+from cases import CASES, Case, actions, each_id, requests
 from gymnasium.utils.env_checker import check_env as gymnasium_check
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
 from own_system import OWN_ID, WalkOptions, build
 from pettingzoo.test import parallel_api_test, parallel_seed_test
-from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as sb3_check
-from stable_baselines3.common.env_util import make_vec_env
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
@@ -29,7 +29,11 @@ from fusion_gym.envs.vector import FusionVectorEnv
 from fusion_gym.envs.views import SensorView
 from fusion_gym.validation import ConfigurationError
 
-each_id = pytest.mark.parametrize("env_id", IDS)
+COMMON_CASES = [case for case in CASES if not set(case.options) - {
+    "information", "access", "clock", "memory", "broadcast", "action", "error",
+}]  # fmt: skip
+each_case = pytest.mark.parametrize("case", COMMON_CASES, ids=str)
+each_default = pytest.mark.parametrize("case", [c for c in CASES if not c.options], ids=str)
 
 
 @pytest.fixture(autouse=True)
@@ -59,15 +63,16 @@ def test_pettingzoos_checks(env_id: str) -> None:
 
 @each_case
 def test_agents_of_pettingzoo_see_the_rows_of_their_sensors(case: Case) -> None:
-    if case.not_local:
-        with pytest.raises(ConfigurationError, match=case.not_local):
+    if not case.local:
+        with pytest.raises(ConfigurationError, match="information = 'centre'"):
             fusion_gym.parallel_env(case.env_id, **case.options)
         return
-    env, view = fusion_gym.parallel_env(case.env_id, **case.options), SensorView(case.task())
-    batch, bucket = case.batch([7], owner=view.owner), case.task().bucket
+    env, task = fusion_gym.parallel_env(case.env_id, **case.options), case.task()
+    view, bucket = SensorView(task), task.bucket
+    batch = case.batch(1, 7, view.owner)
     observations, _ = env.reset(seed=7)
-    assert env.possible_agents == [f"sensor_{m}" for m in range(case.task().sensors)]
-    for wanted in requests(case.task(), 1, 6):
+    assert env.possible_agents == [f"sensor_{m}" for m in range(task.sensors)]
+    for wanted in requests(task, 1, 6):
         rows = np.stack(list(observations.values()))
         np.testing.assert_array_equal(rows, view.rows(batch.observe()))
         outcome = batch.step(wanted)
@@ -82,10 +87,10 @@ def test_agents_of_pettingzoo_see_the_rows_of_their_sensors(case: Case) -> None:
         np.testing.assert_array_equal(costs, outcome.granted[:, 0] * bucket.cost[:, 0])
 
 
-@each_lasting
+@each_case
 def test_sensors_rows_of_stable_baselines_are_the_coordinators_runs(case: Case) -> None:
-    if case.not_local:
-        with pytest.raises(ConfigurationError, match=case.not_local):
+    if not case.local:
+        with pytest.raises(ConfigurationError, match="information = 'centre'"):
             fusion_gym.make_sb3_vec_env(case.env_id, 3, local=True, **case.options)
         return
     options = case.options | {"horizon": 5}
@@ -108,6 +113,96 @@ def test_sensors_rows_of_stable_baselines_are_the_coordinators_runs(case: Case) 
             np.testing.assert_array_equal(rows, local.view.rows(last))
             returns = np.repeat([info["episode"]["r"] for info in infos], sensors)
             assert [info["episode"]["r"] for info in row_infos] == returns.tolist()
+
+
+@pytest.mark.parametrize("clock", [False, True])
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_agrees_with_gymnasiums_vector_of_single_environments(
+    mode: AutoresetMode, clock: bool
+) -> None:
+    """Runs 1 and 3 are reset in mid-episode, so that episodes end at different times."""
+    case = CASES[0]
+    task = case.task()
+    options: dict[str, Any] = {"num_envs": 4, "horizon": 5, "clock": clock}
+    ours: Any = gymnasium.make_vec(
+        case.env_id, vectorization_mode="vector_entry_point", autoreset_mode=mode, **options
+    )
+    options["vector_kwargs"] = {"autoreset_mode": mode}
+    theirs: Any = gymnasium.make_vec(case.env_id, vectorization_mode="sync", **options)
+    assert ours.metadata["autoreset_mode"] is theirs.metadata["autoreset_mode"] is mode
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+
+    def reset(seed: Any, mask: NDArray[np.bool_] | None) -> None:
+        mine, other = ({} if mask is None else {"reset_mask": mask.copy()} for _ in range(2))
+        same(ours.reset(seed=seed, options=mine), theirs.reset(seed=seed, options=other))
+
+    reset(3, None)
+    endings = set()
+    for number, wanted in enumerate(requests(task, 4, 20)):
+        action = actions(task, wanted)
+        mine, other = ours.step(action), theirs.step(action)
+        same(mine, other)
+        over = other[2 if clock else 3].copy()
+        endings.add(tuple(over.tolist()))
+        if mode is AutoresetMode.DISABLED and over.any():
+            reset(None, over)
+        if number == 1:
+            reset([None, 70, None, None], np.array([False, True, False, True]))
+    assert endings == {(False,) * 4, (True, False) * 2, (False, True) * 2}
+
+
+def same(mine: Any, other: Any) -> None:
+    """Bitwise and of the same types, through dictionaries, tuples and arrays of objects."""
+    if isinstance(other, dict):
+        assert mine.keys() == other.keys()
+        for key, value in other.items():
+            same(mine[key], value)
+    elif isinstance(other, tuple) or (isinstance(other, np.ndarray) and other.dtype == object):
+        assert len(mine) == len(other)
+        for one, two in zip(mine, other, strict=True):
+            same(one, two)
+    elif other is None:
+        assert mine is None
+    else:
+        np.testing.assert_array_equal(mine, other, strict=True)
+
+
+@each_case
+def test_stable_baselines_rows_are_the_vector_environments(case: Case) -> None:
+    """With the episodes' sums in the infos of those that end."""
+    horizon, options = 5, case.options | {"horizon": 5}
+    task = case.task(horizon=5)
+    theirs = FusionVectorEnv(task, 3, AutoresetMode.SAME_STEP)
+    ours = fusion_gym.make_sb3_vec_env(case.env_id, 3, seed=40, **options)
+    np.testing.assert_array_equal(ours.reset(), theirs.reset(seed=40)[0], strict=True)
+    returns, spent = np.zeros((2, 3))
+    for step, wanted in enumerate(requests(task, 3, 2 * horizon + 1), start=1):
+        action = actions(task, wanted)
+        observation, reward, done, infos = ours.step(action)
+        expected, value, terminated, truncated, info = theirs.step(action)
+        over = terminated if task.clock else truncated
+        np.testing.assert_array_equal(observation, expected, strict=True)
+        np.testing.assert_array_equal(reward, value.astype(np.float32), strict=True)
+        np.testing.assert_array_equal(done, over)
+        assert over.all() == (step % horizon == 0)
+        returns += value
+        spent += info["final_info"]["cost"] if over.all() else info["cost"]
+        if not over.all():
+            assert infos == [{}, {}, {}]
+            continue
+        for run in range(3):
+            assert infos[run].keys() == {"terminal_observation", "TimeLimit.truncated", "episode"}
+            assert infos[run]["TimeLimit.truncated"] is not task.clock
+            last = info["final_obs"][run]
+            np.testing.assert_array_equal(infos[run]["terminal_observation"], last, strict=True)
+            episode = infos[run]["episode"]
+            assert (episode["r"], episode["l"], episode["cost"]) == (
+                returns[run],
+                horizon,
+                spent[run],
+            )
+        returns, spent = np.zeros((2, 3))
 
 
 @each_id
@@ -181,15 +276,6 @@ def test_an_unknown_option_is_named(case: Case) -> None:
                 make(colour="red")
     with pytest.raises(ConfigurationError, match="information = 'nobody'"):
         fusion_gym.make_task(case.env_id, information="nobody")
-
-
-@each_id
-def test_stable_baselines_makes_an_environment_of_its_id(env_id: str) -> None:
-    vector = make_vec_env(env_id, n_envs=2, seed=0)
-    model = PPO("MlpPolicy", env_id, n_steps=4, batch_size=4, n_epochs=1, device="cpu")
-    vector.reset()
-    assert vector.step(np.array([vector.action_space.sample()] * 2))[1].shape == (2,)
-    assert model.learn(4).num_timesteps == 4
 
 
 def test_an_environment_of_ones_own_is_registered_once() -> None:

@@ -21,6 +21,7 @@ class WalkState:
 
     truth: Array
     measurement: Array
+    held: Array
     age: Array
     prior: Array
     prior_variance: Array
@@ -43,6 +44,7 @@ class RandomWalk(System[WalkState]):
         Signal("measurement", "own", "(sensors, 1, N)", "the new measurement"),
         Signal("innovation", "own", "(sensors, 1, N)", "that minus its expectation"),
         Signal("innovation_deviation", "centre", "(sensors, 1, N)", "its deviation"),
+        Signal("held", "centre", "(sensors, 1, N)", "the last delivered measurement"),
         Signal("age", "centre", "(sensors, N)", "steps since the last delivery"),
         Signal("prior_mean", "centre", "(n, N)", "the centre's prediction"),
         Signal("prior_covariance", "centre", "(n, n, N)", "its covariance"),
@@ -58,7 +60,7 @@ class RandomWalk(System[WalkState]):
 
     def start(self, noise: Array) -> WalkState:
         zero, one = np.zeros_like(noise), np.ones_like(noise)
-        return WalkState(noise.copy(), zero, zero, zero, one, zero, one)
+        return WalkState(noise.copy(), zero, zero, zero, zero, one, zero, one)
 
     def sense(self, state: WalkState, noise: Array) -> WalkState:
         truth = state.truth + np.sqrt(self.q) * noise[:1]
@@ -75,6 +77,7 @@ class RandomWalk(System[WalkState]):
         gain = np.where(granted, state.prior_variance / (state.prior_variance + self.r), 0.0)
         return replace(
             state,
+            held=np.where(granted, state.measurement, state.held),
             age=np.where(granted, 0.0, state.age),
             mean=np.where(
                 granted, state.prior + gain * (state.measurement - state.prior), state.prior
@@ -87,6 +90,7 @@ class RandomWalk(System[WalkState]):
             "measurement": state.measurement[:, None],
             "innovation": lambda: (state.measurement - state.prior)[:, None],
             "innovation_deviation": lambda: np.sqrt(state.prior_variance + self.r)[:, None],
+            "held": state.held[:, None],
             "age": state.age,
             "prior_mean": state.prior,
             "prior_covariance": state.prior_variance[:, None],

@@ -1,0 +1,171 @@
+"""The cases of the laws: every registered environment, and the options that change its parts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from own_system import OWN_ID
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.memory import Owner
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import ENVIRONMENTS
+
+Array = NDArray[Any]
+Options = dict[str, Any]
+IDS = [name for name in ENVIRONMENTS if name != OWN_ID] + [OWN_ID]
+
+SCARCE: Options = {
+    "tokens": "limited", "token_rate": 0.5, "token_capacity": 30.0, "initial_tokens": 9.0,
+    "token_cost": 3.0,
+}  # fmt: skip
+FREE: Options = {"tokens": "unlimited", "access": "any"}
+DRAWN: Options = {"cost_weight": "random", "price_range": (0.001, 1.0), "clock": True}
+LOSSY: Options = {"sensors": 3, "channel": "gilbert_elliott", "coefficient": (0.9, 1.0, 1.02)}
+UNCENSORED: Options = {"filter": "kalman", "censoring_threshold": -np.inf, "random_start": True}
+NOISY: Options = {
+    "true_process_noise": (0.5, 2.0),
+    "true_transition": (0.9, 1.1),
+    "true_measurement_noise": 2.0,
+    "memory": True,
+}
+# Options that every environment has.
+COMMON: list[Options] = [
+    {},
+    {"information": "centre", "access": "any", "clock": True},
+    {"memory": True} | SCARCE | DRAWN,
+    {"memory": True, "broadcast": "packets", "action": "discrete", "access": "any"},
+    {"access": "single", "error": "trace"},
+    {"access": "round_robin", "broadcast": "estimate", "belief_features": "value"},
+    {"access": "random", "error": "maximum", "error_weight": 2.0},
+]
+# Options of one environment.
+VARIANTS: dict[str, list[Options]] = {
+    "TobitOscillator": [
+        {"filter": "tobit"},
+        {"filter": "adf", "sharing": "fixed"} | SCARCE,
+        {"filter": "stochastic", "stochastic_weight": 1.0, "fusion": "sici"},
+        {"filter": "tobit", "fusion": "ci", "order": None},
+        {"filter": "tobit", "fusion": "sci", "measurement_matrices": (((1.0, 0.0),),)},
+        {"silent": "predict", "event_error": False, "process_noise": "full"},
+        UNCENSORED | {"token_cost": (1.0, 2.0, 4.0), "sharing": "equal"},
+        UNCENSORED | {"memory": True, "packet": "estimate"} | SCARCE,
+        {"filter": "tobit", "true_threshold_shift": (-1.0, 1.0)} | NOISY,
+    ],
+    "CorrelatedTracking": [
+        {"fusion": "sci", "order": (2, 0, 1)},
+        {"fusion": "ci", "track_actual": True},
+        {
+            "fusion": "ici",
+            "measurement_matrices": (((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),),
+            "measurement_variance": ((0.6, 0.4),),
+            "noise_coupling": 0.2,
+        },
+        {"noise_scale": "random"} | NOISY,
+    ],
+    "MarkovJumpTracking": [
+        {"fusion": "ci"},
+        {"fusion": "sici"},
+        {"filter": "centralised"},
+        {"filter": "imm", "information": "centre"},
+        {"filter": "imm"} | NOISY,
+        {"filter": "centralised", "memory_filter": "imm", "memory": True},
+    ],
+    "UnknownInput": [
+        {"filter": "predict", "fusion": "exact_ci"},
+        {"filter": "paper", "input_signal": "steps"},
+        {"hold_variance": 0.1, "input_signal": "random_walk", "fusion": "sici"},
+        {"example": "paper", "input_phase": "random"},
+        {"example": "paper", "input_signal": "steps", "filter": "random_walk", "fusion": "ici"},
+        {"filter": "paper"} | NOISY,
+    ],
+    "BiasedOscillator": [
+        {"filter": "adf", "access": "any"},
+        {"filter": "kalman", "random_start": True},
+        {"bias_aware": False, "access": "round_robin"} | SCARCE,
+        {"memory": True, "packet": "estimate", "memory_filter": "kalman"},
+    ],
+    "BiasedTracking": [
+        {"filter": "stochastic", "stochastic_weight": 1.0, "access": "any", "fusion": "ici"},
+    ],
+    "LinearFusion": [
+        {"fusion": rule, "measurement_matrices": [[1, 0], [[0, 1], [1, 1]], [1, -1]]}
+        for rule in ("ci", "sci")
+    ]
+    + [
+        {"censoring_threshold": (-2.0, -2.0), "access": "round_robin"},
+        {"filter": "adf", "packet": "estimate"} | NOISY,
+        {
+            "measurement_matrices": [[1, 0], [[0, 1], [1, 1]]],
+            "joint_measurement_covariance": [[0.3, 0.2, 0.1], [0.2, 0.3, 0.1], [0.1, 0.1, 0.2]],
+        },
+    ],
+    "RemoteEstimation": [
+        LOSSY | {"access": "single", "initial_deviation": 1.0},
+        {"sensors": 2, "channel": "independent"},
+        LOSSY | {"information": "centre"} | SCARCE,
+        LOSSY | {"memory": True, "true_transition": (0.8, 0.95)},
+    ],
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """An environment with options."""
+
+    env_id: str
+    options: Options
+
+    def task(self, **more: Any) -> Task:
+        """The task, with further options."""
+        return fusion_gym.make_task(self.env_id, **self.options | more)
+
+    def batch(
+        self, runs: int = 3, seed: int = 0, owner: Owner | None = None, **more: Any
+    ) -> EpisodeBatch:
+        """Runs with the seeds ``seed``, ``seed + 1``, …, each at the start of an episode."""
+        return EpisodeBatch.seeded(self.task(**more), runs, seed, owner)
+
+    @property
+    def local(self) -> bool:
+        """Whether sensors can decide by themselves."""
+        central = {("information", "centre"), ("packet", "estimate")}
+        return not any(
+            (name, self.options.get(name)) in central for name in ("information", "packet")
+        )
+
+    def __str__(self) -> str:
+        words = [f"{k}={v}" if isinstance(v, str) else k for k, v in self.options.items()]
+        return "-".join([short(self.env_id), *words])
+
+
+def short(env_id: str) -> str:
+    """The name of an environment without namespace and version."""
+    return env_id.partition("/")[2].partition("-")[0]
+
+
+CASES = [
+    Case(env_id, options) for env_id in IDS for options in COMMON + VARIANTS.get(short(env_id), [])
+]
+each_case = pytest.mark.parametrize("case", CASES, ids=str)
+each_id = pytest.mark.parametrize("env_id", IDS, ids=short)
+
+
+def requests(task: Task, runs: int, steps: int, rate: float = 0.4) -> NDArray[np.bool_]:
+    """Random requests (steps, sensors, runs), always the same; one a step with single access."""
+    wanted = np.random.default_rng(7).random((steps, task.sensors, runs)) < rate
+    return wanted & (wanted.cumsum(1) == 1) if task.access == "single" else wanted
+
+
+def actions(task: Task, wanted: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Actions (runs, …) of a coordinator for the requests (sensors, runs)."""
+    if task.access == "single":
+        return np.where(wanted.any(0), 1 + wanted.argmax(0), 0)
+    if task.action == "discrete":
+        return (wanted * 2 ** np.arange(task.sensors)[:, None]).sum(0)
+    return wanted.T.astype(np.int64)

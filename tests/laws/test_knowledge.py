@@ -1,0 +1,272 @@
+"""Laws of knowledge: nobody sees the truth, or what others measured and did not send to them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from cases import FREE, Array, Case, each_case, each_id, requests
+
+import fusion_gym
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.communication import BROADCASTS
+from fusion_gym.core.runs import Runs
+from fusion_gym.core.system import SignalError, Signals, covers
+from fusion_gym.core.task import Task
+from fusion_gym.envs.views import SensorView
+from fusion_gym.fusion.intersection import covariance_intersection
+from fusion_gym.validation import ConfigurationError
+
+STEPS = 6
+
+
+# --- the truth ------------------------------------------------------------------------------------
+
+
+def blind(batch: EpisodeBatch) -> Runs:
+    """The runs, with nothing left of what no policy may know."""
+    branch, task = batch.branch(), batch.task
+    branch.state, branch._beliefs = task.system.visible(branch.state), None
+    if branch.shadows is not None:
+        kept = {"every": task.shadow, "own": task.shadow, "alone": task.system}
+        seen = {
+            name: system.visible(part)
+            for name, system in kept.items()
+            if system is not None and (part := getattr(branch.shadows, name)) is not None
+        }
+        branch.shadows = dataclasses.replace(branch.shadows, **seen)
+    return branch
+
+
+def shown(runs: Runs) -> dict[str, Array]:
+    """Everything that policies may look at, but the state to plan with."""
+    signals = runs.signals()
+    names = [name for name in signals if name not in ("model", "beliefs", "own_beliefs")]
+    return {name: np.asarray(signals[name]) for name in names}
+
+
+@pytest.mark.parametrize("owner", ["coordinator", "own"])
+@each_case
+def test_nothing_shown_depends_on_the_truth(case: Case, owner: Any) -> None:
+    """A truth is left in the state to plan with only where it has been measured exactly."""
+    if owner == "own" and not case.local:
+        return
+    batch = case.batch(owner=owner, **FREE)
+    system = batch.task.system
+    for wanted in requests(batch.task, 3, STEPS):
+        seeing, seen = shown(batch), shown(blind(batch))
+        assert seen.keys() == seeing.keys()
+        for name, value in seeing.items():
+            np.testing.assert_array_equal(seen[name], value, err_msg=name)
+            assert np.isfinite(value).all(), name
+        measured = Signals(dict(system.read(batch.state)))["measurement"].reshape(-1, 3)
+        model = system.visible(batch.state)
+        truth = system.truth(model)
+        assert (np.isnan(truth) | (truth[:, None] == measured).any(1)).all()
+        planned, arrives = (
+            system.deliver(model, wanted),
+            ~getattr(batch.state, "lost", wanted & False),
+        )
+        kept = (arrives | ~wanted).all(0)
+        batch.step(wanted)
+        for part, real in zip(system.fused(planned), system.fused(batch.delivered), strict=True):
+            assert np.isfinite(part).all()
+            if batch.task.packet == "measurement":
+                np.testing.assert_array_equal(part[..., kept], real[..., kept])
+
+
+@each_id
+def test_the_centre_is_shown_nothing_of_the_sensors(env_id: str) -> None:
+    """Their signals are refused by name; who decides by itself cannot see through the centre."""
+    task = fusion_gym.make_task(env_id, information="centre")
+    signals, hidden = EpisodeBatch.seeded(task, 2, 0).signals(), 0
+    for signal in task.system.signals:
+        if covers("centre", signal.knowledge):
+            assert signal.name in signals
+            continue
+        assert signal.name not in set(signals)
+        with pytest.raises(SignalError, match=f"'{signal.name}'.*information='centre'"):
+            signals[signal.name]
+        hidden += 1
+    assert hidden
+    assert "model" not in signals
+    with pytest.raises(ConfigurationError, match="information = 'centre'"):
+        SensorView(task)
+
+
+# --- what a sensor measured -----------------------------------------------------------------------
+
+
+@each_case
+def test_what_is_measured_and_not_sent_is_its_sensors_own(case: Case) -> None:
+    """Groups of runs on one noise, but for one normal each that reaches the measurements of one
+    sensor alone. That sensor sends nothing: neither the centre nor another sensor notices."""
+    batch = case.batch(1, owner="own" if case.local else None, **FREE)
+    task, view = batch.task, SensorView(batch.task) if case.local else None
+    channels = np.arange(task.system.noise_channels)
+    reached = np.zeros((task.sensors, len(channels)), dtype=np.bool_)
+    for signals, _ in steps(batch, np.append(-1, channels), np.zeros((STEPS, task.sensors, 1))):
+        reached |= differs(signals["measurement"], 0)[:, 1:]
+    groups: list[tuple[int, int, int]] = []  # sensor, first run of its group, changed normal
+    for sensor, alone in enumerate(reached & (reached.sum(0) == 1)):
+        first = len(groups)
+        groups += [(sensor, first, c) for c in (-1, *np.flatnonzero(alone)[:2].tolist())]
+    sensor, base, changed = np.array(groups).T
+    others, noticed = np.arange(task.sensors)[:, None] != sensor, False
+    sent = requests(task, 1, STEPS) & others[None] & (task.packet == "measurement")
+    for signals, runs in steps(batch, changed, sent):
+        for signal in task.system.signals:
+            value = signals[signal.name]
+            if not covers("centre", signal.knowledge):
+                apart = differs(value, base) & others if signal.axes.startswith("(sen") else False
+                assert not np.any(apart), signal.name
+            elif signal.name != "channel_state":
+                assert not differs(value[None], base).any(), signal.name
+        if view is not None:
+            rows = view.rows(runs.observe()).reshape(len(sensor), task.sensors, -1)
+            own = [rows.transpose(1, 2, 0)]
+            own += [runs.signals()[name] for name in ("own_difference", "own_value")]
+            for value in own:
+                apart = differs(value, base)
+                assert not (apart & others).any()
+                noticed |= bool(apart.any())
+        elif task.information == "centre":
+            assert not differs(runs.observe().T[None], base).any()
+    assert (changed >= 0).any()
+    assert noticed or view is None
+
+
+def steps(batch: EpisodeBatch, changed: Array, sent: Array) -> Iterator[tuple[Signals, Runs]]:
+    """Branches of a run, after each step with requests ``sent`` (steps, sensors, N), on a noise of
+    which each has the normal ``changed`` (N,) turned over, or none."""
+    runs, draw = batch.branch(np.zeros(len(changed), dtype=np.int64)), np.random.default_rng(1)
+    turned = np.flatnonzero(changed >= 0)
+    for wanted in np.broadcast_to(sent, (*sent.shape[:2], len(changed))):
+        noise = np.repeat(draw.standard_normal((runs.channels, 1)), len(changed), axis=1)
+        noise[changed[turned], turned] *= -1.5
+        runs.step(wanted.astype(np.bool_), noise)
+        yield Signals(dict(batch.task.system.read(runs.state))), runs
+
+
+def differs(value: Array, base: Any) -> Array:
+    """Whose values (sensors, …, N) differ from those of the runs ``base``, (sensors, N)."""
+    apart = value != (value[..., base] if np.ndim(base) else value[..., :1])
+    return np.asarray(apart.reshape(len(value), -1, value.shape[-1]).any(1))
+
+
+# --- what is believed -----------------------------------------------------------------------------
+
+
+def after(system: Any, state: Any, *sensors: int) -> tuple[Array, Array]:
+    """The centre's mean and covariance after these packets, none of which is lost."""
+    if hasattr(state, "lost"):
+        state = dataclasses.replace(state, lost=np.zeros_like(state.lost))
+    granted = np.zeros((system.sensor_count, system.truth(state).shape[-1]), dtype=np.bool_)
+    granted[list(sensors)] = True
+    found: tuple[Array, Array] = system.fused(system.deliver(state, granted))
+    return found
+
+
+def joined(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
+    """By covariance intersection."""
+    fused = covariance_intersection(*one, *other)
+    return fused.mean, fused.covariance
+
+
+class Beside:
+    """A batch, and plain ones on its seeds whose packets follow from its grants."""
+
+    def __init__(self, task: Task, owner: Any) -> None:
+        self.task, self.owner = task, owner
+        self.batch = EpisodeBatch.seeded(task, 3, 4, owner)
+        self.others: list[tuple[EpisodeBatch, Callable[[Array], Array]]] = []
+
+    def add(self, system: Any, sent: Callable[[Array], Array]) -> EpisodeBatch:
+        """One with this filter that gets the packets ``sent`` (sensors, N)."""
+        plain = dataclasses.replace(self.task, system=system, memory=False, shadow=None)
+        self.others.append((EpisodeBatch.seeded(plain, 3, 4), sent))
+        return self.others[-1][0]
+
+    def step(self, wanted: Array) -> None:
+        """All move on."""
+        granted = self.batch.step(wanted).granted
+        for other, sent in self.others:
+            other.step(sent(granted))
+
+
+@pytest.mark.parametrize("broadcast", BROADCASTS)
+@each_id
+def test_a_sensor_believes_by_what_it_measured_and_received(env_id: str, broadcast: str) -> None:
+    """x*, x̂ and x̂(s) are estimates of runs in which just that is delivered."""
+    more = {"filter": "tobit"} if "TobitOscillator" in env_id else {}
+    if broadcast == "none" and fusion_gym.make_task(env_id, **more).feedback:
+        with pytest.raises(ConfigurationError, match="broadcast = 'none'"):
+            fusion_gym.make_task(env_id, broadcast=broadcast)
+        return
+    task = fusion_gym.make_task(env_id, memory=True, broadcast=broadcast, **FREE, **more)
+    beside, own, alone, packets = Beside(task, "own"), [], [], broadcast == "packets"
+    for itself in (np.arange(task.sensors)[:, None] == s for s in range(task.sensors)):
+        if task.shadow is not None:
+            own.append(beside.add(task.shadow, lambda g, i=itself: (g & packets) | i))
+        alone.append(beside.add(task.system, lambda g, i=itself: g & i))
+    distant = broadcast == "none" or (broadcast == "estimate" and not task.feedback)
+    for wanted in requests(task, 3, STEPS):
+        batch = beside.batch
+        signals = batch.signals()
+        for sensor in range(task.sensors):
+            centre = alone[sensor] if broadcast == "none" else batch
+            silent = after(task.system, centre.state)
+            sent = after(task.system, (alone[sensor] if distant else batch).state, sensor)
+            if broadcast == "estimate" and distant:
+                sent = joined(silent, sent)
+            best = sent
+            if own:
+                best = after(task.shadow, own[sensor].state, sensor)
+                if broadcast == "estimate":
+                    best = joined(sent if task.feedback else silent, best)
+            check(signals["own_difference"][sensor], best[0] - silent[0])
+            value = worth(task, best[0], silent[0], sent[0]) * chance(batch)[sensor]
+            check(signals["own_value"][sensor], value)
+        beside.step(wanted)
+
+
+@each_id
+def test_a_coordinator_believes_by_everything_measured(env_id: str) -> None:
+    """x* is the estimate of runs in which everything is delivered."""
+    more = {"filter": "tobit"} if "TobitOscillator" in env_id else {}
+    task = fusion_gym.make_task(env_id, memory=True, **FREE, **more)
+    beside = Beside(task, "coordinator")
+    whole = beside.add(task.shadow, lambda granted: granted | True) if task.shadow else None
+    for wanted in requests(task, 3, STEPS):
+        batch = beside.batch
+        system, state = (task.system, batch.state) if whole is None else (task.shadow, whole.state)
+        best, silent = (
+            after(system, state, *range(task.sensors))[0],
+            after(task.system, batch.state),
+        )
+        check(batch.signals()["belief_difference"], best - silent[0])
+        for sensor in range(task.sensors):
+            sent = after(task.system, batch.state, sensor)
+            value = worth(task, best, silent[0], sent[0]) * chance(batch)[sensor]
+            check(batch.signals()["transmission_value"][sensor], value)
+        beside.step(wanted)
+
+
+def worth(task: Task, best: Array, silent: Array, sent: Array) -> Array:
+    """By how much a packet brings the centre nearer to x*, in weights of mean 1."""
+    weights = task.reward.state_weights / task.reward.state_weights.mean()
+    return np.asarray((weights * ((best - silent) ** 2 - (best - sent) ** 2)).sum(0))
+
+
+def chance(batch: EpisodeBatch) -> Array:
+    """Probability (sensors, N) that a packet sent now arrives."""
+    known = getattr(batch.task.system, "arrival_probability", lambda state: None)(batch.state)
+    return np.ones((batch.task.sensors, batch.num_envs)) if known is None else known
+
+
+def check(found: Array, expected: Array) -> None:
+    """To rounding."""
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)

@@ -1,0 +1,147 @@
+"""Laws of the network: who is served, what it costs, what the reward pays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cases import IDS, SCARCE, Case, each_case, each_id, requests, short
+
+import fusion_gym
+from fusion_gym.core.access import ACCESS_RULES
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.validation import ConfigurationError
+
+STEPS = 8
+NOT_ADOPTING = ("MarkovJumpTracking", "UnknownInput", "RemoteEstimation", "RandomWalk")
+
+
+@each_case
+def test_a_denied_request_changes_nothing(case: Case) -> None:
+    """What follows is bitwise what follows without it."""
+    batch, denied = case.batch(**SCARCE), 0
+    for wanted in requests(batch.task, 3, STEPS, rate=0.8):
+        grantable, other = batch.grantable(), batch.branch()
+        assert not (batch.answer(wanted).granted & ~grantable).any()
+        outcome = batch.step(wanted)
+        denied += int((wanted & ~outcome.granted).sum())
+        found = other.step(outcome.granted, batch.normals())
+        for name in set(outcome._fields) - {"requested"}:
+            np.testing.assert_array_equal(getattr(found, name), getattr(outcome, name), name)
+        np.testing.assert_array_equal(other.observe(), batch.observe())
+        np.testing.assert_array_equal(other.tokens, batch.tokens)
+    assert denied
+
+
+@pytest.mark.parametrize("access", ACCESS_RULES)
+@each_id
+def test_only_who_is_admitted_is_granted(env_id: str, access: str) -> None:
+    """With tokens without end, exactly those that are admitted and ask."""
+    task = fusion_gym.make_task(env_id, access=access, tokens="unlimited")
+    batch, turns = EpisodeBatch.seeded(task, 40, 0), np.zeros(task.sensors)
+    for step, wanted in enumerate(np.random.default_rng(0).random((STEPS, task.sensors, 40)) < 0.7):
+        admitted = batch.signals()["admitted"]
+        granted = batch.step(wanted).granted
+        if access == "single":
+            np.testing.assert_array_equal(granted.sum(0), wanted.any(0))
+            assert not (granted & ~wanted).any()
+            continue
+        np.testing.assert_array_equal(granted, wanted & admitted)
+        turns += admitted.sum(1)
+        if access == "round_robin":
+            assert (admitted == (np.arange(task.sensors) == step % task.sensors)[:, None]).all()
+        else:
+            assert (admitted.sum(0) == (task.sensors if access == "any" else 1)).all()
+    if access == "random":
+        mean = turns.sum() / task.sensors
+        assert (np.abs(turns - mean) < 4.0 * np.sqrt(mean) * (task.sensors > 1) + 1e-9).all()
+
+
+@each_case
+def test_only_grants_cost_tokens_and_the_balance_closes(case: Case) -> None:
+    for scarce in ({}, SCARCE):
+        batch = case.batch(**scarce)
+        chosen, cost = batch.task.settings, batch.signals()["token_cost"][:, 0]
+        rate, capacity = chosen["token_rate"], chosen["token_capacity"]
+        for wanted in requests(batch.task, 3, STEPS):
+            before = batch.signals()["tokens"].copy()
+            outcome = batch.step(wanted)
+            assert not (outcome.granted & ~wanted).any()
+            np.testing.assert_allclose(outcome.cost, cost @ outcome.granted)
+            if chosen["tokens"] == "limited":
+                assert (outcome.cost <= before + 1e-9).all()
+                before = np.minimum(capacity, before - outcome.cost + rate)
+            np.testing.assert_allclose(batch.signals()["tokens"], before, atol=1e-9)
+
+
+@each_case
+def test_the_reward_is_minus_weighted_error_and_price(case: Case) -> None:
+    batch = case.batch()
+    task, chosen, price = batch.task, batch.task.settings, batch.signals()["price"].copy()
+    if chosen["cost_weight"] == "random":
+        assert len(set(price)) == 3
+        assert (np.array(chosen["price_range"])[[0]] <= price).all()
+        assert (np.array(chosen["price_range"])[[1]] >= price).all()
+    else:
+        assert (price == chosen["cost_weight"]).all()
+    for wanted in requests(task, 3, STEPS):
+        outcome = batch.step(wanted)
+        mean, covariance = task.system.fused(batch.delivered)
+        np.testing.assert_allclose(outcome.error, task.system.truth(batch.delivered) - mean)
+        size = outcome.error**2
+        if chosen["error"] == "trace":
+            size = np.einsum("iir->ir", covariance)
+        weighted = task.reward.state_weights * size
+        error = weighted.max(0) if chosen["error"] == "maximum" else weighted.sum(0)
+        np.testing.assert_allclose(outcome.reward_error, -chosen["error_weight"] * error)
+        np.testing.assert_allclose(outcome.reward_communication, -price * outcome.cost)
+        np.testing.assert_array_equal(
+            outcome.reward, outcome.reward_error + outcome.reward_communication
+        )
+        np.testing.assert_array_equal(batch.signals()["price"], price)
+
+
+@each_case
+def test_a_delivery_begins_age_and_held_value_anew(case: Case) -> None:
+    """And nothing else does. A packet may be lost, or hold nothing where nothing is sampled."""
+    batch = case.batch(information="sensors")
+    loses, arrived = hasattr(batch.task.system, "arriving"), 0
+    for wanted in requests(batch.task, 3, STEPS):
+        before = batch.signals()
+        age, new, held = (np.copy(before[name]) for name in ("age", "measurement", "held"))
+        granted = batch.step(wanted).granted
+        after = batch.signals()
+        fresh = granted & (after["age"] == 1)
+        assert loses or fresh[granted & before.get("sampled", True)].all()
+        assert (after["age"][~fresh] == age[~fresh] + 1).all()
+        sent = np.broadcast_to(fresh[:, None], held.shape)
+        np.testing.assert_array_equal(after["held"], np.where(sent, new, held))
+        arrived += int(fresh.sum())
+    assert arrived
+
+
+@each_id
+def test_an_estimate_is_adopted_where_a_packet_arrives(env_id: str) -> None:
+    """Where requests are denied or nobody asks, the centre goes on by itself."""
+    more = {"filter": "tobit"} if "TobitOscillator" in env_id else {}
+    options = {"memory": True, "packet": "estimate"} | SCARCE | more
+    if short(env_id) in NOT_ADOPTING:
+        with pytest.raises(ConfigurationError, match="packet = 'estimate'"):
+            fusion_gym.make_task(env_id, **options)
+        return
+    task = fusion_gym.make_task(env_id, **options)
+    batch, denied, adopted = EpisodeBatch.seeded(task, 3, 5), 0, 0
+    for wanted in requests(task, 3, 2 * STEPS, rate=0.7):
+        best, silent = batch.beliefs().best, batch.beliefs().silent
+        granted = batch.step(wanted).granted.any(0)
+        mean, covariance = task.system.fused(batch.delivered)
+        np.testing.assert_allclose(mean, np.where(granted, best.mean[0], silent.mean[0]))
+        expected = np.where(granted, best.covariance[0], silent.covariance[0])
+        np.testing.assert_allclose(covariance, expected, atol=1e-12)
+        adopted += int((granted & (best.mean[0] != silent.mean[0]).any(0)).sum())
+        denied += int((wanted.any(0) & ~granted).sum())
+    assert denied
+    assert adopted
+
+
+def test_every_environment_is_under_the_laws() -> None:
+    assert set(fusion_gym.envs.registration.ENVIRONMENTS) == set(IDS)

@@ -1,0 +1,69 @@
+"""What the counterfactual learner is credited with: clipping, ends of episodes, scaled rewards."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+import fusion_gym
+from fusion_gym.agents.training.counterfactual import CounterfactualPPO, Rollout
+from fusion_gym.envs.privileged import PrivilegedVecEnv
+
+ENV = "fusion_gym/TobitOscillator-v0"
+
+
+def env_of(runs: int = 5, **options: Any) -> PrivilegedVecEnv:
+    return PrivilegedVecEnv(fusion_gym.make_task(ENV, filter="tobit", **options), runs)
+
+
+def test_the_surrogate_is_clipped_from_below() -> None:
+    """min(ρ A, clip(ρ) A) (Schulman et al. 2017), of alternatives and of what came later."""
+    env = env_of()
+    model = CounterfactualPPO("MlpPolicy", env, ent_coef=0.0, vf_coef=0.0, batch_size=30)
+    generator = torch.Generator().manual_seed(3)
+    observations = torch.randn((6, *env.observation_space.shape), generator=generator)  # type: ignore[misc]
+    decisions = model._decisions
+    new = decisions.log_probabilities(model._logits(observations, None)).detach()
+    old = (new + torch.randn(new.shape, generator=generator)).log_softmax(-1)
+    advantages = torch.randn(new.shape, generator=generator)
+    surplus = torch.randn(6, generator=generator)
+    chosen = torch.randint(0, decisions.choices, new.shape[:2], generator=generator)
+    rollout = Rollout(
+        observations, None, chosen, old, advantages, surplus, torch.zeros(6), torch.zeros(6)
+    )
+    loss, _ = model._loss(rollout, torch.arange(6), 1.0, 0.2)
+
+    def clipped(ratio: Any, credit: Any) -> Any:
+        return np.where(credit > 0.0, np.minimum(ratio, 1.2), np.maximum(ratio, 0.8)) * credit
+
+    ratio, taken = (new - old).exp().numpy(), (new - old).gather(-1, chosen[..., None])
+    gain = (old.exp().numpy() * clipped(ratio, advantages.numpy())).sum((-1, -2))
+    late = clipped(taken.sum((-1, -2)).exp().numpy(), surplus.numpy())
+    np.testing.assert_allclose(float(loss.detach()), -(gain + late).mean(), rtol=1e-4)
+
+
+def test_an_episode_cut_short_is_worth_what_its_last_observation_is() -> None:
+    """Not what the next episode begins with: there the age is less."""
+    env = env_of(horizon=2, token_rate=0.0, initial_tokens=0.0)
+    model: Any = CounterfactualPPO(
+        "MlpPolicy", env, alternatives="flips", n_steps=2, gamma=0.5, gae_lambda=0.0, batch_size=2
+    )
+    age = env.observation_names.index("age[0]")
+    model._critic = lambda observation: 1e6 * observation[..., age]
+    _, callback = model._setup_learn(100)
+    model.collect_rollouts(env, callback, model.rollout_buffer, 2)
+    worth = model._rollout.returns.reshape(2, -1).numpy() / 0.5e6
+    np.testing.assert_allclose(worth, [[2.0 / 12.0] * 5, [3.0 / 13.0] * 5], rtol=1e-4)
+
+
+def test_an_alternative_that_is_what_was_done_pays_the_same() -> None:
+    """Also where rewards are scaled by the price of the episode."""
+    price = {"cost_weight": "random", "price_range": (0.003, 0.3)}
+    task = fusion_gym.make_task(ENV, filter="tobit", **price)
+    env = PrivilegedVecEnv(task, 8, price_exponent=0.5)
+    env.reset()
+    actions = np.random.default_rng(0).integers(0, 2, (8, 3))
+    (_, rewards, *_), other = env.step_alternatives(actions, (actions.T == 1)[None])
+    np.testing.assert_allclose(other.reward[0], rewards, rtol=1e-6)

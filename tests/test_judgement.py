@@ -1,0 +1,80 @@
+"""Verdicts are of intervals, worst cases the worst, envelopes chosen where they are tuned."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from small_suite import small_suite
+
+from fusion_gym.agents.reproduction.judging import below
+from fusion_gym.agents.reproduction.round_robin_tobit.judging import always_below
+from fusion_gym.agents.suite import envelopes
+from fusion_gym.agents.suite.classes import classes_of
+from fusion_gym.agents.suite.config import load_suite
+from fusion_gym.agents.suite.robust_summary import summary
+from fusion_gym.evaluation.envelope import chosen_mse
+
+NOISE = np.array([-3.0, 1.0, -2.0, 3.5])
+
+
+def interval(mean: float, low: float, high: float) -> dict[str, float]:
+    return {"mean": mean, "low": low, "high": high}
+
+
+def test_a_mean_below_another_is_not_yet_below() -> None:
+    assert NOISE.mean() < 0.0
+    assert not below(NOISE, np.zeros(4))
+    assert below(NOISE - 10.0, np.zeros(4))
+    error = np.full((3, 5), 0.1)
+    assert always_below(np.stack([-0.5 * error, error]))[0] == "does not hold"
+    assert always_below(np.stack([-5.0 * error, error]))[0] == "holds"
+
+
+def test_cases_are_counted_by_their_intervals_and_the_worst_is_named() -> None:
+    found = {
+        "as_assumed": interval(-0.3, -0.4, -0.2),
+        "clear": interval(-0.2, -0.3, -0.1),
+        "open": interval(0.1, -0.1, 0.3),
+        "worse": interval(0.2, 0.1, 0.3),
+    }
+    cases = {name: {"title": name, "agents": {"middle": one}} for name, one in found.items()}
+    lines = summary([{"setting": "small", "cases": cases}], {"small": "a setting"})
+    (row,) = (line for line in lines if "as they are" in line)
+    assert [cell.strip() for cell in row.split("|")][4:7] == ["1", "1", "1"]
+    assert row.rstrip(" |").endswith("worse")
+    assert "+20" in row
+
+
+# The middle policy lies below the line through its neighbours where it is tuned, above it after.
+TUNED = {"a": (0.0, 1.0), "b": (0.5, 0.4), "c": (1.0, 0.0)}
+TESTED = {"a": (0.0, 1.0), "b": (0.5, 0.6), "c": (1.0, 0.0)}
+RESULTS: dict[str, Any] = {
+    name: SimpleNamespace(rate=np.full((4, 3), rate), mse=np.full(4, mse))
+    for name, (rate, mse) in TESTED.items()
+}
+
+
+def test_all_policies_of_an_envelope_count_where_it_is_measured() -> None:
+    np.testing.assert_allclose(chosen_mse(RESULTS, 0.5), 0.6)
+
+
+def test_vertices_are_those_of_the_tuning_episodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite = load_suite(small_suite(tmp_path))
+    candidates = {
+        name: envelopes.Candidate(
+            name, (), "family", "centre", (0, 1), rate, interval(mse, mse, mse)
+        )
+        for name, (rate, mse) in (TUNED | {"d": (0.5, 0.8)}).items()
+    }
+    monkeypatch.setattr(envelopes, "candidates_of", lambda *_: (candidates, 4))
+    monkeypatch.setattr(envelopes.Test, "read", lambda test, work: RESULTS[test.policy])
+    of = next(iter(classes_of(suite.settings[0])))
+    found = envelopes.content_of(suite, suite.settings[0], of, [], tmp_path)
+    assert [vertex["policy"] for vertex in found["vertices"]] == ["a", "b", "c"]
+    assert [vertex["convex"] for vertex in found["vertices"]] == [True, False, True]
