@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from fusion_gym.arrays import Array
+from fusion_gym.core.options import AccessRule
 
-AccessRule = Literal["any", "single", "round_robin", "random"]
 ACCESS_RULES: tuple[str, ...] = get_args(AccessRule)
 
 

@@ -9,16 +9,17 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fusion_gym import declaration
 from fusion_gym.arrays import Array
-from fusion_gym.core import declaration
-from fusion_gym.core.access import AccessRule
-from fusion_gym.core.reward import ErrorKind
 from fusion_gym.core.system import System
 from fusion_gym.core.token_bucket import SharingRule
 from fusion_gym.errors import refusal
 from fusion_gym.importing import name_of
 
+AccessRule = Literal["any", "single", "round_robin", "random"]
 Tokens = Literal["limited", "unlimited"]
+SharingRule = Literal["equal", "fixed", "rotating"]
+ErrorKind = Literal["squared", "trace", "maximum"]
 Broadcast = Literal["none", "estimate", "packets"]
 Feature = Literal["difference", "value"]
 Action = Literal["binary", "discrete"]

@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.options import ErrorKind
 from fusion_gym.importing import name_of, named
 from fusion_gym.validation import ConfigurationError
 
 Cost = Callable[[Array, Array], Any]  # of errors (n, N) and covariances (n, n, N)
-ErrorKind = Literal["squared", "trace", "maximum"]
 ERROR_KINDS: tuple[str, ...] = get_args(ErrorKind)
 TRAINING_ERRORS = ("squared", "excess", "mismatch")
 _LARGEST = 1e32  # of squares on average: rewards are also handed on as float32

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.options import SharingRule
 from fusion_gym.validation import ConfigurationError
 
-SharingRule = Literal["equal", "fixed", "rotating"]
 SHARING_RULES: tuple[str, ...] = get_args(SharingRule)
 _ROUNDING = 1e-9  # tokens: ten times 0.1 pays for a transmission that costs 1
 

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fusion_gym.core.declaration import choices, hints, meanings, type_text
 from fusion_gym.core.options import CommonOptions, plain
+from fusion_gym.declaration import choices, hints, meanings, type_text
 
 
 class Option(NamedTuple):

@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.access import AccessRule
-from fusion_gym.core.options import Scenario, Tokens
+from fusion_gym.core.options import AccessRule, Scenario, Tokens
 from fusion_gym.core.reward import equal_weights
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.tobit.options import (

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.core.options import Scenario
-from fusion_gym.core.token_bucket import SharingRule
+from fusion_gym.core.options import Scenario, SharingRule
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.tobit.bound_filter import BoundConstants, BoundTobitFilter, EventError
 from fusion_gym.systems.tobit.options import (
