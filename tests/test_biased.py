@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -244,16 +243,6 @@ def test_single_access_lets_one_request_through(bits: list[bool], step: int) -> 
     if passed.any():
         distance = (np.flatnonzero(bits) - step) % len(bits)
         assert (passed[:, 0].argmax() - step) % len(bits) == distance.min()
-
-
-def test_the_single_access_action_names_the_sensor() -> None:
-    env = gymnasium.make(OSCILLATOR)
-    assert env.action_space == gymnasium.spaces.Discrete(3)
-    env.reset(seed=0)
-    for action, granted in ((0, [False, False]), (1, [True, False]), (2, [False, True])):
-        assert env.step(action)[4]["granted"].tolist() == granted
-    with pytest.raises(ValueError, match=r"0\.\.2"):
-        env.unwrapped.step(3)
 
 
 def test_divergence_is_told() -> None:

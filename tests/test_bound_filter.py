@@ -217,8 +217,8 @@ DEPTHS = {0.02: 2.05, 1e-8: 5.61, 1e-12: 7.03, 1e-20: 9.26, 1e-60: 16.37, 1e-200
 
 @pytest.mark.parametrize("probability", DEPTHS)
 @pytest.mark.parametrize("held_at_threshold", [True, False], ids=["held at τ", "held above τ"])
-@pytest.mark.parametrize("level", [0.0, 2.0, -1.5])
-@pytest.mark.parametrize("size", [1, 2, 3])
+@pytest.mark.parametrize("level", [0.0, -1.5])
+@pytest.mark.parametrize("size", [2])
 def test_paper_filter_is_the_printed_one_deep_in_censoring(
     size: int, level: float, held_at_threshold: bool, probability: float
 ) -> None:

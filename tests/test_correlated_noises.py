@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,11 +12,8 @@ import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.fusion.rules import InformationFusion
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.solvers.silence.model import silence_model
-from fusion_gym.systems.tobit.centre import Feedback, FeedbackCentre
-from fusion_gym.systems.tobit.filters import KalmanFilter
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -110,20 +106,6 @@ def test_covariance_intersection_keeps_its_bound(fusion: str) -> None:
     best, found = (run_episodes(t, make_policy("always", t), 500, 0) for t in (joint, nodes))
     assert found.mse.mean() < 0.97 * found.bound_trace.mean()
     assert best.mse.mean() < 0.9 * found.mse.mean()
-
-
-def test_informations_that_are_simply_added_would_claim_too_much() -> None:
-    task = task_of()
-    best = run_episodes(task, make_policy("always", task), 500, 0)
-    assert best.nees.mean() == pytest.approx(1.0, abs=0.03)
-    system: Any = task.system
-    naive = FeedbackCentre(
-        KalmanFilter(system.centre.sensors), InformationFusion(), Feedback.in_shares(None, 3)
-    )
-    wrong = replace(task, system=replace(system, centre=naive))
-    found = run_episodes(wrong, make_policy("always", wrong), 500, 0)
-    assert found.nees.mean() > 1.2
-    assert found.mse.mean() > 1.1 * best.mse.mean()
 
 
 def test_a_large_prior_keeps_its_digits() -> None:

@@ -216,12 +216,6 @@ def test_the_first_step_climbs_the_expected_value(name: str) -> None:
 
 SETTINGS: list[Any] = [
     ("counterfactual_ppo", {"memory": True}, {"error": "mismatch"}, {}),
-    ("counterfactual_ppo", {"action": "discrete"}, {"error": "excess"}, {}),
-    ("counterfactual_ppo", {"access": "single"}, {"target_rate": 0.1}, {}),
-    (
-        "counterfactual_ppo",
-        {"memory": True, "broadcast": "packets"}, {"error": "mismatch"}, {"local": True},
-    ),
     (
         "counterfactual_maskable_ppo",
         {"cost_weight": "random", "price_range": [0.003, 0.3]}, {"price_exponent": 0.5}, {},

@@ -23,7 +23,6 @@ from fusion_gym.evaluation.cross_term import CrossTerm, cross_terms, usual_polic
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.intervals import Interval
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.validation import ConfigurationError
 
 OSCILLATOR, INPUT = "fusion_gym/TobitOscillator-v0", "fusion_gym/UnknownInput-v0"
 ORDINARY = {"filter": "tobit", "random_start": True, "token_rate": 2, "horizon": 30}
@@ -108,12 +107,6 @@ def test_more_policies_and_a_higher_level_make_wider_intervals() -> None:
     )
     assert width(cross_terms(task, system, policies, 60, 0, level=0.999)) > width(alone)
     assert width(cross_terms(task, system, policies, 60, 0)) == width(alone)
-
-
-@pytest.mark.parametrize("episodes", [1, 0, 2.5])
-def test_one_episode_says_nothing(episodes: Any) -> None:
-    with pytest.raises(ConfigurationError, match="episodes"):
-        measured(OSCILLATOR, ORDINARY, ["always"], episodes=episodes)
 
 
 def test_the_worst_is_one_that_is_told_from_zero() -> None:

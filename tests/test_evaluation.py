@@ -141,15 +141,15 @@ def test_summary(task: Task) -> None:
 
 @pytest.mark.parametrize("law", ["normal", "exponential"])
 def test_interval_covers_the_mean_19_times_in_20(law: str) -> None:
-    """800 samples of 50, each with the true mean 1; percentile intervals cover a little less."""
+    """400 samples of 50, each with the true mean 1; percentile intervals cover a little less."""
     rng = np.random.default_rng(17)
     hits = 0
-    for _ in range(800):
+    for _ in range(400):
         samples = rng.normal(1.0, 2.0, 50) if law == "normal" else rng.exponential(1.0, 50)
         mean, low, high = mean_interval(samples, seed=int(rng.integers(2**31)))
         assert mean == np.mean(samples)
         hits += low <= 1.0 <= high
-    assert hits / 800 == pytest.approx(0.94 if law == "normal" else 0.92, abs=0.025)
+    assert hits / 400 == pytest.approx(0.94 if law == "normal" else 0.92, abs=0.035)
 
 
 @pytest.mark.parametrize("samples", [[3.5], [2.0, 2.0, 2.0], [0.0] * 50], ids=str)

@@ -126,13 +126,6 @@ def test_in_the_solved_case_a_small_beam_reaches_the_optimum() -> None:
     assert not found.exact.any()
 
 
-def test_with_free_tokens_it_is_no_worse_than_always() -> None:
-    task = fusion_gym.make_task(TOBIT, **(BENCHMARK | {"tokens": "unlimited"}))
-    free = run_hindsight(task, price=0.0, width=8, episodes=10, seed=0)
-    always = run_episodes(task, make_policy("always", task), 10, seed=0)
-    assert (free.mse < always.mse).all()
-
-
 def test_it_costs_less_than_policies_that_do_not_know_the_noise() -> None:
     price = 0.02
     options: dict[str, Any] = {"cost_weight": price, "price_range": (0.003, 0.3)}

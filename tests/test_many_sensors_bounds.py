@@ -13,7 +13,6 @@ from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.policies.hindsight import find_schedules
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.solvers import solve_ages, solve_task
@@ -111,15 +110,6 @@ def test_up_to_their_bounds_they_are_not_refused() -> None:
     linear(16, action="discrete")
     with pytest.warns(UserWarning, match="one transmission after another"):
         make_policy("lookahead:price=0.1", linear(40))
-
-
-def test_matrices_of_many_channels_are_refused_before_anything_runs() -> None:
-    structure = Structure("of one prior", holds=("joint covariance",))
-    with pytest.raises(
-        ConfigurationError, match=r"'matrix'.*41 sensors.*at most 40.*'sici' or 'sci'"
-    ):
-        choose_rule("matrix", structure, 41)
-    choose_rule("matrix", structure, 40)
 
 
 @pytest.mark.parametrize("action", ["binary", "discrete"])

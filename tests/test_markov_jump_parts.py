@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from reference_markov_jump import PAPER, Dense, best_weights, random_model
 
 from fusion_gym.fusion.rules import MatrixWeightedFusion
-from fusion_gym.fusion.table import RULES
 from fusion_gym.systems.markov_jump.lag_errors import LagRecursion
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
@@ -297,20 +296,6 @@ def test_an_estimate_that_comes_twice_changes_nothing() -> None:
         many = MatrixWeightedFusion().fuse(means[order], joint[np.ix_(order, order)])
         np.testing.assert_allclose(many.mean, pair.mean, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(many.covariance, pair.covariance, rtol=1e-9, atol=1e-9)
-
-
-def test_intersection_is_never_better_than_matrix_weights() -> None:
-    joint = random_joint(7, 3, 2, 200, 8)
-    means = np.random.default_rng(1).normal(size=(3, 2, 200))
-    best = np.einsum("iir->r", MatrixWeightedFusion().fuse(means, joint).covariance)
-    for name in ("ci", "sci", "sici"):
-        claimed = RULES[name].make(None).fuse(means, joint).covariance
-        if name != "sici":
-            assert (np.einsum("iir->r", claimed) >= best * (1 - 1e-5)).all()
-        assert np.isfinite(claimed).all()
-    alone = RULES["ci"].make(None).fuse(means[:1], joint[:1, :1])
-    np.testing.assert_allclose(alone.mean, means[0], rtol=1e-9)
-    np.testing.assert_allclose(alone.covariance, joint[0, 0], rtol=1e-9)
 
 
 # --- bad input -----------------------------------------------------------------------------------

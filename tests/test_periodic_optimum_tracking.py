@@ -16,7 +16,6 @@ from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies import periodic_optimum
 from fusion_gym.policies.periodic_optimum import PeriodicOptimum, episode_traces
-from fusion_gym.systems.correlated.system import CorrelatedTrackingSystem
 from fusion_gym.systems.unknown_input.system import UnknownInputSystem
 from fusion_gym.validation import ConfigurationError
 
@@ -213,17 +212,6 @@ def test_brute_force_of_uncensored_nodes(name: str) -> None:
     assert_searched(task, 2, 3, traces, 1e-9)
     best = all_schedules(2, 3, 2)[..., int(np.argmin(traces))]
     assert squared_by_impulses(task.system, best, 30) == pytest.approx(min(traces), rel=1e-9)
-
-
-def test_actual_covariances_are_not_there_unless_tracked() -> None:
-    system = correlated().system
-    assert isinstance(system, CorrelatedTrackingSystem)
-    state = system.start(np.zeros((system.start_channels, 2)))
-    with pytest.raises(ConfigurationError, match="track_actual"):
-        system.error_covariance(state)
-    tracking = system.with_actual_covariance()
-    state = tracking.start(np.zeros((system.start_channels, 2)))
-    assert linalg.trace(tracking.error_covariance(state)) == pytest.approx([3.0, 3.0])
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from fusion_gym.agents import __main__ as everything
 from fusion_gym.agents import command_line, evaluate
 from fusion_gym.agents.command_line import Long
 from fusion_gym.agents.output import progress
-from fusion_gym.agents.output.progress import progress_bar, quietly, writing
+from fusion_gym.agents.output.progress import progress_bar
 
 EVALUATE = [
     *("--env", "fusion_gym/TobitOscillator-v0", "--set", "horizon=20"),
@@ -82,15 +82,6 @@ def test_where_nobody_watches_a_line_is_printed_now_and_then(
     assert gaps == sorted(gaps)
     assert len(told) < 70
     assert capsys.readouterr() == ("", "evaluating: 100 %, 10,000/10,000 steps, 2:46:40, always\n")
-
-
-def test_quiet_says_nothing_and_ends(capsys: pytest.CaptureFixture[str]) -> None:
-    with quietly(), quietly(False), progress_bar(3, "evaluating") as bar:
-        writing(("results", "here"))
-        bar.update(3)
-    assert capsys.readouterr() == ("", "")
-    writing(("results", "here"), ("episodes", "there"))
-    assert capsys.readouterr().err == "writing results into here, episodes into there\n"
 
 
 def test_every_long_command_can_be_quiet() -> None:

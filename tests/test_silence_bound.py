@@ -27,7 +27,8 @@ from fusion_gym.solvers.silence import (
     simulate,
     solve_silence,
 )
-from fusion_gym.solvers.silence.lattice import hat_weights, spread
+from fusion_gym.solvers.silence.lattice import Coordinates, hat_weights, spread
+from fusion_gym.solvers.silence.survival import Survival
 from fusion_gym.solvers.single import solve_finite
 from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.validation import ConfigurationError
@@ -200,6 +201,34 @@ def test_hats_keep_the_mean_and_widen_the_noise(deviation: float) -> None:
     # A concave function has its mean bounded from below: here that of -|X|.
     mean = -2.0 * weights @ np.arange(len(weights))
     assert mean <= -deviation * np.sqrt(2.0 / np.pi) + 1e-12
+
+
+def test_silence_lasts_no_longer_than_its_bounds_say() -> None:
+    draw, transition = np.random.default_rng(0), np.array(TURN)
+    noise, form = np.diag([0.3, 0.1]), np.diag([1.0, 0.8])
+    survival = Survival(transition, np.ones(2), 21)
+    for _ in range(20):
+        survival.add(form, noise)
+    assert np.trace(survival.curvature) < 2 * 20
+    for start in ([0.0, 0.0], [0.5, 0.0], [0.0, -0.9]):
+        error = np.tile(np.array(start)[:, None], 20_000)
+        silent = np.ones(20_000)
+        total = np.ones(20_000)
+        for _ in range(19):
+            error = transition @ error + np.sqrt(noise) @ draw.standard_normal(error.shape)
+            silent *= np.linalg.norm(form @ error, axis=0) <= 1.0
+            total += silent
+        assert total.mean() < 0.5 * np.trace(survival.curvature)
+
+
+def test_coordinates_make_noise_and_curvature_diagonal() -> None:
+    draw = np.random.default_rng(1)
+    root, factor = draw.standard_normal((3, 3)), draw.standard_normal((3, 2))
+    curvature, noise = root @ root.T, factor @ factor.T
+    found = Coordinates.create(curvature, noise)
+    assert found.basis.T @ curvature @ found.basis == pytest.approx(np.eye(3), abs=1e-9)
+    assert found.basis @ np.diag(found.variance) @ found.basis.T == pytest.approx(noise, abs=1e-9)
+    assert (found.variance == 0.0).sum() == 1
 
 
 # --- where it does not apply ----------------------------------------------------------------------
