@@ -336,11 +336,11 @@ def test_intersection_is_never_better_than_matrix_weights() -> None:
     means = np.random.default_rng(1).normal(size=(3, 2, 200))
     best = np.einsum("iir->r", MatrixWeightedFusion().fuse(means, joint).covariance)
     for name in ("ci", "sci", "sici"):
-        claimed = RULES[name].make(None).fuse(means, joint).covariance
+        claimed = RULES[name].make().fuse(means, joint).covariance
         if name != "sici":
             assert (np.einsum("iir->r", claimed) >= best * (1 - 1e-5)).all()
         assert np.isfinite(claimed).all()
-    alone = RULES["ci"].make(None).fuse(means[:1], joint[:1, :1])
+    alone = RULES["ci"].make().fuse(means[:1], joint[:1, :1])
     np.testing.assert_allclose(alone.mean, means[0], rtol=1e-9)
     np.testing.assert_allclose(alone.covariance, joint[0, 0], rtol=1e-9)
 
