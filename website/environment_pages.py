@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import inspect
-import re
-import sys
 from collections.abc import Sequence
 
 import fusion_gym
 from fusion_gym.core.options import CommonOptions
 from fusion_gym.core.task import Task
 from fusion_gym.envs.option_text import options_in, short
+from fusion_gym.envs.pages import table
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 from fusion_gym.envs.vector import reset_infos
 from fusion_gym.envs.views import make_view
-from website.parts import ALSO, FILTERS, PAGES_OF, offered
-from website.places import DOCS
+from fusion_gym.fusion.table import offered
+from website.papers import paper_of
+from website.parts import filter_slug
+from website.places import DOCS, pages_of
 
 MEANINGS = {
     "cost": "tokens spent in the step, never negative (the convention of constrained learning)",
@@ -31,7 +31,7 @@ MEANINGS = {
 
 def of_page(page: str) -> list[str]:
     """Ids of the environments that a page tells of."""
-    return [env_id for env_id in ENVIRONMENTS if PAGES_OF.get(env_id) == page]
+    return [env_id for env_id in ENVIRONMENTS if pages_of().get(env_id) == page]
 
 
 def at_a_glance(env_id: str) -> str:
@@ -47,14 +47,20 @@ def at_a_glance(env_id: str) -> str:
         ("action", f"`{view.actions}`"),
         ("steps of an episode", str(task.horizon)),
     ]
-    if names := offered("filter")[env_id]:
-        rows.append(("filters", ", ".join(_filter_link(env_id, name) for name in names)))
-    if names := offered("fusion")[env_id]:
+    kind = options_of(env_id)
+    links = [
+        f"[`{name or owner.__name__}`](filters/{filter_slug(owner)}.md)"
+        for name, owner in kind.filters.items()
+    ]
+    if links:
+        rows.append(("filters", ", ".join(links)))
+    if kind.structure is not None:
+        names = offered(kind.structure)
         rows.append(("fusion", ", ".join(f"[`{name}`](fusion/{name}.md)" for name in names)))
-    paper = _paper(env_id)
+    paper = paper_of(env_id)
     if (DOCS / "reproduction" / f"{paper}.md").exists():
         rows.append(("made anew", f"[the paper's figures and claims](reproduction/{paper}.md)"))
-    return _table(("", env_id.split("/")[1]), rows)
+    return table(("", env_id.split("/")[1]), rows)
 
 
 def tables(env_id: str) -> str:
@@ -63,13 +69,13 @@ def tables(env_id: str) -> str:
     name = env_id.split("/")[1]
     parts = [
         f"### Actions of {name}",
-        _table(("with", "action space", "meaning"), _actions(env_id)),
+        table(("with", "action space", "meaning"), _actions(env_id)),
         f"### Reward of {name}",
-        _table(("", "by default"), _reward(task)),
+        table(("", "by default"), _reward(task)),
         f"### Info of {name}",
-        _table(("entry", "type", "shape", "meaning"), _infos(task)),
+        table(("entry", "type", "shape", "meaning"), _infos(task)),
         f"### Options of {name}",
-        _table(("option", "type", "default"), _options(options_of(env_id))),
+        table(("option", "type", "default"), _options(options_of(env_id))),
     ]
     return "\n\n".join(parts)
 
@@ -81,21 +87,6 @@ def with_tables(text: str, page: str) -> str:
     overview = "\n\n".join(at_a_glance(env_id) for env_id in every)
     tail = "\n\n".join(["## From the code", *(tables(env_id) for env_id in every)])
     return f"{head.strip()}\n\n{overview}\n{mark}{sections.strip()}\n\n{tail}\n"
-
-
-def _filter_link(env_id: str, name: str) -> str:
-    found = [
-        slug for slug, (_, _, value, ids) in FILTERS.items() if value == name and env_id in ids
-    ]
-    slug = found[0] if found else ALSO.get((name, env_id))
-    return f"[`{name}`](filters/{slug}.md)" if slug else f"`{name}`"
-
-
-def _paper(env_id: str) -> str:
-    """The word by which the module of the environment's options names its paper."""
-    module = inspect.getdoc(sys.modules[options_of(env_id).__module__]) or ""
-    found = re.search(r"^Source: (\w+)", module, re.MULTILINE)
-    return found[1] if found else ""
 
 
 def _place(kind: type) -> str:
@@ -164,10 +155,3 @@ def _words(annotation: str) -> str:
 
 def _cut(text: str) -> str:
     return text if len(text) <= 60 else f"{text[:57]}…"
-
-
-def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
-    lines = [head, tuple("---" for _ in head), *rows]
-    return "\n".join(
-        "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in lines
-    )

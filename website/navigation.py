@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from website import reference
-from website.parts import KIND_NAMES, slugs
+from website.parts import KIND_NAMES, parts
 from website.places import DOCS
 
 # Titles are short here, for a phone; pages that are not named stand at the end of "Use".
@@ -63,8 +63,8 @@ def navigation() -> list[Any]:
         for _, page in group
     }
     others = sorted(path.name for path in DOCS.glob("*.md") if path.name not in named)
-    parts = {
-        kind: [f"{kind}/index.md", *(f"{kind}/{slug}.md" for slug in slugs(kind))]
+    made = {
+        kind: [f"{kind}/index.md", *(f"{kind}/{part.name}.md" for part in parts(kind))]
         for kind in KIND_NAMES
     }
     return [
@@ -72,7 +72,7 @@ def navigation() -> list[Any]:
         {"Tutorials": _there(_TUTORIALS) + _unnamed("tutorials", _TUTORIALS)},
         {"Use": _there(_USE) + others},
         {"Environments": _there(_ENVIRONMENTS)},
-        {"Parts": [{KIND_NAMES[kind]: pages} for kind, pages in parts.items()]},
+        {"Parts": [{KIND_NAMES[kind]: pages} for kind, pages in made.items()]},
         {
             "Results": [
                 {"Report": "results/report.md"},

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +14,7 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import System
 from fusion_gym.errors import ConfigurationError, refusal
+from fusion_gym.fusion.table import Structure
 from fusion_gym.importing import name_of
 
 
@@ -23,7 +24,12 @@ class CommonOptions:
 
     Network, access and token bucket; what a packet holds and who hears what; memory; episode,
     observation, action and reward; how far the truth departs from what everybody assumes.
+    ``filters`` are the classes behind the values of an option ``filter``, whose docstrings declare
+    them; ``structure`` decides which fusion rules an option ``fusion`` takes.
     """
+
+    filters: ClassVar[Mapping[str, type]] = {}
+    structure: ClassVar[Structure | None] = None
 
     access: str = "any"
     tokens: str = "limited"

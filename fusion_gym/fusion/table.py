@@ -74,11 +74,11 @@ RULES = {
         MatrixWeightedFusion, "joint covariance", "Sum with the best matrix weights.", cubic=True
     ),
     "sici": Rule(
-        _INVERSE, "common information", "Inverse covariance intersection, in turn.", ordered=True
+        _INVERSE, "common information", "Inverse covariance intersection, two by two.", ordered=True
     ),
-    "sci": Rule(_IN_TURN, "nothing", "Covariance intersection, in turn: a bound.", ordered=True),
+    "sci": Rule(_IN_TURN, "nothing", "Covariance intersection, two by two: a bound.", ordered=True),
     "ci": Rule(
-        CovarianceIntersection, "nothing", "Covariance intersection at once: a bound.", cubic=True
+        CovarianceIntersection, "nothing", "Covariance intersection of all: a bound.", cubic=True
     ),
     "exact_ci": Rule(
         CovarianceIntersection, "tracked weights", "The same with exact weights.", cubic=True

@@ -18,6 +18,8 @@ import numpy as np
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import KNOWLEDGE
 from fusion_gym.core.task import Task
+from fusion_gym.docstrings import read
+from fusion_gym.envs.pages import plain_marks, table
 from fusion_gym.importing import named
 from fusion_gym.policies.base import Policy, owner_of
 from fusion_gym.policies.settings import parse_settings
@@ -132,6 +134,17 @@ def policy_parameters(name: str) -> dict[str, inspect.Parameter]:
         ConfigurationError: an unknown name.
     """
     return _parameters(name, policy_maker(name))
+
+
+def policy_table(kind: Kind) -> str:
+    """Return the policies of a kind as a Markdown table, from their declarations."""
+    rows = []
+    for name in policy_names(kind):
+        given = list(policy_parameters(name))
+        shown = f"`{name}:{given.pop(0).upper()}`" if kind == "agent" else f"`{name}`"
+        summary = plain_marks(read(policy_maker(name)).summary)
+        rows.append((shown, summary, ", ".join(f"`{key}`" for key in given)))
+    return table(("policy", "meaning", "parameters"), rows)
 
 
 def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:

@@ -7,7 +7,9 @@ Section 6.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,6 +47,8 @@ class CorrelatedTrackingOptions(CommonOptions):
     the reward.
     """
 
+    filters: ClassVar[Mapping[str, type]] = {"": RobustKalmanFilter}  # without a choice
+    structure: ClassVar[Structure | None] = _STRUCTURE
     # Plant, equations (1) and (64): position, velocity, acceleration
     transition: ArrayLike = ((1.0, _T, _T * _T / 2), (0.0, 1.0, _T), (0.0, 0.0, 1.0))
     process_gain: ArrayLike = ((_T * _T / 2,), (_T,), (1.0,))

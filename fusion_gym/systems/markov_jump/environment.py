@@ -6,7 +6,9 @@ systems with correlated noises and fading measurements), Section 6.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 from numpy.typing import ArrayLike
 
@@ -16,13 +18,20 @@ from fusion_gym.core.options import CommonOptions, Nature, Scenario
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.markov_jump.central_system import MarkovJumpCentralSystem
+from fusion_gym.systems.markov_jump.centralised_linear import CentralisedLinearFilter
+from fusion_gym.systems.markov_jump.interacting_models import InteractingModels
+from fusion_gym.systems.markov_jump.linear_minimum_variance import LocalFilters
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
 from fusion_gym.systems.markov_jump.system import MarkovJumpSystem
 from fusion_gym.validation import ConfigurationError
 
 _T = 0.5  # the paper's sampling time in seconds
-FILTERS = ("local", "centralised", "imm")
+FILTERS: dict[str, type] = {
+    "local": LocalFilters,
+    "centralised": CentralisedLinearFilter,
+    "imm": InteractingModels,
+}
 _ESTIMATES_ALREADY = "packets carry the nodes' estimates already, which remember every measurement"
 _STRUCTURE = Structure(common="all contain the same process noise", holds=("joint covariance",))
 
@@ -53,6 +62,8 @@ class MarkovJumpTrackingOptions(CommonOptions):
     token bucket (the paper has none, hence ``tokens="unlimited"``) and the reward.
     """
 
+    filters: ClassVar[Mapping[str, type]] = FILTERS
+    structure: ClassVar[Structure | None] = _STRUCTURE
     # Plant, equation (1): position, velocity; one Φ and Γ a mode
     transitions: ArrayLike = (((0.8, 0.2 * _T), (0.0, 0.6)), ((1.0, _T), (0.0, _T)))
     process_gains: ArrayLike = (((1.5,), (0.6,)), ((0.5 * _T * _T,), (_T,)))

@@ -9,7 +9,9 @@ Round-Robin protocol", IEEE Transactions on Signal and Information Processing ov
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +25,7 @@ from fusion_gym.systems.tobit.options import (
     FILTERS,
     FeedbackOptions,
     at_the_nodes,
+    classes,
     make_centre,
     remembering_system,
     stochastic_defaults,
@@ -57,6 +60,7 @@ class BiasedOscillatorOptions(FeedbackOptions):
     ``information_shares`` (equal) and the reward.
     """
 
+    filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
     # Plant and bias, equations (1) and (3)
     transition: ArrayLike = ((_COS, -_SIN), (_SIN, _COS))
     process_covariance: ArrayLike = ((0.0025, 0.0), (0.0, 0.0025))

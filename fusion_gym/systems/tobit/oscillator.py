@@ -8,8 +8,9 @@ Systems 4:19, 2024, Section 4.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +25,7 @@ from fusion_gym.systems.tobit.options import (
     FeedbackOptions,
     Filter,
     at_the_nodes,
+    classes,
     feedback_centre,
     make_centre,
     remembering_system,
@@ -41,6 +43,14 @@ _SMALLEST_EPSILON = 1e-9
 _LARGEST_EVENT_ERROR = 1e120  # its square must be a float64
 _HELD = "the silent filter goes on from the last delivered measurement (silent='hold')"
 _IDENTITY = ((1.0, 0.0), (0.0, 1.0))
+_FILTERS = {
+    "paper": Filter(
+        BoundTobitFilter,
+        lambda chosen, sensors: feedback_centre(chosen, _bound_filter(chosen, sensors)),
+    ),
+    "tobit": at_the_nodes(TobitKalmanFilter),
+    **FILTERS,
+}
 
 
 @dataclass(frozen=True)
@@ -63,6 +73,7 @@ class TobitOscillatorOptions(FeedbackOptions):
     are repeated in turn for other numbers of sensors.
     """
 
+    filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
     # Plant, equation (1)
     transition: ArrayLike = ((_COS, _SIN), (-_SIN, _COS))
     process_noise: str = "scalar"
@@ -192,15 +203,6 @@ def _refuse_explosion(chosen: TobitOscillatorOptions, error: EventError) -> None
             f"{listed} are not allowed together: the bound of the event error must stay below "
             f"{_LARGEST_EVENT_ERROR:g}; use a smaller decay, a larger divisor or event_error=False"
         )
-
-
-_FILTERS = {
-    "paper": Filter(
-        lambda chosen, sensors: feedback_centre(chosen, _bound_filter(chosen, sensors))
-    ),
-    "tobit": at_the_nodes(TobitKalmanFilter),
-    **FILTERS,
-}
 
 
 def _trigger(chosen: TobitOscillatorOptions, sensors: int) -> dict[str, tuple[float, ...]]:
