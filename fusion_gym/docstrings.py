@@ -1,4 +1,4 @@
-"""Docstrings as declarations: a summary, and paragraphs behind labels such as ``Source:``.
+"""Docstrings as declarations: a summary, and paragraphs behind labels such as ``Source:``; tables.
 
 A label stands at the beginning of a paragraph; indented paragraphs below belong to it.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 _LABEL = re.compile(r"(Args|Returns|Raises|Equation|Assumes|Sources?|Example):[ \n]")
@@ -47,3 +48,16 @@ def read(owner: Any) -> Docstring:
         section.append(paragraph)
     parts = {name: textwrap.dedent("\n\n".join(found)) for name, found in labelled.items()}
     return Docstring("\n\n".join(text), parts)
+
+
+def plain_marks(text: str) -> str:
+    """Return a docstring's text with Markdown's code marks."""
+    return re.sub(r":\w+:`~?|``", "`", text)
+
+
+def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    """Return a Markdown table, the columns of its source aligned."""
+    lines = [head, *(tuple(cell.replace("|", "\\|") for cell in row) for row in rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(head) - 1)]
+    padded = ["| " + " | ".join(map(str.ljust, line, (*widths, 0))) + " |" for line in lines]
+    return "\n".join((padded[0], "|---" * len(head) + "|", *padded[1:]))

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import fusion_gym
 from fusion_gym.core.options import CommonOptions
 from fusion_gym.core.task import Task
+from fusion_gym.docstrings import table
 from fusion_gym.envs.option_text import options_in, short
-from fusion_gym.envs.pages import table
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 from fusion_gym.envs.vector import reset_infos
 from fusion_gym.envs.views import make_view

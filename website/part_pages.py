@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from fusion_gym.envs.pages import table
+from fusion_gym.docstrings import table
 from website.docstrings import markdown
 from website.papers import citations
 from website.parts import KIND_NAMES, Part, example_of, parameters, parts

@@ -16,7 +16,7 @@ from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 
-from fusion_gym.envs.pages import table
+from fusion_gym.docstrings import table
 from fusion_gym.validation import choice
 
 from .checked import Positive, Rate, Several, Share, Strict, Weight
@@ -190,12 +190,11 @@ def algorithm_table(_: str) -> str:
             f"`{name}`",
             row.meaning,
             "`Discrete`" if row.discrete_only else "all",
-            ", ".join(f"`{key}`" for key in row.config.model_fields if key != "name"),
             row.source,
         )
         for name, row in TABLE.items()
     )
-    return table(("algorithm", "meaning", "actions", "settings", "source"), rows)
+    return table(("algorithm", "meaning", "actions", "source"), rows)
 
 
 def settings(content: Any) -> AlgorithmConfig:

@@ -13,7 +13,6 @@ import inspect
 import re
 import shlex
 import sys
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,7 @@ from fusion_gym.core.options import CommonOptions
 from fusion_gym.core.reward import Price
 from fusion_gym.core.system import Block, covers, numbered
 from fusion_gym.core.task import Task
-from fusion_gym.docstrings import read
+from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.envs.option_text import listed, options_in, short
 from fusion_gym.envs.registration import make_task, options_of
 from fusion_gym.envs.views import heard, make_view
@@ -222,11 +221,6 @@ def _paragraphs(kind: type[CommonOptions]) -> list[str]:
     return [] if text.startswith(f"{kind.__name__}(") else plain_marks(text).split("\n\n")
 
 
-def plain_marks(text: str) -> str:
-    """Markdown's code marks, in the place of those of docstrings."""
-    return re.sub(r":\w+:`~?|``", "`", text)
-
-
 def _row(task: Task, block: Block, condition: str = "") -> tuple[str, ...]:
     axes = ",".join(_axis(task, block, place) for place in range(len(block.labels)))
     name = f"`{block.name}[{axes}]`" if axes else f"`{block.name}`"
@@ -250,14 +244,6 @@ def _axis(task: Task, block: Block, place: int) -> str:
     if labels == task.system.state_names:
         return "state"
     return "component" if place and labels == numbered(len(labels)) else "/".join(labels)
-
-
-def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
-    """Return a Markdown table, the columns of its source aligned."""
-    lines = [head, *(tuple(cell.replace("|", "\\|") for cell in row) for row in rows)]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(head) - 1)]
-    padded = ["| " + " | ".join(map(str.ljust, line, (*widths, 0))) + " |" for line in lines]
-    return "\n".join((padded[0], "|---" * len(head) + "|", *padded[1:]))
 
 
 def _options(words: list[str]) -> dict[str, Any]:

@@ -18,8 +18,7 @@ import numpy as np
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import KNOWLEDGE
 from fusion_gym.core.task import Task
-from fusion_gym.docstrings import read
-from fusion_gym.envs.pages import plain_marks, table
+from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.importing import named
 from fusion_gym.policies.base import Policy, owner_of
 from fusion_gym.policies.settings import parse_settings
