@@ -152,10 +152,8 @@ TABLE = {
         A2C, A2CConfig, "advantage actor-critic", "V. Mnih et al., ICML 2016 (arXiv 1602.01783)"
     ),
     "counterfactual_maskable_ppo": Algorithm(
-        CounterfactualMaskablePPO,
-        CounterfactualConfig,
-        "PPO with counterfactual credit and the mask of `maskable_ppo`",
-        _CREDIT,
+        CounterfactualMaskablePPO, CounterfactualConfig,
+        "PPO with counterfactual credit and the mask of `maskable_ppo`", _CREDIT,
     ),
     "counterfactual_ppo": Algorithm(
         CounterfactualPPO, CounterfactualConfig, "PPO with counterfactual credit", _CREDIT
@@ -164,34 +162,23 @@ TABLE = {
         DQN, DQNConfig, "deep Q-learning", "V. Mnih et al., arXiv 1312.5602", discrete_only=True
     ),
     "maskable_ppo": Algorithm(
-        MaskablePPO,
-        PPOConfig,
-        "PPO that cannot choose what the tokens do not allow",
+        MaskablePPO, PPOConfig, "PPO that cannot choose what the tokens do not allow",
         "S. Huang and S. Ontañón, arXiv 2006.14171",
     ),
     "ppo": Algorithm(
         PPO, PPOConfig, "proximal policy optimisation", "J. Schulman et al., arXiv 1707.06347"
     ),
     "recurrent_ppo": Algorithm(
-        RecurrentPPO,
-        RecurrentPPOConfig,
-        "PPO with an LSTM, for tasks that hide the sensors' signals",
-        "J. Schulman et al., arXiv 1707.06347",
-        "MlpLstmPolicy",
-        discrete_only=True,
+        RecurrentPPO, RecurrentPPOConfig, "PPO with an LSTM, for tasks that hide signals",
+        "J. Schulman et al., arXiv 1707.06347", "MlpLstmPolicy", discrete_only=True,
     ),
-}
+}  # fmt: skip
 
 
 def algorithm_table(_: str) -> str:
     """Return the algorithms as a Markdown table."""
     rows = (
-        (
-            f"`{name}`",
-            row.meaning,
-            "`Discrete`" if row.discrete_only else "all",
-            row.source,
-        )
+        (f"`{name}`", row.meaning, "`Discrete`" if row.discrete_only else "all", row.source)
         for name, row in TABLE.items()
     )
     return table(("algorithm", "meaning", "actions", "source"), rows)

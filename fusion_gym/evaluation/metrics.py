@@ -15,57 +15,48 @@ from fusion_gym.validation import ConfigurationError
 
 
 class Metric(NamedTuple):
-    """A row of the table: ``samples`` of the episodes' results, and what they mean.
+    """A row of the table: its meaning, which values are ``better``, and its ``samples``.
 
-    Of samples (E,) a summary has the mean with its 95 % bootstrap interval over episodes, of an
-    array with a column for each ``axis`` the means. ``column`` heads it in printed tables, where
-    ``form`` writes the mean, and ``interval`` adds the half width.
+    Samples are by default the field of :class:`EpisodeResults` of its name. Of samples (E,) a
+    summary has the mean with its 95 % bootstrap interval over episodes, of an array with a column
+    for each ``axis`` the means. ``column`` heads it in printed tables, where ``form`` writes the
+    mean, and ``interval`` adds the half width.
     """
 
-    samples: Callable[[EpisodeResults], Array]
     meaning: str
     better: Literal["lower", "higher", "1", ""] = ""
     axis: Literal["", "sensor", "state"] = ""
     column: str = ""
     form: str = ".3f"
     interval: bool = False
+    samples: Callable[[EpisodeResults], Array] | None = None
+
+    def summary(self, name: str, results: EpisodeResults) -> Any:
+        """Return what a summary has of it: an interval, or a list along its axis."""
+        found = self.samples(results) if self.samples else getattr(results, name)
+        return found.mean(0).tolist() if self.axis else mean_interval(found)._asdict()
 
 
 METRICS = {
     "mse": Metric(
-        lambda found: found.mse,
         "squared error of the fused estimate, summed over states, per step",
         "lower", column="MSE", form=".4g", interval=True,
     ),
     "armse": Metric(
-        lambda found: np.sqrt(found.squared_error),
         "root of the mean squared error over episodes, averaged over time",
-        "lower", axis="state",
+        "lower", "state", samples=lambda results: np.sqrt(results.squared_error),
     ),
     "bound_trace": Metric(
-        lambda found: found.bound_trace,
-        "trace of the claimed covariance, per step",
-        column="trace P", form=".4g",
+        "trace of the claimed covariance, per step", column="trace P", form=".4g"
     ),
-    "nees": Metric(
-        lambda found: found.nees,
-        "normalised squared error for each state: 1 for a consistent filter",
-        "1", column="NEES",
-    ),
-    "rate": Metric(
-        lambda found: found.rate, "transmissions per step", "lower", "sensor", column="rate"
-    ),
-    "requests": Metric(
-        lambda found: found.requests, "requests per step", axis="sensor", column="requests"
-    ),
-    "tokens": Metric(lambda found: found.tokens, "tokens spent per step", "lower", column="tokens"),
-    "denied": Metric(
-        lambda found: found.denied, "requests refused per step", "lower", column="denied"
-    ),
+    "nees": Metric("normalised squared error, divided by the states", "1", column="NEES"),
+    "rate": Metric("transmissions per step", "lower", "sensor", "rate"),
+    "requests": Metric("requests per step", axis="sensor", column="requests"),
+    "tokens": Metric("tokens spent per step", "lower", column="tokens"),
+    "denied": Metric("requests refused per step", "lower", column="denied"),
     "return": Metric(
-        lambda found: found.returns,
-        "sum of the rewards of an episode",
-        "higher", column="return", form=".4g", interval=True,
+        "sum of the rewards of an episode", "higher", column="return", form=".4g", interval=True,
+        samples=lambda results: results.returns,
     ),
 }  # fmt: skip
 
@@ -75,12 +66,7 @@ def summarise(results: EpisodeResults) -> dict[str, Any]:
 
     ``{"mean", "low", "high"}``, or a list with one number a sensor or a state.
     """
-    return {
-        name: metric.samples(results).mean(0).tolist()
-        if metric.axis
-        else mean_interval(metric.samples(results))._asdict()
-        for name, metric in METRICS.items()
-    }
+    return {name: metric.summary(name, results) for name, metric in METRICS.items()}
 
 
 def metric_table(_: str) -> str:

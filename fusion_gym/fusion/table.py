@@ -108,17 +108,9 @@ class Structure:
         return REASONS[rule.assumes].format(common=self.common)
 
 
-def offered(structure: Structure, sensors: int | None = None) -> list[str]:
-    """Return the names of the rules for these estimates, of so many sensors if they are given."""
-    rules = {name: rule for name, rule in RULES.items() if structure.refusal(rule) is None}
-    if sensors is None:
-        return list(rules)
-    estimates = sensors + structure.prediction
-    return [
-        name
-        for name, rule in rules.items()
-        if not (rule.pair and estimates != 2) and not (rule.cubic and sensors > MOST_TOGETHER)
-    ]
+def offered(structure: Structure) -> list[str]:
+    """Return the names of the rules that are sound for these estimates."""
+    return [name for name, rule in RULES.items() if structure.refusal(rule) is None]
 
 
 def choose_rule(
@@ -148,7 +140,7 @@ def choose_rule(
             f"estimates{prediction}; it must be 'sici' (two at a time) for more"
         )
     if rule.cubic and sensors > MOST_TOGETHER:
-        others = offered(structure, sensors)
+        others = [key for key in known if not RULES[key].cubic and not RULES[key].pair]
         instead = f", so it must be {' or '.join(map(repr, others))}" if others else ""
         raise ConfigurationError(
             f"fusion = {name!r} is not allowed with {sensors} sensors: it joins the estimates of "

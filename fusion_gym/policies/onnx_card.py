@@ -16,8 +16,7 @@ from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.options import plain
 from fusion_gym.core.system import MEANING, Block, numbered
 from fusion_gym.envs.views import SensorView
-from fusion_gym.policies.card import ALGORITHMS
-from fusion_gym.policies.model import ModelPolicy
+from fusion_gym.policies.model import ALGORITHMS, ModelPolicy
 from fusion_gym.policies.onnx_graph import DecisionGraph, Shapes
 from fusion_gym.version import __version__
 
