@@ -198,11 +198,10 @@ class Quantiles(Shape):
 
 # A policy in the JSON of an evaluation: an interval for a metric, or a list.
 _Row = Annotated[list[float], pydantic.Field(min_length=1)]
-EVALUATED = pydantic.create_model(
-    "EVALUATED",
-    __base__=Shape,
-    **{name: (_Row if metric.axis else Interval, ...) for name, metric in METRICS.items()},
-)
+_FIELDS: dict[str, Any] = {
+    name: (_Row if metric.axis else Interval, ...) for name, metric in METRICS.items()
+}
+EVALUATED = pydantic.create_model("EVALUATED", __base__=Shape, **_FIELDS)
 
 
 class Evaluation(Shape):
