@@ -8,6 +8,7 @@ import inspect
 import itertools
 import re
 import textwrap
+from collections.abc import Mapping
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -71,14 +72,17 @@ _hints_of = functools.cache(hints)  # for every object of options is checked
 
 
 def check(options: Any) -> None:
-    """Check the options that are declared as ``Literal`` or ``bool``.
+    """Check the options that are declared as ``Literal``, ``bool`` or a name of a table.
+
+    Names that a function offers are left to it, for it says why others are refused.
 
     Raises:
         ConfigurationError: a value that the type does not have.
     """
     for name, hint in _hints_of(options.__class__).items():
         value, parts = getattr(options, name), _parts(hint)
-        if (value is None and NoneType in parts) or get_origin(hint) is Annotated:
+        table = hint.__metadata__[0] if get_origin(hint) is Annotated else {}
+        if (value is None and NoneType in parts) or not isinstance(table, Mapping):
             continue
         if allowed := choices(hint):
             validation.choice(name, value, allowed)

@@ -26,7 +26,6 @@ from fusion_gym.agents.suite.robustness import load_robustness
 from fusion_gym.envs import pages
 from fusion_gym.envs.option_text import options_in
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
-from fusion_gym.policies.registry import policy_names
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -107,12 +106,6 @@ def test_files_and_names_of_the_library_that_the_texts_name_exist() -> None:
     assert len(names) > 10
     assert not [name for name in files if "/my_" not in name and not (ROOT / name).exists()]
     assert not [name for name in names if pydoc.locate(name) is None]
-
-
-def test_every_policy_is_on_its_page() -> None:
-    page = (ROOT / "docs" / "policies.md").read_text()
-    missing = [name for name in policy_names() if not re.search(rf"`{name}(:\w+)?`", page)]
-    assert not missing
 
 
 def test_the_committed_report_says_what_the_results_say() -> None:

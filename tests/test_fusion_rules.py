@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import ConfigurationError
 from fusion_gym.fusion.intersection import SequentialIntersection
-from fusion_gym.fusion.table import REASONS, RULES, Assumption, Structure, choose_rule
+from fusion_gym.fusion.table import REASONS, RULES, Assumption, Structure, choose_rule, offered
 
 Array = NDArray[np.float64]
 RUNS = 40
@@ -33,7 +33,7 @@ def silences(count: int) -> NDArray[np.bool_]:
 @pytest.mark.parametrize("rule", RULES)
 def test_gains_make_the_mean_and_add_up_to_one(rule: str) -> None:
     means, joint = estimates(rule)
-    fused = RULES[rule].make(None).fuse(means, joint)
+    fused = RULES[rule].make().fuse(means, joint)
     identity = np.broadcast_to(np.eye(3)[..., None], fused.covariance.shape)
     np.testing.assert_allclose(fused.gains.sum(0), identity, atol=1e-9)
     np.testing.assert_allclose(
@@ -48,7 +48,7 @@ def test_gains_make_the_mean_and_add_up_to_one(rule: str) -> None:
 def test_the_silent_are_not_read_and_count_for_nothing(rule: str) -> None:
     """Each lane is what the active estimates alone give; nobody gives nothing."""
     means, joint = estimates(rule)
-    active, fusion = silences(len(means)), RULES[rule].make(None)
+    active, fusion = silences(len(means)), RULES[rule].make()
     dirty, pairs = np.where(active[:, None], means, np.nan), active[:, None] & active
     fused = fusion.fuse(dirty, np.where(pairs[:, :, None, None], joint, np.nan), active)
     for run in range(RUNS):
@@ -68,7 +68,7 @@ def test_the_silent_are_not_read_and_count_for_nothing(rule: str) -> None:
 def test_a_covariance_is_claimed_where_the_assumption_holds(rule: str) -> None:
     """For this joint covariance, of errors that are correlated in no special way."""
     means, joint = estimates(rule)
-    fused = RULES[rule].make(None).fuse(means, joint)
+    fused = RULES[rule].make().fuse(means, joint)
     actual = np.einsum("aijN,abjkN,blkN->ilN", fused.gains, joint, fused.gains)
     margin = np.linalg.eigvalsh(np.moveaxis(fused.covariance - actual, -1, 0))[:, 0]
     scale = np.einsum("iiN->N", actual)
@@ -103,8 +103,10 @@ def test_assumptions_are_known_by_name() -> None:
 
 @pytest.mark.parametrize("name", ["cii", "", 3, None, ["ci"]])
 def test_an_unknown_rule_is_refused(name: Any) -> None:
-    with pytest.raises(ConfigurationError, match=r"fusion = .* one of 'sici', 'sci', 'ci', 'ici'"):
-        choose_rule(name, Structure("all contain the same noise"), 2)
+    structure = Structure("all contain the same noise")
+    known = ", ".join(map(repr, offered(structure)))
+    with pytest.raises(ConfigurationError, match=f"fusion = .* one of {known}"):
+        choose_rule(name, structure, 2)
 
 
 def test_the_prediction_comes_before_the_sensors() -> None:
@@ -123,6 +125,6 @@ def test_one_alone_everywhere_is_kept(rule: str) -> None:
     means, joint = estimates(rule)
     active = np.zeros((len(means), RUNS), dtype=np.bool_)
     active[1] = True
-    fused = RULES[rule].make(None).fuse(means, joint, active)
+    fused = RULES[rule].make().fuse(means, joint, active)
     np.testing.assert_allclose(fused.mean, means[1], rtol=1e-9)
     np.testing.assert_allclose(fused.covariance, joint[1, 1], rtol=1e-9)

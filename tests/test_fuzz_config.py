@@ -21,30 +21,19 @@ from fusion_gym.agents.training.run import check
 
 Content = dict[str, Any]
 _UNKNOWN = ("nobody_knows_this",)
-NAMES = {
-    "a2c": "tobit_oscillator_a2c",
-    "counterfactual_maskable_ppo": "tobit_oscillator_front",
-    "counterfactual_ppo": "biased_tracking_front",
-    "dqn": "remote_estimation_dqn",
-    "maskable_ppo": "tobit_oscillator_maskable_ppo",
-    "ppo": "remote_estimation_ppo",
-    "recurrent_ppo": "tobit_oscillator_recurrent_ppo",
-}
+SMALL = {"network": {"hidden": [4], "activation": "tanh"}, "batch_size": 8}
+SMALL |= {"buffer_size": 100, "n_steps": 8}
 
 
 def plain(kind: str) -> Content:
-    """A shipped config of this algorithm with all its fields, small enough to make in no time."""
-    content = load(Experiment, NAMES[kind]).model_dump(mode="json")
+    """A config of this algorithm with all its fields, small enough to make in no time."""
+    content = load(Experiment, "remote_estimation_ppo").model_dump(mode="json")
     content["environment"]["options"]["horizon"] = 20
-    content["algorithm"]["name"] = kind
+    if TABLE[kind].discrete_only:
+        content["environment"]["options"]["action"] = "discrete"
     content["training"]["num_envs"] = 2
-    content["algorithm"] |= {"network": {"hidden": [4], "activation": "tanh"}, "batch_size": 8}
-    if kind == "a2c":
-        del content["algorithm"]["batch_size"]
-    if kind == "dqn":
-        content["algorithm"]["buffer_size"] = 100
-    else:
-        content["algorithm"]["n_steps"] = 8
+    content["algorithm"] = TABLE[kind].config(name=kind).model_dump(mode="json")
+    content["algorithm"] |= {key: SMALL[key] for key in SMALL.keys() & content["algorithm"].keys()}
     return content
 
 

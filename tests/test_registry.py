@@ -76,10 +76,7 @@ def test_a_maker_is_given_the_task_and_says_what_is_missing(task: Task) -> None:
         return Steady("clock", gain)
 
     register_policy("gains", make, "reference")
-    assert policy_names("reference") == [
-        "estimate_difference", "gains", "kullback_leibler", "lookahead", "optimal",
-        "periodic_optimum", "rollout", "value_of_information", "whittle",
-    ]  # fmt: skip
+    assert "gains" in policy_names("reference")
     policy: Any = make_policy("gains:gain=2", task)
     assert policy.number == 2
     with pytest.raises(ConfigurationError, match="policy 'gains' needs a parameter 'gain'"):

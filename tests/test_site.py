@@ -9,50 +9,26 @@ from pathlib import Path
 import pytest
 
 from fusion_gym.envs.registration import ENVIRONMENTS
-from fusion_gym.fusion.table import RULES
-from fusion_gym.policies.registry import policy_names
-from website import check, environment_pages, parts, places
-from website.docstrings import told
+from website import check, environment_pages, part_pages, parts, places
 from website.narrow import too_wide
 from website.navigation import navigation
 
 
-def test_every_policy_filter_and_fusion_rule_has_an_equation() -> None:
-    assert parts.equations("rules").keys() == {*policy_names("rule"), *policy_names("reference")}
-    assert parts.equations("fusion").keys() == RULES.keys()
-    assert parts.equations("filters").keys() == parts.FILTERS.keys()
-
-
-def test_every_filter_that_an_environment_offers_has_a_page() -> None:
-    paged = {(value, one) for _, _, value, ids in parts.FILTERS.values() for one in ids}
-    offered = {(v, one) for one, values in parts.offered("filter").items() for v in values}
-    assert offered
-    assert offered == {pair for pair in paged if pair[0]} | parts.ALSO.keys()
-
-
-def test_every_fusion_rule_that_an_environment_offers_has_a_page() -> None:
-    offered = {value for values in parts.offered("fusion").values() for value in values}
-    assert {"federated", "matrix", "ci", "ici", "sci", "sici", "exact_ci"} == offered
-
-
-def test_a_docstring_without_an_assumption_is_told() -> None:
-    def bare() -> None:
-        """What it is.
-
-        Source: nobody.
-        """
-
-    with pytest.raises(ValueError, match="no Assumes in its text"):
-        told(bare)
+@pytest.mark.parametrize("folder", parts.KIND_NAMES)
+def test_every_page_has_equation_assumption_and_source(folder: str) -> None:
+    pages = part_pages.pages(folder, {})
+    overview = pages.pop(f"{folder}/index.md")
+    assert len(pages) > 7
+    for place, text in pages.items():
+        assert f"({Path(place).name})" in overview
+        for head in ("Equation", "What it assumes", "Source"):
+            body = re.search(rf"^## {head}\n\n(.+?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL)
+            assert body is not None, f"{place}: {head}"
+            assert len(body[1].strip()) > 5
 
 
 def test_environment_pages_get_their_tables() -> None:
-    paged = {
-        env_id
-        for page in set(parts.PAGES_OF.values())
-        for env_id in environment_pages.of_page(page)
-    }
-    assert paged == ENVIRONMENTS.keys()
+    assert places.pages_of().keys() == ENVIRONMENTS.keys()
     text = environment_pages.with_tables("# A page\n\nText.\n\n## One\n\nMore.\n", "biased")
     heads = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     assert heads[:3] == ["A page", "One", "From the code"]

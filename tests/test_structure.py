@@ -13,6 +13,7 @@ ROOT = Path(__file__).parent.parent
 FLOORS = {
     "arrays": 0,
     "declaration": 0,
+    "docstrings": 0,
     "errors": 0,
     "gaussian": 0,
     "importing": 0,

@@ -11,26 +11,15 @@ import yaml
 from fusion_gym.agents.training.algorithms import TABLE
 
 ENV = "fusion_gym/TobitOscillator-v0"
-PPO = {"n_steps": 16, "batch_size": 128, "n_epochs": 1}
+_SIZES = {"n_steps": 16, "batch_size": 128, "n_epochs": 1, "memory": 8}
+_SIZES |= {"buffer_size": 2000, "learning_starts": 100}
 SMALL: dict[str, dict[str, Any]] = {
-    "ppo": {"name": "ppo"} | PPO,
-    "maskable_ppo": {"name": "maskable_ppo"} | PPO,
-    "recurrent_ppo": {"name": "recurrent_ppo", "memory": 8} | PPO,
-    "counterfactual_ppo": {"name": "counterfactual_ppo"} | PPO,
-    "counterfactual_maskable_ppo": {
-        "name": "counterfactual_maskable_ppo",
-        "alternatives": "flips",
-        **PPO,
-    },
-    "a2c": {"name": "a2c", "n_steps": 8},
-    "dqn": {
-        "name": "dqn",
-        "buffer_size": 2000,
-        "learning_starts": 100,
-        "batch_size": 32,
-        "learning_rate_end": 1e-4,
-    },
+    kind: {"name": kind} | {k: v for k, v in _SIZES.items() if k in row.config.model_fields}
+    for kind, row in TABLE.items()
 }
+SMALL["a2c"]["n_steps"] = 8
+SMALL["counterfactual_maskable_ppo"]["alternatives"] = "flips"
+SMALL["dqn"] |= {"batch_size": 32, "learning_rate_end": 1e-4}
 
 
 def small_config(folder: Path, kind: str = "ppo", **changes: Any) -> Path:

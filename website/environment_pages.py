@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import inspect
 import re
-import sys
-from collections.abc import Sequence
 
 import fusion_gym
+from fusion_gym.docstrings import table
 from fusion_gym.envs.pages import page
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 from fusion_gym.envs.views import make_view
-from website.parts import ALSO, FILTERS, PAGES_OF, offered
-from website.places import DOCS
+from website.papers import paper_of
+from website.parts import filter_slug
+from website.places import DOCS, pages_of
 
 SECTIONS = ("Action space", "Reward", "Episode end", "Info")
 
 
 def of_page(name: str) -> list[str]:
     """Ids of the environments that a page tells of."""
-    return [env_id for env_id in ENVIRONMENTS if PAGES_OF.get(env_id) == name]
+    return [env_id for env_id in ENVIRONMENTS if pages_of().get(env_id) == name]
 
 
 def at_a_glance(env_id: str) -> str:
@@ -35,14 +34,20 @@ def at_a_glance(env_id: str) -> str:
         ("action", f"`{view.actions}`"),
         ("steps of an episode", str(task.horizon)),
     ]
-    if names := offered("filter")[env_id]:
-        rows.append(("filters", ", ".join(_filter_link(env_id, name) for name in names)))
-    if names := offered("fusion")[env_id]:
+    kind = options_of(env_id)
+    links = [
+        f"[`{name or owner.__name__}`](filters/{filter_slug(owner)}.md)"
+        for name, owner in kind.filters.items()
+    ]
+    if links:
+        rows.append(("filters", ", ".join(links)))
+    if kind.structure is not None:
+        names = kind.structure.offered
         rows.append(("fusion", ", ".join(f"[`{name}`](fusion/{name}.md)" for name in names)))
-    paper = _paper(env_id)
+    paper = paper_of(env_id)
     if (DOCS / "reproduction" / f"{paper}.md").exists():
         rows.append(("made anew", f"[the paper's figures and claims](reproduction/{paper}.md)"))
-    return _table(("", env_id.split("/")[1]), rows)
+    return table(("", env_id.split("/")[1]), rows)
 
 
 def sections(env_id: str) -> str:
@@ -61,25 +66,3 @@ def with_tables(text: str, name: str) -> str:
     overview = "\n\n".join(at_a_glance(env_id) for env_id in every)
     tail = "\n\n".join(["## From the code", *(sections(env_id) for env_id in every)])
     return f"{head.strip()}\n\n{overview}\n{mark}{body.strip()}\n\n{tail}\n"
-
-
-def _filter_link(env_id: str, name: str) -> str:
-    found = [
-        slug for slug, (_, _, value, ids) in FILTERS.items() if value == name and env_id in ids
-    ]
-    slug = found[0] if found else ALSO.get((name, env_id))
-    return f"[`{name}`](filters/{slug}.md)" if slug else f"`{name}`"
-
-
-def _paper(env_id: str) -> str:
-    """The word by which the module of the environment's options names its paper."""
-    module = inspect.getdoc(sys.modules[options_of(env_id).__module__]) or ""
-    found = re.search(r"^Source: (\w+)", module, re.MULTILINE)
-    return found[1] if found else ""
-
-
-def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
-    lines = [head, tuple("---" for _ in head), *rows]
-    return "\n".join(
-        "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in lines
-    )

@@ -7,63 +7,28 @@ from typing import Any
 
 import numpy as np
 
-import fusion_gym
 from fusion_gym.agents.output import palette
 from fusion_gym.agents.output.palette import plt
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
+from fusion_gym.envs.pages import task_of
 from fusion_gym.policies.base import owner_of
 from fusion_gym.policies.registry import make_policy
+from website.parts import Part, example_of
 
 STEPS = 80
-_TOBIT = (
-    "fusion_gym/TobitOscillator-v0",
-    {"filter": "tobit", "random_start": True, "token_rate": 2.0},
-)
-_MEMORY = (_TOBIT[0], {**_TOBIT[1], "memory": True})
-_MARKOV: tuple[str, dict[str, Any]] = ("fusion_gym/MarkovJumpTracking-v0", {})
-_REMOTE: tuple[str, dict[str, Any]] = ("fusion_gym/RemoteEstimation-v0", {})
-_TWO = (_REMOTE[0], {"sensors": 2, "cost_weight": 5.0})
-# What is asked of which environment; elsewhere the name alone, of the Tobit oscillator.
-SETTINGS: dict[str, tuple[str, tuple[str, dict[str, Any]]]] = {
-    "adaptive_innovation": ("adaptive_innovation", ("fusion_gym/CorrelatedTracking-v0", {})),
-    "always": ("always", (_TOBIT[0], {**_TOBIT[1], "tokens": "unlimited"})),
-    "adaptive_threshold": ("adaptive_threshold", ("fusion_gym/UnknownInput-v0", {})),
-    "centre_variance": ("centre_variance:threshold=2.5", _MARKOV),
-    "dynamic_event": ("dynamic_event:scale=3", _TOBIT),
-    "estimate_difference": ("estimate_difference:threshold=0.25", _MEMORY),
-    "information_gain": ("information_gain:threshold=0.2", _TOBIT),
-    "innovation_threshold": ("innovation_threshold:threshold=1.2", _TOBIT),
-    "kullback_leibler": ("kullback_leibler:threshold=0.8,at_most=1", _MEMORY),
-    "local_variance": ("local_variance:m=0.9", _MARKOV),
-    "lookahead": ("lookahead:price=0.03", _MEMORY),
-    "optimal": ("optimal", _REMOTE),
-    "paced": ("paced:rate=0.07", _TOBIT),
-    "periodic": ("periodic:period=15", _TOBIT),
-    "periodic_optimum": ("periodic_optimum:packets=2,period=6", _MARKOV),
-    "random": ("random:rate=0.07", _TOBIT),
-    "rollout": (
-        "rollout:samples=8,price=0.03,base=value_of_information:price=0.006,at_most=1",
-        _MEMORY,
-    ),
-    "round_robin": ("round_robin:period=5", _TOBIT),
-    "send_on_delta": ("send_on_delta:threshold=3", _TOBIT),
-    "stochastic_event": ("stochastic_event:weight=0.3", _TOBIT),
-    "value_of_information": ("value_of_information:threshold=0.03,at_most=1", _MEMORY),
-    "variance_threshold": ("variance_threshold:threshold=0.25", _TOBIT),
-    "whittle": ("whittle:price=5", _TWO),
-}
 _KNOWING = {
     "own_memory": palette.RULES_MEMORY,
     "coordinator_memory": palette.RULES_MEMORY,
 }
 
 
-def drawn(name: str, reference: bool) -> tuple[bytes, str]:
-    """The figure of a policy as SVG, and its caption."""
-    spec, (env_id, options) = SETTINGS.get(name, (name, _TOBIT))
-    task = fusion_gym.make_task(env_id, **options)
+def drawn(part: Part) -> tuple[bytes, str]:
+    """The figure of a policy's example as SVG, and its caption."""
+    spec, env = example_of(part)
+    task = task_of(env)
     errors, granted, denied, known = _episode(task, spec)
+    reference = part.kind == "reference"
     style = palette.REFERENCE if reference else _KNOWING.get(known, palette.RULES)
     with plt.rc_context({**palette.LARGE, "svg.fonttype": "path"}):
         figure, (above, below) = plt.subplots(
@@ -85,7 +50,7 @@ def drawn(name: str, reference: bool) -> tuple[bytes, str]:
         image = io.BytesIO()
         figure.savefig(image, format="svg", metadata={"Date": None})
         plt.close(figure)
-    return image.getvalue(), _caption(spec, env_id, errors, granted, denied)
+    return image.getvalue(), _caption(spec, env.split()[0], errors, granted, denied)
 
 
 def _caption(spec: str, env_id: str, errors: Any, granted: Any, denied: Any) -> str:

@@ -9,20 +9,19 @@ import numpy as np
 from fusion_gym.agents.output import palette
 from fusion_gym.agents.output.palette import plt
 from fusion_gym.fusion.table import RULES
+from website.parts import Part
 
 FIRST = np.array([[4.0, 1.2], [1.2, 1.0]])
 SECOND = np.array([[1.0, -0.5], [-0.5, 3.0]])
 MEANS = np.array([[0.0, 0.0], [0.7, 0.5]])
 SHARED = 0.5  # of each estimate's error, as a correlation of the whitened errors
-# Rules whose claim holds only if the two errors are independent.
-NEED_INDEPENDENCE = ("federated", "information")
 
 
-def drawn(name: str) -> tuple[bytes, str]:
+def drawn(part: Part) -> tuple[bytes, str]:
     """The figure of a fusion rule as SVG, and its caption."""
-    joint = _joint()
-    given = joint if name == "matrix" else np.stack((FIRST, SECOND))
-    fused = RULES[name].make(None).fuse(MEANS[..., None], given[..., None])
+    joint, rule = _joint(), RULES[part.name]
+    given = joint if rule.assumes == "joint covariance" else np.stack((FIRST, SECOND))
+    fused = rule.make().fuse(MEANS[..., None], given[..., None])
     gains, claimed = fused.gains[..., 0], fused.covariance[..., 0]
     actual = sum(gains[i] @ joint[i, j] @ gains[j].T for i in range(2) for j in range(2))
     with plt.rc_context({**palette.LARGE, "svg.fonttype": "path"}):
@@ -45,7 +44,7 @@ def drawn(name: str) -> tuple[bytes, str]:
         plt.close(figure)
     holds = bool(np.linalg.eigvalsh(claimed - actual).min() > -1e-9)
     return image.getvalue(), _caption(
-        name, holds, float(np.trace(claimed)), float(np.trace(actual))
+        part.name, holds, float(np.trace(claimed)), float(np.trace(actual))
     )
 
 

@@ -55,7 +55,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for (kind, name), (image, caption) in _figures().items():
         captions[kind][name] = caption
         add(f"{kind}/{name}.svg", image)
-    for kind in part_pages.KINDS:
+    for kind in parts.KIND_NAMES:
         for place, text in part_pages.pages(kind, captions[kind]).items():
             add(place, _RANKED.format(_FIRST) + text)
     for place, text in reference.pages().items():
@@ -80,14 +80,12 @@ def on_page_content(html: str, **kwargs: Any) -> str:
 
 def _figures() -> dict[tuple[str, str], tuple[bytes, str]]:
     """The made figures with their captions, drawn by as many processes as there are cores."""
-    asked: list[tuple[str, str, Any]] = [
-        ("fusion", part.slug, (fusion_figures.drawn, part.slug)) for part in parts.fusions()
+    asked: list[tuple[str, Any, Any]] = [
+        *(("fusion", fusion_figures.drawn, part) for part in parts.fusions()),
+        *(("rules", episode_figures.drawn, part) for part in parts.policies()),
     ]
-    for part in parts.policies():
-        reference_ = part.kind == "reference"
-        asked.append(("rules", part.slug, (episode_figures.drawn, part.slug, reference_)))
     with ProcessPoolExecutor(min(2, os.cpu_count() or 1)) as pool:
-        running = {(kind, name): pool.submit(*task) for kind, name, task in asked}
+        running = {(kind, part.name): pool.submit(draw, part) for kind, draw, part in asked}
         return {key: future.result() for key, future in running.items()}
 
 

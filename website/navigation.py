@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from typing import Any
 
 from website import reference
-from website.parts import KIND_NAMES, slugs
-from website.places import DOCS
+from website.parts import KIND_NAMES, parts
+from website.places import DOCS, pages_of
 
 # Titles are short here, for a phone; pages that are not named stand at the end of "Use".
 _USE = (
@@ -24,15 +24,6 @@ _USE = (
     ("Many machines", "cluster.md"),
     ("The demo", "demo.md"),
     ("Versions", "versions.md"),
-)
-_ENVIRONMENTS = (
-    ("Tobit oscillator", "tobit_oscillator.md"),
-    ("Correlated tracking", "correlated_tracking.md"),
-    ("Markov jump tracking", "markov_jump.md"),
-    ("Unknown input", "unknown_input.md"),
-    ("Remote estimation", "remote_estimation.md"),
-    ("Biased oscillator and target", "biased.md"),
-    ("Linear fusion: your own", "linear_fusion.md"),
 )
 _TUTORIALS = (
     ("A first trigger of your own", "tutorials/first_trigger.md"),
@@ -57,22 +48,20 @@ def navigation() -> list[Any]:
         ("How one step works", "step.md"),
         ("For newcomers", "newcomer.md"),
     ]
-    named = {
-        page
-        for group in (start, _USE, _ENVIRONMENTS, _BENCHMARK, _CONTRIBUTING)
-        for _, page in group
-    }
+    environments = list(dict.fromkeys(f"{page}.md" for page in pages_of().values()))
+    groups = (start, _USE, _BENCHMARK, _CONTRIBUTING)
+    named = {page for group in groups for _, page in group} | set(environments)
     others = sorted(path.name for path in DOCS.glob("*.md") if path.name not in named)
-    parts = {
-        kind: [f"{kind}/index.md", *(f"{kind}/{slug}.md" for slug in slugs(kind))]
+    made = {
+        kind: [f"{kind}/index.md", *(f"{kind}/{part.name}.md" for part in parts(kind))]
         for kind in KIND_NAMES
     }
     return [
         {"Start": _there(start)},
         {"Tutorials": _there(_TUTORIALS) + _unnamed("tutorials", _TUTORIALS)},
         {"Use": _there(_USE) + others},
-        {"Environments": _there(_ENVIRONMENTS)},
-        {"Parts": [{KIND_NAMES[kind]: pages} for kind, pages in parts.items()]},
+        {"Environments": environments},
+        {"Parts": [{KIND_NAMES[kind]: pages} for kind, pages in made.items()]},
         {
             "Results": [
                 {"Report": "results/report.md"},

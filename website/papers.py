@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import re
+import sys
 
-from website.places import DOCS
+from fusion_gym.docstrings import read
+from fusion_gym.envs.registration import options_of
+from website.places import DOCS, pages_of
 
-# The page of the environment that cites the paper of which docstrings speak by this word.
-PAPERS = {
-    "tobit_token_bucket": "tobit_oscillator",
-    "adaptive_innovation": "correlated_tracking",
-    "markov_jump": "markov_jump",
-    "unknown_input": "unknown_input",
-    "round_robin_tobit": "biased",
-}
+
+def paper_of(env_id: str) -> str:
+    """The word by which the module of the environment's options names its paper, or nothing."""
+    module = read(sys.modules[options_of(env_id).__module__]).labelled.get("Source", "")
+    return re.split(r"\W", module)[0]
 
 
 def citations(text: str) -> list[str]:
     """What the papers are of which a text speaks by their words, with links to what is made."""
-    found = []
-    for word, page in PAPERS.items():
-        if re.search(rf"\b{word}\b(?![./])", text):
+    found, seen = [], set()
+    for env_id, page in pages_of().items():
+        word = paper_of(env_id)
+        if word and page not in seen and re.search(rf"\b{word}\b(?![./])", text):
+            seen.add(page)
             source = re.search(r"^Source: (.*?)\n\n", _doc(page), re.MULTILINE | re.DOTALL)
             assert source is not None, page
             cited = " ".join(source[1].split()).replace(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import posixpath
 import re
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -20,6 +21,13 @@ PAGES = {
 _SOURCES = {page: source for source, page in PAGES.items()}
 _LINK = re.compile(r"(\]\()([^)\s#]*)(#[^)\s]*)?(\))")
 _CODE = re.compile(r"(^```.*?^```)", re.DOTALL | re.MULTILINE)
+
+
+@cache
+def pages_of() -> dict[str, str]:
+    """The page of each environment by its id, as the README's table has them, without ".md"."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    return dict(re.findall(r"\[`(fusion_gym/[\w-]+)`\]\(docs/(\w+)\.md\)", text))
 
 
 def source_of(page: str) -> str:

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from fusion_gym.evaluation.intervals import Interval
+from fusion_gym.evaluation.metrics import METRICS, Metric
 
 
 def console() -> Console:
@@ -52,26 +53,24 @@ def evaluation_table(
     differences: Mapping[str, Interval],
 ) -> Table:
     """One row a policy; ``differences`` to a reference may be empty."""
-    columns = ["policy", "MSE", "median", "rate", "requests", "tokens", "denied"]
-    columns += ["trace P", "NEES", "return", *(["MSE - reference"] if differences else [])]
+    metrics = {name: metric for name, metric in METRICS.items() if metric.column}
+    columns = ["policy", *(metric.column for metric in metrics.values()), "median"]
+    columns += ["MSE - reference"] if differences else []
     rows = []
     for name, found in policies.items():
-        row = [
-            name,
-            number(found["mse"]),
-            f"{quantiles[name]['median']:.4g}",
-            f"{sum(found['rate']) / len(found['rate']):.3f}",
-            f"{sum(found['requests']) / len(found['requests']):.3f}",
-            f"{found['tokens']['mean']:.3f}",
-            f"{found['denied']['mean']:.3f}",
-            f"{found['bound_trace']['mean']:.4g}",
-            f"{found['nees']['mean']:.3f}",
-            number(found["return"]),
-        ]
+        row = [name, *(_cell(metric, found[key]) for key, metric in metrics.items())]
+        row.append(f"{quantiles[name]['median']:.4g}")
         if differences:
             row.append(difference(differences[name]) if name in differences else "reference")
         rows.append(row)
     return table(title, columns, rows, _CAPTION)
+
+
+def _cell(metric: Metric, found: Any) -> str:
+    """A metric's mean, over sensors where it has one for each, with its half width if shown."""
+    if metric.interval:
+        return number(found)
+    return format(sum(found) / len(found) if metric.axis else found["mean"], metric.form)
 
 
 def state_table(states: Sequence[str], policies: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -82,6 +81,6 @@ def state_table(states: Sequence[str], policies: Mapping[str, Mapping[str, Any]]
 
 
 _CAPTION = (
-    "mean ± half width of the 95 % bootstrap interval, and median, over episodes; rate and "
-    "requests per sensor and step, tokens and denied per step; NEES is 1 for a consistent filter"
+    "mean ± half width of the 95 % bootstrap interval, and median of the MSE, over episodes; rate "
+    "and requests per sensor and step, tokens and denied per step; NEES 1 is a consistent filter"
 )

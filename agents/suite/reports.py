@@ -6,12 +6,13 @@ The files hold more than this; nothing is converted.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import pydantic
 from pydantic import FiniteFloat, NonNegativeInt
 
 from fusion_gym.core.system import Knowledge
+from fusion_gym.evaluation.metrics import METRICS
 
 from ..input.files import checked
 from ..output.files import read_json
@@ -195,22 +196,18 @@ class Quantiles(Shape):
     median: float
 
 
-class Evaluated(Policy):
-    """A policy in the JSON of an evaluation."""
-
-    requests: list[float] = pydantic.Field(min_length=1)
-    armse: list[float]
-    tokens: Mean
-    denied: Mean
-    bound_trace: Mean
-    nees: Mean
-    total: Interval = pydantic.Field(alias="return")
+# A policy in the JSON of an evaluation: an interval for a metric, or a list.
+_Row = Annotated[list[float], pydantic.Field(min_length=1)]
+_FIELDS: dict[str, Any] = {
+    name: (_Row if metric.axis else Interval, ...) for name, metric in METRICS.items()
+}
+EVALUATED = pydantic.create_model("EVALUATED", __base__=Shape, **_FIELDS)
 
 
 class Evaluation(Shape):
     """The JSON of an evaluation."""
 
-    policies: dict[str, Evaluated]
+    policies: dict[str, EVALUATED]  # type: ignore[valid-type]
     quantiles: dict[str, Quantiles]
 
     @pydantic.model_validator(mode="after")

@@ -16,6 +16,7 @@ from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 
+from fusion_gym.docstrings import table
 from fusion_gym.validation import choice
 
 from .checked import Positive, Rate, Several, Share, Strict, Weight
@@ -127,13 +128,15 @@ class DQNConfig(AlgorithmConfig):
 
 @dataclass(frozen=True)
 class Algorithm:
-    """A row: the class, its settings, its kind of policy, whether it knows Discrete actions only.
+    """A row: class, settings, meaning, source, kind of policy, whether Discrete actions only.
 
     RecurrentPPO accepts MultiBinary actions and then fails on them while it trains.
     """
 
     model: type[BaseAlgorithm]
     config: type[AlgorithmConfig]
+    meaning: str
+    source: str
     policy: str = "MlpPolicy"
     discrete_only: bool = False
 
@@ -143,15 +146,42 @@ class Algorithm:
         return issubclass(self.model, Counterfactual)
 
 
+_CREDIT = "this library ([Learning](learning.md))"
 TABLE = {
-    "a2c": Algorithm(A2C, A2CConfig),
-    "counterfactual_maskable_ppo": Algorithm(CounterfactualMaskablePPO, CounterfactualConfig),
-    "counterfactual_ppo": Algorithm(CounterfactualPPO, CounterfactualConfig),
-    "dqn": Algorithm(DQN, DQNConfig, discrete_only=True),
-    "maskable_ppo": Algorithm(MaskablePPO, PPOConfig),
-    "ppo": Algorithm(PPO, PPOConfig),
-    "recurrent_ppo": Algorithm(RecurrentPPO, RecurrentPPOConfig, "MlpLstmPolicy", True),
-}
+    "a2c": Algorithm(
+        A2C, A2CConfig, "advantage actor-critic", "V. Mnih et al., ICML 2016 (arXiv 1602.01783)"
+    ),
+    "counterfactual_maskable_ppo": Algorithm(
+        CounterfactualMaskablePPO, CounterfactualConfig,
+        "PPO with counterfactual credit and the mask of `maskable_ppo`", _CREDIT,
+    ),
+    "counterfactual_ppo": Algorithm(
+        CounterfactualPPO, CounterfactualConfig, "PPO with counterfactual credit", _CREDIT
+    ),
+    "dqn": Algorithm(
+        DQN, DQNConfig, "deep Q-learning", "V. Mnih et al., arXiv 1312.5602", discrete_only=True
+    ),
+    "maskable_ppo": Algorithm(
+        MaskablePPO, PPOConfig, "PPO that cannot choose what the tokens do not allow",
+        "S. Huang and S. Ontañón, arXiv 2006.14171",
+    ),
+    "ppo": Algorithm(
+        PPO, PPOConfig, "proximal policy optimisation", "J. Schulman et al., arXiv 1707.06347"
+    ),
+    "recurrent_ppo": Algorithm(
+        RecurrentPPO, RecurrentPPOConfig, "PPO with an LSTM, for tasks that hide signals",
+        "J. Schulman et al., arXiv 1707.06347", "MlpLstmPolicy", discrete_only=True,
+    ),
+}  # fmt: skip
+
+
+def algorithm_table(_: str) -> str:
+    """Return the algorithms as a Markdown table."""
+    rows = (
+        (f"`{name}`", row.meaning, "`Discrete`" if row.discrete_only else "all", row.source)
+        for name, row in TABLE.items()
+    )
+    return table(("algorithm", "meaning", "actions", "source"), rows)
 
 
 def settings(content: Any) -> AlgorithmConfig:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from fusion_gym import declaration
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import System
-from fusion_gym.core.token_bucket import SharingRule
 from fusion_gym.errors import refusal
+from fusion_gym.fusion.table import Structure
 from fusion_gym.importing import name_of
 
 AccessRule = Literal["any", "single", "round_robin", "random"]
@@ -32,7 +32,12 @@ class CommonOptions:
     A field is the declaration of an option: type, default, and the docstring below it. Validation,
     ``help``, the specification and the tables of the documentation read it. A value that a type
     ``Literal`` or ``bool`` does not have is refused when the object is made.
+    ``filters`` are the classes behind the values of an option ``filter``, whose docstrings declare
+    them; ``structure`` decides which fusion rules an option ``fusion`` takes.
     """
+
+    filters: ClassVar[Mapping[str, type]] = {}
+    structure: ClassVar[Structure | None] = None
 
     access: AccessRule = "any"
     """Rule of medium access. ``"any"`` admits all requests, ``"single"`` grants one request a step.

@@ -1,9 +1,9 @@
 """An environment's page, made from what the code declares: options, blocks, spaces.
 
-``python -m fusion_gym.envs.pages docs/*.md`` writes the tables of these files. A table stands
-between ``<!-- observation: ID name=value -->`` and ``<!-- end -->``; after a semicolon follow other
-options, and the entries that they add are marked. ``<!-- options: ID ID name name -->`` is a table
-of the options of these environments, of all without a name.
+``python -m fusion_gym.envs.pages docs/*.md`` writes the tables of these files anew. A table stands
+between ``<!-- KIND: TEXT -->`` and ``<!-- end -->``, KIND a name of ``TABLES``. The text of
+``observation`` is ``ID name=value``; after a semicolon follow other options, and what they add is
+marked so. ``options`` has ids, and the names of the options in the table.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import inspect
 import re
 import shlex
 import sys
-from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,9 +29,12 @@ from fusion_gym.core.options import CommonOptions
 from fusion_gym.core.reward import Price
 from fusion_gym.core.system import Block, covers, numbered
 from fusion_gym.core.task import Task
+from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.envs.option_text import listed, options_in, short
 from fusion_gym.envs.registration import make_task, options_of
 from fusion_gym.envs.views import heard, make_view
+from fusion_gym.fusion.table import RULES
+from fusion_gym.importing import named
 
 LEGEND = """\
 A star marks what only the sensors know: `information="centre"` leaves it out. The third column
@@ -90,9 +92,19 @@ _BELIEFS: dict[Owner, str] = {
     "own": "only with `memory=True` or `belief_features`, for a sensor by itself",
 }
 _SEES = {"own": "its own", "told": "all", "hidden": "none"}
-_MARKED = re.compile(r"(<!-- (observation|options): (.*?) -->\n).*?(<!-- end -->)", re.DOTALL)
 _WORDS = {"ArrayLike": "number or array", "float": "number", "int": "whole number", "str": "word"}
 _LONGEST = 60  # characters of a default in a table
+# What writes the tables of a kind from the text of their marker: "module:function".
+TABLES = {
+    "observation": f"{__name__}:observation_text",
+    "options": f"{__name__}:option_table",
+    "filters": f"{__name__}:filter_table",
+    "fusion": f"{__name__}:fusion_table",
+    "policies": "fusion_gym.policies.registry:policy_table",
+    "metrics": "fusion_gym.evaluation.metrics:metric_table",
+    "algorithms": "fusion_gym.agents.training.algorithms:algorithm_table",
+}
+_MARKED = re.compile(rf"(<!-- ({'|'.join(TABLES)}): (.*?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def page(env_id: str, task: Task | None = None) -> str:
@@ -122,7 +134,7 @@ def page(env_id: str, task: Task | None = None) -> str:
         open_loop=f"{float(weights @ system.open_loop(task.horizon)):.3g}",
         horizon=task.horizon,
         options=kind.__name__,
-        arguments="\n".join(f"    {_plain(line)}" for line in listed(options_in(kind))),
+        arguments="\n".join(f"    {plain_marks(line)}" for line in listed(options_in(kind))),
         history="\n".join(f"- {text}" for text in ["v0: first version.", *versions]),
     )
 
@@ -146,17 +158,18 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
     price = replace(task.reward, price=Price(None, (0.01, 1.0)))
     for block in network_blocks(replace(task, access="round_robin", clock=True, reward=price)):
         rows[block.name] = _row(task, block, "" if block.name in always else _NETWORK[block.name])
-    return _table(("entries", "range", "a sensor sees", "meaning"), rows.values())
+    return table(("entries", "range", "a sensor sees", "meaning"), rows.values())
 
 
-def option_table(words: Sequence[str]) -> str:
+def option_table(text: str) -> str:
     """Return the options of environments that have the same ones as a Markdown table.
 
-    ``words`` are ids, and the names of the options in the table; without a name all are.
+    ``text`` has ids, and the names of the options in the table; without a name all are.
 
     Raises:
         ConfigurationError: an id that is not registered.
     """
+    words = text.split()
     every = [options_in(options_of(word)) for word in words if "/" in word]
     names = [word for word in words if "/" not in word] or list(every[0])
     rows = []
@@ -164,8 +177,8 @@ def option_table(words: Sequence[str]) -> str:
         types = (_WORDS.get(part, f"`{part}`") for part in every[0][name].type.split(" | "))
         defaults = dict.fromkeys(f"`{short(options[name].default)}`" for options in every)
         cells = " or ".join(types), "; ".join(d if len(d) < _LONGEST else "…" for d in defaults)
-        rows.append((f"`{name}`", *map(_double, cells), _plain(every[0][name].meaning)))
-    return _table(("option", "type", "default", "meaning"), rows)
+        rows.append((f"`{name}`", *map(_double, cells), plain_marks(every[0][name].meaning)))
+    return table(("option", "type", "default", "meaning"), rows)
 
 
 def documented(text: str) -> str:
@@ -176,33 +189,55 @@ def documented(text: str) -> str:
     """
 
     def anew(match: re.Match[str]) -> str:
-        if match[2] == "options":
-            return f"{match[1]}{option_table(match[3].split())}\n{match[4]}"
-        first, *others = match[3].split(";")
-        env_id, *options = shlex.split(first)
-        tasks = [
-            (_listed(words), make_task(env_id, **_options(words)))
-            for words in (options, *(shlex.split(other) for other in others))
-        ]
-        (given, task), *rest = tasks
-        count = len(ObservationLayout(task).names)
-        states = ", ".join(f"`{name}`" for name in task.system.state_names)
-        last = f"With {given or 'the defaults'} these are {count} numbers; states: {states}."
-        table = observation_table(task, *rest)
-        return f"{match[1]}{LEGEND}\n\n{table}\n\n{last}\n{match[4]}"
+        return f"{match[1]}{named('table', TABLES[match[2]])(match[3])}\n{match[4]}"
 
     return _MARKED.sub(anew, text)
+
+
+def observation_text(marker: str) -> str:
+    """Return legend, table and size of the observation that a marker names.
+
+    Raises:
+        ConfigurationError: an id or an option that does not exist.
+    """
+    first, *others = marker.split(";")
+    env_id, *options = shlex.split(first)
+    given, task = _listed(options), task_of(first)
+    rest = [(_listed(shlex.split(text)), task_of(f"{env_id} {text}")) for text in others]
+    count = len(ObservationLayout(task).names)
+    states = ", ".join(f"`{name}`" for name in task.system.state_names)
+    last = f"With {given or 'the defaults'} these are {count} numbers; states: {states}."
+    return f"{LEGEND}\n\n{observation_table(task, *rest)}\n\n{last}"
+
+
+def task_of(text: str) -> Task:
+    """Return the task that ``ID name=value …`` names.
+
+    Raises:
+        ConfigurationError: an id or an option that does not exist.
+    """
+    env_id, *options = shlex.split(text)
+    return make_task(env_id, **_options(options))
+
+
+def filter_table(env_id: str) -> str:
+    """Return the values of an environment's option ``filter`` with their meanings."""
+    filters = options_of(env_id).filters.items()
+    rows = ((f'`"{name}"`', plain_marks(read(kind).summary)) for name, kind in filters)
+    return table(("`filter`", "meaning"), rows)
+
+
+def fusion_table(env_id: str) -> str:
+    """Return the values of an environment's option ``fusion`` with their meanings."""
+    structure = options_of(env_id).structure
+    names = [] if structure is None else structure.offered
+    return table(("`fusion`", "meaning"), ((f'`"{name}"`', RULES[name].meaning) for name in names))
 
 
 def _paragraphs(kind: type[CommonOptions]) -> list[str]:
     text = inspect.cleandoc(kind.__doc__ or "")
     # A dataclass without a docstring gets its signature for one.
-    return [] if text.startswith(f"{kind.__name__}(") else [_plain(t) for t in text.split("\n\n")]
-
-
-def _plain(text: str) -> str:
-    """Markdown's code marks, in the place of those of docstrings."""
-    return re.sub(r":\w+:`~?|``", "`", text)
+    return [] if text.startswith(f"{kind.__name__}(") else plain_marks(text).split("\n\n")
 
 
 def _row(task: Task, block: Block, condition: str = "") -> tuple[str, ...]:
@@ -210,7 +245,7 @@ def _row(task: Task, block: Block, condition: str = "") -> tuple[str, ...]:
     name = f"`{block.name}[{axes}]`" if axes else f"`{block.name}`"
     star = "" if covers("centre", block.knowledge) else " *"
     low, high = block.bounds
-    meaning = _plain(block.meaning) + (f"; {condition}" if condition else "")
+    meaning = plain_marks(block.meaning) + (f"; {condition}" if condition else "")
     return name + star, f"{low:g}..{high:g}", _seen(task, block), meaning
 
 
@@ -228,13 +263,6 @@ def _axis(task: Task, block: Block, place: int) -> str:
     if labels == task.system.state_names:
         return "state"
     return "component" if place and labels == numbered(len(labels)) else "/".join(labels)
-
-
-def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
-    lines = [head, *rows]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(head) - 1)]
-    padded = ["| " + " | ".join(map(str.ljust, line, (*widths, 0))) + " |" for line in lines]
-    return "\n".join((padded[0], "|---" * len(head) + "|", *padded[1:]))
 
 
 def _options(words: list[str]) -> dict[str, Any]:

@@ -2,34 +2,80 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from fusion_gym.arrays import Array
+from fusion_gym.docstrings import table
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import Interval, mean_interval
 from fusion_gym.validation import ConfigurationError
 
 
-def summarise(results: EpisodeResults) -> dict[str, Any]:
-    """The metrics of one policy, as the evaluation's JSON holds them.
+class Metric(NamedTuple):
+    """A row of the table: its meaning, which values are ``better``, and its ``samples``.
 
-    ``mse``, ``bound_trace``, ``nees``, ``tokens``, ``denied`` and ``return`` are
-    ``{"mean", "low", "high"}`` with a 95 % bootstrap interval over episodes; ``rate`` and
-    ``requests`` have one number a sensor; ``armse`` has one a state, the mean over time of the
-    root of the mean over episodes of the squared error.
+    Samples are by default the field of :class:`EpisodeResults` of its name. Of samples (E,) a
+    summary has the mean with its 95 % bootstrap interval over episodes, of an array with a column
+    for each ``axis`` the means. ``column`` heads it in printed tables, where ``form`` writes the
+    mean, and ``interval`` adds the half width.
     """
-    return {
-        "mse": mean_interval(results.mse)._asdict(),
-        "armse": np.sqrt(results.squared_error).mean(0).tolist(),
-        "bound_trace": mean_interval(results.bound_trace)._asdict(),
-        "nees": mean_interval(results.nees)._asdict(),
-        "rate": results.rate.mean(0).tolist(),
-        "requests": results.requests.mean(0).tolist(),
-        "tokens": mean_interval(results.tokens)._asdict(),
-        "denied": mean_interval(results.denied)._asdict(),
-        "return": mean_interval(results.returns)._asdict(),
-    }
+
+    meaning: str
+    better: Literal["lower", "higher", "1", ""] = ""
+    axis: Literal["", "sensor", "state"] = ""
+    column: str = ""
+    form: str = ".3f"
+    interval: bool = False
+    samples: Callable[[EpisodeResults], Array] | None = None
+
+    def summary(self, name: str, results: EpisodeResults) -> Any:
+        """Return what a summary has of it: an interval, or a list along its axis."""
+        found = self.samples(results) if self.samples else getattr(results, name)
+        return found.mean(0).tolist() if self.axis else mean_interval(found)._asdict()
+
+
+METRICS = {
+    "mse": Metric(
+        "squared error of the fused estimate, summed over states, per step",
+        "lower", column="MSE", form=".4g", interval=True,
+    ),
+    "armse": Metric(
+        "root of the mean squared error over episodes, averaged over time",
+        "lower", "state", samples=lambda results: np.sqrt(results.squared_error),
+    ),
+    "bound_trace": Metric(
+        "trace of the claimed covariance, per step", column="trace P", form=".4g"
+    ),
+    "nees": Metric("normalised squared error, divided by the states", "1", column="NEES"),
+    "rate": Metric("transmissions per step", "lower", "sensor", "rate"),
+    "requests": Metric("requests per step", axis="sensor", column="requests"),
+    "tokens": Metric("tokens spent per step", "lower", column="tokens"),
+    "denied": Metric("requests refused per step", "lower", column="denied"),
+    "return": Metric(
+        "sum of the rewards of an episode", "higher", column="return", form=".4g", interval=True,
+        samples=lambda results: results.returns,
+    ),
+}  # fmt: skip
+
+
+def summarise(results: EpisodeResults) -> dict[str, Any]:
+    """Return every metric of ``METRICS`` for one policy, as the evaluation's JSON holds it.
+
+    ``{"mean", "low", "high"}``, or a list with one number a sensor or a state.
+    """
+    return {name: metric.summary(name, results) for name, metric in METRICS.items()}
+
+
+def metric_table(_: str) -> str:
+    """Return the metrics as a Markdown table."""
+    rows = (
+        (f"`{name}`", metric.meaning, metric.axis or "mean, low, high", metric.better)
+        for name, metric in METRICS.items()
+    )
+    return table(("metric", "meaning", "a number for each", "better"), rows)
 
 
 def robust_summary(results: EpisodeResults) -> dict[str, float]:

@@ -235,7 +235,7 @@ def inverse_covariance_intersection(
 
 @dataclass(frozen=True)
 class SequentialIntersection(FusionRule):
-    """Joins the first estimate with each other one in turn, two at a time.
+    r"""Join the first estimate with each other one in turn, two at a time.
 
     ``join`` is :func:`covariance_intersection`, a bound for every correlation, or
     :func:`inverse_covariance_intersection`, smaller, a bound for common information only.
@@ -246,9 +246,35 @@ class SequentialIntersection(FusionRule):
     Raises:
         ConfigurationError: an order that is no permutation, or not one of the l estimates.
 
+    Equation:
+        With covariance intersection, for one estimate i after the other, in the order of arrival
+        (``order``):
+
+        $$
+        P\leftarrow\left(\omega P^{-1}+(1-\omega)P_i^{-1}\right)^{-1},\qquad \hat x\leftarrow
+        P\left(\omega P_{\mathrm{old}}^{-1}\hat x+(1-\omega)P_i^{-1}x_i\right)
+        $$
+
+        With inverse covariance intersection:
+
+        $$
+        X=\left(\omega P+(1-\omega)P_i\right)^{-1},\qquad
+        P\leftarrow\left(P^{-1}+P_i^{-1}-X\right)^{-1}
+        $$
+
+        $$
+        \hat x\leftarrow K\hat x+L\,x_i,\qquad K=P_{\mathrm{new}}\left(P^{-1}-\omega
+        X\right),\qquad L=P_{\mathrm{new}}\left(P_i^{-1}-(1-\omega)X\right)
+        $$
+
+        Each ω is that of the smallest trace; K + L = I.
+
     Assumes: what ``join`` assumes, at every step.
 
-    Source: adaptive_innovation, equations (37) to (40) and (47) to (52), gains by (56) and (59).
+    Source: adaptive_innovation, equations (37) to (40) and (47) to (52), gains by (56) and (59);
+    S. J. Julier and J. K. Uhlmann, "A non-divergent estimation algorithm in the presence of unknown
+    correlations", 1997; B. Noack, J. Sijs, M. Reinhardt and U. D. Hanebeck, "Decentralized data
+    fusion with inverse covariance intersection", Automatica 79, 2017.
     """
 
     join: Callable[[Array, Array, Array, Array], Fused] = covariance_intersection

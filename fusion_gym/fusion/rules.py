@@ -98,11 +98,24 @@ def inverses(covariance: Array) -> Array:
 
 @dataclass(frozen=True)
 class InformationFusion(FusionRule):
-    """Sum of the informations of independent estimates: P = (Σ P_i⁻¹)⁻¹, x = P Σ P_i⁻¹ x_i.
+    r"""Sum of the informations of independent estimates: P = (Σ P_i⁻¹)⁻¹, x = P Σ P_i⁻¹ x_i.
 
     It has no parameters. The result is optimal for independent errors, and for those of nodes
     that share a prior in shares of its information. A prior that several estimates have in full
     is counted as often as they do, and P is then too small.
+
+    Equation:
+        $$
+        P=\left(\sum_i P_i^{-1}\right)^{-1},\qquad \hat x=P\sum_i P_i^{-1}x_i
+        $$
+
+        Of nodes that get the estimate back in shares wᵢ (``information_shares``):
+
+        $$
+        P_i\leftarrow P/w_i,\qquad x_i\leftarrow\hat x,\qquad \sum_i w_i=1
+        $$
+
+        so that the prior is counted once when the informations are added up.
 
     Assumes: independent errors, or nodes whose common prior was shared out among them.
 
@@ -162,7 +175,7 @@ def _replaced_in_turn(terms: Array, others: Array) -> Array:
 
 @dataclass(frozen=True)
 class MatrixWeightedFusion(FusionRule):
-    """x = Σ A_i x_i with Σ A_i = I and the smallest error variance of all such sums.
+    r"""x = Σ A_i x_i with Σ A_i = I and the smallest error variance of all such sums.
 
     It needs the joint covariance. The weights of (56), (eᵀ Σ⁻¹ e)⁻¹ eᵀ Σ⁻¹ with e a column of
     identities, are those of the best linear correction of the first estimate by the differences
@@ -171,6 +184,15 @@ class MatrixWeightedFusion(FusionRule):
     Cov(D) is singular too, and a relative ridge of 1e-12 on it stands for its pseudo-inverse. The
     result is that of (eᵀ T⁺ e)⁺ eᵀ T⁺ with T = Σ + e eᵀ. The covariance is
     weights · Σ · weightsᵀ of the given Σ, the true one for these weights.
+
+    Equation:
+        $$
+        \hat x=\sum_i A_i x_i,\qquad (A_1,\dots,A_l)=(e^{\mathsf T}\Sigma^{-1}e)^{-1}e^{\mathsf
+        T}\Sigma^{-1},\qquad P=A\,\Sigma\,A^{\mathsf T}
+        $$
+
+        Σ is the joint covariance of all errors, blocks Pᵢⱼ, and e a column of identities, so that
+        Σᵢ Aᵢ = I. Where Σ is singular it is (eᵀ T⁺ e)⁺ eᵀ T⁺ with T = Σ + e eᵀ.
 
     Assumes: the joint covariance of all errors is known, cross-covariances included; no
     Gaussian law is needed.

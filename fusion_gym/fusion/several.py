@@ -25,10 +25,27 @@ _RIDGE = 1e-10  # keeps the curvature invertible where estimates are alike
 
 @dataclass(frozen=True)
 class CovarianceIntersection(FusionRule):
-    """All estimates at once, by :func:`covariance_intersection_many`.
+    r"""Covariance intersection of all estimates at once (:func:`covariance_intersection_many`).
 
     Like its sequential form it bounds the actual covariance for every correlation of the errors.
     Where ``active`` leaves one estimate alone it is taken as it is.
+
+    Equation:
+        $$
+        P=\left(\sum_i w_i P_i^{-1}\right)^{-1},\qquad \hat x=P\sum_i w_i P_i^{-1}x_i
+        $$
+
+        $$
+        w=\arg\min\ \mathrm{tr}\,P\quad\text{over}\quad w_i\ge0,\ \ \sum_i w_i=1
+        $$
+
+        Any weights give a bound. In ``UnknownInput-v0`` ``ci`` follows the minimum from step to
+        step to within 1 % of the trace, and ``exact_ci`` finds it at every step.
+
+    Assumes: the P_i bound their own error covariances; nothing of their correlations.
+
+    Source: the optimum is an A-optimal design, and the gap is J. Kiefer's, "General equivalence
+    theory for optimum designs", Annals of Statistics 2, 1974.
     """
 
     def fuse(

@@ -20,7 +20,6 @@ from fusion_gym.fusion.several import CovarianceIntersection
 from fusion_gym.validation import ConfigurationError
 
 MOST_TOGETHER = 40  # sensors whose estimates a rule joins at once, at a cost of their cube
-Order = tuple[int, ...] | None
 Assumption = Literal[
     "nothing",
     "common information",
@@ -50,13 +49,15 @@ REASONS: dict[Assumption, str] = {
 class Rule:
     """A row of the table.
 
-    ``make`` gives the rule for an order of arrival, ``assumes`` is what it needs to hold for its
-    covariance to be a bound, ``pair`` means exactly two estimates, ``ordered`` that the order
+    ``make`` gives the rule, for an ``order`` of arrival where it has one; the docstring of its
+    class has the equation, the assumption and the source. ``assumes`` is what it needs to hold for
+    its covariance to be a bound, ``pair`` means exactly two estimates, ``ordered`` that the order
     belongs to it, and ``cubic`` that its cost grows with the cube of the number of estimates.
     """
 
-    make: Callable[[Order], FusionRule]
+    make: Callable[..., FusionRule]
     assumes: Assumption
+    meaning: str
     pair: bool = False
     ordered: bool = False
     cubic: bool = False
@@ -65,14 +66,26 @@ class Rule:
 _IN_TURN = partial(SequentialIntersection, covariance_intersection)
 _INVERSE = partial(SequentialIntersection, inverse_covariance_intersection)
 RULES = {
-    "federated": Rule(lambda order: InformationFusion(), "information shares"),
-    "information": Rule(lambda order: InformationFusion(), "independence"),
-    "matrix": Rule(lambda order: MatrixWeightedFusion(), "joint covariance", cubic=True),
-    "sici": Rule(_INVERSE, "common information", ordered=True),
-    "sci": Rule(_IN_TURN, "nothing", ordered=True),
-    "ci": Rule(lambda order: CovarianceIntersection(), "nothing", cubic=True),
-    "exact_ci": Rule(lambda order: CovarianceIntersection(), "tracked weights", cubic=True),
-    "ici": Rule(_INVERSE, "common information", pair=True),
+    "federated": Rule(
+        InformationFusion, "information shares", "Sum of informations, fed back in shares."
+    ),
+    "information": Rule(InformationFusion, "independence", "Sum of informations."),
+    "matrix": Rule(
+        MatrixWeightedFusion, "joint covariance", "Sum with the best matrix weights.", cubic=True
+    ),
+    "sici": Rule(
+        _INVERSE, "common information", "Inverse covariance intersection, two by two.", ordered=True
+    ),
+    "sci": Rule(_IN_TURN, "nothing", "Covariance intersection, two by two: a bound.", ordered=True),
+    "ci": Rule(
+        CovarianceIntersection, "nothing", "Covariance intersection of all: a bound.", cubic=True
+    ),
+    "exact_ci": Rule(
+        CovarianceIntersection, "tracked weights", "The same with exact weights.", cubic=True
+    ),
+    "ici": Rule(
+        _INVERSE, "common information", "Inverse covariance intersection of a pair.", pair=True
+    ),
 }
 
 
@@ -113,13 +126,13 @@ def choose_rule(
             order for a rule that has none, or one that is no permutation of the sensors 0 to
             l - 1.
     """
-    offered = structure.offered
-    if isinstance(name, str) and name in RULES and name not in offered:
+    known = structure.offered
+    if isinstance(name, str) and name in RULES and name not in known:
         raise ConfigurationError(
             f"fusion = {name!r} is not allowed: it must be one of "
-            f"{', '.join(map(repr, offered))}, for {structure.refusal(RULES[name])}"
+            f"{', '.join(map(repr, known))}, for {structure.refusal(RULES[name])}"
         )
-    rule = RULES[validation.choice("fusion", name, offered)]
+    rule = RULES[validation.choice("fusion", name, known)]
     if rule.pair and sensors + structure.prediction != 2:
         prediction = " (the centre's prediction is one of them)" if structure.prediction else ""
         raise ConfigurationError(
@@ -127,21 +140,21 @@ def choose_rule(
             f"estimates{prediction}; it must be 'sici' (two at a time) for more"
         )
     if rule.cubic and sensors > MOST_TOGETHER:
-        others = [key for key in offered if not RULES[key].cubic and not RULES[key].pair]
+        others = [key for key in known if not RULES[key].cubic and not RULES[key].pair]
         instead = f", so it must be {' or '.join(map(repr, others))}" if others else ""
         raise ConfigurationError(
             f"fusion = {name!r} is not allowed with {sensors} sensors: it joins the estimates of "
             f"at most {MOST_TOGETHER}, for its cost grows with the cube of their number{instead}"
         )
     if order is None:
-        return rule.make(None)
+        return rule.make()
     if not rule.ordered:
         raise ConfigurationError(
             f"order = {validation.shown(order)} is not allowed with fusion={name!r}: it belongs "
             "to the sequential rules 'sici' and 'sci'"
         )
     arrival = _arrival(order, sensors)
-    return rule.make((0, *(i + 1 for i in arrival)) if structure.prediction else arrival)
+    return rule.make(order=(0, *(i + 1 for i in arrival)) if structure.prediction else arrival)
 
 
 def _arrival(order: ArrayLike, sensors: int) -> tuple[int, ...]:

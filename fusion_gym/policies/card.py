@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import sb3_contrib
+import stable_baselines3
 import torch
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
@@ -29,13 +31,21 @@ from fusion_gym.validation import ConfigurationError
 
 ENTRY = "fusion_gym_model"
 FORMAT = 1
+# Every algorithm of both libraries by its name in configs and saved models: MaskablePPO is
+# "maskable_ppo".
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower(): kind
+    for library in (stable_baselines3, sb3_contrib)
+    for name, kind in vars(library).items()
+    if isinstance(kind, type) and issubclass(kind, BaseAlgorithm)
+}
 # The policies that are rebuilt from their weights, by algorithm.
 POLICIES: dict[str, type[BasePolicy]] = {
-    "a2c": ActorCriticPolicy,
-    "dqn": DQNPolicy,
-    "maskable_ppo": MaskableActorCriticPolicy,
-    "ppo": ActorCriticPolicy,
-    "recurrent_ppo": RecurrentActorCriticPolicy,
+    name: policy
+    for name, kind in ALGORITHMS.items()
+    for policy in kind.policy_aliases.values()
+    if policy
+    in (ActorCriticPolicy, DQNPolicy, MaskableActorCriticPolicy, RecurrentActorCriticPolicy)
 }
 ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     "elu": torch.nn.ELU,

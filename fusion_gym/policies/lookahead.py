@@ -22,7 +22,7 @@ _MOST_GREEDY = 40  # of which one after another is added, each time the best of 
 
 
 class Lookahead:
-    """Takes the transmissions with the least expected error over the next steps and price.
+    r"""Request the sensors with the least expected error over the next steps and price.
 
     A coordinator that knows all new measurements has the best estimate x̂* by delivering them all;
     with memory, by all that was ever measured. Whatever it lets through, x̂, the fused error's
@@ -41,15 +41,33 @@ class Lookahead:
     system; exact for linear systems, plausible for others. This is neither an optimum nor a bound,
     but a policy that knows the model.
 
+    Args:
+        price: p >= 0 of a token, in the reward's units.
+        steps: h >= 1, steps over which the distance is summed.
+
+    Raises:
+        ConfigurationError: fewer than one step, a negative price, information other than
+            "sensors", or more than 40 sensors, unless only one transmits at a time.
+
+    Equation:
+        $$
+        S=\arg\min_{S}\ \mathrm{E}\sum_{k=0}^{h-1}\lVert x^\star(t+k)-\hat
+        x_S(t+k)\rVert_W^2+p\sum_{s\in S}c_s
+        $$
+
+        x* and x̂_S are the best estimate and the centre's after the packets of S, both going on
+        without noise and transmissions for h (``steps``) steps; the expectation is over what
+        arrives. W are the weights of the reward's error term, p is ``price``, c the tokens that a
+        transmission costs. S runs over all sets that the network would grant.
+
     Assumes: x* is the conditional mean given all measurements, a model that is true, and no
     further transmission within the steps.
 
     Source: none of one paper; receding-horizon control of the decisions, with the value of
     :mod:`fusion_gym.core.beliefs`.
 
-    Raises:
-        ConfigurationError: fewer than one step, a negative price, information other than
-            "sensors", or more than 40 sensors, unless only one transmits at a time.
+    Example: ``lookahead:price=0.03`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    random_start=True token_rate=2 memory=True``.
     """
 
     stateless: ClassVar[bool] = True
@@ -64,7 +82,6 @@ class Lookahead:
                 "must be 'sensors', for it weighs the new measurements"
             )
         self._task = task
-        self.knowledge: Knowledge = knows(task, own=False)
         self.greedy = task.sensors > _MOST_TOGETHER and task.access != "single"
         if self.greedy and task.sensors > _MOST_GREEDY:
             raise ConfigurationError(
@@ -88,6 +105,11 @@ class Lookahead:
             order[np.searchsorted(number, number[sent] - (1 << sensor), sorter=order)]
             for sensor, sent in enumerate(self._sent)
         ]
+
+    @property
+    def knowledge(self) -> Knowledge:
+        """A coordinator, with what was never sent if the task has memory."""
+        return knows(self._task, own=False)
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Nothing to forget."""

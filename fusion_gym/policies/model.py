@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from typing import Any
 
 import numpy as np
-import sb3_contrib
-import stable_baselines3
 from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -17,17 +14,8 @@ from fusion_gym.core.system import Knowledge, Signals, least_covering
 from fusion_gym.core.task import Task
 from fusion_gym.envs.views import Rows, make_view
 from fusion_gym.policies.base import Requests
-from fusion_gym.policies.card import ENTRY, card
+from fusion_gym.policies.card import ALGORITHMS, ENTRY, card
 from fusion_gym.validation import ConfigurationError
-
-# Every algorithm of both libraries by its name in configs and saved models: MaskablePPO is
-# "maskable_ppo".
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
-    re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower(): kind
-    for library in (stable_baselines3, sb3_contrib)
-    for name, kind in vars(library).items()
-    if isinstance(kind, type) and issubclass(kind, BaseAlgorithm)
-}
 
 
 def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:

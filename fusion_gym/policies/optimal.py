@@ -15,11 +15,29 @@ from fusion_gym.solvers.task import solve_task
 
 
 class OptimalPolicy:
-    """Requests as the solved optimum of a task does; it looks at errors, channels and tokens.
+    r"""Request as the solved optimum of a task does, by errors, channels and tokens.
 
-    ``criterion`` as in :func:`solve_task`: the exact optimum of an episode knows the steps that
-    are left, the stationary one does not. ``price`` of a token stands for the task's own.
-    ``optimum`` holds the cost that it attains.
+    The exact optimum of an episode knows the steps that are left, the stationary one does not
+    (:func:`solve_task`). ``optimum`` holds the cost that it attains.
+
+    Args:
+        criterion: ``finite``, the optimum of an episode, or ``average``, the stationary one.
+        price: p >= 0 of a token; None for the task's own.
+
+    Raises:
+        ConfigurationError: a task that is not solved here, or a negative price.
+
+    Equation:
+        $$
+        V_t(e)=\min\left\{w\,e^2+\mathrm{E}\,V_{t+1}(a
+        e+\nu),\ \ p+\mathrm{E}\,V_{t+1}(\nu)\right\}
+        $$
+
+        One source with a perfect channel, in the literature's order of events: e is the error if
+        nothing is sent, a the source's coefficient, ν its noise, w the weight of the error, p the
+        price of a transmission. The solver has the channel's state, its losses, the tokens and a
+        second source as well; the request is the second choice, best exactly where |e| is at least
+        a threshold.
 
     Assumes: remote estimation of one source or two, whose model is true.
 
@@ -27,8 +45,7 @@ class OptimalPolicy:
     Markovian state", IEEE Trans. Automatic Control 65, 2020, for one source
     (:mod:`fusion_gym.solvers`).
 
-    Raises:
-        ConfigurationError: a task that is not solved here, or a negative price.
+    Example: ``optimal`` in ``fusion_gym/RemoteEstimation-v0``.
     """
 
     stateless: ClassVar[bool] = True
@@ -38,9 +55,11 @@ class OptimalPolicy:
             reward = dataclasses.replace(task.reward, price=Price.create(price))
             task = dataclasses.replace(task, reward=reward)
         self.optimum = solve_task(task, criterion)
-        # Thresholds are each source's own; a table looks at both errors.
-        separate = self.optimum.threshold is not None
-        self.knowledge: Knowledge = "own" if separate else "coordinator"
+
+    @property
+    def knowledge(self) -> Knowledge:
+        """A sensor's own error, by its thresholds; with a table of two sources both errors."""
+        return "own" if self.optimum.threshold is not None else "coordinator"
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Nothing to forget."""

@@ -33,7 +33,7 @@ _found: dict[str, Schedule] = {}
 
 
 class PeriodicOptimum:
-    """Repeats the schedule of ``packets`` requests in ``period`` steps with the smallest trace.
+    r"""Repeat the schedule of ``packets`` requests in ``period`` steps with the smallest trace.
 
     All schedules are compared by the system's own recursion, whatever it costs: the phase against
     the sensors' sampling and the start matters, so none is left out. It looks at no signal but the
@@ -56,6 +56,26 @@ class PeriodicOptimum:
 
     The result of a search is kept while the process lives, and with ``cache``, a path, in a file.
 
+    Args:
+        packets: q, the requests of all sensors in a period.
+        period: p, in steps.
+        cache: path of a file that keeps the schedule; None for none.
+        average: ``steady`` for the steady state, or ``episode`` for an episode from its start.
+
+    Raises:
+        ConfigurationError: a number that is not allowed, more schedules than can be compared, a
+            task whose access is not "any", or a system whose covariances depend on the data (it
+            declares the contrary by a ``covariance_cycle`` that is not None).
+
+    Equation:
+        $$
+        \min_{\pi}\ \frac{1}{T}\sum_{t=1}^{T}\mathrm{tr}\,P_t(\pi)\qquad \text{over
+        all}\ \pi\in\{0,1\}^{p\times l}\ \text{with}\ \sum\pi=q
+        $$
+
+        π is repeated every p (``period``) steps and has q (``packets``) requests of l sensors. The
+        mean is over the steady state or an episode (``average``).
+
     Assumes: covariances that depend on no data, and that every request is granted.
 
     Source: none of one paper; exhaustive search. That a periodic schedule comes arbitrarily
@@ -63,10 +83,7 @@ class PeriodicOptimum:
     solutions of the infinite-horizon linear sensor scheduling problem", IEEE Trans. Automatic
     Control 59, 2014.
 
-    Raises:
-        ConfigurationError: a number that is not allowed, more schedules than can be compared, a
-            task whose access is not "any", or a system whose covariances depend on the data (it
-            declares the contrary by a ``covariance_cycle`` that is not None).
+    Example: ``periodic_optimum:packets=2,period=6`` in ``fusion_gym/MarkovJumpTracking-v0``.
     """
 
     knowledge: ClassVar[Knowledge] = "clock"

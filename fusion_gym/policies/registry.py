@@ -18,6 +18,7 @@ import numpy as np
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import KNOWLEDGE
 from fusion_gym.core.task import Task
+from fusion_gym.docstrings import plain_marks, read, table
 from fusion_gym.importing import named
 from fusion_gym.policies.base import Policy, owner_of
 from fusion_gym.policies.settings import parse_settings
@@ -35,49 +36,50 @@ class Context(TypedDict):
 
 
 class Row(NamedTuple):
-    """A policy's kind and its maker: a callable, or where to import it, as "module:attribute".
+    """A policy's maker: a callable, or where to import it, as "module:attribute"; and its kind.
 
     The maker takes the policy's parameters by name, the task if it has a parameter ``task``, and
-    whether files may run code if it has a parameter ``trust``.
-    A rule looks at signals alone, a reference takes the task and its model, an agent was trained;
-    an agent's first parameter is the text behind its name. The parameter ``rest`` takes all the
-    text behind it, for it may hold colons and commas.
+    whether files may run code if it has a parameter ``trust``. Its docstring declares the policy.
+    An attribute ``rest`` names the parameter that takes all the text behind it, for it may hold
+    colons and commas. ``None`` is the kind of the maker: a function makes an agent, whose first
+    parameter is the text behind its name; a class with a parameter ``task`` is a reference, which
+    takes the task and its model; another is a rule, which looks at signals alone.
     """
 
-    kind: Kind
     maker: Maker | str
-    rest: str | None = None
+    kind: Kind | None = None
 
 
-_HERE = "fusion_gym.policies"
-_RULES = f"{_HERE}.rules"
 _ROWS: dict[str, Row] = {
-    "adaptive_innovation": Row("rule", f"{_RULES}.adaptive_innovation:AdaptiveInnovation"),
-    "adaptive_threshold": Row("rule", f"{_RULES}.adaptive_threshold:AdaptiveThreshold"),
-    "always": Row("rule", f"{_RULES}.constant:Always"),
-    "centre_variance": Row("rule", f"{_RULES}.centre_variance:CentreVariance"),
-    "dynamic_event": Row("rule", f"{_RULES}.dynamic_event:DynamicEvent"),
-    "estimate_difference": Row("reference", f"{_RULES}.estimate_difference:EstimateDifference"),
-    "information_gain": Row("rule", f"{_RULES}.information_gain:InformationGain"),
-    "innovation_threshold": Row("rule", f"{_RULES}.innovation_threshold:InnovationThreshold"),
-    "kullback_leibler": Row("reference", f"{_RULES}.kullback_leibler:KullbackLeibler"),
-    "local_variance": Row("rule", f"{_RULES}.local_variance:LocalVariance"),
-    "lookahead": Row("reference", f"{_HERE}.lookahead:Lookahead"),
-    "model": Row("agent", f"{_HERE}.saved:saved_agent"),
-    "never": Row("rule", f"{_RULES}.constant:Never"),
-    "optimal": Row("reference", f"{_HERE}.optimal:OptimalPolicy"),
-    "paced": Row("rule", f"{_RULES}.paced:Paced"),
-    "periodic": Row("rule", f"{_RULES}.periodic:Periodic"),
-    "periodic_optimum": Row("reference", f"{_HERE}.periodic_optimum:PeriodicOptimum"),
-    "random": Row("rule", f"{_RULES}.random:Random"),
-    "rollout": Row("reference", f"{_HERE}.rollout:Rollout", rest="base"),
-    "round_robin": Row("rule", f"{_RULES}.periodic:RoundRobin"),
-    "send_on_delta": Row("rule", f"{_RULES}.send_on_delta:SendOnDelta"),
-    "stochastic_event": Row("rule", f"{_RULES}.stochastic_event:StochasticEvent"),
-    "value_of_information": Row("reference", f"{_RULES}.value_of_information:ValueOfInformation"),
-    "variance_threshold": Row("rule", f"{_RULES}.variance_threshold:VarianceThreshold"),
-    "whittle": Row("reference", f"{_HERE}.whittle:WhittleIndex"),
-    "zoo": Row("agent", f"{_HERE}.saved:zoo_agent"),
+    name: Row(f"fusion_gym.policies.{place}")
+    for name, place in {
+        "adaptive_innovation": "rules.adaptive_innovation:AdaptiveInnovation",
+        "adaptive_threshold": "rules.adaptive_threshold:AdaptiveThreshold",
+        "always": "rules.constant:Always",
+        "centre_variance": "rules.centre_variance:CentreVariance",
+        "dynamic_event": "rules.dynamic_event:DynamicEvent",
+        "estimate_difference": "rules.estimate_difference:EstimateDifference",
+        "information_gain": "rules.information_gain:InformationGain",
+        "innovation_threshold": "rules.innovation_threshold:InnovationThreshold",
+        "kullback_leibler": "rules.kullback_leibler:KullbackLeibler",
+        "local_variance": "rules.local_variance:LocalVariance",
+        "lookahead": "lookahead:Lookahead",
+        "model": "saved:saved_agent",
+        "never": "rules.constant:Never",
+        "optimal": "optimal:OptimalPolicy",
+        "paced": "rules.paced:Paced",
+        "periodic": "rules.periodic:Periodic",
+        "periodic_optimum": "periodic_optimum:PeriodicOptimum",
+        "random": "rules.random:Random",
+        "rollout": "rollout:Rollout",
+        "round_robin": "rules.periodic:RoundRobin",
+        "send_on_delta": "rules.send_on_delta:SendOnDelta",
+        "stochastic_event": "rules.stochastic_event:StochasticEvent",
+        "value_of_information": "rules.value_of_information:ValueOfInformation",
+        "variance_threshold": "rules.variance_threshold:VarianceThreshold",
+        "whittle": "whittle:WhittleIndex",
+        "zoo": "saved:zoo_agent",
+    }.items()
 }
 
 
@@ -100,7 +102,7 @@ def register_policy(name: str, maker: Maker, kind: Kind = "rule") -> None:
         raise ConfigurationError(f"name = {name!r} is not allowed: there is a policy of that name")
     choice("kind", kind, get_args(Kind))
     _parameters(name, maker)
-    _ROWS[name] = Row(kind, maker)
+    _ROWS[name] = Row(maker, kind)
 
 
 def policy_names(kind: Kind | None = None) -> list[str]:
@@ -111,7 +113,37 @@ def policy_names(kind: Kind | None = None) -> list[str]:
     """
     if kind is not None:
         choice("kind", kind, get_args(Kind))
-    return sorted(name for name, row in _ROWS.items() if kind in (None, row.kind))
+    return sorted(name for name, row in _ROWS.items() if kind in (None, _kind(row)))
+
+
+def policy_maker(name: str) -> Maker:
+    """Return what makes the policy of this name; its docstring declares the policy.
+
+    Raises:
+        ConfigurationError: an unknown name.
+    """
+    keys("policy", [name], _ROWS)
+    return _maker(_ROWS[name])
+
+
+def policy_parameters(name: str) -> dict[str, inspect.Parameter]:
+    """Return the parameters that a text may set, in the maker's order.
+
+    Raises:
+        ConfigurationError: an unknown name.
+    """
+    return _parameters(name, policy_maker(name))
+
+
+def policy_table(kind: Kind) -> str:
+    """Return the policies of a kind as a Markdown table, from their declarations."""
+    rows = []
+    for name in policy_names(kind):
+        given = list(policy_parameters(name))
+        shown = f"`{name}:{given.pop(0).upper()}`" if kind == "agent" else f"`{name}`"
+        summary = plain_marks(read(policy_maker(name)).summary)
+        rows.append((shown, summary, ", ".join(f"`{key}`" for key in given)))
+    return table(("policy", "meaning", "parameters"), rows)
 
 
 def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
@@ -127,7 +159,7 @@ def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
     """
     context: Context = {"task": task, "trust": boolean("trust", trust)}
     policy = _make(spec, task.policy_defaults, context)
-    if _asked(spec)[1].kind != "agent":  # loading it has checked all that it sees
+    if _kind(_asked(spec)[1]) != "agent":  # loading it has checked all that it sees
         _try_out(spec, policy, task)
     return policy
 
@@ -140,7 +172,7 @@ def make_rule(spec: str, defaults: dict[str, dict[str, Any]] | None = None) -> P
     Raises:
         ConfigurationError: an unknown rule or parameter, or a value that is not allowed.
     """
-    if _asked(spec)[1].kind != "rule":
+    if _kind(_asked(spec)[1]) != "rule":
         raise ConfigurationError(f"policy {spec!r} is no rule: make_policy makes it for a task")
     return _make(spec, defaults or {}, {"task": None, "trust": False})
 
@@ -150,11 +182,11 @@ def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> P
     maker = _maker(row)
     known = _parameters(name, maker)
     given: dict[str, Any] = {}
-    if row.kind == "agent":
+    if _kind(row) == "agent":
         key, (value, *entries) = next(iter(known)), text.split(",")
         given[key] = value.removeprefix(f"{key}=")
     else:
-        text, given = _split_rest(text, row.rest)
+        text, given = _split_rest(text, getattr(maker, "rest", None))
         entries = text.split(",") if text else []
     settings = parse_settings(f"parameter of policy {name!r}", entries)
     keys(f"parameter of policy {name!r}", settings, known.keys() - given.keys())
@@ -204,8 +236,7 @@ def _asked(spec: str) -> tuple[str, Row, str]:
             f"policy = {name!r} is not allowed: it must be a class with knowledge, reset and "
             "__call__, as one derived from fusion_gym.policies.base.Rule"
         )
-    kind: Kind = "reference" if "task" in inspect.signature(found).parameters else "rule"
-    return name, Row(kind, found), behind
+    return name, Row(found), behind
 
 
 def _maker(row: Row) -> Maker:
@@ -215,6 +246,15 @@ def _maker(row: Row) -> Maker:
         found: Maker = getattr(importlib.import_module(module), attribute)
         return found
     return maker
+
+
+def _kind(row: Row) -> Kind:
+    maker = _maker(row)
+    if row.kind is not None:
+        return row.kind
+    if not isinstance(maker, type):
+        return "agent"
+    return "reference" if "task" in inspect.signature(maker).parameters else "rule"
 
 
 def _parameters(name: str, maker: Maker) -> dict[str, inspect.Parameter]:

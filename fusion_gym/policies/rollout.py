@@ -23,7 +23,7 @@ _LANES = 16384  # simulations side by side, unless those of one run are more
 
 
 class Rollout:
-    """One policy improvement on the policy ``base``, whose text ends that of this one.
+    r"""Request what is best in simulations in which the policy ``base`` goes on.
 
     At every step it tries, as first decisions, nobody, each sensor alone and what the base asks
     for; after each the base goes on for ``steps`` more, in ``samples`` simulations. They begin with
@@ -41,19 +41,41 @@ class Rollout:
     than its base: where one improvement brings little, the base is nearly the best of those near
     it. It does samples · (steps + 1) · (sensors + 1) steps of the base for one of its own.
 
-    Assumes: a model that is true, for what is imagined comes of it.
-
-    Source: D. P. Bertsekas, J. N. Tsitsiklis and C. Wu, "Rollout algorithms for combinatorial
-    optimization", Journal of Heuristics 3, 1997.
+    Args:
+        base: policy that is improved; the text behind ``base=`` is all its own.
+        samples: M >= 1, simulations of each decision.
+        steps: h >= 1, steps of the base after a decision.
+        price: p >= 0 of a token; None for the task's own.
+        doubt: standard errors by which a decision must beat the base's.
 
     Raises:
         ConfigurationError: a number that is not allowed; a base that cannot be made, that keeps
             variables of its own from step to step, or that looks at each sensor's own beliefs; a
             task whose policies do not see the sensors, or whose system cannot be imagined.
+
+    Equation:
+        $$
+        a=\arg\min_{a}\ \frac{1}{M}\sum_{m=1}^{M}\sum_{k=0}^{h}\left(\lVert x^\star_m(t+k)-\hat
+        x_m(t+k)\rVert_W^2+p\,C_m(t+k)\right)
+        $$
+
+        The first decision a is nobody, one sensor, or what the base asks for; after it the base
+        goes on. m counts the ``samples`` M, h is ``steps``, C are the tokens spent, p is ``price``,
+        W the weights of the reward's error term. Another decision than the base's must be better by
+        ``doubt`` standard errors of the difference.
+
+    Assumes: a model that is true, for what is imagined comes of it.
+
+    Source: D. P. Bertsekas, J. N. Tsitsiklis and C. Wu, "Rollout algorithms for combinatorial
+    optimization", Journal of Heuristics 3, 1997.
+
+    Example: ``rollout:samples=8,price=0.03,base=value_of_information:price=0.006,at_most=1`` in
+    ``fusion_gym/TobitOscillator-v0 filter=tobit random_start=True token_rate=2 memory=True``.
     """
 
     stateless: ClassVar[bool] = False  # it draws
     remember: ClassVar[Owner] = "coordinator"
+    rest: ClassVar[str] = "base"
 
     def __init__(
         self,
@@ -86,12 +108,16 @@ class Rollout:
             raise validation.refusal(
                 "base", base, "a coordinator's policy, for simulations begin with what it believes"
             )
-        self.knowledge: Knowledge = knows(task, own=False)
         memory = Memory(task, "coordinator")
         self._task = task
         self._weights = task.reward.error_weight * task.reward.state_weights
         self._imagination = Imagination(task, memory, ObservationLayout(task))
         self.reset(0)
+
+    @property
+    def knowledge(self) -> Knowledge:
+        """A coordinator, with what was never sent if the task has memory."""
+        return knows(self._task, own=False)
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Begin again: run i imagines with a stream of its own, that of ``seed + i``."""

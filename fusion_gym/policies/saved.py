@@ -15,7 +15,12 @@ def saved_agent(
     *,
     trust: bool = False,
 ) -> Policy:
-    """The agent saved at ``path``; torch is imported only here.
+    """Request as a Stable-Baselines3 model does that is saved in a file; torch is imported here.
+
+    Args:
+        path: the file, with or without ``.zip``.
+        deterministic: take the likeliest action in the place of a draw.
+        price: of a token, for an agent that was trained for a range of prices.
 
     Raises:
         ConfigurationError: as :func:`fusion_gym.policies.loading.load_model_policy`.
@@ -28,7 +33,12 @@ def saved_agent(
 def zoo_agent(
     task: Task, name: str, deterministic: bool = True, price: float | None = None
 ) -> Policy:
-    """The agent of this name in :mod:`fusion_gym.zoo`.
+    """Request as an agent of the model zoo does, :mod:`fusion_gym.zoo`.
+
+    Args:
+        name: the agent's.
+        deterministic: take the likeliest action in the place of a draw.
+        price: of a token, for an agent that was trained for a range of prices.
 
     Raises:
         ConfigurationError: no agent of that name, one whose file is not what its card says, or one

@@ -17,7 +17,7 @@ from fusion_gym.solvers.whittle import index_table
 
 
 class WhittleIndex:
-    """Requests the sources whose index reaches the price of a transmission, highest first.
+    r"""Request the sources whose Whittle index reaches the price of a transmission.
 
     The index of a source with error e and channel state s is the price λ at which its own optimum
     does not care whether it transmits. With thresholds that grow with the price it is the inverse
@@ -25,18 +25,32 @@ class WhittleIndex:
     fixed price the rule is the stationary optimum; for many sources that share a network it is
     Whittle's heuristic, which is asymptotically optimal in similar problems and not in general.
 
-    ``at_most`` sources are requested in a step (None: one with ``access="single"``, else all);
-    ``price`` of a token stands for the task's own. With a price of zero it asks for whoever has
-    the highest index.
+    With a price of zero it requests the sources of the highest index.
+
+    Args:
+        price: p >= 0 of a token; None for the task's own.
+        at_most: most sources requested in a step; None: one with ``access="single"``, else all.
 
     Raises:
         ConfigurationError: another system than remote estimation, an unstable source, or
             thresholds that do not grow with the price.
 
+    Equation:
+        $$
+        \lambda_i(e)=\inf\{\lambda:\ k_i(\lambda)\ge|e|\},\qquad \delta_i(t)=1\Rightarrow
+        \lambda_i(e_i)/c_i\ge p
+        $$
+
+        kᵢ(λ) is the optimal threshold of source i by itself at the price λ of a transmission, for
+        the channel's last state; p is ``price``, c the tokens that a transmission costs. Of those,
+        the ``at_most`` of the highest index per token.
+
     Assumes: sources that are independent of one another, with |a| <= 1, whose model is true.
 
     Source: P. Whittle, "Restless bandits: activity allocation in a changing world", Journal of
     Applied Probability 25A, 1988.
+
+    Example: ``whittle:price=5`` in ``fusion_gym/RemoteEstimation-v0 sensors=2 cost_weight=5.0``.
     """
 
     stateless: ClassVar[bool] = True
@@ -49,8 +63,11 @@ class WhittleIndex:
         self._price = validation.number("price", fixed, at_least=0.0)
         self._cost = task.bucket.cost
         self._tables = [index_table(number, problem) for number, problem in enumerate(problems)]
-        # Without a limit each source decides by itself, whatever access does with the requests.
-        self.knowledge: Knowledge = "own" if self._at_most is None else "coordinator"
+
+    @property
+    def knowledge(self) -> Knowledge:
+        """A sensor's own error; with ``at_most`` all errors, for the largest index is sent."""
+        return "own" if self._at_most is None else "coordinator"
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Nothing to forget."""

@@ -13,21 +13,35 @@ from fusion_gym.policies.base import PerSensor, Requests, Rule, not_negative, pa
 
 @dataclass
 class AdaptiveInnovation(Rule):
-    """Request when |ε|² >= a exp(-(b + c |ε at the last request|)), with ε the innovation.
+    r"""Request when |ε|² >= a exp(-(b + c |ε at the last request|)), with ε the innovation.
 
-    ``threshold`` a is in squared units of the measurement, ``offset`` b without unit,
-    ``sensitivity`` c in the inverse unit of the measurement: after a large innovation a sensor
-    becomes easier to provoke. Before an episode's first request the remembered innovation is zero.
-    ``sensitivity=0`` is a fixed threshold, ``threshold=0`` requests always.
+    After a large innovation a sensor becomes easier to provoke. Before an episode's first request
+    the remembered innovation is zero.
 
     The rule decides at the sensor, so a request moves the threshold whether or not the network
     grants it: what it remembers may be a measurement that was never delivered. In the paper every
     request is granted. The printed exponent -b + c |ε| contradicts the text, which wants a
     decreasing function.
 
+    Args:
+        threshold: a >= 0, in squared units of the measurement; 0 requests always.
+        offset: b >= 0, without unit.
+        sensitivity: c >= 0, in the inverse unit of the measurement; 0 is a fixed threshold.
+
+    Equation:
+        $$
+        \delta_i(t)=1\iff |\varepsilon_i(t)|^2\ge
+        a_i\exp\left(-b_i-c_i\,|\varepsilon_i(l_i)|\right)
+        $$
+
+        ε is the innovation, lᵢ the step of the sensor's last request, before which ε counts as 0. a
+        is ``threshold``, b ``offset``, c ``sensitivity``.
+
     Assumes: a prediction of the measurement at the sensor, and that requests are granted.
 
     Source: adaptive_innovation, equations (9)-(11), defaults of Section 6.
+
+    Example: ``adaptive_innovation`` in ``fusion_gym/CorrelatedTracking-v0``.
     """
 
     threshold: PerSensor = parameter(0.6, not_negative)

@@ -14,24 +14,44 @@ from fusion_gym.policies.base import PerSensor, Requests, Rule, parameter, shape
 
 @dataclass
 class AdaptiveThreshold(Rule):
-    """Request when |σ|² > ρ, with σ the measurement minus the last delivered one.
+    r"""Request when |σ|² > ρ, with σ the measurement minus the last delivered one.
 
     The threshold follows ρ' = ρ̄ + |σ|²/(λ + |σ|²) (ρ - ρ̄) in every step, with σ before the
-    transmission: it only rises, from ``rho_initial`` ρ₀ at an episode's start to ``rho_bar`` ρ̄.
-    ``rho_bar``, ``rho_initial`` and ``adaptation`` λ are in squared units of the measurement;
-    ``scale`` multiplies ρ̄ and ρ₀, for sweeps.
+    transmission: it only rises, from ρ₀ at an episode's start to ρ̄.
 
     While every request is granted, |σ|² <= ρ̄ wherever nothing was sent. σ is taken against the
     last delivery and not the last request, so that this also holds again after a denied request
     is repeated. The measurement at time 0 counts as delivered.
 
+    Args:
+        rho_bar: ρ̄, the limit of the threshold, in squared units of the measurement.
+        rho_initial: ρ₀ <= ρ̄, the threshold at an episode's start.
+        adaptation: λ > 0, in squared units of the measurement.
+        scale: factor of ρ̄ and ρ₀, for sweeps.
+
     Raises:
         ConfigurationError: not 0 <= ρ₀ <= ρ̄ <= 1, or λ <= 0, or a negative scale.
+
+    Equation:
+        $$
+        \delta_i(t)=1\iff |\sigma_i(t)|^2>\rho_i(t),\qquad \sigma_i=y_i-\bar y_i
+        $$
+
+        $$
+        \rho_i(t+1)=\bar\rho_i+\frac{|\sigma_i|^2}{\lambda_i+|\sigma_i|^2}
+        \,(\rho_i(t)-\bar\rho_i),\qquad
+        \rho_i(0)=\rho_{0,i}
+        $$
+
+        ȳᵢ is the last delivered measurement. ρ̄ is ``rho_bar``, ρ₀ ``rho_initial``, λ
+        ``adaptation``; ``scale`` multiplies ρ̄ and ρ₀.
 
     Assumes: a centre that holds the last delivered value, and for the bound ρ̄ that every
     request is granted.
 
     Source: unknown_input, equations (5)-(7), defaults of Section 4.
+
+    Example: ``adaptive_threshold`` in ``fusion_gym/UnknownInput-v0``.
     """
 
     rho_bar: PerSensor = 0.05

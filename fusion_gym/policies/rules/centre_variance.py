@@ -12,20 +12,36 @@ from fusion_gym.policies.base import Requests, Rule, check_at_most, parameter, s
 
 @dataclass
 class CentreVariance(Rule):
-    """Request the fewest sensors, chosen greedily, that bring the centre's trace below a threshold.
+    r"""Request the fewest sensors, by greedy choice, that bring the fused trace below a threshold.
 
     The trace is that of the fused covariance after the step, in squared units of the state. If it
-    is at least ``threshold`` without any packet, the sensor that lowers it most is requested; if
-    it still is, the one that lowers it most in addition; and so on, ``at_most`` of them (None:
-    all). It looks at no measurement, so without a token limit it is a schedule.
+    is at least θ without any packet, the sensor that lowers it most is requested; if it still is,
+    the one that lowers it most in addition; and so on. It looks at no measurement, so without a
+    token limit it is a schedule.
 
     Unlike the rule ``variance_threshold`` it takes the plain
     trace, and it knows what several packets bring together.
+
+    Args:
+        threshold: θ >= 0, in squared units of the state.
+        at_most: most sensors requested in a step; None for no limit.
+
+    Equation:
+        $$
+        S_0=\varnothing,\qquad
+        S_{k+1}=S_k\cup\{\arg\min_{s}\ \mathrm{tr}\,P_{S_k\cup\{s\}}\}\quad\text{while}\quad
+        \mathrm{tr}\,P_{S_k}\ge\theta
+        $$
+
+        The last of these sets is requested. P_S is the fused covariance of this step after the
+        packets of S, θ is ``threshold``; at most ``at_most`` sensors are added.
 
     Assumes: claimed covariances that are true; what was measured plays no part.
 
     Source: the threshold is that of S. Trimpe and R. D'Andrea, "Event-based state estimation with
     variance-based triggering", IEEE Trans. Automatic Control 59, 2014; the choice is ours.
+
+    Example: ``centre_variance:threshold=2.5`` in ``fusion_gym/MarkovJumpTracking-v0``.
     """
 
     threshold: float = parameter(1.6, validation.number, at_least=0.0)

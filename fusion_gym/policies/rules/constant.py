@@ -13,11 +13,19 @@ from fusion_gym.policies.base import Requests, Rule, shape_of
 
 @dataclass
 class Always(Rule):
-    """Every sensor requests at every step.
+    r"""Request every sensor at every step.
+
+    Equation:
+        $$
+        \delta_i(t)=1
+        $$
 
     Assumes: nothing.
 
     Source: none; the end of the trade-off at which everything is sent that the tokens pay for.
+
+    Example: ``always`` in ``fusion_gym/TobitOscillator-v0 filter=tobit random_start=True
+    tokens=unlimited``.
     """
 
     knowledge: ClassVar[Knowledge] = "clock"
@@ -29,11 +37,19 @@ class Always(Rule):
 
 @dataclass
 class Never(Rule):
-    """No sensor ever requests.
+    r"""Request no sensor, ever.
+
+    Equation:
+        $$
+        \delta_i(t)=0
+        $$
 
     Assumes: nothing.
 
     Source: none; the end of the trade-off at which the centre only predicts.
+
+    Example: ``never`` in ``fusion_gym/TobitOscillator-v0 filter=tobit random_start=True
+    token_rate=2``.
     """
 
     knowledge: ClassVar[Knowledge] = "clock"

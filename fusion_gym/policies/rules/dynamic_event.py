@@ -23,18 +23,41 @@ from fusion_gym.policies.base import (
 
 @dataclass
 class DynamicEvent(Rule):
-    """Request when |ε| >= η/χ + σ, with ε the last requested minus the current measurement.
+    r"""Request when |ε| >= η/χ + σ, with ε the last requested minus the current measurement.
 
-    ``threshold`` σ and ``initial`` η₀ are in the unit of the measurement, ``decay`` λ and
-    ``divisor`` χ without unit; ``scale`` multiplies σ and η₀, for sweeps. The dynamic variable
+    The dynamic variable
     follows η' = λ η + σ - |ε|, where ε is zero after a request, and is clipped at zero: the
     condition λ χ > 1 that would keep it positive is violated by the paper's own numbers. It
     remembers measurements that were not requested, and ε those that were denied.
+
+    Args:
+        threshold: σ >= 0, in the unit of the measurement.
+        decay: λ >= 0, without unit.
+        divisor: χ > 0, without unit.
+        initial: η₀ >= 0, in the unit of the measurement.
+        scale: factor of σ and η₀, for sweeps.
+
+    Equation:
+        $$
+        \delta_i(t)=1\iff |\varepsilon_i|\ge\frac{\eta_i(t)}{\chi_i}+\sigma_i
+        $$
+
+        $$
+        \eta_i(t+1)=\max\left(0,\ \lambda_i\,\eta_i(t)+\sigma_i
+        -(1-\delta_i(t))\,|\varepsilon_i|\right),\qquad
+        \eta_i(0)=\eta_{0,i}
+        $$
+
+        εᵢ is the last requested measurement minus the present one. σ is ``threshold``, λ ``decay``,
+        χ ``divisor``, η₀ ``initial``; ``scale`` multiplies σ and η₀.
 
     Assumes: a centre that holds the last delivered value, and that requests are granted: ε is
     taken against the last request.
 
     Source: tobit_token_bucket, equations (11)-(15).
+
+    Example: ``dynamic_event:scale=3`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    random_start=True token_rate=2``.
     """
 
     threshold: PerSensor = parameter((0.1, 0.2, 0.3), not_negative)

@@ -16,14 +16,34 @@ from fusion_gym.policies.believing import BelievingRule
 
 @dataclass
 class EstimateDifference(BelievingRule):
-    """Request when |x* - x̂| >= ``threshold``; of the sensors, those of the highest value.
+    r"""Request when |x* - x̂| >= ``threshold``; of the sensors, those of the highest value.
 
     x* is the estimate that could be made and x̂ the centre's if nobody transmits
     (:mod:`fusion_gym.core.beliefs`). The norm is weighted as in the reward, by weights of mean 1,
-    in the unit of the states; ``whitened`` by the centre's claimed covariance, without a unit.
-    ``at_most`` limits a step to the sensors whose transmission is worth most (None: all). With
-    ``own`` every sensor decides by itself, on its own memory and what it hears: without memory
-    that is a threshold on what its own measurement would change.
+    in the unit of the states. With ``own`` and without memory it is a threshold on what a sensor's
+    own measurement would change.
+
+    Args:
+        own: every sensor decides by itself, on its own memory and what it hears.
+        threshold: θ >= 0, in the unit of the states, or without a unit.
+        whitened: weigh by the inverse of the centre's claimed covariance.
+        at_most: most sensors requested in a step, those of the highest value; None for no limit.
+
+    Raises:
+        ConfigurationError: a value that is not allowed, ``at_most`` with ``own``, or a task whose
+            policies do not see the sensors.
+
+    Equation:
+        $$
+        \lVert x^\star-\hat x\rVert_W\ge\theta\ \Rightarrow\ \text{request the sensors of the
+        highest value}\ v(s)
+        $$
+
+        x* is the best estimate that could be made, x̂ the centre's if nobody transmits, W weights
+        of mean 1 as in the reward (with ``whitened`` P⁻¹, P the centre's covariance of x̂), θ
+        ``threshold``, v as in
+        :class:`~fusion_gym.policies.rules.value_of_information.ValueOfInformation`; ``at_most``
+        sensors are requested. With ``own`` every sensor compares the x* and the x̂ that it knows.
 
     Assumes: x* is the conditional mean given all that its owner knows: the error is then that
     of x*, which no decision changes, plus the squared difference.
@@ -32,9 +52,8 @@ class EstimateDifference(BelievingRule):
     IEEE CDC 2004; G. M. Lipsa and N. C. Martins, "Remote state estimation with communication costs
     for first-order LTI systems", IEEE Trans. Automatic Control 56, 2011.
 
-    Raises:
-        ConfigurationError: a value that is not allowed, ``at_most`` with ``own``, or a task whose
-            policies do not see the sensors.
+    Example: ``estimate_difference:threshold=0.25`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    random_start=True token_rate=2 memory=True``.
     """
 
     threshold: float = parameter(0.2, validation.number, at_least=0.0)

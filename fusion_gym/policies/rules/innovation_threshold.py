@@ -22,11 +22,23 @@ from fusion_gym.policies.base import (
 
 @dataclass
 class InnovationThreshold(Rule):
-    """Request when the innovation's norm is at least ``threshold``.
+    r"""Request when the innovation's norm is at least ``threshold``.
 
-    The norm is Euclidean in the unit of the measurement, or, with ``whitened``, of the innovation
-    in predicted standard deviations. ``at_most`` limits a step to the sensors with the largest
-    norms (None: no limit).
+    The norm is Euclidean.
+
+    Args:
+        threshold: θ >= 0, in the unit of the measurement, or without a unit.
+        whitened: take the innovation in predicted standard deviations.
+        at_most: most sensors requested in a step, those of the largest norms; None for no limit.
+
+    Equation:
+        $$
+        \delta_i(t)=1\iff \lVert z_i(t)\rVert\ge\theta_i,\qquad z_i=y_i-\hat y_i
+        $$
+
+        ŷᵢ is the predicted measurement, θ is ``threshold``; with ``whitened`` each component of z
+        is divided by its predicted standard deviation. With ``at_most``, those of the largest
+        norms.
 
     Assumes: a prediction of the measurement at the sensor; with ``whitened`` also that its
     predicted deviation is true. Silence is taken for no information by the filters here.
@@ -34,6 +46,9 @@ class InnovationThreshold(Rule):
     Source: after J. Wu, Q.-S. Jia, K. H. Johansson and L. Shi, "Event-based sensor data
     scheduling: trade-off between communication rate and estimation quality", IEEE Trans.
     Automatic Control 58, 2013 (there with the maximum norm of the whitened innovation).
+
+    Example: ``innovation_threshold:threshold=1.2`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    random_start=True token_rate=2``.
     """
 
     threshold: PerSensor = parameter(1.0, not_negative)

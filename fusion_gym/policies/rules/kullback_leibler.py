@@ -16,23 +16,39 @@ from fusion_gym.policies.believing import BelievingRule
 
 @dataclass
 class KullbackLeibler(BelievingRule):
-    """Request where the divergence of the centre's two densities is at least ``threshold`` nats.
+    r"""Request where the divergence of the centre's two densities is at least ``threshold`` nats.
 
     D(s) = ½ (tr P⁻¹ P_s - n + δᵀ P⁻¹ δ + ln det P - ln det P_s): from the Gaussian N(x̂(s), P_s)
     that the centre would hold after the packet of s alone to N(x̂, P), its prediction, with
     δ = x̂(s) - x̂. With ``own`` and memory x*, with all that the sensor remembers, stands for x̂(s).
     It counts what a packet teaches, variance included, whether or not the estimate moves.
-    ``at_most`` limits a step to the sensors of highest divergence (None: no limit). With ``own``
-    every sensor decides by itself.
+
+    Args:
+        own: every sensor decides by itself.
+        threshold: θ >= 0, in nats.
+        at_most: most sensors requested in a step, those of the highest divergence; None for no
+            limit.
+
+    Raises:
+        ConfigurationError: a value that is not allowed, ``at_most`` with ``own``, or a task whose
+            policies do not see the sensors.
+
+    Equation:
+        $$
+        D(s)=\frac{1}{2}\left(\mathrm{tr}(P^{-1}P_s)-n+\delta^{\mathsf
+        T}P^{-1}\delta+\ln\frac{\det P}{\det P_s}\right)\ge\theta,\qquad \delta=\hat x(s)-\hat x
+        $$
+
+        N(x̂, P) is the centre's density if nobody transmits, N(x̂(s), P_s) after the packet of s
+        alone, n the number of states, θ ``threshold`` in nats.
 
     Assumes: Gaussian densities, and claimed covariances that are true.
 
     Source: J. W. Marck and J. Sijs, "Relevant sampling applied to event-based state-estimation",
     SENSORCOMM 2010.
 
-    Raises:
-        ConfigurationError: a value that is not allowed, ``at_most`` with ``own``, or a task whose
-            policies do not see the sensors.
+    Example: ``kullback_leibler:threshold=0.8,at_most=1`` in ``fusion_gym/TobitOscillator-v0
+    filter=tobit random_start=True token_rate=2 memory=True``.
     """
 
     threshold: float = parameter(0.5, validation.number, at_least=0.0)

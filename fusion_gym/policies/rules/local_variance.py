@@ -12,17 +12,29 @@ from fusion_gym.policies.base import PerSensor, Requests, Rule, each_number, par
 
 @dataclass
 class LocalVariance(Rule):
-    """Request where the trace of the node's own error covariance is at least ``reference`` + ``m``.
+    r"""Request where the trace of the node's error covariance is at least ``reference`` + ``m``.
 
-    Both are in squared units of the state; ``m`` may have any sign. ``reference`` is the trace
-    that the fusion of all nodes reaches at full rate, which the environment supplies; without it
-    ``m`` is the threshold. The traces depend on time alone, so the rule is a schedule that becomes
+    The traces depend on time alone, so the rule is a schedule that becomes
     periodic, whatever is measured, and it prefers the worst node.
+
+    Args:
+        m: distance to the reference, in squared units of the state, of any sign.
+        reference: trace that the fusion of all nodes reaches at full rate; the environment supplies
+            it.
+
+    Equation:
+        $$
+        \delta_i(t)=1\iff \mathrm{tr}\,P_i(t)\ge P_{\mathrm{ref}}+m_i
+        $$
+
+        Pᵢ is the node's own error covariance, P_ref ``reference``.
 
     Assumes: node covariances that depend on time alone, as those of linear filters do, so that
     centre and node know them both.
 
     Source: markov_jump, equation (33).
+
+    Example: ``local_variance:m=0.9`` in ``fusion_gym/MarkovJumpTracking-v0``.
     """
 
     m: PerSensor = parameter(0.9, each_number)

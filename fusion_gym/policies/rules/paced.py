@@ -17,19 +17,33 @@ _ROUNDING = 1e-9
 
 @dataclass
 class Paced(Rule):
-    """Each sensor requests at ``rate``, its requests spread as evenly as possible.
+    r"""Request each sensor at ``rate``, its requests spread as evenly as possible.
 
-    A sensor requests at step t, counted from 0, where ⌊(t + 1) r + φ⌋ > ⌊t r + φ⌋ with its rate r
-    in [0, 1], any real number. In every window of n steps it makes less than one request more or
-    fewer than n r. The phases φ are i/sensors for sensor i if ``staggered``, which spreads sensors
-    of one rate evenly among each other too, and 0 otherwise.
+    A sensor requests at step t, counted from 0, where ⌊(t + 1) r + φ⌋ > ⌊t r + φ⌋ with its rate r.
+    In every window of n steps it makes less than one request more or
+    fewer than n r. The phases φ are i/sensors for sensor i if ``staggered``, and 0 otherwise.
 
     For r = 1/period this is ``periodic`` but for the phase. It is what an event trigger of the same
     rate has to beat.
 
+    Args:
+        rate: r in [0, 1], any real number.
+        staggered: spread sensors of one rate evenly among each other too.
+
+    Equation:
+        $$
+        \delta_i(t)=1\iff \lfloor (t+1)\,r_i+\varphi_i\rfloor>\lfloor
+        t\,r_i+\varphi_i\rfloor,\qquad \varphi_i=i/l
+        $$
+
+        r is ``rate``, l the number of sensors, i counts from 0; all φ are 0 without ``staggered``.
+
     Assumes: nothing; it looks at the clock alone.
 
     Source: none; the balanced sequence of a rate r, ⌊(t + 1) r + φ⌋ - ⌊t r + φ⌋.
+
+    Example: ``paced:rate=0.07`` in ``fusion_gym/TobitOscillator-v0 filter=tobit random_start=True
+    token_rate=2``.
     """
 
     rate: PerSensor = parameter(0.2, each_number, at_least=0.0, at_most=1.0)

@@ -14,13 +14,27 @@ from fusion_gym.policies.base import Requests, Rule, parameter, shape_of
 
 @dataclass
 class Periodic(Rule):
-    """Every sensor requests once in ``period`` steps.
+    r"""Request every sensor once in ``period`` steps.
 
-    ``staggered`` spreads the sensors over the period; otherwise all request together.
+    Args:
+        period: steps between two requests of a sensor, >= 1.
+        staggered: spread the sensors over the period; otherwise all request together.
+
+    Equation:
+        $$
+        \delta_i(t)=1\iff t\equiv\varphi_i\ (\mathrm{mod}\ p),\qquad \varphi_i=\lfloor
+        i\,p/l\rfloor
+        $$
+
+        p is ``period``, l the number of sensors, i counts from 0; all φ are 0 without
+        ``staggered``.
 
     Assumes: nothing; it looks at the clock alone.
 
     Source: none; what an event trigger is usually compared with.
+
+    Example: ``periodic:period=15`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    random_start=True token_rate=2``.
     """
 
     period: int = parameter(4, validation.integer, at_least=1)
@@ -36,12 +50,26 @@ class Periodic(Rule):
 
 @dataclass
 class RoundRobin(Rule):
-    """One sensor after another, the next one every ``period`` steps.
+    r"""Request one sensor after another, the next one every ``period`` steps.
+
+    Args:
+        period: steps between two requests, >= 1.
+
+    Equation:
+        $$
+        \delta_i(t)=1\iff t\equiv 0\ (\mathrm{mod}\ p)\ \ \text{and}\ \ \lfloor t/p\rfloor\equiv
+        i\ (\mathrm{mod}\ l)
+        $$
+
+        p is ``period``, l the number of sensors, i counts from 0.
 
     Assumes: nothing; it looks at the clock alone.
 
     Source: round_robin_tobit, equation (4), for the protocol in which one sensor a step may
     transmit.
+
+    Example: ``round_robin:period=5`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    random_start=True token_rate=2``.
     """
 
     period: int = parameter(1, validation.integer, at_least=1)

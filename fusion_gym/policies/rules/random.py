@@ -14,11 +14,24 @@ _STREAM = 0x72616E646F6D  # keeps the requests apart from the noise of the same 
 
 @dataclass
 class Random(Rule):
-    """Each sensor requests with probability ``rate``, independently at every step.
+    r"""Request each sensor with probability ``rate``, independently at every step.
+
+    Args:
+        rate: r in [0, 1].
+
+    Equation:
+        $$
+        \Pr\{\delta_i(t)=1\}=r_i
+        $$
+
+        r is ``rate``; all draws are independent.
 
     Assumes: nothing; requests are independent of everything.
 
     Source: none; what an event trigger is usually compared with.
+
+    Example: ``random:rate=0.07`` in ``fusion_gym/TobitOscillator-v0 filter=tobit random_start=True
+    token_rate=2``.
     """
 
     rate: PerSensor = parameter(0.2, each_number, at_least=0.0, at_most=1.0)

@@ -12,13 +12,26 @@ from fusion_gym.policies.base import PerSensor, Requests, Rule, not_negative, pa
 
 @dataclass
 class SendOnDelta(Rule):
-    """Request when |y - last delivered y| >= ``threshold``, in the unit of the measurement.
+    r"""Request when |y - last delivered y| >= ``threshold``, in the unit of the measurement.
+
+    Args:
+        threshold: θ >= 0, in the unit of the measurement.
+
+    Equation:
+        $$
+        \delta_i(t)=1\iff \lVert y_i(t)-\bar y_i\rVert\ge\theta_i
+        $$
+
+        ȳᵢ is the last delivered measurement of sensor i, θ is ``threshold``.
 
     Assumes: a centre that holds the last delivered value: the threshold then bounds how far it
     is off.
 
     Source: M. Miskowicz, "Send-on-delta concept: an event-based data reporting strategy",
     Sensors 6, 2006.
+
+    Example: ``send_on_delta:threshold=3`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    random_start=True token_rate=2``.
     """
 
     threshold: PerSensor = parameter(1.0, not_negative)

@@ -17,15 +17,27 @@ _STREAM = 0x73746F6368  # keeps the draws apart from the noise of the same seed
 
 @dataclass
 class StochasticEvent(Rule):
-    """Each sensor stays silent with probability exp(-weight · |z|² / 2), z its innovation.
+    r"""Keep each sensor silent with probability exp(-w |z|² / 2), z its innovation.
 
-    ``weight`` >= 0 is the paper's Z, here a multiple of the identity for each sensor, in the
-    inverse squared unit of the measurement. With ``whitened`` the innovation is taken in predicted
-    standard deviations and the weight has no unit. Weight 0 never requests.
+    The weight w is the paper's Z, here a multiple of the identity for each sensor.
 
     The silence is a soft event: given silence the posterior stays Gaussian, and
     ``filter="stochastic"`` is the exact filter for it (of the plain
     innovation, not of the whitened one).
+
+    Args:
+        weight: w >= 0, in the inverse squared unit of the measurement, or without a unit; 0 never
+            requests.
+        whitened: take the innovation in predicted standard deviations.
+
+    Equation:
+        $$
+        \Pr\{\delta_i(t)=0\}=\exp\left(-\frac{1}{2}\,w_i\,\lVert z_i(t)\rVert^2\right),\qquad
+        z_i=y_i-\hat y_i
+        $$
+
+        w is ``weight``; with ``whitened`` each component of z is divided by its predicted standard
+        deviation.
 
     Assumes: a prediction of the measurement at the sensor; for the exact posterior a linear
     Gaussian system, uncensored sensors and requests that are all granted.
@@ -33,6 +45,9 @@ class StochasticEvent(Rule):
     Source: D. Han, Y. Mo, J. Wu, S. Weerakkody, B. Sinopoli and L. Shi, "Stochastic
     event-triggered sensor schedule for remote state estimation", IEEE Trans. Automatic Control
     60(10), 2015, the closed-loop schedule.
+
+    Example: ``stochastic_event:weight=0.3`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    random_start=True token_rate=2``.
     """
 
     weight: PerSensor = parameter(1.0, not_negative)

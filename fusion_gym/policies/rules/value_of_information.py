@@ -21,27 +21,45 @@ def _optional(name: str, value: float | None) -> None:
 
 @dataclass
 class ValueOfInformation(BelievingRule):
-    """Request the sensors whose transmission is worth at least ``threshold``, or its ``price``.
+    r"""Request the sensors whose transmission is worth at least ``threshold``, or its ``price``.
 
     v(s) = ‖x* - x̂‖² - E‖x* - x̂(s)‖² with x* the estimate that could be made, x̂ the centre's if
     nobody transmits and x̂(s) if s alone does (:mod:`fusion_gym.core.beliefs`): with memory x*
-    holds all that was measured and not sent, without it this step's measurements. ``threshold`` is
-    in squared units of the states, weighted as in the reward by weights of mean 1; ``price`` is
-    that of a token in the reward's units, and v(s) in these must be at least price · tokens. Just
-    one of them is given; by default the threshold is 0.03.
+    holds all that was measured and not sent, without it this step's measurements. The norm has
+    the reward's weights, of mean 1. It is the strongest rule in most settings, above all with
+    memory.
 
-    ``at_most`` limits a step to the sensors of highest value (None: no limit). ``steps`` sums the
-    distances over as many steps ahead, without noise and further transmissions. With ``own`` every
-    sensor decides by itself, on its own memory and what it hears.
+    Args:
+        own: every sensor decides by itself, on its own memory and what it hears.
+        threshold: θ >= 0, in squared units of the states; 0.03 where no price is given either.
+        price: of a token, in the reward's units, in the place of the threshold.
+        at_most: most sensors requested in a step, those of the highest value; None for no limit.
+        steps: steps ahead over which the distances are summed, without noise and further
+            transmissions.
+
+    Raises:
+        ConfigurationError: both thresholds, a value that is not allowed, ``at_most`` or ``steps``
+            with ``own``, or a task whose policies do not see the sensors.
+
+    Equation:
+        $$
+        v(s)=\lVert x^\star-\hat x\rVert_W^2-\mathrm{E}\,\lVert x^\star-\hat x(s)\rVert_W^2,\qquad
+        \delta_s(t)=1\Rightarrow v(s)\ge\theta
+        $$
+
+        x* is the best estimate that could be made, x̂ the centre's if nobody transmits, x̂(s) if s
+        alone transmits; the expectation is over the packet's arrival. W are weights of mean 1 as in
+        the reward, θ is ``threshold``. With ``price`` p in its place, v in the reward's units must
+        reach p times the tokens of the transmission. Of those, the ``at_most`` of the highest
+        value; with ``steps`` h the squares are summed over h steps ahead.
 
     Assumes: x* is the conditional mean given all that its owner knows, and that what counts is
     the next ``steps`` steps.
 
     Sources: see :mod:`fusion_gym.core.beliefs`.
 
-    Raises:
-        ConfigurationError: both thresholds, a value that is not allowed, ``at_most`` or ``steps``
-            with ``own``, or a task whose policies do not see the sensors.
+    Example: ``value_of_information:threshold=0.03,at_most=1`` in ``fusion_gym/TobitOscillator-v0
+    filter=tobit random_start=True token_rate=2 memory=True``.
     """
 
     threshold: float | None = parameter(None, _optional)

@@ -14,15 +14,32 @@ from fusion_gym.policies.base import Requests, Rule, check_at_most, parameter, s
 
 @dataclass
 class VarianceThreshold(Rule):
-    """Request when the fused covariance without any transmission would have a trace >= threshold.
+    r"""Request when the fused covariance without any transmission would have a trace >= threshold.
 
-    ``threshold`` is in squared units of the state. The ``at_most`` sensors that would reduce the
-    trace most are requested (None: all). It looks at no measurement.
+    It looks at no measurement.
+
+    Args:
+        threshold: θ >= 0, in squared units of the state.
+        at_most: most sensors requested in a step, those that reduce the trace most; None for no
+            limit.
+
+    Equation:
+        $$
+        \mathrm{tr}(W P_\varnothing)\ge\theta\ \Rightarrow\ \delta_i(t)=1\ \text{for the sensors
+        of the largest}\ \ \mathrm{tr}(W P_\varnothing)-\mathrm{tr}(W P_{\{i\}})
+        $$
+
+        P_∅ is the fused covariance of this step if nobody transmits and P_{i} if sensor i alone
+        does, W the reward's weights of the states, θ ``threshold``; ``at_most`` sensors are
+        requested.
 
     Assumes: claimed covariances that are true; what was measured plays no part.
 
     Source: after S. Trimpe and R. D'Andrea, "Event-based state estimation with variance-based
     triggering", IEEE Trans. Automatic Control 59, 2014.
+
+    Example: ``variance_threshold:threshold=0.25`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    random_start=True token_rate=2``.
     """
 
     threshold: float = parameter(0.1, validation.number, at_least=0.0)

@@ -7,8 +7,9 @@ Section 6.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -47,6 +48,8 @@ class CorrelatedTrackingOptions(CommonOptions):
     the reward.
     """
 
+    filters: ClassVar[Mapping[str, type]] = {"": RobustKalmanFilter}  # without a choice
+    structure: ClassVar[Structure | None] = _STRUCTURE
     transition: ArrayLike = ((1.0, _T, _T * _T / 2), (0.0, 1.0, _T), (0.0, 0.0, 1.0))
     """Φ of equations (1) and (64), (n, n)."""
     process_gain: ArrayLike = ((_T * _T / 2,), (_T,), (1.0,))

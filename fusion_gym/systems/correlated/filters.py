@@ -32,12 +32,24 @@ class RobustOutcomes(NamedTuple):
 
 @dataclass(frozen=True)
 class RobustKalmanFilter:
-    """The minimum-variance filter of each node for noises at the bounds of their variances.
+    r"""Minimum-variance filter of each node for noises at the bounds of their variances.
 
     It knows that its measurement noise is correlated with the noise that moved the plant. Without
     a delivery the posterior is the prior. For smaller actual variances its covariance is an upper
     bound of the actual one (Theorem 1), whatever is delivered, as long as what is delivered does
     not depend on the noise.
+
+    Equation:
+        $$
+        S_y=H P H^{\mathsf T}+H S+(H S)^{\mathsf T}+R,\qquad K=(P H^{\mathsf T}+S)\,S_y^{-1}
+        $$
+
+        $$
+        \hat x^{+}=\hat x+K(y-H\hat x),\qquad P^{+}=P-K(P H^{\mathsf T}+S)^{\mathsf T}
+        $$
+
+        S = Γ σ_w² βᵀ is the covariance of the process noise and the sensor's noise, R = σ_η² + β
+        σ_w² βᵀ; all variances stand at their bounds. When nothing arrives the prediction stays.
 
     Assumes: a linear plant, variances below their bounds, all in one proportion, and
     transmissions that are not chosen by the noise.

@@ -115,7 +115,7 @@ def predict_jointly(belief: Belief, maps: Array, variance: Array) -> Prediction:
 
 @dataclass(frozen=True)
 class CentralisedLinearFilter:
-    """The best linear estimate from all measurements delivered so far, of a mode nobody knows.
+    r"""Best linear filter at the centre, of all delivered measurements.
 
     The state of the belief is ζ = col(x 1{θ = m}), and there is one model. Covariances depend on
     time and on what was delivered, not on the data, and are exact.
@@ -124,6 +124,27 @@ class CentralisedLinearFilter:
     y_i = c_i ζ + α_i w plus own noise · ``motion`` [Ā B̄(k)] (a, s, T) · ``additional`` Q_c(k)
     (a, a, T) · ``variance`` of the own noises σ_i² C_i P(k) C_iᵀ + R_i (l, T). Tables end when they
     have settled.
+
+    Equation:
+        $$
+        z=\begin{bmatrix}\zeta\\ w\end{bmatrix},\qquad K_i=\frac{P_z r_i^{\mathsf T}}{r_i P_z
+        r_i^{\mathsf T}+\sigma_i^2C_iMC_i^{\mathsf T}+R_i},\qquad r_i=(c_i,\ \alpha_i)
+        $$
+
+        $$
+        \hat z\leftarrow\hat z+K_i(y_i-r_i\hat z),\qquad P_z\leftarrow P_z-K_i\,r_iP_z
+        $$
+
+        for every measurement that was delivered, one after the other; then
+
+        $$
+        \hat\zeta(k+1)=(\bar A\ \ \bar B)\,\hat z,\qquad P_\zeta(k+1)=(\bar A\ \ \bar
+        B)\,P_z\,(\bar A\ \ \bar B)^{\mathsf T}+Q_c
+        $$
+
+        with the model of
+        :class:`~fusion_gym.systems.markov_jump.linear_minimum_variance.LocalFilters`, w anew with
+        mean 0 and covariance Q, and Q_c the covariance of ξ.
 
     Assumes: a Markov jump system whose mode nobody sees, and transmissions that are not chosen
     by the noise; the estimate is the best linear one, not the best.

@@ -6,8 +6,9 @@ systems with correlated noises and fading measurements), Section 6.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar
 
 from numpy.typing import ArrayLike
 
@@ -18,12 +19,20 @@ from fusion_gym.core.options import CommonOptions, Scenario, Tokens
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.markov_jump.central_system import MarkovJumpCentralSystem
+from fusion_gym.systems.markov_jump.centralised_linear import CentralisedLinearFilter
+from fusion_gym.systems.markov_jump.interacting_models import InteractingModels
+from fusion_gym.systems.markov_jump.linear_minimum_variance import LocalFilters
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
 from fusion_gym.systems.markov_jump.system import MarkovJumpSystem
 from fusion_gym.validation import ConfigurationError
 
 _T = 0.5  # the paper's sampling time in seconds
+FILTERS: dict[str, type] = {
+    "local": LocalFilters,
+    "centralised": CentralisedLinearFilter,
+    "imm": InteractingModels,
+}
 _ESTIMATES_ALREADY = "packets carry the nodes' estimates already, which remember every measurement"
 _STRUCTURE = Structure(common="all contain the same process noise", holds=("joint covariance",))
 
@@ -54,6 +63,8 @@ class MarkovJumpTrackingOptions(CommonOptions):
     token bucket (the paper has none, hence ``tokens="unlimited"``) and the reward.
     """
 
+    filters: ClassVar[Mapping[str, type]] = FILTERS
+    structure: ClassVar[Structure | None] = _STRUCTURE
     transitions: ArrayLike = (((0.8, 0.2 * _T), (0.0, 0.6)), ((1.0, _T), (0.0, _T)))
     """Φ of each mode, equation (1), (modes, n, n). The plant must be mean-square stable."""
     process_gains: ArrayLike = (((1.5,), (0.6,)), ((0.5 * _T * _T,), (_T,)))
@@ -86,10 +97,10 @@ class MarkovJumpTrackingOptions(CommonOptions):
     """Variance R_η of η, Section 6: one number, or one per sensor."""
     tokens: Tokens = "unlimited"
     token_rate: float = 3.0
-    filter: Literal["local", "centralised", "imm"] = "local"
+    filter: Annotated[str, FILTERS] = "local"
     """``"local"`` is the paper's filter at each node, equations (12)-(22): packets carry estimates.
     ``"centralised"`` and ``"imm"`` are one filter at the centre: packets carry measurements."""
-    memory_filter: Literal["local", "centralised", "imm"] | None = None
+    memory_filter: Annotated[str | None, FILTERS] = None
     fusion: Annotated[str | None, _STRUCTURE.offered] = None
     """Rule that joins the copies, with ``filter="local"`` only. The default ``"matrix"`` has matrix
     weights (55)-(57). ``"ci"`` is covariance intersection, ``"ici"`` its inverse form for two

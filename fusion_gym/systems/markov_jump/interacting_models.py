@@ -29,7 +29,7 @@ from fusion_gym.systems.markov_jump.sensors import FadingSensors
 
 @dataclass(frozen=True)
 class InteractingModels:
-    """Estimates of the state and probabilities of the modes from the delivered measurements.
+    r"""Interacting multiple models at the centre: a Kalman filter and a probability for each mode.
 
     Model j stands for θ(k) = j; its belief is about z = col(x, w). Since θ(k) governs both the
     measurement at k and the move to k + 1, beliefs are predicted by their own mode's matrices and
@@ -40,6 +40,27 @@ class InteractingModels:
 
     Shapes, s = n + r: ``maps`` (M, n + l, s, 1) from z to col(x, y), ``motion`` [Φ_j Γ_j]
     (M, n, s, 1), ``unfaded`` H (M, l, n, 1).
+
+    Equation:
+        $$
+        \mu_j\leftarrow\frac{\mu_j\,\ell_j}{\sum_i\mu_i\,\ell_i},\qquad \mu_m(k+1)=\sum_j
+        p_{jm}\,\mu_j,\qquad \omega_{j|m}=\frac{p_{jm}\,\mu_j}{\mu_m(k+1)}
+        $$
+
+        $$
+        \hat x_m(k+1)=\sum_j\omega_{j|m}\,\hat x_j^{-},\qquad
+        P_m(k+1)=\sum_j\omega_{j|m}\left(P_j^{-}+(\hat x_j^{-}-\hat x_m)(\hat x_j^{-}-\hat
+        x_m)^{\mathsf T}\right)
+        $$
+
+        $$
+        \hat x=\sum_m\mu_m\hat x_m,\qquad P=\sum_m\mu_m\left(P_m+(\hat x_m-\hat x)(\hat x_m-\hat
+        x)^{\mathsf T}\right)
+        $$
+
+        μ are the probabilities of the modes, p the Markov chain, ℓⱼ the likelihood of the delivered
+        measurements under mode j. x̂ⱼ⁻, Pⱼ⁻ are the prediction of the Kalman filter of mode j, with
+        yᵢ = β̄ᵢ Hᵢⱼ x + αᵢ w plus a noise of variance Rᵢ + σᵢ² E(Hᵢⱼ x)².
 
     Assumes: one Gaussian a mode after every step, and fading that acts as Gaussian noise.
 

@@ -149,10 +149,10 @@ class FilterUpdate(NamedTuple):
 
 @dataclass(frozen=True)
 class LocalFilters:
-    """The nodes' filters, with the joint covariance of their errors, as tables over time.
+    r"""Best linear filters at the nodes, with the joint covariance of their errors.
 
-    Every table has time as its last axis; :meth:`at` turns times into places. A table ends when
-    it has become periodic (to 1e-13), and its last period then stands for all later times.
+    Every table has time as its last axis; :meth:`at` turns times into places. A table ends when it
+    has become periodic (to 1e-13), and its last period then stands for all later times.
 
     With l sensors, a = modes · n: ``transition`` Ā (a, a, 1) · ``measurement_matrix`` c (l, a, 1) ·
     ``input`` B̄ (a, r, T) · ``gain`` K (l, a, T) · ``noise_gain`` K_w (l, r, T) ·
@@ -161,6 +161,27 @@ class LocalFilters:
     (l, l, a, a, T), L⁺ the errors after the update · ``filtered_cross`` E ε_i L⁺_j (l, l, a, T) ·
     ``predicted_cross`` E ε_i L_j(k+1|k) (l, l, a, T). ``period`` is the number of steps after
     which the sensors' sampling repeats, at most T.
+
+    Equation:
+        $$
+        \zeta(k+1)=\bar A\,\zeta(k)+\bar B\,w(k)+\xi(k),\qquad y_i=c_i\zeta+v_i
+        $$
+
+        $$
+        K_i=\frac{P_i c_i^{\mathsf T}}{q_i},\qquad K_{w,i}=\frac{Q\alpha_i^{\mathsf
+        T}}{q_i},\qquad q_i=c_i P_i c_i^{\mathsf T}+\sigma_i^2 C_i M C_i^{\mathsf T}+\alpha_i
+        Q\alpha_i^{\mathsf T}+R_i
+        $$
+
+        $$
+        \hat\zeta_i^{+}=\hat\zeta_i+K_i\varepsilon_i,\qquad \hat w_i=K_{w,i}\varepsilon_i,\qquad
+        \hat\zeta_i(k+1)=\bar A\,\hat\zeta_i^{+}+\bar B\,\hat w_i
+        $$
+
+        ζ stacks x·1{θ = m} over the modes m; ξ is what the unknown mode adds, of covariance M(k+1)
+        − Ā M(k) Āᵀ − B̄ Q B̄ᵀ with M the second moment of ζ. εᵢ = yᵢ − cᵢ ζ̂ᵢ is the innovation, cᵢ
+        = β̄ᵢ Cᵢ the faded measurement row, σᵢ² the fading's variance. Where the sensor does not
+        sample both gains are zero.
 
     Assumes: a Markov jump system whose mode nobody sees; the estimate is the best linear one,
     not the best.

@@ -9,8 +9,9 @@ Round-Robin protocol", IEEE Transactions on Signal and Information Processing ov
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +25,7 @@ from fusion_gym.systems.tobit.options import (
     FILTERS,
     FeedbackOptions,
     at_the_nodes,
+    classes,
     make_centre,
     remembering_system,
     stochastic_defaults,
@@ -58,6 +60,7 @@ class BiasedOscillatorOptions(FeedbackOptions):
     ``information_shares`` (equal) and the reward.
     """
 
+    filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
     transition: ArrayLike = ((_COS, -_SIN), (_SIN, _COS))
     """A of equation (1), (n, n)."""
     process_covariance: ArrayLike = ((0.0025, 0.0), (0.0, 0.0025))

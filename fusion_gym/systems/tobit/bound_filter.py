@@ -118,10 +118,38 @@ class EventError:
 
 @dataclass(frozen=True)
 class BoundTobitFilter:
-    """Tobit Kalman filter whose gain minimises the trace of the paper's bound.
+    r"""Tobit Kalman filter whose gain minimises the trace of the paper's bound.
 
     ``event_error`` (or None) is the κ₆ Ξ term of a delivery; ``hold`` says what happens without
     one: True updates with the held value as the paper does, False predicts.
+
+    Equation:
+        $$
+        \tilde C=q\,C,\quad a=q\lambda\sqrt R,\quad u=(1-q)\tau,\quad
+        \Omega=(1+\epsilon_{14})P+(1+1/\epsilon_{14})\,\hat x\hat x^{\mathsf T}
+        $$
+
+        $$
+        S_{\mathrm{delivered}}=\kappa_2\,a a^{\mathsf
+        T}+\mathrm{diag}\left(qR+q(1-q)\left(\kappa_3\,C\Omega C^{\mathsf
+        T}+\kappa_8\tau^2\right)\right)+\kappa_6\,\Xi\,I
+        $$
+
+        $$
+        S_{\mathrm{held}}=\kappa_2\,a a^{\mathsf T}+\kappa_4\,\tilde C\Omega\tilde C^{\mathsf
+        T}+\kappa_5\,\bar y\bar y^{\mathsf T}+\kappa_7\,u u^{\mathsf T}
+        $$
+
+        $$
+        K=\kappa_1 P\tilde C^{\mathsf T}\left(\kappa_1\tilde C P\tilde C^{\mathsf
+        T}+S\right)^{-1},\qquad P^{+}=\kappa_1(I-K\tilde C)P(I-K\tilde C)^{\mathsf T}+K S
+        K^{\mathsf T}
+        $$
+
+        q, λ and ŷ as in the :class:`~fusion_gym.systems.tobit.tobit_filter.TobitKalmanFilter`, x̂⁺
+        = x̂ + K (ȳ − ŷ) with ȳ the value that is held, which is the new one after a delivery. Of C
+        Ω Cᵀ in the diagonal only the diagonal counts. κ₁ to κ₈ come of the 14 numbers ε of
+        ``bound_epsilon``; Ξ bounds the trigger's event error (``event_error``).
 
     Assumes: the paper's dynamic event trigger, for Ξ; and that censoring is independent of the
     noise, which it is not, so that the bound is not proven.

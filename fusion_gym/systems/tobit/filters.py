@@ -170,10 +170,21 @@ def in_lanes(values: Array, lanes: NDArray[np.intp]) -> Array:
 
 @dataclass(frozen=True)
 class KalmanFilter:
-    """Kalman filter that ignores censoring; when nothing arrives the prior is the posterior.
+    r"""Kalman filter that ignores censoring; when nothing arrives the prior is the posterior.
 
     S = C P Cᵀ + R, K = P Cᵀ S⁻¹. Biased wherever measurements are censored: it stands beside the
     Tobit filters to show what they are worth.
+
+    Equation:
+        $$
+        S=C P C^{\mathsf T}+R,\qquad K=P C^{\mathsf T}S^{-1}
+        $$
+
+        $$
+        \hat x^{+}=\hat x+K(y-C\hat x),\qquad P^{+}=P-K S K^{\mathsf T}
+        $$
+
+        When nothing arrives the prediction stays.
 
     Assumes: a linear plant, Gaussian noises independent of one another, uncensored
     measurements, and transmissions that are not chosen by the noise.
@@ -211,7 +222,7 @@ class KalmanFilter:
 
 @dataclass(frozen=True)
 class StochasticEventFilter:
-    """A delivery is a Kalman update; silence is a measurement too, of variance R + Z⁻¹.
+    r"""Kalman filter for which silence is a measurement too, of variance R + Z⁻¹.
 
     A sensor that stays silent with probability exp(-zᵀ Z z / 2), z its innovation and
     Z = ``weight`` · I, says by its silence that z was small: as if z = 0 had been measured with
@@ -226,6 +237,19 @@ class StochasticEventFilter:
 
     ``weight`` has shape (sensors, 1), in the inverse squared unit of the measurement, >= 0; with
     weight 0 silence says nothing. Build one with :meth:`create`.
+
+    Equation:
+        $$
+        \text{delivered:}\qquad K=P C^{\mathsf T}(C P C^{\mathsf T}+R)^{-1},\quad \hat x^{+}=\hat
+        x+K(y-C\hat x),\quad P^{+}=P-K C P
+        $$
+
+        $$
+        \text{silent:}\qquad \hat x^{+}=\hat x,\qquad P^{+}=P-P C^{\mathsf T}\left(C P C^{\mathsf
+        T}+R+Z^{-1}\right)^{-1}C P
+        $$
+
+        Z = w I is the weight of the policy ``stochastic_event`` (``stochastic_weight``).
 
     Assumes: a linear plant, Gaussian noises, uncensored sensors, the policy
     ``stochastic_event`` with the same weight, and that every request is granted.

@@ -26,11 +26,24 @@ _MOST_CHANNELS = 100  # whose joint covariance is solved in every step
 
 @dataclass(frozen=True)
 class JointCentre:
-    """The centre takes all measurements that arrive in a step at once; there are no nodes.
+    r"""Kalman filter at the centre, of all measurements that arrive in a step; there are no nodes.
 
     With C and y the rows of what has arrived and R the covariance of their noises, correlations
     between sensors included: S = C P Cᵀ + R, K = P Cᵀ S⁻¹, x̂ = x⁻ + K (y - C x⁻), P = P⁻ - K C P⁻.
     Optimal for uncensored sensors; censoring is ignored.
+
+    Equation:
+        $$
+        S=C P C^{\mathsf T}+R,\qquad K=P C^{\mathsf T}S^{-1}
+        $$
+
+        $$
+        \hat x^{+}=\hat x+K(y-C\hat x),\qquad P^{+}=P-K C P
+        $$
+
+        y and C stack the measurements of all sensors that have arrived in the step, and R is the
+        covariance of their noises, correlations between sensors included. When nothing arrives the
+        prediction stays.
 
     Assumes: a linear plant, Gaussian noises whose joint covariance is known, uncensored sensors,
     and transmissions that are not chosen by the noise.

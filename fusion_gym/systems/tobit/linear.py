@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,13 +12,14 @@ from numpy.typing import ArrayLike
 from fusion_gym import validation
 from fusion_gym.core.options import Scenario, plain
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
-from fusion_gym.systems.tobit.joint import joint_centre
+from fusion_gym.systems.tobit.joint import JointCentre, joint_centre
 from fusion_gym.systems.tobit.linear_sensors import linear_sensors
 from fusion_gym.systems.tobit.options import (
     FILTERS,
     FeedbackOptions,
     Filter,
     at_the_nodes,
+    classes,
     make_centre,
     remembering_system,
     stochastic_defaults,
@@ -33,7 +34,7 @@ _FILTERS = {
     "tobit": at_the_nodes(TobitKalmanFilter),
     "adf": FILTERS["adf"],
     "stochastic": FILTERS["stochastic"],
-    "joint": Filter(joint_centre, nodes=False),
+    "joint": Filter(JointCentre, joint_centre, nodes=False),
 }
 _STEP = 0.1  # seconds between two samples of the default target
 # Observed variances are relative to those after so many silent steps: a target that nobody sees
@@ -63,6 +64,7 @@ class LinearFusionOptions(FeedbackOptions):
     one sensor measures its position in metres, one its velocity in metres a second.
     """
 
+    filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
     transition: ArrayLike = ((1.0, _STEP), (0.0, 1.0))
     """A of x(t+1) = A x(t) + w(t), (n, n)."""
     process_covariance: ArrayLike = (

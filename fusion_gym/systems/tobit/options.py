@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from numpy.typing import ArrayLike
 
@@ -30,6 +30,7 @@ _STRUCTURE = Structure(
 class FeedbackOptions(CommonOptions):
     """Options of the fusion and its feedback; ``None`` is the default of the filter or the rule."""
 
+    structure: ClassVar[Structure | None] = _STRUCTURE
     fusion: Annotated[str | None, _STRUCTURE.offered] = None
     """Rule that joins the nodes' estimates, by default ``"federated"`` (tobit_token_bucket,
     equations (50) and (51)). ``"ci"`` is covariance intersection, ``"ici"`` its inverse form for
@@ -46,20 +47,27 @@ class FeedbackOptions(CommonOptions):
 
 @dataclass(frozen=True)
 class Filter:
-    """A row of a table of filters: the centre that it makes of options and sensors.
+    """A row of a table of filters: its class, and the centre that it makes of options and sensors.
 
-    ``own`` are options that belong to this filter alone; elsewhere they are ``None``. ``nodes``
-    says whether there are nodes to be joined; without, the options of their fusion are ``None``.
+    The docstring of ``kind`` has meaning, equation, assumption and source. ``own`` are options that
+    belong to this filter alone; elsewhere they are ``None``. ``nodes`` says whether there are nodes
+    to be joined; without, the options of their fusion are ``None``.
     """
 
+    kind: type
     make: Callable[[Any, CensoredSensors], Centre]
     own: tuple[str, ...] = ()
     nodes: bool = True
 
 
-def at_the_nodes(node: Callable[[CensoredSensors], NodeFilter]) -> Filter:
-    """The row of a node filter without options of its own."""
-    return Filter(lambda chosen, sensors: feedback_centre(chosen, node(sensors)))
+def at_the_nodes(kind: Any) -> Filter:
+    """The row of a node filter's class that has no options of its own."""
+    return Filter(kind, lambda chosen, sensors: feedback_centre(chosen, kind(sensors)))
+
+
+def classes(filters: Mapping[str, Filter]) -> dict[str, type]:
+    """The class of each filter of a table."""
+    return {name: row.kind for name, row in filters.items()}
 
 
 def make_centre(
@@ -168,8 +176,8 @@ def refuse_fusion(chosen: FeedbackOptions, kind: str) -> None:
 # What every environment of the family offers; each adds its paper's own.
 FILTERS = {
     "kalman": at_the_nodes(KalmanFilter),
-    "adf": Filter(assumed_density_centre, nodes=False),
-    "stochastic": Filter(stochastic_centre, own=("stochastic_weight",)),
+    "adf": Filter(AssumedDensityFilter, assumed_density_centre, nodes=False),
+    "stochastic": Filter(StochasticEventFilter, stochastic_centre, own=("stochastic_weight",)),
 }
 
 

@@ -8,8 +8,9 @@ Systems 4:19, 2024, Section 4.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +25,7 @@ from fusion_gym.systems.tobit.options import (
     FeedbackOptions,
     Filter,
     at_the_nodes,
+    classes,
     feedback_centre,
     make_centre,
     remembering_system,
@@ -43,7 +45,8 @@ _HELD = "the silent filter goes on from the last delivered measurement (silent='
 _IDENTITY = ((1.0, 0.0), (0.0, 1.0))
 _FILTERS = {
     "paper": Filter(
-        lambda chosen, sensors: feedback_centre(chosen, _bound_filter(chosen, sensors))
+        BoundTobitFilter,
+        lambda chosen, sensors: feedback_centre(chosen, _bound_filter(chosen, sensors)),
     ),
     "tobit": at_the_nodes(TobitKalmanFilter),
     **FILTERS,
@@ -70,6 +73,7 @@ class TobitOscillatorOptions(FeedbackOptions):
     are repeated in turn for other numbers of sensors.
     """
 
+    filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
     transition: ArrayLike = ((_COS, _SIN), (-_SIN, _COS))
     """A of equation (1), (n, n). By default a rotation by 0.052 π."""
     process_noise: Literal["scalar", "full"] = "scalar"

@@ -79,9 +79,30 @@ def _two_sided_moments(sensors: CensoredSensors, latent: Array, deviation: Array
 
 @dataclass(frozen=True)
 class TobitKalmanFilter:
-    """Tobit Kalman filter; when nothing arrives the prior is the posterior.
+    r"""Tobit Kalman filter; when nothing arrives the prior is the posterior.
 
     S = q C P Cᵀ q + R v, K = P Cᵀ q S⁻¹ with q, v of :func:`expect_censored`.
+
+    Equation:
+        $$
+        \zeta=\frac{\tau-C\hat x}{\sqrt R},\quad q=1-\Phi(\zeta),\quad
+        \lambda=\frac{\varphi(\zeta)}{q},\quad v=1-\lambda(\lambda-\zeta)
+        $$
+
+        $$
+        \hat y=q\,(C\hat x+\lambda\sqrt R)+(1-q)\,\tau,\qquad S=q\,C P C^{\mathsf T}q+R\,v,\qquad
+        K=P C^{\mathsf T}q\,S^{-1}
+        $$
+
+        $$
+        \hat x^{+}=\hat x+K(y-\hat y),\qquad P^{+}=P-K S K^{\mathsf T}
+        $$
+
+        τ is the threshold below which the sensor shows τ; φ and Φ are the normal density and
+        distribution. q is the probability of an uncensored value, given the predicted state, and v
+        the variance of the standardised noise given that. With an upper threshold as well, q is the
+        probability between the two, λ and v the mean and variance of the standardised noise there,
+        and ŷ = a τ + b υ + q (C x̂ + λ √R), with a and b the probabilities below and above.
 
     Assumes: a linear plant and Gaussian noises; q and v are those at the predicted state, as if
     it were exact, and transmissions are not chosen by the noise.
@@ -110,13 +131,32 @@ class TobitKalmanFilter:
 
 @dataclass(frozen=True)
 class AssumedDensityFilter:
-    """Takes scalar measurements one after another at the centre, sensor by sensor.
+    r"""Assumed-density filter at the centre, of one scalar measurement after another.
 
     Let S = C P Cᵀ + R, K = P Cᵀ/S and t = (C x̂ - τ)/√S. An uncensored component gets the Kalman
     update. A component at its lower threshold τ moves the mean by -√S h K, and P loses
     P Cᵀ C P h (h - t)/S, with the hazard h = φ(t)/(1 - Φ(t)); at the upper threshold the signs
     are mirrored. These are the exact posterior mean and covariance of a Gaussian prior given
     that event; the posterior is then taken to be Gaussian again.
+
+    Equation:
+        $$
+        S=C P C^{\mathsf T}+R,\qquad t=\frac{C\hat x-\tau}{\sqrt S},\qquad
+        h=\frac{\varphi(t)}{1-\Phi(t)}
+        $$
+
+        $$
+        y>\tau:\qquad \hat x^{+}=\hat x+P C^{\mathsf T}\frac{y-C\hat x}{S},\qquad P^{+}=P-\frac{P
+        C^{\mathsf T}C P}{S}
+        $$
+
+        $$
+        y=\tau:\qquad \hat x^{+}=\hat x-P C^{\mathsf T}\frac{h}{\sqrt S},\qquad P^{+}=P-\frac{P
+        C^{\mathsf T}C P}{S}\,h(h-t)
+        $$
+
+        One scalar measurement after another. At an upper threshold the signs of t and of the step
+        are mirrored.
 
     Assumes: a linear plant, Gaussian noises, and a posterior that is nearly Gaussian;
     transmissions are not chosen by the noise.

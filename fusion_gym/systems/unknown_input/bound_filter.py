@@ -21,11 +21,12 @@ _UNBOUNDED = 1e60  # a bound beyond this is growing without limit; the gains hav
 
 @dataclass(frozen=True)
 class BoundTables:
-    """Gains and bounds of every node at the times 0 to T, for all runs alike.
+    r"""The paper's filter, corrected: its gain minimises a bound, for all runs alike.
 
-    Nothing in them depends on the data or on what was sent: when nothing arrives the node takes
-    the last measurement for the present one, and |σ|² <= ρ̄ bounds what that does. With ε the
-    factor of Young's inequality, Φ = (1 + ε)(𝒜 Ξ 𝒜ᵀ + 𝒲) and R = (1 + ε) V + (1 + 1/ε) ρ̄ I.
+    Tables of every node at the times 0 to T. Nothing in them depends on the data or on what was
+    sent: when nothing arrives the node takes the last measurement for the present one, and |σ|² <=
+    ρ̄ bounds what that does. With ε the factor of Young's inequality, Φ = (1 + ε)(𝒜 Ξ 𝒜ᵀ + 𝒲) and R
+    = (1 + ε) V + (1 + 1/ε) ρ̄ I.
 
     ``gain`` 𝒢 (l, s, m, T + 1), ``covariance`` (l, s, s, T + 1), the bound after the update, and
     ``delivered`` (l, s, s, T + 1), the same if the present measurement is known to be new (no
@@ -34,6 +35,27 @@ class BoundTables:
 
     The bound holds under a trigger that sends whenever |σ|² > ρ̄ and whose requests are granted.
     For a policy without that guarantee, and after a request that was denied, it is void.
+
+    Equation:
+        $$
+        \Phi=(1+\epsilon)(\mathcal A\,\Xi_x\mathcal A^{\mathsf T}+\mathcal W),\qquad
+        R=(1+\epsilon)V+(1+1/\epsilon)\,\bar\rho\,I,\qquad \Omega=C\Phi C^{\mathsf T}+R
+        $$
+
+        $$
+        L=\left((C\mathcal B)^{\mathsf T}\Omega^{-1}C\mathcal B\right)^{-1}(C\mathcal B)^{\mathsf
+        T}\Omega^{-1},\qquad N=\mathcal B L+\Phi C^{\mathsf T}U(U^{\mathsf T}\Omega
+        U)^{-1}U^{\mathsf T}
+        $$
+
+        $$
+        \hat x^{+}=\hat x+N(\bar y-C\hat x),\qquad \hat d=L(\bar y-C\hat x),\qquad \Xi_x=(I-N
+        C)\Phi(I-N C)^{\mathsf T}+N R N^{\mathsf T},\qquad \Xi_d=L\,\Omega L^{\mathsf T}
+        $$
+
+        x̂ is predicted without the input, U a basis of the kernel of (C ℬ)ᵀ, with 𝒜, ℬ, 𝒲 over one
+        sampling instant. ȳ is the last delivered measurement, ε is ``young_factor``, ρ̄
+        ``rho_bar``.
 
     Assumes: |σ|² <= ρ̄ wherever nothing was sent, and rank C ℬ = number of inputs; nothing of
     the input.

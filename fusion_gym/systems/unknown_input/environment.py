@@ -7,9 +7,9 @@ Information Technology & Electronic Engineering 24, 2023.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Literal, NamedTuple, get_args
+from typing import Annotated, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,6 +41,20 @@ _STRUCTURE = Structure(common="all contain the same process noise", holds=("trac
 Signal = Literal["sinusoids", "steps", "random_walk"]
 
 
+class Filter(NamedTuple):
+    """A filter's class, whose docstring declares it, and the nodes that it makes."""
+
+    kind: type
+    make: Callable[[UnknownInputOptions, _Parts], Nodes]
+
+
+FILTERS = {
+    "random_walk": Filter(RandomWalkInputFilter, lambda chosen, parts: _random_walk(chosen, parts)),
+    "predict": Filter(ExactInputStateFilter, lambda chosen, parts: _predict(parts)),
+    "paper": Filter(BoundTables, lambda chosen, parts: _paper(chosen, parts)),
+}
+
+
 @dataclass(frozen=True)
 class UnknownInputOptions(CommonOptions):
     """Two carts, tied by springs, under a force that nobody knows, seen in part by three sensors.
@@ -60,6 +74,8 @@ class UnknownInputOptions(CommonOptions):
     :mod:`fusion_gym.systems.unknown_input.examples` lists; a number that is given goes before it.
     """
 
+    filters: ClassVar[Mapping[str, type]] = {name: row.kind for name, row in FILTERS.items()}
+    structure: ClassVar[Structure | None] = _STRUCTURE
     example: Annotated[str, EXAMPLES] = "two_carts"
     """Example that gives the numbers of all options that are ``None``."""
     transition: ArrayLike | None = None
@@ -278,7 +294,7 @@ def _nodes(
             f"hold_variance = {validation.shown(chosen.hold_variance)} is not allowed with "
             f"filter={kind!r}: it belongs to filter='random_walk'"
         )
-    return FILTERS[kind](chosen, _Parts(model, sensors, joint, fusion, factor, horizon))
+    return FILTERS[kind].make(chosen, _Parts(model, sensors, joint, fusion, factor, horizon))
 
 
 class _Parts(NamedTuple):
@@ -302,7 +318,7 @@ def _random_walk(chosen: UnknownInputOptions, parts: _Parts) -> Nodes:
     return RunNodes(parts.model, parts.sensors, node, parts.fusion, hold)
 
 
-def _predict(chosen: UnknownInputOptions, parts: _Parts) -> Nodes:
+def _predict(parts: _Parts) -> Nodes:
     node = ExactInputStateFilter(parts.model, parts.joint)
     return RunNodes(parts.model, parts.sensors, node, parts.fusion)
 
@@ -311,13 +327,6 @@ def _paper(chosen: UnknownInputOptions, parts: _Parts) -> Nodes:
     bound = _given(chosen.rho_bar)
     tables = BoundTables.create(parts.joint, parts.model, bound, parts.factor, parts.horizon)
     return TableNodes.create(parts.model, parts.sensors, tables, parts.fusion)
-
-
-FILTERS: dict[str, Callable[[UnknownInputOptions, _Parts], Nodes]] = {
-    "random_walk": _random_walk,
-    "predict": _predict,
-    "paper": _paper,
-}
 
 
 def _trigger(chosen: UnknownInputOptions, sensors: int) -> dict[str, tuple[float, ...]]:

@@ -12,13 +12,34 @@ from fusion_gym.systems.unknown_input.sensors import InputSensors
 
 @dataclass(frozen=True)
 class ExactInputStateFilter:
-    """Unbiased minimum-variance estimates of state and input from the latest measurement.
+    r"""Exact unbiased filter of state and input, of minimum variance.
 
     An update assumes nothing about the input that has just acted: its estimate comes from this
     measurement alone. While every measurement arrives the covariance is therefore the actual one,
     for every input. Where none arrives there is nothing to estimate the input from, and the node
     predicts with the :class:`InputModel`; from then on its covariance is a claim that is as good
     as the model.
+
+    Equation:
+        $$
+        \Phi=\mathcal A\,P_x\mathcal A^{\mathsf T}+\mathcal W,\qquad \Omega=C\Phi C^{\mathsf T}+V
+        $$
+
+        $$
+        L=\left((C\mathcal B)^{\mathsf T}\Omega^{-1}C\mathcal B\right)^{-1}(C\mathcal B)^{\mathsf
+        T}\Omega^{-1},\qquad N=\mathcal B L+\Phi C^{\mathsf T}U(U^{\mathsf T}\Omega
+        U)^{-1}U^{\mathsf T}
+        $$
+
+        $$
+        z=\begin{bmatrix}x\\ d\end{bmatrix},\quad G=\begin{bmatrix}N\\ L\end{bmatrix},\qquad \hat
+        z^{+}=\hat z+G(y-C\hat x),\qquad P^{+}=M\Phi M^{\mathsf T}+G V G^{\mathsf T}
+        $$
+
+        U is a basis of the kernel of (C ℬ)ᵀ and M = [I; 0] − G C, with 𝒜, ℬ, 𝒲 over one sampling
+        instant. The gain hides the input, N C ℬ = ℬ and L C ℬ = I, so any prediction of the input
+        in x̂ gives the same estimate. When nothing arrives the node predicts with the input's
+        model, d′ = m d + η.
 
     Assumes: rank C ℬ = number of inputs; nothing of the input while everything arrives, and its
     model where nothing does.
@@ -45,11 +66,28 @@ class ExactInputStateFilter:
 
 @dataclass(frozen=True)
 class RandomWalkInputFilter:
-    """The Kalman filter of z = [x(k); d(k - 1)] under an :class:`InputModel`.
+    r"""Kalman filter of z = [x(k); d(k - 1)] under a model of the input, :class:`InputModel`.
 
     Unlike the unbiased filters it uses what it knew of the input before, and it is optimal if the
     input does follow the model. The actual input does not, so its covariance is a claim, not a
     bound; how good a claim depends on the model's numbers.
+
+    Equation:
+        $$
+        z=\begin{bmatrix}x(k)\\ d(k-1)\end{bmatrix},\qquad \hat z\leftarrow F\hat z,\quad
+        P\leftarrow F P F^{\mathsf T}+Q,\qquad F=\begin{bmatrix}\mathcal A&\mathcal
+        B\,m\\ 0&m\end{bmatrix}
+        $$
+
+        $$
+        K=P C_z^{\mathsf T}(C_zPC_z^{\mathsf T}+V)^{-1},\qquad \hat z^{+}=\hat z+K(y-C_z\hat
+        z),\qquad P^{+}=P-K C_zP
+        $$
+
+        The input follows d(k) = m d(k − 1) + η with m ``input_memory`` and η of deviation
+        ``input_change``; Q is the covariance of [ℬ η + w; η], C_z = (C, 0). When nothing arrives
+        the prediction stays, or with ``hold_variance`` the held value is taken as a measurement of
+        so much more variance.
 
     Assumes: an input that follows its model, and transmissions that are not chosen by the
     noise.

@@ -1,0 +1,65 @@
+"""Every policy, fusion rule, filter, metric and algorithm of the library declares itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from fusion_gym.agents.training.algorithms import TABLE
+from fusion_gym.docstrings import read
+from fusion_gym.envs.pages import task_of
+from fusion_gym.evaluation.metrics import METRICS
+from fusion_gym.fusion.table import RULES
+from fusion_gym.policies.registry import make_policy, policy_names, policy_parameters
+from website import parts
+
+POLICIES = {part.name: part for part in parts.policies()}
+DECLARED = [part for kind in parts.KIND_NAMES for part in parts.parts(kind)]
+
+
+@pytest.mark.parametrize("part", DECLARED, ids=lambda part: part.name)
+def test_a_declaration_is_complete(part: parts.Part) -> None:
+    found = read(part.owner)
+    wanted = {"Equation", "Assumes", "Source"} | ({"Example"} if part.kind else set())
+    assert found.summary.endswith((".", ":"))
+    assert wanted <= found.labelled.keys()
+    assert all(found.labelled[label].strip() for label in wanted)
+    assert found.labelled["Equation"].count("$$") in range(2, 99, 2)
+
+
+@pytest.mark.parametrize("name", [*policy_names("rule"), *policy_names("reference")])
+def test_a_policy_declares_its_parameters_and_runs_as_its_example(name: str) -> None:
+    assert list(POLICIES[name].docstring.arguments) == list(policy_parameters(name))
+    assert len(parts.parameters(POLICIES[name])) == len(policy_parameters(name))
+    spec, env = parts.example_of(POLICIES[name])
+    assert spec.partition(":")[0] == name
+    make_policy(spec, task_of(env))
+
+
+def test_rows_say_what_they_mean() -> None:
+    rows: list[Any] = [*RULES.values(), *METRICS.values(), *TABLE.values()]
+    assert all(row.meaning for row in rows)
+    assert all(row.source for row in TABLE.values())
+
+
+def test_sections_are_told_apart() -> None:
+    def bare() -> None:
+        """What it *is*: all of it.
+
+        More.
+
+        Args:
+            a: one thing
+                in two lines.
+            b: another.
+
+        Sources: nobody;
+        nowhere.
+        """
+
+    found = read(bare)
+    assert found.summary == "What it *is*: all of it."
+    assert found.text.endswith("More.")
+    assert found.arguments == {"a": "one thing in two lines.", "b": "another."}
+    assert found.labelled["Source"] == "nobody;\nnowhere."
