@@ -111,9 +111,9 @@ def copy(folder: Path) -> Path:
         made = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "runs")
         return Path(shutil.copytree(ROOT, folder, ignore=made))
     for name in filter(None, listed.stdout.split("\0")):
-        if (ROOT / name).is_file():
+        if (ROOT / name).is_file() or (ROOT / name).is_symlink():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(ROOT / name, folder / name)
+            shutil.copyfile(ROOT / name, folder / name, follow_symlinks=False)
     return folder
 
 
