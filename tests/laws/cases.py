@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,7 @@ from own_system import OWN_ID
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.memory import Owner
+from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import ENVIRONMENTS
 
@@ -121,6 +123,7 @@ class Case:
     env_id: str
     options: Options
 
+    @functools.cache  # noqa: B019  cases live as long as the tests
     def task(self, **more: Any) -> Task:
         """The task, with further options."""
         return fusion_gym.make_task(self.env_id, **self.options | more)
@@ -169,3 +172,8 @@ def actions(task: Task, wanted: NDArray[np.bool_]) -> NDArray[np.int64]:
     if task.action == "discrete":
         return (wanted * 2 ** np.arange(task.sensors)[:, None]).sum(0)
     return wanted.T.astype(np.int64)
+
+
+def read(batch: EpisodeBatch) -> Signals:
+    """All signals of a system, withheld ones too."""
+    return Signals(dict(batch.task.system.read(batch.state)))

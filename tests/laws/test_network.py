@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cases import IDS, SCARCE, Case, each_case, each_id, requests, short
+from cases import IDS, SCARCE, Case, each_case, each_id, read, requests, short
 
 import fusion_gym
 from fusion_gym.core.access import ACCESS_RULES
@@ -103,13 +103,13 @@ def test_the_reward_is_minus_weighted_error_and_price(case: Case) -> None:
 @each_case
 def test_a_delivery_begins_age_and_held_value_anew(case: Case) -> None:
     """And nothing else does. A packet may be lost, or hold nothing where nothing is sampled."""
-    batch = case.batch(information="sensors")
+    batch = case.batch()
     loses, arrived = hasattr(batch.task.system, "arriving"), 0
     for wanted in requests(batch.task, 3, STEPS):
-        before = batch.signals()
+        before = read(batch)
         age, new, held = (np.copy(before[name]) for name in ("age", "measurement", "held"))
         granted = batch.step(wanted).granted
-        after = batch.signals()
+        after = read(batch)
         fresh = granted & (after["age"] == 1)
         assert loses or fresh[granted & before.get("sampled", True)].all()
         assert (after["age"][~fresh] == age[~fresh] + 1).all()

@@ -5,21 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
-from cases import Array, Case, actions, each_case, requests
+from cases import Array, Case, actions, each_case, read, requests
 
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.system import Signals
+from fusion_gym.envs.single import FusionEnv
 
 RUNS, STEPS = 4, 7
-
-
-def read(batch: EpisodeBatch) -> Signals:
-    """All signals of a system, withheld ones too."""
-    return Signals(dict(batch.task.system.read(batch.state)))
 
 
 @each_case
@@ -49,9 +44,9 @@ def hidden(batch: EpisodeBatch) -> list[Array]:
 
 @each_case
 def test_a_run_is_the_same_by_itself_and_in_a_batch(case: Case) -> None:
-    """Bitwise that of Gymnasium's single environment, though it begins later and others anew."""
+    """Bitwise that of the single environment, though it begins later and others anew."""
     batch = case.batch(70, 100, horizon=6)
-    env: Any = gymnasium.make(case.env_id, **case.options | {"horizon": 6}).unwrapped
+    env: Any = FusionEnv(case.task(horizon=6))
     wanted, run = requests(batch.task, 70, 2 * STEPS), 37  # on no boundary of a vector register
     for asked in wanted[:2]:
         batch.step(asked)
@@ -109,7 +104,7 @@ def contents(runs: Any) -> list[bytes]:
 @each_case
 def test_an_observation_is_finite_within_its_bounds_and_declared(case: Case) -> None:
     """So are signals, with the axes that are declared; also long after the last delivery."""
-    batch = case.batch(RUNS, horizon=24)
+    batch = case.batch(RUNS)
     layout, system = ObservationLayout(batch.task), batch.task.system
     assert len(set(layout.names)) == len(layout.names) == len(layout.low)
     assert (layout.low < layout.high).all()
@@ -158,7 +153,7 @@ def place(price: Array, low: float, high: float) -> Array:
 
 @each_case
 def test_blocks_that_every_system_may_have_mean_the_same(case: Case) -> None:
-    batch, found = case.batch(RUNS, tokens="limited"), 0
+    batch, found = case.batch(RUNS), 0
     ratios: dict[str, list[Array]] = {}
     kind = type(batch.task.system).__name__
     for wanted in requests(batch.task, RUNS, STEPS):
