@@ -1,0 +1,82 @@
+"""Names and texts keep to the words of docs/glossary.md; older prose is listed and only shrinks."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import fusion_gym
+from fusion_gym.envs import registered
+from fusion_gym.envs.registration import ENVIRONMENTS, class_name
+
+ROOT = Path(__file__).parent.parent
+EXEMPT = ROOT / "tests" / "glossary_exempt.txt"
+MODULES = sorted(p for f in ("fusion_gym", "agents") for p in (ROOT / f).rglob("*.py"))
+TREES = {p.relative_to(ROOT).as_posix(): ast.parse(p.read_text()) for p in MODULES}
+
+
+def rejected(heading: str) -> list[str]:
+    """The words of the first column under a heading of the glossary."""
+    section = (ROOT / "docs/glossary.md").read_text().split(f"## {heading}\n")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| (.*?) \|", section, re.MULTILINE)[1:]
+    return [word for row in rows for word in row.split(", ")]
+
+
+WORDS, NAMES = set(rejected("Rejected words")), set(rejected("Rejected names"))
+IN_PROSE = re.compile(rf"\b({'|'.join(sorted(WORDS))})\b", re.IGNORECASE)
+
+
+def public_names(tree: ast.Module) -> Iterator[str]:
+    """Public functions, methods, classes, their parameters and fields."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            yield node.name
+            if isinstance(node, ast.FunctionDef):
+                yield from (a.arg for a in ast.walk(node.args) if isinstance(a, ast.arg))
+            else:
+                yield from (
+                    ast.unparse(f.target) for f in node.body if isinstance(f, ast.AnnAssign)
+                )
+
+
+def named_by_environments() -> set[str]:
+    """Policies, commands, and the signals and entries of all environments."""
+    names = {*fusion_gym.policy_names(), *(p.stem for p in (ROOT / "agents").glob("*.py"))}
+    for task in map(fusion_gym.make_task, ENVIRONMENTS):
+        names |= {s.name for s in task.system.signals} | {b.name for b in task.system.observation}
+    return names
+
+
+def texts() -> Iterator[tuple[str, str]]:
+    for path in sorted((ROOT / "docs").rglob("*.md")):
+        if path.name != "glossary.md":
+            yield path.relative_to(ROOT).as_posix(), path.read_text()
+    for name, tree in TREES.items():
+        values = (getattr(n.value, "value", 0) for n in ast.walk(tree) if isinstance(n, ast.Expr))
+        yield name, "\n".join(value for value in values if isinstance(value, str))
+    for env_id in ENVIRONMENTS:
+        yield env_id, str(getattr(registered, f"{class_name(env_id)}Env").__doc__)
+
+
+def test_public_names_hold_no_rejected_word() -> None:
+    names = named_by_environments().union(*map(public_names, TREES.values()))
+    parts = {n: {w.lower() for w in re.findall("[A-Z]?[a-z]+", n)} for n in names}
+    assert not {n for n in names if n in NAMES or parts[n] & WORDS}
+
+
+def test_a_public_name_has_one_meaning() -> None:
+    places = defaultdict(set)
+    for path, tree in TREES.items():
+        for node in tree.body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                places[node.name].add(path)
+    assert not {n: p for n, p in places.items() if len(p) > 1 and n != "main"}
+
+
+def test_older_prose_only_shrinks() -> None:
+    listed = {p: int(n) for n, p in map(str.split, EXEMPT.read_text().splitlines())}
+    counts = {path: len(IN_PROSE.findall(text)) for path, text in texts()}
+    assert {path: n for path, n in counts.items() if n} == listed  # lower what fell
