@@ -9,7 +9,7 @@ from types import ModuleType
 from fusion_gym.validation import ConfigurationError, choice
 
 from . import missing_extra
-from .output.ending import told
+from .output.ending import report_errors
 
 FOLDER = Path(__file__).parent
 COMMANDS = sorted(file.stem for file in FOLDER.glob("[a-z]*.py") if file.stem != "command_line")
@@ -29,10 +29,10 @@ def main() -> None:
     """Entry point of ``fusion-gym``; the commands need the packages of the extra ``agents``.
 
     Raises:
-        SystemExit: as :func:`told`; an unknown command (2).
+        SystemExit: as :func:`report_errors`; an unknown command (2).
     """
     name = sys.argv[1] if sys.argv[1:] else "--help"
-    with told():
+    with report_errors():
         if name in ("-h", "--help"):
             print(usage())
             return

@@ -22,15 +22,15 @@ from .input.options import OutputFolder, Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
 from .output.progress import writing
 from .output.tables import console
-from .suite.agreement import agreement
+from .suite.agreement import agreement_table
 from .suite.beside_rules import SHIPPED
-from .suite.classes import names_of, trained
+from .suite.classes import names_of, trained_classes
 from .suite.committed import FOLDER, Shelf, complete
 from .suite.config import Setting, Suite, load_suite
-from .suite.envelopes import run_test, task_of
-from .suite.jobs import Folders, finished, jobs, rules_of
+from .suite.envelopes import envelope_task, run_test
+from .suite.jobs import Folders, job_finished, jobs, rules_of
 from .suite.team import BackendName, Team
-from .suite.work import conclude, run
+from .suite.work import conclude, run_job
 from .suite.workers import Work, side_by_side
 from .training.checked import parse
 
@@ -85,56 +85,56 @@ class Benchmark(Long):
     def _run(self) -> None:
         suite = self.suite()
         team = Team(self.workers, self.backend, self.address)
-        folders = Folders.chosen(self.results, self.work, self.quick)
+        folders = Folders.create(self.results, self.work, self.quick)
         if not team.here:  # whoever works has another working directory
             folders = Folders(folders.results.absolute(), folders.work.absolute())
         writable_folder("results", folders.results)
         writable_folder("work", folders.work)
         by_name = {setting.name: setting for setting in suite.settings}
-        chosen = [by_name[choice("envs", name, by_name)] for name in self.envs or by_name]
+        settings = [by_name[choice("envs", name, by_name)] for name in self.envs or by_name]
         for name in self.classes:
             choice("classes", name, names_of(suite))
         classes = self.classes or names_of(suite)
-        for setting in chosen:
-            task_of(setting)
-        with folders.alone():
-            self._check_resumed(folders, chosen)
+        for setting in settings:
+            envelope_task(setting)
+        with folders.lock():
+            self._check_resumed(folders, settings)
             writing(("finished pieces", folders.results), ("trainings and episodes", folders.work))
-            shelf = self._shelf(suite, chosen, folders)
-            for setting in chosen:
-                compared = [of.name for of in trained(suite, setting)]
+            shelf = self._shelf(suite, settings, folders)
+            for setting in settings:
+                compared = [of.name for of in trained_classes(suite, setting)]
                 complete(shelf.suite, [setting], compared, shelf.results, folders.work, team)
             rules = [
                 Work(4.0, run_test, (test, folders.work))
-                for setting in chosen
+                for setting in settings
                 for test in rules_of(suite, setting, shelf)
                 if not test.path(folders.work).exists()
             ]
             side_by_side(rules, team, "rules")
             # All of the settings' pieces, for the verdict is over all of them.
-            every = jobs(suite, chosen, names_of(suite), shelf)
-            done = [job.place for job in every if finished(job, suite, folders)]
+            every = jobs(suite, settings, names_of(suite), shelf)
+            done = [job.place for job in every if job_finished(job, suite, folders)]
             side_by_side(
                 [
-                    Work(job.weight, run, (job, suite, folders, shelf))
-                    for job in jobs(suite, chosen, classes, shelf)
+                    Work(job.weight, run_job, (job, suite, folders, shelf))
+                    for job in jobs(suite, settings, classes, shelf)
                     if job.place not in done
                 ],
                 team,
                 "benchmark",
             )
-            judged = [Work(30.0, conclude, (suite, one, folders, shelf)) for one in chosen]
+            judged = [Work(30.0, conclude, (suite, item, folders, shelf)) for item in settings]
             side_by_side(judged, team, "verdicts")
         if self.quick:
-            beside = agreement(folders.results, USUAL, [one.name for one in chosen])
+            beside = agreement_table(folders.results, USUAL, [setting.name for setting in settings])
             if beside is not None:
                 console().print(beside)
         report = f"fusion-gym report --results {folders.results}"
         print(f"results in {folders.results}: {report}")
 
-    def _check_resumed(self, folders: Folders, chosen: Sequence[Setting]) -> None:
+    def _check_resumed(self, folders: Folders, values: Sequence[Setting]) -> None:
         """Raises ConfigurationError where there are results and no --resume."""
-        names = [f"{s.name}/*.json" for s in chosen] + [f"{FOLDER}/{s.name}.json" for s in chosen]
+        names = [f"{s.name}/*.json" for s in values] + [f"{FOLDER}/{s.name}.json" for s in values]
         there = [path for name in names for path in folders.results.glob(name)]
         if there and not self.resume:
             raise ConfigurationError(
@@ -142,12 +142,12 @@ class Benchmark(Long):
                 "work: go on with --resume, or give another --results and --work"
             )
 
-    def _shelf(self, suite: Suite, chosen: Sequence[Setting], folders: Folders) -> Shelf:
+    def _shelf(self, suite: Suite, settings: Sequence[Setting], folders: Folders) -> Shelf:
         """The quick benchmark takes the envelopes that are shipped, if they are of this config."""
         shipped = Shelf(load_suite(self.config), SHIPPED)
         if self.quick and all(
-            {of.name for of in trained(suite, setting)} <= shipped.found(setting).keys()
-            for setting in chosen
+            {of.name for of in trained_classes(suite, setting)} <= shipped.envelopes(setting).keys()
+            for setting in settings
         ):
             return shipped
         return Shelf(suite, folders.results)

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.floor import everything_delivered, opened
+from fusion_gym.evaluation.floor import everything_delivered, everything_delivered_tasks
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.solvers.silence import SilenceBound, silence_bound, silence_model
 from fusion_gym.validation import choice
@@ -61,7 +61,10 @@ class Bound(Long):
         """Work out floors and bound, write and print them."""
         options = parse_settings("option", list(chain(*self.options)))
         choice("weights", self.weights, _WEIGHTS)
-        task, open_wide = make_task(self.env, **options), opened(self.env, options, self.filters)
+        task, open_wide = (
+            make_task(self.env, **options),
+            everything_delivered_tasks(self.env, options, self.filters),
+        )
         weights = _reward_weights(task) if self.weights == "reward" else None
         if self.rates:
             silence_model(task, weights)  # refuses what the bound does not hold for
@@ -82,7 +85,7 @@ class Bound(Long):
                 self.env, options, self.filters, self.episodes, self.seed, bar.update
             )
         report["everything_delivered"] = {
-            name: found._asdict() for name, found in delivered.items()
+            name: value._asdict() for name, value in delivered.items()
         }
         write(self.json, report)
         console = tables.console()
@@ -93,23 +96,23 @@ class Bound(Long):
     def _bound(self, task: Task, weights: Any) -> SilenceBound:
         with progress_bar(len(self.rates), "bounding", unit="rates") as bar:
 
-            def told(done: int, text: str) -> None:
+            def progress_line(done: int, text: str) -> None:
                 bar.say(text)
                 bar.reach(done)
 
-            found = silence_bound(
-                task, self.rates, weights, self.accuracy, self.points, progress=told
+            bound = silence_bound(
+                task, self.rates, weights, self.accuracy, self.points, progress=progress_line
             )
             bar.reach(len(self.rates))
-            return found
+            return bound
 
 
 def summary(bound: SilenceBound, rates: tuple[float, ...]) -> dict[str, Any]:
     """The bound at each rate, and the costs that show it, as the JSON holds them."""
     rows = []
     for rate in rates:
-        value, shown = bound.at(rate)
-        rows.append({"rate": rate, "bound": value, "price": shown.price, "gap": shown.gap})
+        value, visible = bound.at(rate)
+        rows.append({"rate": rate, "bound": value, "price": visible.price, "gap": visible.gap})
     costs = [asdict(cost) | {"gap": cost.gap} for cost in bound.costs]
     return {"floor": bound.floor, "bounds": rows, "costs": costs}
 
@@ -120,11 +123,11 @@ def _reward_weights(task: Task) -> Any:
 
 def _floors(report: dict[str, Any]) -> Table:
     delivered = report["everything_delivered"].items()
-    rows = [(f"filter {name}", tables.number(found)) for name, found in delivered]
+    rows = [(f"filter {name}", tables.table_number(value)) for name, value in delivered]
     if "floor" in report:
         rows.append(("uncensored, Kalman filter: unavoidable", f"{report['floor']:.4g}"))
     heads = ("everything delivered", "MSE, every state with 1")
-    return tables.table(f"{report['env']}: floors", heads, rows)
+    return tables.table_tables(f"{report['env']}: floors", heads, rows)
 
 
 def _table(report: dict[str, Any]) -> Table:
@@ -133,7 +136,7 @@ def _table(report: dict[str, Any]) -> Table:
         for row in report["bounds"]
     ]
     heads = ("rate", "error at least", "price of a packet", "gap at this price")
-    return tables.table("no policy has less", heads, rows)
+    return tables.table_tables("no policy has less", heads, rows)
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ import tyro
 from fusion_gym.validation import ConfigurationError
 
 from .input.options import check_options
-from .output.ending import flush, told
+from .output.ending import flush, report_errors
 from .output.progress import quietly
 
 Words = tuple[tuple[str, ...], ...]  # of an option that may be given several times
@@ -67,12 +67,12 @@ class Long(Command):
 
         Those ``added`` are not repeated, and those ``without`` are left out.
         """
-        more = [*added, *(["--resume"] if "resume" in {one.name for one in fields(self)} else [])]
+        more = [*added, *(["--resume"] if "resume" in {item.name for item in fields(self)} else [])]
         words = [word for word in sys.argv[1:] if word not in (*more, *without)]
         return shlex.join(["fusion-gym", type(self).__name__.lower(), *words, *more])
 
 
-def read(kind: type[_Kind]) -> _Kind:
+def read_command(kind: type[_Kind]) -> _Kind:
     """The command with the options of the command line.
 
     Raises:
@@ -81,9 +81,9 @@ def read(kind: type[_Kind]) -> _Kind:
         ConfigurationError: a word is empty, or no text.
     """
     _check_words()
-    said = io.StringIO()
+    output = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(output):
             return tyro.cli(
                 kind,
                 prog=f"fusion-gym {kind.__name__.lower()}",
@@ -91,7 +91,7 @@ def read(kind: type[_Kind]) -> _Kind:
             )
     except SystemExit as end:
         if end.code:
-            print(f"error: {_essence(said.getvalue())}", file=sys.stderr)
+            print(f"error: {_essence(output.getvalue())}", file=sys.stderr)
         flush()
         raise
 
@@ -100,13 +100,13 @@ def start(kind: type[Command]) -> None:
     """Read the command, check its options and do it.
 
     Raises:
-        SystemExit: as :func:`told`.
+        SystemExit: as :func:`report_errors`.
     """
     command: Command | None = None
     if os.getcwd() not in sys.path:  # where modules of one's own lie: an installed script lacks it
         sys.path.append(os.getcwd())
-    with told(lambda: command.interrupted() if command else "interrupted"):
-        command = read(kind)
+    with report_errors(lambda: command.interrupted() if command else "interrupted"):
+        command = read_command(kind)
         check_options(command)
         with quietly(isinstance(command, Long) and command.quiet):
             command.run()

@@ -25,7 +25,7 @@ from .input.options import Episodes, OutputFolder, Seed, Whole
 from .output.progress import writing
 from .suite.comparison import compare, run_all
 from .suite.sweep import Sweep
-from .training.checked import load
+from .training.checked import load_checked
 from .training.config import Experiment
 
 
@@ -54,18 +54,21 @@ class Compare(Long):
 
     def run(self) -> None:
         """Run all policies on the same seeds; write, print and draw the comparison."""
-        chosen, sweep = load(Experiment, self.config).environment, load(Sweep, self.sweep, "sweep")
-        task = make_task(chosen.id, **chosen.options)
-        asked = self.asked(task)
-        for policy in asked:
+        world, sweep = (
+            load_checked(Experiment, self.config).environment,
+            load_checked(Sweep, self.sweep, "sweep"),
+        )
+        task = make_task(world.id, **world.options)
+        requested = self.policies_of(task)
+        for policy in requested:
             make_policy(policy, task, trust=self.trust)
         writing(("evaluation, comparison and figure", self.output))
         baselines = run_all(
             task, sweep.policies, self.episodes, self.seed, "baselines", trust=self.trust
         )
-        compare(chosen.id, task, sweep, baselines, asked, self.seed, self.output, self.trust)
+        compare(world.id, task, sweep, baselines, requested, self.seed, self.output, self.trust)
 
-    def asked(self, task: Task) -> list[str]:
+    def policies_of(self, task: Task) -> list[str]:
         """The policy, or the policy at each of the prices.
 
         Raises:

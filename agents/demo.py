@@ -2,7 +2,7 @@
 
     fusion-gym demo [--output runs/demo] [--episodes 1000] [--fresh]
 
-In the Tobit oscillator's benchmark setting it trains an agent for a coordinator and one for sensors
+In the Tobit oscillator's benchmark setting it trains an agent for a scheduler and one for sensors
 by themselves, side by side; both see the price of a token. It runs them at seven prices, and on the
 same test episodes the rules of the committed envelopes that know as much, without memory and with
 it; and it draws the agents over the rules. What is finished in the output folder is not done again,
@@ -34,11 +34,11 @@ from .output.folders import alone_in
 from .output.progress import writing
 from .suite.beside_rules import Ground, Trials
 from .suite.envelope_table import at_least
-from .suite.envelopes import task_of
+from .suite.envelopes import envelope_task
 from .suite.team import Team
 from .suite.trainings import train_beside
 from .suite.workers import side_by_side
-from .training.checked import load
+from .training.checked import load_checked
 from .training.config import Experiment
 from .training.run import holds_training
 
@@ -49,25 +49,25 @@ TEAM = Team(2)
 class Learner(NamedTuple):
     """Who learns: the config that trains it, its title, and the classes of rules beside it.
 
-    ``plain`` rules know what the agent does but what it remembers, ``remembering`` ones exactly as
-    much. ``bounded`` where the proven bound and the rollout are for: a coordinator.
+    ``plain`` rules know what the agent does but what it remembers, ``with_memory`` ones exactly as
+    much. ``bounded`` where the proven bound and the rollout are for: a scheduler.
     """
 
     name: str
     config: str
     title: str
     plain: str
-    remembering: str
+    with_memory: str
     bounded: bool = False
 
 
 LEARNERS = (
     Learner(
-        name="coordinator",
+        name="scheduler",
         config="tobit_oscillator_front",
-        title="A coordinator that sees all new measurements",
+        title="A scheduler that sees all new measurements",
         plain="sensors",
-        remembering="sensors_memory",
+        with_memory="sensors_memory",
         bounded=True,
     ),
     Learner(
@@ -75,7 +75,7 @@ LEARNERS = (
         config="tobit_oscillator_front_local",
         title="Sensors by themselves, which hear the centre's estimate",
         plain="local_estimate",
-        remembering="local_estimate_memory",
+        with_memory="local_estimate_memory",
     ),
 )
 
@@ -96,12 +96,12 @@ class Demo(Long):
     def run(self) -> None:
         """From trainings to figures."""
         ground = Ground.read(SETTING, self.episodes)
-        folders = {one.name: self.output / one.name for one in LEARNERS}
+        folders = {learner.name: self.output / learner.name for learner in LEARNERS}
         experiments = {
-            one.name: load(Experiment, one.config).changed(
-                folders[one.name] / "agent", timesteps=self.timesteps
+            learner.name: load_checked(Experiment, learner.config).changed(
+                folders[learner.name] / "agent", timesteps=self.timesteps
             )
-            for one in LEARNERS
+            for learner in LEARNERS
         }
         with ended_like_by_ctrl_c(), alone_in(self.output, "output"):
             if self.fresh:
@@ -111,13 +111,13 @@ class Demo(Long):
             train_beside(experiments)
             trained = time.perf_counter()
             tests = {
-                one.name: Trials.of(ground, (one.plain, one.remembering), folders[one.name])
-                for one in LEARNERS
+                item.name: Trials.of(ground, (item.plain, item.with_memory), folders[item.name])
+                for item in LEARNERS
             }
-            side_by_side([work for one in tests.values() for work in one.left()], TEAM, "tests")
+            side_by_side([work for test in tests.values() for work in test.left()], TEAM, "tests")
             tested = time.perf_counter()
-            for one in LEARNERS:
-                conclude(one, tests[one.name], folders[one.name])
+            for learner in LEARNERS:
+                _conclude(learner, tests[learner.name], folders[learner.name])
         seconds = (trained - began, tested - trained, time.perf_counter() - tested)
         parts = "trainings {:.0f} s, tests {:.0f} s, tables and figures {:.0f} s".format(*seconds)
         print(f"figures, tables and models are in {self.output}; {sum(seconds):.0f} s: {parts}")
@@ -144,7 +144,7 @@ def remove(folders: Iterable[Path]) -> None:
         shutil.rmtree(folder)
 
 
-def conclude(learner: Learner, tests: Trials, folder: Path) -> None:
+def _conclude(learner: Learner, tests: Trials, folder: Path) -> None:
     """Write, print and draw what an agent and its rules brought."""
     report = tests.report()
     write(folder / "front.json", report)
@@ -155,7 +155,7 @@ def conclude(learner: Learner, tests: Trials, folder: Path) -> None:
 
 def front_table(learner: Learner, ground: Ground, report: Mapping[str, Any]) -> Table:
     """A row a price: the agent, and the rules of both classes at its rate."""
-    bucket = task_of(ground.setting).bucket
+    bucket = envelope_task(ground.setting).bucket
     caption = (
         f"{ground.episodes:,} episodes, the same for all, and all under the same token bucket: "
         f"{bucket.rate:g} tokens a step, at most {bucket.capacity:g}, {bucket.cost[0, 0]:g} a "
@@ -170,14 +170,14 @@ def front_table(learner: Learner, ground: Ground, report: Mapping[str, Any]) -> 
         table.add_column("difference", justify="right", no_wrap=True)
     for point in report["points"]:
         row = [f"{point['price']:.3g}", f"{point['rate']:.4f}", f"{point['mse']['mean']:.4f}"]
-        for name in (learner.plain, learner.remembering):
+        for name in (learner.plain, learner.with_memory):
             below = point["rules"].get(name)
-            row += [f"{below['mse']:.4f}", share(below["difference"])] if below else ["–", "–"]
+            row += [f"{below['mse']:.4f}", _share(below["difference"])] if below else ["–", "–"]
         table.add_row(*row)
     return table
 
 
-def share(interval: Mapping[str, float]) -> str:
+def _share(interval: Mapping[str, float]) -> str:
     """A relative difference with its interval, in per cent."""
     mean, low, high = (100.0 * interval[key] for key in ("mean", "low", "high"))
     return f"{mean:+.1f} % [{low:+.1f}, {high:+.1f}]"
@@ -187,7 +187,7 @@ def title_of(learner: Learner, report: Mapping[str, Any]) -> str:
     """Who learned, and where its front lies, on average over the prices."""
     lies = [
         f"{100 * abs(mean):.1f} % {'below' if mean < 0 else 'above'} the rules {which} memory"
-        for name, which in ((learner.plain, "without"), (learner.remembering, "with"))
+        for name, which in ((learner.plain, "without"), (learner.with_memory, "with"))
         if name in report["mean"]
         for mean in [report["mean"][name]["mean"]]
     ]
@@ -196,14 +196,14 @@ def title_of(learner: Learner, report: Mapping[str, Any]) -> str:
 
 def draw_front(path: Path, learner: Learner, tests: Trials, report: Mapping[str, Any]) -> None:
     """The agent's front over everything that is known of its classes."""
-    ground, remembering = tests.ground, tests.results(learner.remembering)
+    ground, remembering = tests.ground, tests.results(learner.with_memory)
     agent = [(point["rate"], Interval(**point["mse"])) for point in report["points"]]
     rates = np.linspace(0.0, 1.2 * max(rate for rate, _ in agent), 200)
     bound = ground.bound if learner.bounded else None
     layers = front_figure.Layers(
         single=ground.single(learner.plain),
         plain=[(point.rate, point.mse) for point in points_of(tests.results(learner.plain))],
-        remembering=[(point.rate, point.mse) for point in points_of(remembering)],
+        with_memory=[(point.rate, point.mse) for point in points_of(remembering)],
         rollout=ground.simulations(remembering) if learner.bounded else [],
         bound=[(rate, at_least(bound, rate)) for rate in rates] if bound else [],
         agent=agent,
@@ -218,11 +218,11 @@ def draw_front(path: Path, learner: Learner, tests: Trials, report: Mapping[str,
 
 def draw_episodes(folder: Path, learner: Learner, tests: Trials) -> None:
     """One episode of the agent at its middle price, and of the rule whose rate is nearest."""
-    agent, rules = tests.agent[len(tests.agent) // 2], tests.results(learner.remembering)
+    agent, rules = tests.agent[len(tests.agent) // 2], tests.results(learner.with_memory)
     rate = agent.read(tests.work).rate.mean()
     rule = min(rules, key=lambda name: abs(rules[name].rate.mean() - rate))
-    for name, test in (("agent", agent), ("rule", tests.rules[learner.remembering][rule])):
-        task = task_of(test.setting, test.options)
+    for name, test in (("agent", agent), ("rule", tests.rules[learner.with_memory][rule])):
+        task = envelope_task(test.setting, test.options)
         trajectory = record_episode(task, test.make(task), test.seed)
         path, title = folder / f"episode_{name}.png", f"{test.name}\n{learner.name}"
         figures.episode(path, title, trajectory, task.bucket.capacity)

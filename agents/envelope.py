@@ -22,7 +22,7 @@ from .output.progress import writing
 from .suite.classes import classes_of
 from .suite.committed import FOLDER, complete, path_of, present
 from .suite.config import load_suite
-from .suite.envelope_table import text_of
+from .suite.envelope_table import envelope_text
 from .suite.jobs import Folders
 from .suite.team import Team
 
@@ -51,7 +51,7 @@ class Envelope(Long):
     def run(self) -> None:
         """Do all work that is not finished, and write the table."""
         suite = load_suite(self.config, self.quick)
-        folders = Folders.chosen(self.results, self.work, self.quick)
+        folders = Folders.create(self.results, self.work, self.quick)
         writable_folder("results", folders.results)
         writable_folder("work", folders.work)
         by_name = {setting.name: setting for setting in suite.settings}
@@ -59,7 +59,7 @@ class Envelope(Long):
         known = dict.fromkeys(c.name for setting in settings for c in classes_of(setting))
         for name in self.classes:
             choice("classes", name, known)
-        with folders.alone():
+        with folders.lock():
             there = [
                 name
                 for setting in settings
@@ -79,7 +79,7 @@ class Envelope(Long):
                 suite, settings, self.classes, folders.results, folders.work, Team(self.workers)
             )
             readme = folders.results / FOLDER / "README.md"
-            write_text(readme, text_of(folders.results, "fusion-gym envelope"))
+            write_text(readme, envelope_text(folders.results, "fusion-gym envelope"))
         print(f"envelopes in {path_of(folders.results, '').parent}, the table in {readme}")
 
 

@@ -67,45 +67,45 @@ class Evaluate(Long):
         return super().interrupted()
 
 
-def evaluate(given: Evaluate) -> dict[str, Any]:
+def evaluate(command: Evaluate) -> dict[str, Any]:
     """Run the evaluation that the command line asks for and return what the JSON holds.
 
     Raises:
         ConfigurationError: anything that is not allowed, before the first episode.
     """
-    env_id, options, _ = environment_of(given.env, given.config, given.options)
+    env_id, options, _ = environment_of(command.env, command.config, command.options)
     task = make_task(env_id, **options)
-    names = list(dict.fromkeys(chain(*given.policies)))
+    names = list(dict.fromkeys(chain(*command.policies)))
     if not names:
         raise ConfigurationError("policies = [] is not allowed: give --policies NAME …")
-    if given.reference is not None and given.reference not in names:
+    if command.reference is not None and command.reference not in names:
         raise ConfigurationError(
-            f"reference = {given.reference!r} is not allowed: it must be one of the policies "
+            f"reference = {command.reference!r} is not allowed: it must be one of the policies "
             f"{names}"
         )
-    if given.resume and given.reference:
+    if command.resume and command.reference:
         raise ConfigurationError(
-            f"resume = True is not allowed with reference = {given.reference!r}: paired "
+            f"resume = True is not allowed with reference = {command.reference!r}: paired "
             "differences need the episodes of every policy, and the JSON holds only their means"
         )
-    policies = {name: make_policy(name, task, trust=given.trust) for name in names}
+    policies = {name: make_policy(name, task, trust=command.trust) for name in names}
     report: dict[str, Any] = {
         "env": env_id,
-        "episodes": given.episodes,
-        "seed": given.seed,
+        "episodes": command.episodes,
+        "seed": command.seed,
         "horizon": task.horizon,
         "settings": task.settings,
         "states": list(task.system.state_names),
         "policies": {},
         "quantiles": {},
     }
-    done = finished(given.json, report) if given.resume else {"policies": {}}
+    done = finished(command.json, report) if command.resume else {"policies": {}}
     results: dict[str, EpisodeResults] = {}
-    steps = given.episodes * task.horizon
-    if given.json is None:
+    steps = command.episodes * task.horizon
+    if command.json is None:
         remark("nothing is written (--json FILE keeps the results)")
     else:
-        writing(("the results of each policy", given.json))
+        writing(("the results of each policy", command.json))
     earlier = steps * len(done["policies"].keys() & policies.keys())
     with progress_bar(len(names) * steps, "evaluating", earlier) as bar:
         for name, policy in policies.items():
@@ -114,22 +114,22 @@ def evaluate(given: Evaluate) -> dict[str, Any]:
                 report["quantiles"][name] = done["quantiles"][name]
                 continue
             bar.say(name)
-            results[name] = run_episodes(task, policy, given.episodes, given.seed, bar.update)
+            results[name] = run_episodes(task, policy, command.episodes, command.seed, bar.update)
             report["policies"][name] = summarise(results[name])
             report["quantiles"][name] = robust_summary(results[name])
-            write(given.json, report)
+            write(command.json, report)
     differences = {
-        name: paired_difference(found, results[given.reference])
-        for name, found in results.items()
-        if given.reference and name != given.reference
+        name: paired_difference(result, results[command.reference])
+        for name, result in results.items()
+        if command.reference and name != command.reference
     }
-    if given.reference:
+    if command.reference:
         report["reference"] = {
-            "name": given.reference,
-            "differences": {name: found._asdict() for name, found in differences.items()},
+            "name": command.reference,
+            "differences": {name: difference._asdict() for name, difference in differences.items()},
         }
-    write(given.json, report)
-    title = f"{env_id}: {given.episodes} episodes of {task.horizon} steps, seed {given.seed}"
+    write(command.json, report)
+    title = f"{env_id}: {command.episodes} episodes of {task.horizon} steps, seed {command.seed}"
     console = tables.console()
     console.print(
         tables.evaluation_table(title, report["policies"], report["quantiles"], differences)

@@ -1,6 +1,6 @@
-"""Export a saved agent as an ONNX file, for sensors and coordinators that run without this library.
+"""Export a saved agent as an ONNX file, for sensors and schedulers that run without this library.
 
-    fusion-gym export zoo:tobit_oscillator_sensors_memory,price=0.02 --onnx coordinator.onnx
+    fusion-gym export zoo:tobit_oscillator_sensors_memory,price=0.02 --onnx scheduler.onnx
 
 The file has everything from the observation to the request, and says what the observation is. It is
 checked against the agent on 10,000 observations of whole episodes, and not kept if it differs.
@@ -53,38 +53,38 @@ class Export(Command):
         return f"interrupted: no new file in {self.onnx}"
 
 
-def export(given: Export) -> list[str]:
+def export(command: Export) -> list[str]:
     """Write the file and return what there is to say of it, in lines.
 
     Raises:
         ConfigurationError: anything that is not allowed, or a graph that decides otherwise than the
             agent; then no file is written.
     """
-    kind, _, rest = spec(given.model).partition(":")
-    env_id, options = _environment(given, kind, rest.partition(",")[0])
+    kind, _, rest = spec(command.model).partition(":")
+    env_id, options = _environment(command, kind, rest.partition(",")[0])
     # Here, for it needs torch, which takes seconds to load.
     from fusion_gym.evaluation.onnx_export import export_onnx
     from fusion_gym.policies.onnx_graph import require_onnx
 
     require_onnx("onnx")
     task = make_task(env_id, **options)
-    agent = make_policy(f"{kind}:{rest}", task, trust=given.trust)
+    agent = make_policy(f"{kind}:{rest}", task, trust=command.trust)
     try:
-        with replacing(given.onnx) as unfinished:
-            made = export_onnx(agent, task, unfinished, env_id, given.model)
+        with replacing(command.onnx) as unfinished:
+            model = export_onnx(agent, task, unfinished, env_id, command.model)
     except ConfigurationError as error:
-        raise ConfigurationError(f"model = {given.model!r} is not exported: {error}") from None
-    asked = ", ".join(f"{name} {_shape(shape)}" for name, shape in made.inputs.items())
-    answers = ", ".join(f"{name} {_shape(shape)}" for name, shape in made.outputs.items())
-    found = made.agreement
+        raise ConfigurationError(f"model = {command.model!r} is not exported: {error}") from None
+    text = ", ".join(f"{name} {_shape(shape)}" for name, shape in model.inputs.items())
+    answers = ", ".join(f"{name} {_shape(shape)}" for name, shape in model.outputs.items())
+    result = model.agreement
     return [
-        f"{given.model} is in {given.onnx}: {made.size:,} bytes",
-        f"from {asked}",
+        f"{command.model} is in {command.onnx}: {model.size:,} bytes",
+        f"from {text}",
         f"to {answers}",
-        f"as the agent on {found.observations:,} observations of {found.episodes:,} episodes of "
-        f"{env_id}: all decisions agree, numbers differ by {found.difference:.2g} at most",
-        f"one decision on one thread here: {1e6 * made.latency.median:.1f} µs in the median, 99 % "
-        f"below {1e6 * made.latency.most:.1f} µs",
+        f"as the agent on {result.observations:,} observations of {result.episodes:,} episodes of "
+        f"{env_id}: all decisions agree, numbers differ by {result.difference:.2g} at most",
+        f"one decision on one thread here: {1e6 * model.latency.median:.1f} µs in the median, 99 % "
+        f"below {1e6 * model.latency.most:.1f} µs",
     ]
 
 
@@ -104,26 +104,26 @@ def spec(text: str) -> str:
     )
 
 
-def _environment(given: Export, kind: str, name: str) -> tuple[str, dict[str, Any]]:
+def _environment(command: Export, kind: str, name: str) -> tuple[str, dict[str, Any]]:
     """Id and options: those given, else those that the agent was trained in.
 
     Raises:
         ConfigurationError: neither is known.
     """
-    config = given.config
-    if given.env is None and config is None:
+    config = command.config
+    if command.env is None and config is None:
         if kind == "zoo":
             trained = zoo.card(name)["training"]["environment"]
-            own = parse_settings("option", [word for words in given.options for word in words])
+            own = parse_settings("option", [word for words in command.options for word in words])
             return trained["id"], trained["options"] | own
         beside = Path(name).parent / "config.yaml"
         if not beside.is_file():
             raise ConfigurationError(
-                f"env = None is not allowed with model = {given.model!r}, beside which lies no "
+                f"env = None is not allowed with model = {command.model!r}, beside which lies no "
                 "config.yaml of its training: give --env ID or --config FILE"
             )
         config = str(beside)
-    env_id, options, _ = environment_of(given.env, config, given.options)
+    env_id, options, _ = environment_of(command.env, config, command.options)
     return env_id, options
 
 

@@ -56,62 +56,62 @@ class Mismatch(Long):
     def run(self) -> None:
         """Measure, write and print the cross term under each policy."""
         env_id, options, experiment = environment_of(self.env, self.config, self.options)
-        task, chosen = make_task(env_id, **options), self.filter
-        if chosen is None and experiment is not None:
-            chosen = experiment.training.error_filter
-        system = reference_system(env_id, options, chosen)
+        task, filter_name = make_task(env_id, **options), self.filter
+        if filter_name is None and experiment is not None:
+            filter_name = experiment.training.error_filter
+        system = reference_system(env_id, options, filter_name)
         names = list(dict.fromkeys(chain(*self.policies))) or usual_policies(task)
         policies = {name: make_policy(name, task, trust=self.trust) for name in names}
         if self.json is not None:
             writing(("the results", self.json))
         total = len(policies) * self.episodes * task.horizon
         with progress_bar(total, "measuring the cross term") as bar:
-            found = cross_terms(
+            terms = cross_terms(
                 task, system, policies, self.episodes, self.seed, progress=bar.update
             )
         report: dict[str, Any] = {
             "env": env_id,
             "settings": task.settings,
-            "filter": chosen,
+            "filter": filter_name,
             "episodes": self.episodes,
             "seed": self.seed,
             "horizon": task.horizon,
-            "policies": {name: summary(part) for name, part in found.items()},
-            "compatible": all(part.compatible for part in found.values()),
+            "policies": {name: _summary(part) for name, part in terms.items()},
+            "compatible": all(part.compatible for part in terms.values()),
         }
         write(self.json, report)
         console = tables.console()
-        console.print(_table(f"{env_id}: {self.episodes} episodes, seed {self.seed}", found))
-        console.print(_verdict(found))
+        console.print(_table(f"{env_id}: {self.episodes} episodes, seed {self.seed}", terms))
+        console.print(_verdict(terms))
 
 
-def summary(found: CrossTerm) -> dict[str, Any]:
+def _summary(term: CrossTerm) -> dict[str, Any]:
     """A policy's cross term as the JSON holds it."""
-    plain = found._asdict() | {"share": found.share._asdict()}
-    return plain | {"compatible": found.compatible}
+    plain = term._asdict() | {"share": term.share._asdict()}
+    return plain | {"compatible": term.compatible}
 
 
-def _table(title: str, found: dict[str, CrossTerm]) -> Table:
+def _table(title: str, terms: dict[str, CrossTerm]) -> Table:
     rows = [
         (
             name,
             f"{part.rate:.3f}",
             *(f"{value:.4g}" for value in (part.error, part.floor, part.mismatch)),
-            part.shown,
+            part.text,
             "yes" if part.compatible else "no",
         )
-        for name, part in found.items()
+        for name, part in terms.items()
     ]
     heads = ("policy", "rate", "error", "floor", "mismatch", "cross term", "may be zero")
-    return tables.table(title, heads, rows, _CAPTION)
+    return tables.table_tables(title, heads, rows, _CAPTION)
 
 
-def _verdict(found: dict[str, CrossTerm]) -> str:
-    name, part = worst(found)
+def _verdict(terms: dict[str, CrossTerm]) -> str:
+    name, part = worst(terms)
     if part.compatible:
         return "no cross term is told from zero: mismatch may stand for the error here"
     return (
-        f"the cross term is {part.shown} of the error under {name}: train with error: excess, "
+        f"the cross term is {part.text} of the error under {name}: train with error: excess, "
         "or with a filter for the measurements under which it is none"
     )
 

@@ -16,13 +16,13 @@ from .command_line import Command, start
 from .input.files import read_text
 from .input.options import OutputFolder
 from .output.files import write_text
-from .output.markup import code, page_of, plain, ranged, table
+from .output.markup import code, page_of, plain_text, ranged, table_markup
 from .suite import overview, report_layers
 from .suite.committed import FOLDER
-from .suite.found import Found, read_results
-from .suite.report_pages import documented
+from .suite.report_pages import update_pages
 from .suite.report_tables import classes_table, rates_table, worth_table
 from .suite.report_words import caption, sentences
+from .suite.setting_results import SettingResults, read_results
 from .suite.verdict import RATES
 
 TITLE = "Results of the benchmark"
@@ -39,15 +39,15 @@ class Report(Command):
 
     def run(self) -> None:
         """Draw the figures, write README.md and report.html."""
-        found = read_results(self.results)
+        value = read_results(self.results)
         pages = {
-            path: documented(read_text("pages", path), found, self.results) for path in self.pages
+            path: update_pages(read_text("pages", path), value, self.results) for path in self.pages
         }
         quick = " --quick" if self.results.name == "quick" else ""
-        text = text_of(found, f"fusion-gym benchmark{quick}", "fusion-gym report")
-        overview.draw(self.results, found)
-        for name, one in found.items():
-            report_layers.draw(self.results / name, one)
+        text = text_of(value, f"fusion-gym benchmark{quick}", "fusion-gym report")
+        overview.draw_overview(self.results, value)
+        for name, item in value.items():
+            report_layers.draw_layers(self.results / name, item)
         page, readme = self.results / "report.html", self.results / "README.md"
         write_text(readme, text)
         write_text(page, page_of(text, self.results, TITLE))
@@ -56,29 +56,31 @@ class Report(Command):
         print(f"wrote {', '.join(map(str, (readme, page, *pages)))}")
 
 
-def text_of(found: dict[str, Found], command: str, second: str = "fusion-gym report") -> str:
+def text_of(
+    value: dict[str, SettingResults], command: str, second: str = "fusion-gym report"
+) -> str:
     """The report in Markdown, made by these two commands."""
     lines = [
         f"# {TITLE}",
         "",
         f"Made by `{command}` and `{second}` from the JSON beside this file.",
         "",
-        *how_to_read(found),
-        *overview_section(found),
-        *above_section(found),
+        *how_to_read(value),
+        *overview_section(value),
+        *above_section(value),
     ]
-    for one in found.values():
-        lines += setting_section(one)
+    for item in value.values():
+        lines += setting_section(item)
     return "\n".join(lines)
 
 
-def how_to_read(found: dict[str, Found]) -> list[str]:
+def how_to_read(settings: dict[str, SettingResults]) -> list[str]:
     """The report's first section."""
-    first = next(iter(found.values())).baselines
+    first = next(iter(settings.values())).baselines
     last = first["seed"] + first["episodes"] - 1
-    agents = [front["seeds"] for one in found.values() for front in one.classes.values()]
-    tuned = [one.envelopes["inputs"]["tuning"] for one in found.values() if one.envelopes]
-    validated = [one.validation for one in found.values() if one.validation]
+    agents = [front["seeds"] for setting in settings.values() for front in setting.classes.values()]
+    tuned = [item.envelopes["inputs"]["tuning"] for item in settings.values() if item.envelopes]
+    validated = [setting.validation for setting in settings.values() if setting.validation]
     seeds = [f"Test: {first['seed']:,} to {last:,}, the same noise for all."]
     if tuned:
         seeds.append(
@@ -98,50 +100,55 @@ def how_to_read(found: dict[str, Found]) -> list[str]:
 
 
 def _of(every: Sequence[Mapping[str, Any]], key: str) -> str:
-    return ranged([one[key] for one in every])
+    return ranged([item[key] for item in every])
 
 
-def overview_section(found: dict[str, Found]) -> list[str]:
+def overview_section(settings: dict[str, SettingResults]) -> list[str]:
     """All settings beside each other."""
     text = Path(overview.__file__).with_suffix(".md").read_text(encoding="utf-8")
     return [
         *text.splitlines(),
-        *overview.knowing_table(found),
+        *overview.knowing_table(settings),
         "What learning is worth, agents against the rules of the same class:",
         "",
-        *overview.learning_table(found),
+        *overview.learning_table(settings),
     ]
 
 
-def above_section(found: dict[str, Found]) -> list[str]:
+def above_section(settings: dict[str, SettingResults]) -> list[str]:
     """The points at which agents are worse than rules."""
-    rows = overview.above_rows(found)
-    count = overview.headline_count(found)
+    rows = overview.above_rows(settings)
+    count = overview.headline_count(settings)
     return [
         "## Where agents are worse than rules",
         "",
         f"{count[0].upper()}{count[1:]}{':' if rows else '.'}",
         "",
-        *table(["setting", "class", "price", "rate", "difference"], rows),
+        *table_markup(["setting", "class", "price", "rate", "difference"], rows),
     ]
 
 
-def setting_section(found: Found) -> list[str]:
+def setting_section(value: SettingResults) -> list[str]:
     """A setting's figure, what was found, and its tables."""
-    title = f"{plain(found.verdict['title'])}: {code(found.baselines['env'])}, {code(found.name)}."
-    panels = [" ".join(p.title.split()) for p in report_layers.panels_of(found)[1]]
-    lines = [f"## {plain(found.label)}", "", title, ""]
-    lines += [f"- {sentence}" for sentence in sentences(found)]
-    lines += ["", f"![Errors against rates: {plain(found.label)}]({quote(found.name)}/pareto.png)"]
-    lines += ["", caption(found, panels), ""]
-    if found.baselines.get("genie"):
-        genie = found.baselines["genie"]
-        lines += [f"Genie: MSE {genie['mse']['mean']:.4g}; {plain(genie['assumes'])}.", ""]
+    title = (
+        f"{plain_text(value.verdict['title'])}: {code(value.baselines['env'])}, {code(value.name)}."
+    )
+    panels = [" ".join(p.title.split()) for p in report_layers.panels_of(value)[1]]
+    lines = [f"## {plain_text(value.label)}", "", title, ""]
+    lines += [f"- {sentence}" for sentence in sentences(value)]
+    lines += [
+        "",
+        f"![Errors against rates: {plain_text(value.label)}]({quote(value.name)}/pareto.png)",
+    ]
+    lines += ["", caption(value, panels), ""]
+    if value.baselines.get("genie"):
+        genie = value.baselines["genie"]
+        lines += [f"Genie: MSE {genie['mse']['mean']:.4g}; {plain_text(genie['assumes'])}.", ""]
     for head, rows in (
-        ("Agents by class:", classes_table(found)),
+        ("Agents by class:", classes_table(value)),
         ("Mean squared error at 5, 10, 20 and 40 % of the rate of always transmitting:",
-         rates_table(found)),
-        ("What knowing more is worth:", worth_table(found)),
+         rates_table(value)),
+        ("What knowing more is worth:", worth_table(value)),
     ):  # fmt: skip
         lines += [head, "", *rows] if rows else []
     return lines

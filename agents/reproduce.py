@@ -21,7 +21,7 @@ from .input.options import OutputFolder, Seed, Whole
 from .output.ending import ended_like_by_ctrl_c
 from .output.files import remove_partials
 from .output.folders import alone_in
-from .reproduction.making import Job, make, shown
+from .reproduction.making import PieceJob, compute_jobs, results_of
 from .reproduction.page import write_overview, write_page
 from .reproduction.paper import Paper, Piece
 from .reproduction.papers import NAMES, papers
@@ -56,32 +56,33 @@ class Reproduce(Command):
         Raises:
             ConfigurationError: no paper, or one that there is not.
         """
-        chosen = papers(self.papers)
+        names = papers(self.papers)
         jobs = {
-            one.name: {piece.name: self._job(one, piece) for piece in one.pieces} for one in chosen
+            name.name: {piece.name: self._job(name, piece) for piece in name.pieces}
+            for name in names
         }
         with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
-            for one in chosen:
-                remove_partials(self.work / one.name)
+            for item in names:
+                remove_partials(self.work / item.name)
             every = [job for some in jobs.values() for job in some.values()]
             left = [job for job in every if not (self.resume and job.finished())]
             print(f"simulations go into {self.work}, pages into {self.output}", file=sys.stderr)
             work = [
-                Work(job.find().weight * job.episodes / job.find().usual, make, (job,))
+                Work(job.find().weight * job.episodes / job.find().usual, compute_jobs, (job,))
                 for job in left
             ]
             side_by_side(work, Team(self.workers), "reproducing")
-            for one in chosen:
-                made = {
+            for item in names:
+                counts = {
                     name: {"episodes": job.episodes, "seed": job.seed}
-                    for name, job in jobs[one.name].items()
+                    for name, job in jobs[item.name].items()
                 }
-                write_page(one, shown(one, jobs[one.name]), made, self.output)
-                print(f"{one.name}: {self.output / one.name}.md")
+                write_page(item, results_of(item, jobs[item.name]), counts, self.output)
+                print(f"{item.name}: {self.output / item.name}.md")
             write_overview(self.output)
 
-    def _job(self, one: Paper, piece: Piece) -> Job:
-        return Job(one.name, piece.name, self.episodes or piece.usual, self.seed, self.work)
+    def _job(self, paper: Paper, piece: Piece) -> PieceJob:
+        return PieceJob(paper.name, piece.name, self.episodes or piece.usual, self.seed, self.work)
 
     def interrupted(self) -> str:
         """Finished simulations are kept."""

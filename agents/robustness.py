@@ -24,14 +24,14 @@ from .output.ending import ended_like_by_ctrl_c
 from .output.folders import alone_in
 from .output.progress import writing
 from .suite import robust_pieces
-from .suite.classes import trained
+from .suite.classes import trained_classes
 from .suite.committed import Shelf
 from .suite.config import Setting, Suite, load_suite
 from .suite.robust_summary import FOLDER
 from .suite.robust_table import write_table
-from .suite.robust_trial import Trial
-from .suite.robustness import Perturbed, chosen, load_robustness
-from .suite.robustness import Robustness as Config
+from .suite.robust_trial import RobustTrial
+from .suite.robustness import Perturbed, load_robustness, select_settings
+from .suite.robustness import RobustnessSettings as Config
 from .suite.team import Team
 from .suite.workers import Work, side_by_side
 from .training.checked import parse
@@ -78,8 +78,8 @@ class Robustness(Long):
 
     def _run(self) -> None:
         config = load_robustness(self.config)
-        folders = robust_pieces.Folders(self.results, self.work)
-        trials = [self._trial(config, one, folders) for one in chosen(config, self.envs)]
+        folders = robust_pieces.RobustFolders(self.results, self.work)
+        trials = [self._trial(config, item, folders) for item in select_settings(config, self.envs)]
         place = self.results / FOLDER
         writable_folder("results", place)
         with alone_in(place, "results"), alone_in(self.work, "work"):
@@ -95,11 +95,15 @@ class Robustness(Long):
                 )
             writing(("finished pieces", place), ("trainings and episodes", self.work))
             self._work(trials, ("rules", "agents"), folders)
-            trainings = [one for trial in trials for one in trial.trainings]
+            trainings = [training for trial in trials for training in trial.trainings]
             if trainings:
                 work = [
-                    Work(30.0 + one.training.timesteps / 10_000, robust_pieces.run_training, (one,))
-                    for one in trainings
+                    Work(
+                        30.0 + training.training.timesteps / 10_000,
+                        robust_pieces.run_training,
+                        (training,),
+                    )
+                    for training in trainings
                 ]
                 side_by_side(work, Team(self.workers), "trainings over draws")
                 self._work(trials, ("trained",), folders)
@@ -107,8 +111,8 @@ class Robustness(Long):
             side_by_side(rows, Team(self.workers), "verdicts")
             for trial in trials:
                 trial.conclude()
-            every = {one.name: one.title for one in load_suite(config.suite).settings}
-            titles = {one.setting: every[one.setting] for one in config.settings}
+            every = {setting.name: setting.title for setting in load_suite(config.suite).settings}
+            titles = {setting.setting: every[setting.setting] for setting in config.settings}
             table = write_table(self.results, titles, "fusion-gym robustness" + self._how())
         print(f"results in {place}, the table in {table}")
 
@@ -119,24 +123,29 @@ class Robustness(Long):
         episodes = "" if self.episodes == Robustness.episodes else f" --episodes {self.episodes}"
         return trained + episodes
 
-    def _trial(self, config: Config, one: Perturbed, folders: robust_pieces.Folders) -> Trial:
+    def _trial(
+        self, config: Config, entry: Perturbed, folders: robust_pieces.RobustFolders
+    ) -> RobustTrial:
         """A setting with its agents, everything checked."""
         suite = load_suite(config.suite)
         shelf = Shelf(suite, self.results)
         changed = {"training_seeds": self.seeds, "timesteps": self.timesteps}
         changed = {key: value for key, value in changed.items() if value is not None}
         suite = parse(Suite, suite.model_dump() | changed, "command line")
-        setting = next(setting for setting in suite.settings if setting.name == one.setting)
+        setting = next(setting for setting in suite.settings if setting.name == entry.setting)
         of = robust_pieces.class_named(setting, self.of or _usual_class(suite, setting))
         agents = robust_pieces.agents_of(setting, of, self.agents, self.models, USUAL)
         envelope = robust_pieces.envelope_of(shelf, setting, of)
-        return Trial.create(
-            suite, setting, one, config.cases_of(one), of, envelope, agents,
+        return RobustTrial.create(
+            suite, setting, entry, config.cases_of(entry), of, envelope, agents,
             self.trained, self.episodes, folders,
         )  # fmt: skip
 
     def _work(
-        self, trials: Sequence[Trial], kinds: tuple[str, ...], folders: robust_pieces.Folders
+        self,
+        trials: Sequence[RobustTrial],
+        kinds: tuple[str, ...],
+        folders: robust_pieces.RobustFolders,
     ) -> None:
         """Do what is not finished of some kinds."""
         pieces = [piece for trial in trials for piece in trial.pieces(kinds)]
@@ -149,8 +158,8 @@ class Robustness(Long):
 
 
 def _usual_class(suite: Suite, setting: Setting) -> str:
-    """The class of a coordinator that knows most."""
-    names = [of.name for of in trained(suite, setting)]
+    """The class of a scheduler that knows most."""
+    names = [of.name for of in trained_classes(suite, setting)]
     return "sensors_memory" if "sensors_memory" in names else "sensors"
 
 

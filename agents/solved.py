@@ -23,7 +23,7 @@ from .output.files import read_json, write
 from .output.folders import fingerprint
 from .output.progress import progress_bar, writing
 from .suite.verdict import excess
-from .training.checked import load
+from .training.checked import load_checked
 from .training.config import Experiment
 from .training.run import holds_training, train
 
@@ -45,9 +45,9 @@ class Solved(Long):
 
     def run(self) -> None:
         """Train what is not trained, run all on the same seeds, write and print the costs."""
-        experiment = load(Experiment, self.config)
-        name, chosen = experiment.algorithm.name, experiment.environment
-        task = make_task(chosen.id, **chosen.options)
+        experiment = load_checked(Experiment, self.config)
+        name, environment = experiment.algorithm.name, experiment.environment
+        task = make_task(environment.id, **environment.options)
         task.system.nature.refuse("for the solved optimum")
         best = self._tested(task, "optimal", "testing the optimum")
         if best.returns.mean() == 0.0:
@@ -57,20 +57,20 @@ class Solved(Long):
             )
         writing(("trainings and costs", self.output))
         heads = ("policy", "cost of an episode", "rate", "above the optimum [95 %]")
-        table = tables.table(f"{self.config}: {self.episodes} episodes", heads)
+        table = tables.table_tables(f"{self.config}: {self.episodes} episodes", heads)
         report: dict[str, Any] = {"config": self.config, "agents": {}}
         table.add_row("optimal", f"{-best.returns.mean():.4f}", f"{best.rate.mean():.4f}", "")
         for seed in self.seeds:
             model = trained(experiment, seed, self.output)
             agent = self._tested(task, f"model:{model}", f"testing training seed {seed}")
-            found = excess(agent.returns, best.returns)
-            report["agents"][str(seed)] = found
+            result = excess(agent.returns, best.returns)
+            report["agents"][str(seed)] = result
             write(self.output / f"{name}.json", report)
             table.add_row(
                 f"{name}, training seed {seed}",
                 f"{-agent.returns.mean():.4f}",
                 f"{agent.rate.mean():.4f}",
-                f"{found['mean']:+.2%} [{found['low']:+.2%}, {found['high']:+.2%}]",
+                f"{result['mean']:+.2%} [{result['low']:+.2%}, {result['high']:+.2%}]",
             )
         tables.console().print(table)
 
@@ -88,8 +88,8 @@ def trained(experiment: Experiment, seed: int, folder: Path) -> Path:
         KeyboardInterrupt: the training was interrupted.
     """
     output = folder / f"{experiment.algorithm.name}_{seed}"
-    chosen = experiment.changed(output, seed=seed)
-    if not is_finished(chosen) and not train(chosen, resume=holds_training(output))["finished"]:
+    choice = experiment.changed(output, seed=seed)
+    if not is_finished(choice) and not train(choice, resume=holds_training(output))["finished"]:
         raise KeyboardInterrupt
     return output / "final_model.zip"
 

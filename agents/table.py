@@ -18,8 +18,8 @@ from .command_line import Long, start
 from .input.options import Episodes, Seed
 from .output import tables
 from .output.progress import progress_bar
-from .suite.sweep import Comparison
-from .training.checked import load
+from .suite.sweep import SweepSettings
+from .training.checked import load_checked
 
 COLUMNS = ("setting", "requests", "rate", "MSE", "median", "ARMSE", "trace P", "NEES")
 
@@ -43,34 +43,36 @@ class Table(Long):
 
     def run(self) -> None:
         """Run every row and print the table."""
-        rows = rows_of(load(Comparison, self.config), self.episodes, self.seed, trust=self.trust)
+        rows = _rows_of(
+            load_checked(SweepSettings, self.config), self.episodes, self.seed, trust=self.trust
+        )
         if self.markdown:
             lines = [COLUMNS, ("---",) * len(COLUMNS), *rows]
             print("\n".join("| " + " | ".join(line) + " |" for line in lines))
             return
         title = f"{self.episodes} episodes, seed {self.seed}"
-        tables.console().print(tables.table(title, COLUMNS, rows))
+        tables.console().print(tables.table_tables(title, COLUMNS, rows))
 
 
-def rows_of(
-    comparison: Comparison, episodes: int, seed: int, *, trust: bool = False
+def _rows_of(
+    comparison: SweepSettings, episodes: int, seed: int, *, trust: bool = False
 ) -> list[tuple[str, ...]]:
     """One row of text for each of the config's rows; ``trust`` as in ``make_policy``.
 
     Raises:
         ConfigurationError: a row that is not allowed, before the first episode.
     """
-    made = []
+    result = []
     for row in comparison.rows:
         task = make_task(row.environment or comparison.environment, **row.options)
-        made.append((row.label, task, make_policy(row.policy, task, trust=trust)))
-    total = sum(episodes * task.horizon for _, task, _ in made)
-    found = []
+        result.append((row.label, task, make_policy(row.policy, task, trust=trust)))
+    total = sum(episodes * task.horizon for _, task, _ in result)
+    results = []
     with progress_bar(total, "rows") as bar:
-        for label, task, policy in made:
+        for label, task, policy in result:
             bar.say(label)
-            found.append(_cells(label, run_episodes(task, policy, episodes, seed, bar.update)))
-    return found
+            results.append(_cells(label, run_episodes(task, policy, episodes, seed, bar.update)))
+    return results
 
 
 def _cells(label: str, results: EpisodeResults) -> tuple[str, ...]:
@@ -78,10 +80,10 @@ def _cells(label: str, results: EpisodeResults) -> tuple[str, ...]:
         label,
         " ".join(f"{rate:.3f}" for rate in results.requests.mean(0)),
         f"{results.rate.mean():.3f}",
-        tables.number(mean_interval(results.mse)._asdict()),
+        tables.table_number(mean_interval(results.mse)._asdict()),
         f"{np.median(results.mse):.4g}",
         " ".join(f"{error:.3f}" for error in np.sqrt(results.squared_error).mean(0)),
-        tables.number(mean_interval(results.bound_trace)._asdict()),
+        tables.table_number(mean_interval(results.bound_trace)._asdict()),
         f"{results.nees.mean():.3f}",
     )
 

@@ -26,7 +26,7 @@ from fusion_gym.validation import ConfigurationError
 
 from .command_line import Long, SetOptions, start
 from .input.options import Between, OutputFolder, Steps, TrainingSeed, writable_folder
-from .training.checked import load
+from .training.checked import load_checked
 from .training.config import Experiment
 from .training.run import holds_training, train
 
@@ -56,7 +56,7 @@ class Train(Long):
         Raises:
             ConfigurationError: a config or a value that is not allowed.
         """
-        return load(Experiment, self.config).changed(
+        return load_checked(Experiment, self.config).changed(
             self.output,
             parse_settings("option", list(chain(*self.options))),
             timesteps=self.timesteps,

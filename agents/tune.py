@@ -38,9 +38,9 @@ from .input.options import OutputFolder, Steps, Whole
 from .output.files import write_text
 from .output.folders import alone_in, check_inputs, fingerprint
 from .output.progress import Bar, progress_bar, writing
-from .training.checked import load, parse
+from .training.checked import load_checked, parse
 from .training.config import Experiment
-from .training.run import Diverged, check, holds_training, train
+from .training.run import Diverged, check_run, holds_training, train
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
@@ -74,7 +74,7 @@ class Tune(Long):
 
     def run(self) -> None:
         """Search, and write the best config under the command that found it."""
-        experiment = load(Experiment, self.config)
+        experiment = load_checked(Experiment, self.config)
         plain = experiment.model_dump()
         if self.timesteps is not None:
             plain["training"]["timesteps"] = self.timesteps
@@ -91,7 +91,7 @@ class Tune(Long):
         print(f"best return {study.best_value:.4g} with {study.best_params}; config in {path}")
 
 
-def choices(experiment: Experiment) -> dict[str, tuple[Any, ...]]:
+def _choices(experiment: Experiment) -> dict[str, tuple[Any, ...]]:
     """The values among which a study of this experiment chooses, by name."""
     own = getattr(experiment.algorithm, "n_steps", 1)
     steps = tuple(sorted({max(round(own * factor), 1) for factor in FACTORS}))
@@ -105,7 +105,7 @@ def suggest(trial: optuna.Trial, experiment: Experiment, output: Path) -> Experi
     for name, (low, high) in NUMBERS.items():
         if name in algorithm:
             algorithm[name] = trial.suggest_float(name, low, high, log=True)
-    for name, values in choices(experiment).items():
+    for name, values in _choices(experiment).items():
         if name in algorithm or name == "hidden":
             value = trial.suggest_categorical(name, list(values))
             if name == "hidden":
@@ -135,7 +135,7 @@ def tune(
             f"target_rate = {experiment.training.target_rate} is not allowed in tuning: trials "
             "are compared by their return at a fixed price"
         )
-    check(experiment)
+    check_run(experiment)
     try:
         shared = None if storage is None else shared_study(experiment, storage)
         with alone_in(folder, "output"):
@@ -162,9 +162,9 @@ def open_study(experiment: Experiment, folder: Path) -> optuna.Study:
     inputs = inputs_of(experiment)
     if path.exists() and path.stat().st_size > 0:
         with contextlib.closing(sqlite3.connect(path)) as connection:
-            told = connection.execute("PRAGMA quick_check").fetchone()[0]
-        if told != "ok":
-            raise sqlite3.DatabaseError(told)
+            answer = connection.execute("PRAGMA quick_check").fetchone()[0]
+        if answer != "ok":
+            raise sqlite3.DatabaseError(answer)
     elif any(folder.glob("trial_*")):
         raise ConfigurationError(
             f"output = {str(folder)!r} holds trials without their study, study.db: give another "
@@ -218,7 +218,7 @@ def shared_study(experiment: Experiment, storage: str) -> optuna.Study:
     """
     inputs = inputs_of(experiment)
     try:
-        found = _opened(storage)
+        result = _opened(storage)
     except (SQLAlchemyError, ImportError) as error:
         reason = str(error).splitlines()[0]
         raise ConfigurationError(
@@ -226,7 +226,7 @@ def shared_study(experiment: Experiment, storage: str) -> optuna.Study:
         ) from None
     study = optuna.create_study(
         study_name=f"tune_{fingerprint(inputs)[:16]}",
-        storage=found,
+        storage=result,
         sampler=optuna.samplers.TPESampler(constant_liar=True),
         load_if_exists=True,
         direction="maximize",
@@ -278,7 +278,7 @@ def begin_with(study: optuna.Study, experiment: Experiment) -> None:
     """Let the config's own hyper-parameters be the first trial, where the search has them."""
     algorithm = experiment.algorithm.model_dump()
     own: dict[str, Any] = {name: algorithm[name] for name in NUMBERS if name in algorithm}
-    values = choices(experiment)
+    values = _choices(experiment)
     own |= {name: algorithm[name] for name in values if name in algorithm}
     own["hidden"] = ",".join(str(size) for size in experiment.algorithm.network.hidden)
     inside = all(low <= own[name] <= high for name, (low, high) in NUMBERS.items() if name in own)
@@ -308,24 +308,24 @@ def run_trial(trial: optuna.Trial, experiment: Experiment, output: Path, bar: Ba
         KeyboardInterrupt: it was interrupted.
     """
     trial.set_user_attr("folder", output.name)
-    chosen = suggest(trial, experiment, output)
+    suggestion = suggest(trial, experiment, output)
     best, begun = -float("inf"), bar.done
     pruned = False
 
     def watch(record: dict[str, Any]) -> bool:
         nonlocal best, pruned
         best = max(best, record["return"])
-        part = record["timesteps"] / chosen.training.timesteps
+        part = record["timesteps"] / suggestion.training.timesteps
         bar.say(f"{output.name}: {part:.0%}, return {best:.4g}")
         bar.reach(begun, (begun + min(part, 1.0)) / bar.total)
-        if record["timesteps"] >= chosen.training.timesteps:
+        if record["timesteps"] >= suggestion.training.timesteps:
             return False  # the finished model's validation
         trial.report(best, record["timesteps"])
         pruned = trial.should_prune()
         return pruned
 
     try:
-        summary = train(chosen, resume=holds_training(output), quiet=True, watch=watch)
+        summary = train(suggestion, resume=holds_training(output), quiet=True, watch=watch)
     except Diverged:
         pruned = True
     if pruned:
@@ -337,9 +337,9 @@ def run_trial(trial: optuna.Trial, experiment: Experiment, output: Path, bar: Ba
 
 def best_config(study: optuna.Study, experiment: Experiment, command: str) -> str:
     """The config with the best trial's hyper-parameters, as YAML under the command."""
-    found = optuna.trial.FixedTrial(study.best_params)
-    chosen = suggest(found, experiment, Path(experiment.output))  # type: ignore[arg-type]
-    plain = chosen.model_dump(mode="json", exclude_none=True)
+    result = optuna.trial.FixedTrial(study.best_params)
+    suggestion = suggest(result, experiment, Path(experiment.output))  # type: ignore[arg-type]
+    plain = suggestion.model_dump(mode="json", exclude_none=True)
     value = f"best of {ended(study)} trials, validation return {study.best_value:.4g}"
     return f"# Found by {command}: {value}.\n" + yaml.safe_dump(plain, sort_keys=False)
 

@@ -24,7 +24,7 @@ from .output.files import read_json, replacing, write
 from .output.progress import writing
 from .output.small_model import small_model
 from .suite.classes import HEARD, KNOWS
-from .suite.reports import Agent, read
+from .suite.reports import Agent, read_shape
 
 LARGEST = 300_000  # bytes of a model
 MOST = 4_000_000  # bytes of all of them
@@ -47,12 +47,12 @@ class Zoo(Long):
 
     def run(self) -> None:
         """Copy the best training seed of each setting and class, and remove the other agents."""
-        found = best_agents(self.results)
-        if not found:
+        result = best_agents(self.results)
+        if not result:
             raise ConfigurationError(
                 f"results = {str(self.results)!r} is not allowed: it holds no agents"
             )
-        every = chosen(found, self.envs, self.classes)
+        every = select(result, self.envs, self.classes)
         models = {name: model_of(report, self.work) for name, report in every.items()}
         size = sum(map(len, models.values()))
         if size > MOST:
@@ -70,52 +70,52 @@ class Zoo(Long):
 
 def best_agents(results: Path) -> dict[tuple[str, str], dict[str, Any]]:
     """The report of the best training seed, by setting and class."""
-    found: dict[tuple[str, str], dict[str, Any]] = {}
+    result: dict[tuple[str, str], dict[str, Any]] = {}
     for path in sorted(results.glob("*/agent_*.json")):
-        report = read(Agent, path, "results")
+        report = read_shape(Agent, path, "results")
         place = (report["setting"], report["class"])
         value = report["best_validation"]["return"]
-        if place not in found or value > found[place]["best_validation"]["return"]:
-            found[place] = report
-    return found
+        if place not in result or value > result[place]["best_validation"]["return"]:
+            result[place] = report
+    return result
 
 
-def chosen(
-    found: Mapping[tuple[str, str], dict[str, Any]], envs: Iterable[str], classes: Iterable[str]
+def select(
+    content: Mapping[tuple[str, str], dict[str, Any]], envs: Iterable[str], classes: Iterable[str]
 ) -> dict[str, dict[str, Any]]:
     """The agents of these settings and classes, as ``SETTING_CLASS``.
 
     Raises:
         ConfigurationError: a setting or class without agents; names the option and what there is.
     """
-    settings = list(dict.fromkeys(setting for setting, _ in found))
-    known = list(dict.fromkeys(name for _, name in found))
+    settings = list(dict.fromkeys(setting for setting, _ in content))
+    known = list(dict.fromkeys(name for _, name in content))
     for name in envs:
         choice("envs", name, settings)
     for name in classes:
         choice("classes", name, known)
-    wanted = {}
+    required = {}
     for setting in envs or settings:
-        there = [name for one, name in found if one == setting]
+        there = [name for item, name in content if item == setting]
         for name in classes or typical(there):
             if name in there:
-                wanted[f"{setting}_{name}"] = found[setting, name]
-    return wanted
+                required[f"{setting}_{name}"] = content[setting, name]
+    return required
 
 
 def typical(classes: Iterable[str]) -> list[str]:
-    """The centre, the coordinators of one measurement, and sensors that hear least and most.
+    """The centre, the schedulers of one measurement, and sensors that hear least and most.
 
     Those by themselves with memory, and those that hear the least without, where there is none.
     """
     there = set(classes)
-    heard = [one for one in HEARD if {f"local_{one}", f"local_{one}_memory"} & there]
-    wanted = ["centre", "sensors", "sensors_memory"]
-    if heard:
-        least = f"local_{heard[0]}"
-        wanted.append(f"{least}_memory" if f"{least}_memory" in there else least)
-    wanted.append("local_packets_memory")
-    return [name for name in dict.fromkeys(wanted) if name in there]
+    received = [item for item in HEARD if {f"local_{item}", f"local_{item}_memory"} & there]
+    required = ["centre", "sensors", "sensors_memory"]
+    if received:
+        least = f"local_{received[0]}"
+        required.append(f"{least}_memory" if f"{least}_memory" in there else least)
+    required.append("local_packets_memory")
+    return [name for name in dict.fromkeys(required) if name in there]
 
 
 def model_of(report: dict[str, Any], work: Path) -> bytes:
@@ -161,12 +161,12 @@ def add(name: str, report: dict[str, Any], model: bytes, folder: Path) -> None:
         partial.write_bytes(model)
 
 
-def remove_others(folder: Path, kept: Iterable[str]) -> list[str]:
+def remove_others(folder: Path, names: Iterable[str]) -> list[str]:
     """Remove the agents, each a model beside its card, that are not kept; returns their names."""
     removed = []
     for model in sorted(folder.glob("*.zip")):
         card = model.with_suffix(".json")
-        if model.stem not in kept and card.exists() and "sha256" in read_json(card, "zoo"):
+        if model.stem not in names and card.exists() and "sha256" in read_json(card, "zoo"):
             model.unlink()
             card.unlink()
             removed.append(model.stem)

@@ -66,8 +66,8 @@ def evaluate(env: str, options: Content, names: list[str], episodes: int, folder
         words += ["--set", *(f"{key}={value}" for key, value in options.items())]
     command("evaluate", *words, "--json", str(folder / "evaluation.json"))
     report = read(folder / "evaluation.json")
-    chosen = {key: report[key] for key in ("policies", "quantiles")}
-    return json.dumps(chosen, sort_keys=True).encode()
+    selection = {key: report[key] for key in ("policies", "quantiles")}
+    return json.dumps(selection, sort_keys=True).encode()
 
 
 def reproduce(config: Path, episodes: int, folder: Path) -> bytes:
@@ -169,15 +169,15 @@ def fingerprint(work: Work) -> tuple[str, float]:
     """The SHA-256 of what the work gave, and the seconds that it took."""
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        found = hashlib.sha256(work(Path(folder))).hexdigest()
-    return found, time.perf_counter() - began
+        digest = hashlib.sha256(work(Path(folder))).hexdigest()
+    return digest, time.perf_counter() - began
 
 
 def run(output: Path, kinds: list[str], episodes: int, workers: int) -> int:
     """Fill the file with the pieces that it lacks; returns how many of them failed."""
-    found: dict[str, str] = read(output) if output.exists() else {}
+    result: dict[str, str] = read(output) if output.exists() else {}
     pieces = {name: work for kind in kinds for name, work in KINDS[kind](episodes)}
-    left = {name: work for name, work in pieces.items() if name not in found}
+    left = {name: work for name, work in pieces.items() if name not in result}
     print(f"{len(pieces)} pieces, {len(pieces) - len(left)} of them are finished", flush=True)
     output.parent.mkdir(parents=True, exist_ok=True)
     unfinished, failed = output.with_name(output.name + ".part"), 0
@@ -190,10 +190,10 @@ def run(output: Path, kinds: list[str], episodes: int, workers: int) -> int:
                 failed += 1
                 print(f"{name} failed: {error}", file=sys.stderr, flush=True)
                 continue
-            found[name], seconds = future.result()
-            unfinished.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n")
+            result[name], seconds = future.result()
+            unfinished.write_text(json.dumps(result, indent=1, sort_keys=True) + "\n")
             unfinished.replace(output)
-            print(f"{name}: {found[name][:12]}, {seconds:.0f} s", flush=True)
+            print(f"{name}: {result[name][:12]}, {seconds:.0f} s", flush=True)
     finally:
         pool.shutdown(cancel_futures=True)
     return failed
@@ -222,12 +222,12 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--episodes", type=int, default=200, help="of evaluations and tables")
     parser.add_argument("--workers", type=int, default=2, help="commands side by side")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     try:
-        if given.compare:
-            wrong = compare(*given.compare)
+        if arguments.compare:
+            wrong = compare(*arguments.compare)
         else:
-            wrong = run(given.output, given.only, given.episodes, given.workers)
+            wrong = run(arguments.output, arguments.only, arguments.episodes, arguments.workers)
     except KeyboardInterrupt:
         sys.exit(130)
     sys.exit(wrong > 0)

@@ -21,14 +21,14 @@ from pathlib import Path
 from typing import Any
 
 from fusion_gym.agents.output import tables
-from fusion_gym.agents.output.ending import ended_like_by_ctrl_c, told
+from fusion_gym.agents.output.ending import ended_like_by_ctrl_c, report_errors
 from fusion_gym.agents.output.files import read_json, write, write_text
 from fusion_gym.agents.output.folders import alone_in
 from fusion_gym.agents.output.progress import quietly, writing
 from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.learned import finished, report
+from fusion_gym.agents.suite.learned import finished_lessons, report
 from fusion_gym.agents.suite.learning import load_learning
-from fusion_gym.agents.suite.learning_table import overview, text_of
+from fusion_gym.agents.suite.learning_table import learning_text, overview
 from fusion_gym.agents.suite.lessons import run_lesson, run_reference
 from fusion_gym.agents.suite.study import Kind, Lesson, Study
 from fusion_gym.agents.suite.team import Team
@@ -53,36 +53,36 @@ def main() -> None:
     parser.add_argument("--output", type=Path, help="for JSON and tables: results/learning")
     parser.add_argument("--work", type=Path, help="for models and episodes: runs/learning")
     parser.add_argument("--quiet", action="store_true", help="neither progress nor remarks")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     words = [word for word in sys.argv[1:] if word != "--resume"]
     again = shlex.join(["python", "-m", "benchmarks.learning", *words, "--resume"])
     interrupted = f"interrupted; go on with: {again}"
-    with told(lambda: interrupted), quietly(given.quiet), ended_like_by_ctrl_c():
-        run(given)
+    with report_errors(lambda: interrupted), quietly(arguments.quiet), ended_like_by_ctrl_c():
+        run(arguments)
 
 
-def run(given: argparse.Namespace) -> None:
+def run(args: argparse.Namespace) -> None:
     """Do what is not finished, write and print the tables.
 
     Raises:
         ConfigurationError: anything that is not allowed, before anything runs.
     """
-    integer("seeds", given.seeds, at_least=1)
-    integer("workers", given.workers, at_least=1, at_most=512)
-    learning = load_learning(given.config, given.quick)
+    integer("seeds", args.seeds, at_least=1)
+    integer("workers", args.workers, at_least=1, at_most=512)
+    learning = load_learning(args.config, args.quick)
     suite = load_suite(learning.suite)
-    output = given.output or Path("results/learning/quick" if given.quick else "results/learning")
-    work = given.work or Path("runs/learning/quick" if given.quick else "runs/learning/full")
+    output = args.output or Path("results/learning/quick" if args.quick else "results/learning")
+    work = args.work or Path("runs/learning/quick" if args.quick else "runs/learning/full")
     by_name = {course.setting: course for course in learning.settings}
-    chosen = [by_name[choice("setting", name, by_name)] for name in given.settings or by_name]
-    studies = [Study(learning, suite, one, given.results, output, work) for one in chosen]
+    settings = [by_name[choice("setting", name, by_name)] for name in args.settings or by_name]
+    studies = [Study(learning, suite, setting, args.results, output, work) for setting in settings]
     for study in studies:
         study.check()
         study.experiment("front", 0)
         study.experiment("plain", 0)
     with alone_in(output, "output"), alone_in(work, "work"):
         there = [study.report for study in studies if study.report.exists()]
-        if there and not given.resume:
+        if there and not args.resume:
             raise ConfigurationError(
                 f"output = {str(output)!r} holds {there[0].name} already: go on with --resume, or "
                 "give another --output and --work"
@@ -90,21 +90,21 @@ def run(given: argparse.Namespace) -> None:
         writing(("results", output), ("trainings and episodes", work))
         for study in studies:
             measure_throughput(study)
-        teach(studies, given.seeds, Team(given.workers))
+        teach(studies, args.seeds, Team(args.workers))
         for study in studies:
-            report(study, given.seeds)
+            report(study, args.seeds)
         files = [output / f"{name}.json" for name in by_name]
-        found = [read_json(path, "output") for path in files if path.exists()]
-        write_text(output / "README.md", text_of(found, _command(given)))
-        tables.console().print(overview(found))
+        content = [read_json(path, "output") for path in files if path.exists()]
+        write_text(output / "README.md", learning_text(content, _command(args)))
+        tables.console().print(overview(content))
         print(f"results in {output}")
 
 
-def _command(given: argparse.Namespace) -> str:
+def _command(arguments: argparse.Namespace) -> str:
     """The command that makes all tables, some settings' or all."""
-    words = ["python", "-m", "benchmarks.learning", "--seeds", str(given.seeds)]
-    words += ["--quick"] if given.quick else []
-    words += [] if given.config == "learning" else ["--config", str(given.config)]
+    words = ["python", "-m", "benchmarks.learning", "--seeds", str(arguments.seeds)]
+    words += ["--quick"] if arguments.quick else []
+    words += [] if arguments.config == "learning" else ["--config", str(arguments.config)]
     return shlex.join(words)
 
 
@@ -122,8 +122,8 @@ def teach(studies: Sequence[Study], seeds: int, team: Team) -> None:
     for study in studies:
         if study.memoryless is None:
             continue
-        trained = finished(study, "front", seeds)
-        taken = statistics.fmean(one["curve"][-1]["cpu_seconds"] for one in trained)
+        trained = finished_lessons(study, "front", seeds)
+        taken = statistics.fmean(item["curve"][-1]["cpu_seconds"] for item in trained)
         budget = study.learning.plain.budget * taken
         count = min(seeds, study.learning.plain.seeds)
         plain += [Lesson(study, "plain", seed, budget) for seed in range(count)]
@@ -153,10 +153,10 @@ def measure_throughput(study: Study, seconds: float = 0.3) -> None:
         "without": remembering(where.id, where.options, "without", clock=clock),
         "values": remembering(where.id, where.options, "values", clock=clock),
     }
-    found: dict[str, Any] = {
+    result: dict[str, Any] = {
         name: round(statistics.median(turns)) for name, turns in measured(rows, seconds).items()
     }
-    write(study.throughput, found)
+    write(study.throughput, result)
 
 
 if __name__ == "__main__":

@@ -27,9 +27,9 @@ from stable_baselines3.common.logger import Logger
 
 from fusion_gym.agents.output import tables
 from fusion_gym.agents.output.progress import progress_bar, quietly
-from fusion_gym.agents.training.checked import load, parse
+from fusion_gym.agents.training.checked import load_checked, parse
 from fusion_gym.agents.training.config import Experiment
-from fusion_gym.agents.training.run import check
+from fusion_gym.agents.training.run import check_run
 from fusion_gym.core.task import Task
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.envs.registration import make_task
@@ -96,7 +96,7 @@ class _Clock(BaseCallback):
 
 
 def cost(sensors: int, local: bool) -> Cost:
-    """Of a counterfactual training with one flip a sensor: of a coordinator, or of local rows."""
+    """Of a counterfactual training with one flip a sensor: of a scheduler, or of local rows."""
     rows = RUNS * (sensors if local else 1)
     content = {
         "environment": {
@@ -111,13 +111,13 @@ def cost(sensors: int, local: bool) -> Cost:
         "training": {"timesteps": ROLLOUTS * STEPS * rows, "num_envs": RUNS},
         "output": "unused",
     }  # fmt: skip
-    model, env, _ = check(parse(Experiment, content, "many_sensors"))
+    model, env, _ = check_run(parse(Experiment, content, "many_sensors"))
     assert isinstance(env, PrivilegedVecEnv)
     stepped, inside = env.step_alternatives, [0.0]
 
-    def timed(*given: Any) -> Any:
+    def timed(*value: Any) -> Any:
         began = time.process_time()
-        result = stepped(*given)
+        result = stepped(*value)
         inside[0] += time.process_time() - began
         return result
 
@@ -138,19 +138,19 @@ def exponent(sensors: Sequence[int], costs: Sequence[float]) -> float:
 def cost_table(sensors: Sequence[int]) -> tuple[Table, dict[str, Any]]:
     """A row a number of sensors and kind of agent, and the exponents below."""
     heads = ("agent", "sensors", *Cost._fields, "sum")
-    table = tables.table("CPU microseconds of a training step of one run", heads)
+    table = tables.table_tables("CPU microseconds of a training step of one run", heads)
     report: dict[str, Any] = {"sensors": list(sensors)}
     for local in (False, True):
-        name = "local rows" if local else "coordinator, flips"
-        found = [cost(count, local) for count in sensors]
-        for count, part in zip(sensors, found, strict=True):
+        name = "local rows" if local else "scheduler, flips"
+        result = [cost(count, local) for count in sensors]
+        for count, part in zip(sensors, result, strict=True):
             table.add_row(name, str(count), *(f"{value:.0f}" for value in (*part, sum(part))))
-        sums = [sum(part) for part in found]
-        slopes = [exponent(sensors, column) for column in (*zip(*found, strict=True), sums)]
+        sums = [sum(part) for part in result]
+        slopes = [exponent(sensors, column) for column in (*zip(*result, strict=True), sums)]
         last = [exponent(sensors[-2:], sums[-2:])]
         table.add_row(name, "exponent", *(f"{slope:.2f}" for slope in slopes), end_section=True)
         report[name] = {
-            "costs": [part._asdict() for part in found],
+            "costs": [part._asdict() for part in result],
             "exponents": dict(zip((*Cost._fields, "sum"), slopes, strict=True)),
             "exponent_of_the_last_two": last[0],
         }
@@ -169,8 +169,8 @@ def tuned(task: Task, episodes: int) -> list[str]:
         def worth(name: str) -> float:
             bar.say(name)
             policy = make_policy(name, task)
-            found = run_episodes(task, policy, episodes, TUNING_SEED, bar.update)
-            return float(found.returns.mean())
+            results = run_episodes(task, policy, episodes, TUNING_SEED, bar.update)
+            return float(results.returns.mean())
 
         return [
             max((family.format(value) for value in values), key=worth)
@@ -198,22 +198,22 @@ def comparison(
     task: Task, agent: str, rules: Sequence[str], episodes: int, seed: int
 ) -> list[dict[str, Any]]:
     """Agent and rules, best first, each with its paired difference to the agent."""
-    found: dict[str, EpisodeResults] = {}
+    result: dict[str, EpisodeResults] = {}
     with progress_bar((1 + len(rules)) * episodes * task.horizon, "testing") as bar:
         for name in (agent, *rules):
             bar.say(name)
             policy = make_policy(name, task)
-            found[name] = run_episodes(task, policy, episodes, seed, bar.update)
+            result[name] = run_episodes(task, policy, episodes, seed, bar.update)
     rows = [
         {
             "policy": name,
             "return": mean_interval(results.returns)._asdict(),
-            "to_agent": mean_interval(results.returns - found[agent].returns)._asdict(),
+            "to_agent": mean_interval(results.returns - result[agent].returns)._asdict(),
             "rate": float(results.rate.mean()),
             "requests": float(results.requests.mean()),
             "mse": float(results.mse.mean()),
         }
-        for name, results in found.items()
+        for name, results in result.items()
     ]
     return sorted(rows, key=lambda row: -row["return"]["mean"])
 
@@ -221,7 +221,7 @@ def comparison(
 def comparison_table(rows: Sequence[dict[str, Any]], least: float) -> Table:
     """Best first; above the floor is by how much a policy costs more."""
     heads = ("return", "below the agent's", "above the floor", "rate", "requests", "MSE")
-    table = tables.table("forty sensors, one bucket", ("policy", *heads))
+    table = tables.table_tables("forty sensors, one bucket", ("policy", *heads))
     table.add_row("floor: no policy has more", f"{least:.2f}", "", "", "", "", "")
     for row in rows:
         mean, difference = row["return"]["mean"], row["to_agent"]
@@ -249,30 +249,30 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, help="write the figures to this JSON file")
     parser.add_argument("--quiet", action="store_true", help="no progress")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
-    with quietly(given.quiet):
-        table, report = made(given, parser)
-    if given.output is not None:
-        given.output.parent.mkdir(parents=True, exist_ok=True)
-        given.output.write_text(json.dumps(report, indent=1) + "\n")
+    with quietly(arguments.quiet):
+        table, report = build_parts(arguments, parser)
+    if arguments.output is not None:
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        arguments.output.write_text(json.dumps(report, indent=1) + "\n")
     Console(width=130).print(table)
 
 
-def made(
-    given: argparse.Namespace, parser: argparse.ArgumentParser
+def build_parts(
+    arguments: argparse.Namespace, parser: argparse.ArgumentParser
 ) -> tuple[Table, dict[str, Any]]:
     """What was asked for, as a table and for a file."""
-    if given.what == "cost":
-        return cost_table(given.sensors)
-    if given.model is None:
+    if arguments.what == "cost":
+        return cost_table(arguments.sensors)
+    if arguments.model is None:
         parser.error("the table needs --model")
-    chosen = load(Experiment, given.config).environment
-    task = make_task(chosen.id, **chosen.options)
-    rules, least = tuned(task, given.tuning), floor(task)
-    rows = comparison(task, f"model:{given.model}", rules, given.episodes, given.seed)
-    report = {"episodes": given.episodes, "seed": given.seed, "floor": least, "rows": rows}
+    environment = load_checked(Experiment, arguments.config).environment
+    task = make_task(environment.id, **environment.options)
+    rules, least = tuned(task, arguments.tuning), floor(task)
+    rows = comparison(task, f"model:{arguments.model}", rules, arguments.episodes, arguments.seed)
+    report = {"episodes": arguments.episodes, "seed": arguments.seed, "floor": least, "rows": rows}
     return comparison_table(rows, least), report
 
 

@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from fusion_gym.agents.output import tables
-from fusion_gym.agents.output.figures import save
+from fusion_gym.agents.output.figures import save_figure
 from fusion_gym.agents.output.palette import BLUE, GREEN, INK, ORANGE, VERMILLION
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
@@ -37,14 +37,14 @@ MIDDLE = {"sensors": 50, "states": 10}  # what the figure holds fixed
 # What is timed, and how it is drawn. A part is the environment's own, or a policy's decision.
 RULES = {
     "information gain": "information_gain:threshold=0.01",
-    "value of information, coordinator": "value_of_information:price=0.01",
+    "value of information, scheduler": "value_of_information:price=0.01",
     "value of information, own": "value_of_information:price=0.01,own=true",
 }
 STYLES = {
     "step": (INK, "o", "-"),
     "observation": (GREEN, "v", ":"),
     "information gain": (ORANGE, "s", "--"),
-    "value of information, coordinator": (BLUE, "^", "-"),
+    "value of information, scheduler": (BLUE, "^", "-"),
     "value of information, own": (VERMILLION, "D", "-."),
 }
 PARTS = tuple(STYLES)
@@ -120,7 +120,7 @@ def cost(task: Task, part: str, seconds: float) -> float:
 def measured(sensors: Sequence[int], states: Sequence[int], seconds: float) -> list[Cost]:
     """Every part at every size, each the least of several turns through all of them."""
     turns = [list(_turn(sensors, states, seconds)) for _ in range(TURNS)]
-    return [min(same, key=lambda one: one.microseconds) for same in zip(*turns, strict=True)]
+    return [min(same, key=lambda item: item.microseconds) for same in zip(*turns, strict=True)]
 
 
 def _turn(sensors: Sequence[int], states: Sequence[int], seconds: float) -> Iterator[Cost]:
@@ -139,34 +139,34 @@ def exponents(costs: Sequence[Cost]) -> dict[str, dict[str, dict[str, float]]]:
 
     Over sizes from :data:`LARGE` on, and of one state a sensor p alone.
     """
-    found: dict[str, dict[str, dict[str, float]]] = {}
-    for env in dict.fromkeys(one.env for one in costs):
+    result: dict[str, dict[str, dict[str, float]]] = {}
+    for env in dict.fromkeys(item.env for item in costs):
         apart = env == LINEAR
         for part in PARTS:
             large = [
-                one
-                for one in costs
-                if (one.env, one.part) == (env, part)
-                and one.sensors >= LARGE["sensors"]
-                and one.states >= LARGE["states"]
+                item
+                for item in costs
+                if (item.env, item.part) == (env, part)
+                and item.sensors >= LARGE["sensors"]
+                and item.states >= LARGE["states"]
             ]
             names = ["sensors", "states"] if apart else ["sensors"]
-            columns = [np.log([getattr(one, name) for one in large]) for name in names]
+            columns = [np.log([getattr(item, name) for item in large]) for name in names]
             rows = np.stack([*columns, np.ones(len(large))], axis=1)
-            slopes = np.linalg.lstsq(rows, np.log([one.microseconds for one in large]))[0]
+            slopes = np.linalg.lstsq(rows, np.log([item.microseconds for item in large]))[0]
             values = dict(zip(names, map(float, slopes), strict=False))
-            found.setdefault(env, {})[part] = values
-    return found
+            result.setdefault(env, {})[part] = values
+    return result
 
 
 def table(costs: Sequence[Cost], fitted: dict[str, dict[str, dict[str, float]]]) -> Table:
     """A row a size, and below the exponents."""
     heads = ("environment", "sensors", "states", *PARTS)
-    result = tables.table("CPU microseconds of a step of one run", heads)
+    result = tables.table_tables("CPU microseconds of a step of one run", heads)
     rows: dict[tuple[str, int, int], list[str]] = {}
-    for one in sorted(costs, key=lambda one: (one.env, one.states, one.sensors)):
-        place = (one.env, one.sensors, 0 if one.env == REMOTE else one.states)
-        rows.setdefault(place, []).append(f"{one.microseconds:.3g}")
+    for item in sorted(costs, key=lambda item: (item.env, item.states, item.sensors)):
+        place = (item.env, item.sensors, 0 if item.env == REMOTE else item.states)
+        rows.setdefault(place, []).append(f"{item.microseconds:.3g}")
     for (env, count, size), values in rows.items():
         result.add_row(env, str(count), str(size or count), *values)
     for env, parts in fitted.items():
@@ -189,10 +189,10 @@ def figure(costs: Sequence[Cost], *paths: Path) -> None:
     for panel, (title, env, along, fixed) in zip(axes, panels, strict=True):
         for part, (colour, marker, line) in STYLES.items():
             points = [
-                (getattr(one, along), one.microseconds)
-                for one in costs
-                if (one.env, one.part) == (env, part)
-                and all(getattr(one, name) == value for name, value in fixed.items())
+                (getattr(item, along), item.microseconds)
+                for item in costs
+                if (item.env, item.part) == (env, part)
+                and all(getattr(item, name) == value for name, value in fixed.items())
             ]
             if points:
                 panel.loglog(
@@ -206,7 +206,7 @@ def figure(costs: Sequence[Cost], *paths: Path) -> None:
         panel.minorticks_off()
     axes[0].set_ylabel("CPU µs of a step of one run")
     axes[0].legend(fontsize=7.5)
-    save(drawn, *paths)
+    save_figure(drawn, *paths)
 
 
 def main() -> None:
@@ -216,22 +216,22 @@ def main() -> None:
     parser.add_argument("--states", type=int, nargs="+", default=STATES)
     parser.add_argument("--seconds", type=float, default=0.1, help="of each figure and turn")
     parser.add_argument("--output", type=Path, help="folder for the figures and the table")
-    given = parser.parse_args()
-    costs = measured(given.sensors, given.states, given.seconds)
+    arguments = parser.parse_args()
+    costs = measured(arguments.sensors, arguments.states, arguments.seconds)
     fitted = exponents(costs)
     Console(width=150).print(table(costs, fitted))
-    if given.output is not None:
-        given.output.mkdir(parents=True, exist_ok=True)
+    if arguments.output is not None:
+        arguments.output.mkdir(parents=True, exist_ok=True)
         report = {
             "runs": RUNS,
             "turns": TURNS,
-            "seconds": given.seconds,
-            "costs": [one._asdict() for one in costs],
+            "seconds": arguments.seconds,
+            "costs": [item._asdict() for item in costs],
             "fitted_from": LARGE,
             "exponents": fitted,
         }
-        (given.output / "step.json").write_text(json.dumps(report, indent=1) + "\n")
-        figure(costs, given.output / "step.png", given.output / "step.svg")
+        (arguments.output / "step.json").write_text(json.dumps(report, indent=1) + "\n")
+        figure(costs, arguments.output / "step.png", arguments.output / "step.svg")
 
 
 if __name__ == "__main__":

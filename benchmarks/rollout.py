@@ -26,37 +26,37 @@ from fusion_gym.policies.registry import make_policy
 CONFIG = Path(__file__).parent.parent / "configs" / "benchmark.yaml"
 
 
-def point(policy: str, found: EpisodeResults) -> dict[str, Any]:
+def point(policy: str, results: EpisodeResults) -> dict[str, Any]:
     """Rate and mean squared error of a policy's episodes."""
     return {
         "policy": policy,
-        "rate": float(found.rate.mean()),
-        "mse": float(found.mse.mean()),
-        "mse_interval": mean_interval(found.mse)[1:],
+        "rate": float(results.rate.mean()),
+        "mse": float(results.mse.mean()),
+        "mse_interval": mean_interval(results.mse)[1:],
     }
 
 
-def improve(task: Task, price: float, given: Any, progress: Any) -> dict[str, Any]:
+def improve(task: Task, price: float, value: Any, progress: Any) -> dict[str, Any]:
     """The point of one improvement at a price, with its base's beside it."""
-    base = f"value_of_information:price={price / given.ratio:.3g},at_most=1"
-    policy = f"rollout:samples={given.samples},steps={given.steps},price={price:.3g},base={base}"
-    found, plain = (
-        run_episodes(task, make_policy(name, task), given.episodes, given.seed, progress)
+    base = f"value_of_information:price={price / value.ratio:.3g},at_most=1"
+    policy = f"rollout:samples={value.samples},steps={value.steps},price={price:.3g},base={base}"
+    results, plain = (
+        run_episodes(task, make_policy(name, task), value.episodes, value.seed, progress)
         for name in (policy, base)
     )
-    gain = mean_interval(found.returns - plain.returns)
-    return point(policy, found) | {
+    gain = mean_interval(results.returns - plain.returns)
+    return point(policy, results) | {
         "price": price,
         "base": point(base, plain),
         "return_gain": gain.mean,
         "return_gain_interval": gain[1:],
-        "return": float(found.returns.mean()),
+        "return": float(results.returns.mean()),
     }
 
 
 def main() -> None:
     """Entry point."""
-    settings = {one["name"]: one for one in yaml.safe_load(CONFIG.read_text())["settings"]}
+    settings = {item["name"]: item for item in yaml.safe_load(CONFIG.read_text())["settings"]}
     parser = argparse.ArgumentParser(description="One improvement by simulation on the value rule.")
     parser.add_argument("setting", choices=settings)
     parser.add_argument("--prices", type=float, nargs="+", help="default: four of the range")
@@ -67,34 +67,34 @@ def main() -> None:
     parser.add_argument("--ratio", type=float, default=5.0)
     parser.add_argument("--output", type=Path, required=True, help="a folder")
     parser.add_argument("--quiet", action="store_true", help="neither progress nor remarks")
-    given = parser.parse_args()
-    chosen = settings[given.setting]
-    low, high = chosen["price_range"]
-    prices = given.prices or [(low * high) ** 0.5 * factor for factor in (0.3, 1.0, 3.0, 10.0)]
-    environment = chosen["environment"]
+    arguments = parser.parse_args()
+    selection = settings[arguments.setting]
+    low, high = selection["price_range"]
+    prices = arguments.prices or [(low * high) ** 0.5 * factor for factor in (0.3, 1.0, 3.0, 10.0)]
+    environment = selection["environment"]
     points, options = [], environment["options"] | {"memory": True}
     tasks = {
         price: fusion_gym.make_task(environment["id"], **options, cost_weight=price)
         for price in (float(f"{price:.3g}") for price in prices)
     }
-    steps = sum(2 * given.episodes * task.horizon for task in tasks.values())
-    with quietly(given.quiet), progress_bar(steps, given.setting) as bar:
-        writing(("points", given.output))
+    steps = sum(2 * arguments.episodes * task.horizon for task in tasks.values())
+    with quietly(arguments.quiet), progress_bar(steps, arguments.setting) as bar:
+        writing(("points", arguments.output))
         for price, task in tasks.items():
-            points.append(improve(task, price, given, bar.update))
+            points.append(improve(task, price, arguments, bar.update))
             last = points[-1]
             remark(f"price {price}: rate {last['rate']:.4f}, MSE {last['mse']:.4g}")
     report = {
-        "setting": given.setting,
+        "setting": arguments.setting,
         "env": environment["id"],
         "options": options,
-        "episodes": given.episodes,
-        "seed": given.seed,
+        "episodes": arguments.episodes,
+        "seed": arguments.seed,
         "command": " ".join(["python -m benchmarks.rollout", *sys.argv[1:]]),
         "points": points,
     }
-    given.output.mkdir(parents=True, exist_ok=True)
-    path = given.output / f"{given.setting}.json"
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    path = arguments.output / f"{arguments.setting}.json"
     path.write_text(json.dumps(report, indent=1) + "\n")
 
 

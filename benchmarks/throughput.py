@@ -119,19 +119,19 @@ def remembering(
     num_envs: int = 1024,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Workload:
-    """The core's loop: nothing remembered, the ``shadow`` alone, ``values``, or ``own`` values."""
+    """The core's loop without memory, or with ``memory_system``, ``values`` or ``own`` values."""
     changed = {"memory": how != "without", "horizon": 250}
     task = fusion_gym.make_task(env_id, **(options | changed))
-    owner: Owner = "own" if how == "own" else "coordinator"
+    owner: Owner = "own" if how == "own" else "scheduler"
     batch = EpisodeBatch.seeded(task, num_envs, 0, owner)
     draw = np.random.default_rng(0)
-    wanted = draw.random((16, task.sensors, num_envs)) < RATE
+    required = draw.random((16, task.sensors, num_envs)) < RATE
     count = iter(range(10**12))
 
     def step() -> None:
         if how in ("values", "own"):
             batch.beliefs().value()
-        if batch.step(wanted[next(count) % 16]).ended.any():
+        if batch.step(required[next(count) % 16]).ended.any():
             batch.reset()
 
     return _timed(step, num_envs, clock)
@@ -199,18 +199,18 @@ def main() -> None:
         "BiasedTracking, 1,024": vector({}, 1024, "fusion_gym/BiasedTracking-v0"),
     }
     figures = measured(rows, seconds)
-    medians = {name: statistics.median(found) for name, found in figures.items()}
+    medians = {name: statistics.median(figure) for name, figure in figures.items()}
     names = list(rows)
     title = f"steps per second, one thread, median of {TURNS} turns ({ENV} where not named)"
     heads = ("what", "steps/s", "least", "most", "to the FilterPy loop", "to DummyVecEnv")
-    table = tables.table(title, heads)
+    table = tables.table_tables(title, heads)
     for name, median in medians.items():
-        found = figures[name]
+        result = figures[name]
         table.add_row(
             name,
             f"{median:,.0f}",
-            f"{min(found):,.0f}",
-            f"{max(found):,.0f}",
+            f"{min(result):,.0f}",
+            f"{max(result):,.0f}",
             f"{median / medians[names[0]]:.2f}",
             f"{median / medians[names[3]]:.2f}",
         )
@@ -231,18 +231,22 @@ def measured(rows: dict[str, Workload], seconds: float) -> dict[str, list[float]
 
 def memory_table(seconds: float) -> Table:
     """What memory costs: the core's loop with it over without, the median of a turn's ratios."""
-    ways = {"shadow": "shadow alone", "values": "and values", "own": "every sensor's own values"}
+    ways = {
+        "memory_system": "shadow alone",
+        "values": "and values",
+        "own": "every sensor's own values",
+    }
     title = f"core's loop, 1,024 runs, requests at rate {RATE}: with memory over without"
-    table = tables.table(title, ("environment", "steps/s without", *ways.values()))
+    table = tables.table_tables(title, ("environment", "steps/s without", *ways.values()))
     for name, options in REMEMBERED.items():
         env_id = f"fusion_gym/{name.partition(',')[0]}-v0"
         rows = {how: remembering(env_id, options, how) for how in ("without", *ways)}
-        found = measured(rows, seconds)
+        result = measured(rows, seconds)
         ratios = [
-            statistics.median(a / b for a, b in zip(found[how], found["without"], strict=True))
+            statistics.median(a / b for a, b in zip(result[how], result["without"], strict=True))
             for how in ways
         ]
-        without = statistics.median(found["without"])
+        without = statistics.median(result["without"])
         table.add_row(name, f"{without:,.0f}", *(f"{ratio:.2f}" for ratio in ratios))
     return table
 

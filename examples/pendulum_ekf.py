@@ -76,9 +76,9 @@ class PendulumOptions(CommonOptions):
     token_rate: float = 1.0
 
 
-def build(chosen: PendulumOptions) -> Scenario:
+def build(options: PendulumOptions) -> Scenario:
     """The scenario of these options."""
-    return Scenario(chosen, Pendulum())
+    return Scenario(options, Pendulum())
 
 
 fusion_gym.register("examples/Pendulum-v0", build)

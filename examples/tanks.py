@@ -86,10 +86,10 @@ def main(episodes: int = 1000) -> None:
     print(f"{episodes} episodes, seeds 0 to {episodes - 1}; 95 % intervals")
     print(f"{'rule':30s}{'packets a step':>15s}   {'MSE of four levels, cm²':26s}{'NEES':>6s}")
     for label, name in RULES.items():
-        found = run_episodes(task, fusion_gym.make_policy(name, task), episodes, seed=0)
-        mean, low, high = mean_interval(found.mse)
+        results = run_episodes(task, fusion_gym.make_policy(name, task), episodes, seed=0)
+        mean, low, high = mean_interval(results.mse)
         error = f"{mean:.3f} [{low:.3f}, {high:.3f}]"
-        print(f"{label:30s}{found.tokens.mean():15.3f}   {error:26s}{found.nees.mean():6.2f}")
+        print(f"{label:30s}{results.tokens.mean():15.3f}   {error:26s}{results.nees.mean():6.2f}")
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ RULES = {
     "where variance falls most": "information_gain:threshold=0.02",
     "the greatest surprise": "innovation_threshold:threshold=0.5,whitened=true,at_most=1",
     "what it is worth, each by itself": "value_of_information:threshold=0.02,own=true",
-    "what it is worth, to a coordinator": "value_of_information:threshold=0.01,at_most=1",
+    "what it is worth, to a scheduler": "value_of_information:threshold=0.01,at_most=1",
 }
 
 
@@ -51,10 +51,10 @@ def main(episodes: int = 1000) -> None:
     print(f"{episodes} episodes, seeds 0 to {episodes - 1}; 95 % intervals")
     print(f"{'rule':36s}{'packets a step':>15s}   {'MSE of the position, m²':26s}{'NEES':>6s}")
     for label, name in RULES.items():
-        found = run_episodes(task, fusion_gym.make_policy(name, task), episodes, seed=0)
-        mean, low, high = mean_interval(-found.returns / task.horizon)
+        results = run_episodes(task, fusion_gym.make_policy(name, task), episodes, seed=0)
+        mean, low, high = mean_interval(-results.returns / task.horizon)
         error = f"{mean:.3f} [{low:.3f}, {high:.3f}]"
-        print(f"{label:36s}{found.tokens.mean():15.3f}   {error:26s}{found.nees.mean():6.2f}")
+        print(f"{label:36s}{results.tokens.mean():15.3f}   {error:26s}{results.nees.mean():6.2f}")
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 # Faces and their modules; the package of most is part of the extra "agents".
-_FACES = {
+_INTERFACES = {
     "FusionEnv": "single",
     "FusionVectorEnv": "vector",
     "FusionSB3VecEnv": "sb3",
@@ -60,9 +60,11 @@ if not TYPE_CHECKING:  # a type checker knows the names above, and no others
 
     def __getattr__(name: str) -> Any:
         """Stable-Baselines3, torch and PettingZoo are imported only where they are used."""
-        if name in _FACES:
+        if name in _INTERFACES:
             try:
-                return getattr(importlib.import_module(f"{__name__}.envs.{_FACES[name]}"), name)
+                return getattr(
+                    importlib.import_module(f"{__name__}.envs.{_INTERFACES[name]}"), name
+                )
             except ModuleNotFoundError as error:
                 missing = f"{error}: pip install 'fusion-gym[agents]'"
                 raise ModuleNotFoundError(missing, name=error.name) from None

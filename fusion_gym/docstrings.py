@@ -29,8 +29,8 @@ class Docstring(NamedTuple):
     @property
     def arguments(self) -> dict[str, str]:
         """The meaning of each argument, by the section ``Args``."""
-        found = _ARGUMENT.findall(self.labelled.get("Args", ""))
-        return {name: " ".join(meaning.split()) for name, meaning in found}
+        result = _ARGUMENT.findall(self.labelled.get("Args", ""))
+        return {name: " ".join(meaning.split()) for name, meaning in result}
 
 
 def read(owner: Any) -> Docstring:
@@ -46,7 +46,7 @@ def read(owner: Any) -> Docstring:
         elif not paragraph.startswith(" "):
             section = text
         section.append(paragraph)
-    parts = {name: textwrap.dedent("\n\n".join(found)) for name, found in labelled.items()}
+    parts = {name: textwrap.dedent("\n\n".join(value)) for name, value in labelled.items()}
     return Docstring("\n\n".join(text), parts)
 
 

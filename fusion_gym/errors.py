@@ -36,10 +36,10 @@ class UnexpectedArgumentError(ConfigurationError, TypeError):
 
 def refusal(field: str, value: Any, allowed: str) -> ConfigurationError:
     """The error of a field whose value is not what is allowed."""
-    return ConfigurationError(f"{field} = {shown(value)} is not allowed: it must be {allowed}")
+    return ConfigurationError(f"{field} = {display(value)} is not allowed: it must be {allowed}")
 
 
-def shown(value: Any) -> str:
+def display(value: Any) -> str:
     """A value as Python writes it, arrays as lists, on one line, and cut where it is long."""
     text = " ".join(repr(_plain(value)).split())
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
@@ -54,6 +54,6 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def nearest(given: Any, known: Iterable[str]) -> str | None:
+def nearest(value: Any, known: Iterable[str]) -> str | None:
     """The known name that was probably meant."""
-    return next(iter(difflib.get_close_matches(str(given), list(known), n=1)), None)
+    return next(iter(difflib.get_close_matches(str(value), list(known), n=1)), None)

@@ -25,7 +25,7 @@ def imported(field: str, text: str, module: str) -> ModuleType:
         ) from error
 
 
-def named(field: str, text: str) -> Any:
+def import_named(field: str, text: str) -> Any:
     """The object that ``module:name`` stands for.
 
     Raises:
@@ -34,15 +34,15 @@ def named(field: str, text: str) -> Any:
     module, _, name = text.partition(":")
     if not (name and all(part.isidentifier() for part in [*module.split("."), name])):
         raise ConfigurationError(f"{field} = {text!r} is not allowed: it must be 'module:name'")
-    found = imported(field, text, module)
-    if not hasattr(found, name):
+    result = imported(field, text, module)
+    if not hasattr(result, name):
         raise ConfigurationError(
             f"{field} = {text!r} is not allowed: the module {module!r} has no {name!r}"
         )
-    return getattr(found, name)
+    return getattr(result, name)
 
 
-def name_of(found: Any) -> str:
-    """What :func:`named` would take for a function, as far as it has a name."""
-    owner, name = getattr(found, "__module__", None), getattr(found, "__qualname__", None)
-    return f"{owner}:{name}" if owner and name else repr(found)
+def name_of(value: Any) -> str:
+    """What :func:`import_named` would take for a function, as far as it has a name."""
+    owner, name = getattr(value, "__module__", None), getattr(value, "__qualname__", None)
+    return f"{owner}:{name}" if owner and name else repr(value)

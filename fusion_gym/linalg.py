@@ -247,7 +247,7 @@ def factor(a: FloatArray) -> FloatArray:
     return result
 
 
-def draw(mean: FloatArray, covariance: FloatArray, normals: FloatArray) -> FloatArray:
+def draw_normal(mean: FloatArray, covariance: FloatArray, normals: FloatArray) -> FloatArray:
     """From N(mean, covariance): ``(..., n, N)`` of ``(..., n, n, N)`` and standard normals."""
     return mean + matvec(factor(covariance), normals)
 

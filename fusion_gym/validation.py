@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym.arrays import Array
-from fusion_gym.errors import ConfigurationError, UnexpectedArgumentError, nearest, refusal, shown
+from fusion_gym.errors import ConfigurationError, UnexpectedArgumentError, display, nearest, refusal
 
 # Filters square what they are given and divide by it: from here to there float64 can hold that.
 SMALLEST, LARGEST = 1e-15, 1e15
@@ -29,13 +29,13 @@ def _numbers(field: str, value: ArrayLike, allowed: str) -> Array:
     Infinity and what is no number are left to the caller.
     """
     try:
-        given = np.asarray(value)
+        values = np.asarray(value)
     except ValueError:
         raise refusal(field, value, allowed) from None
-    if given.dtype.kind not in "iuf":
+    if values.dtype.kind not in "iuf":
         raise refusal(field, value, allowed)
     with np.errstate(over="ignore"):  # a longer kind of float than float64
-        result = np.array(given, dtype=np.float64)
+        result = np.array(values, dtype=np.float64)
     if np.any((np.abs(result) > LARGEST) & np.isfinite(result)):
         raise refusal(field, value, f"at most {LARGEST:g} in magnitude")
     return result
@@ -50,14 +50,14 @@ def array(
         ConfigurationError: not numeric, not finite, or of another shape.
     """
     result = _numbers(field, value, "an array of numbers")
-    wanted = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
+    required = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
     matches = len(shape) == result.ndim and all(
         1 <= have <= longest if size is None else have == size
         for size, have in zip(shape, result.shape, strict=False)
     )
     if not matches:
         limit = f" (any up to {longest})" if max(result.shape, default=0) > longest else ""
-        raise refusal(field, value, f"an array of shape {wanted}{limit}, not {result.shape}")
+        raise refusal(field, value, f"an array of shape {required}{limit}, not {result.shape}")
     if not np.all(np.isfinite(result)):
         raise refusal(field, value, "finite")
     return result
@@ -72,9 +72,9 @@ def spread(field: str, value: ArrayLike, shape: tuple[int, ...], *, infinity: in
         ConfigurationError: not numeric, not finite, or not broadcastable to ``shape``.
     """
     allowed = f"a number or an array of shape {shape}"
-    given = _numbers(field, value, allowed)
+    values = _numbers(field, value, allowed)
     try:
-        result = np.broadcast_to(given, shape).copy()
+        result = np.broadcast_to(values, shape).copy()
     except ValueError:
         raise refusal(field, value, allowed) from None
     valid = np.isfinite(result) | (np.isinf(result) & (np.sign(result) == infinity))
@@ -167,26 +167,26 @@ def choice(field: str, value: Any, options: Iterable[str]) -> str:
     raise refusal(field, value, "one of " + ", ".join(map(repr, names)) + hint)
 
 
-def keys(kind: str, given: Iterable[str], known: Iterable[str]) -> None:
+def keys(kind: str, value: Iterable[str], known: Iterable[str]) -> None:
     """Every given key is known.
 
     Raises:
         ConfigurationError: names the first unknown key, the nearest match and all known keys.
     """
     names = sorted(known)
-    for key in given:
+    for key in value:
         if key not in names:
-            raise ConfigurationError(f"unknown {kind} {shown(key)}: {_known(key, names)}")
+            raise ConfigurationError(f"unknown {kind} {display(key)}: {_known(key, names)}")
 
 
-def arguments(owner: str, given: Iterable[str], known: Iterable[str]) -> None:
+def arguments(owner: str, value: Iterable[str], known: Iterable[str]) -> None:
     """Every given keyword argument is one that ``owner`` takes.
 
     Raises:
         UnexpectedArgumentError: names the first that is not, the nearest match and all known ones.
     """
     names = sorted(known)
-    for key in given:
+    for key in value:
         if key not in names:
             raise UnexpectedArgumentError.of(
                 owner, key, f"unknown option {key!r}: {_known(key, names)}"
@@ -267,8 +267,8 @@ def runs(value: Any) -> int:
 
 def one_or_each(value: ArrayLike) -> tuple[int, ...]:
     """The shape of a parameter that is one number for all sensors, (), or one for each, (l,)."""
-    given = np.asarray(value)
-    return given.shape if given.ndim == 1 else ()
+    values = np.asarray(value)
+    return values.shape if values.ndim == 1 else ()
 
 
 def adaptive_thresholds(rho_bar: ArrayLike, rho_initial: ArrayLike, adaptation: ArrayLike) -> None:
@@ -285,8 +285,8 @@ def adaptive_thresholds(rho_bar: ArrayLike, rho_initial: ArrayLike, adaptation: 
     initial = not_negative("rho_initial", rho_initial, one_or_each(rho_initial))
     if initial.ndim == limit.ndim == 1 and len(initial) != len(limit):
         raise refusal(
-            "rho_initial", rho_initial, f"a number, or as many as rho_bar = {shown(rho_bar)} has"
+            "rho_initial", rho_initial, f"a number, or as many as rho_bar = {display(rho_bar)} has"
         )
     if np.any(initial > limit):
-        raise refusal("rho_initial", rho_initial, f"<= rho_bar = {shown(rho_bar)}")
+        raise refusal("rho_initial", rho_initial, f"<= rho_bar = {display(rho_bar)}")
     positive("adaptation", adaptation, one_or_each(adaptation))

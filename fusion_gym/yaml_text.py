@@ -20,16 +20,16 @@ class _Loader(yaml.SafeLoader):
         Raises:
             ConstructorError: a key that is given twice.
         """
-        seen = set()
+        visited = set()
         for key_node, _ in node.value:
             if key_node.tag == "tag:yaml.org,2002:merge":
                 continue
             key = self.construct_object(key_node, deep=True)
-            if isinstance(key, Hashable) and key in seen:
+            if isinstance(key, Hashable) and key in visited:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"the key {key!r} is given twice", key_node.start_mark
                 )
-            seen.add(key)
+            visited.add(key)
         return super().construct_mapping(node, deep)
 
 

@@ -67,9 +67,9 @@ def call(command: str, words: list[str], seconds: float = 60.0, limit: int | Non
 
 
 @contextlib.contextmanager
-def without_rights(wanted: bool) -> Iterator[None]:
+def without_rights(requests: bool) -> Iterator[None]:
     """As somebody who may not enter a locked folder, even if the tests run as root."""
-    if not wanted or os.geteuid() != 0:
+    if not requests or os.geteuid() != 0:
         yield
         return
     os.seteuid(NOBODY)
@@ -104,14 +104,14 @@ def flaw(tried: Try, folder: Path) -> str | None:
     lines = ended.err.splitlines()
     if len(lines) != 1 or not lines[0].startswith("error: "):
         return f"not one line: {ended.err[:300]!r}"
-    shown = lines[0].replace("\\\\", "\\")
+    label = lines[0].replace("\\\\", "\\")
     spelled = {tried.option, tried.option.replace("_", "-")}
     spec = tried.option in ("policies", "policy", "against", "set")
     part = re.split("[:=,]", tried.value)[0] if spec else tried.value
     part = repr(part)[1:-1]
-    if part[:100] not in shown:
+    if part[:100] not in label:
         return f"does not name the value: {lines[0][:300]}"
-    if not any(name in shown for name in spelled | SAID.get(tried.option, set())):
+    if not any(name in label for name in spelled | SAID.get(tried.option, set())):
         return f"does not name the option: {lines[0][:300]}"
     if contents(folder) != before:
         return f"left {sorted(contents(folder).keys() ^ before.keys())}"

@@ -26,8 +26,8 @@ def own_table(monkeypatch: pytest.MonkeyPatch) -> None:
 def registries() -> Iterator[None]:
     """What a test registers, environments too, is gone after it."""
     tables: tuple[dict[str, Any], ...] = (ENVIRONMENTS, gym.registry, registry._ROWS)
-    kept = [(table, dict(table)) for table in tables]
+    stored = [(table, dict(table)) for table in tables]
     yield
-    for table, before in kept:
+    for table, before in stored:
         table.clear()
         table.update(before)

@@ -109,18 +109,18 @@ def _likely(env_id: str, option: str) -> st.SearchStrategy[Any]:
     field = next(field for field in fields(options_of(env_id)) if field.name == option)
     hint, default = typing.get_type_hints(options_of(env_id))[option], field.default
     named = words(env_id, option)
-    made: list[st.SearchStrategy[Any]] = [st.just(default)]
+    strategies: list[st.SearchStrategy[Any]] = [st.just(default)]
     if named:
-        made += [st.sampled_from(named)] * 4
+        strategies += [st.sampled_from(named)] * 4
     if hint is bool or default is None:
-        made += [st.booleans()]
+        strategies += [st.booleans()]
     if hint is int:
-        made += [st.integers(1, 2 * default), st.integers(1, 10**4)] * 2
+        strategies += [st.integers(1, 2 * default), st.integers(1, 10**4)] * 2
     elif isinstance(default, float):
-        made += [_factors().map(lambda factor: default * factor)] * 3
+        strategies += [_factors().map(lambda factor: default * factor)] * 3
     elif isinstance(default, tuple) or (default is None and not named):
-        made += [_arrays(default)] * 6
-    return st.one_of(made)
+        strategies += [_arrays(default)] * 6
+    return st.one_of(strategies)
 
 
 def _magnitudes() -> st.SearchStrategy[float]:
@@ -178,13 +178,13 @@ def _changed(array: Any, change: str, factor: float, place: int, odd: Any) -> An
 def options(env_id: str) -> st.SearchStrategy[Options]:
     """One to three options of an environment, at least one of them perhaps hostile."""
     names = [field.name for field in fields(options_of(env_id))]
-    chosen = st.lists(st.sampled_from(names), min_size=1, max_size=3, unique=True)
-    return chosen.flatmap(
+    selection = st.lists(st.sampled_from(names), min_size=1, max_size=3, unique=True)
+    return selection.flatmap(
         lambda drawn: st.fixed_dictionaries({name: values(env_id, name) for name in drawn})
     )
 
 
-def flaw(env_id: str, given: Options, seed: int = 0) -> str | None:
+def flaw(env_id: str, settings: Options, seed: int = 0) -> str | None:
     """What is wrong with how an environment takes these options; ``None`` for nothing.
 
     Right is one line that names a given option, or finite steps, both within the time limit and
@@ -194,10 +194,10 @@ def flaw(env_id: str, given: Options, seed: int = 0) -> str | None:
         warnings.simplefilter("error")
         try:
             env: VectorEnv[Any, Any, Any] = gymnasium.make_vec(
-                env_id, RUNS, vectorization_mode="vector_entry_point", **given
+                env_id, RUNS, vectorization_mode="vector_entry_point", **settings
             )
         except ConfigurationError as error:
-            return _misleading(str(error), given)
+            return _misleading(str(error), settings)
         except Exception as error:
             return f"{type(error).__name__} when made: {error}"
         try:
@@ -206,10 +206,10 @@ def flaw(env_id: str, given: Options, seed: int = 0) -> str | None:
             return f"{type(error).__name__} in a step: {error}"
 
 
-def _misleading(message: str, given: Options) -> str | None:
+def _misleading(message: str, settings: Options) -> str | None:
     if "\n" in message or len(message) > 2000:
         return f"not one line: {message}"
-    if not any(re.search(rf"\b{name}(\[\d+\])? ?=", message) for name in given):
+    if not any(re.search(rf"\b{name}(\[\d+\])? ?=", message) for name in settings):
         return f"names none of the given options: {message}"
     return None
 

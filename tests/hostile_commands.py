@@ -109,11 +109,11 @@ def options(name: str) -> dict[str, Any]:
         importlib.import_module(f"fusion_gym.agents.{name}"), name.capitalize()
     )
     hints = typing.get_type_hints(kind, include_extras=True)
-    found = {field.name: hints[field.name] for field in dataclasses.fields(kind)}
+    result = {field.name: hints[field.name] for field in dataclasses.fields(kind)}
     for field, option in (("options", "set"), ("of", "class")):
-        if field in found:
-            found[option] = found.pop(field)
-    return found
+        if field in result:
+            result[option] = result.pop(field)
+    return result
 
 
 def hostile(option: str, kind: Any, present: list[str] | None = None) -> list[str]:
@@ -161,12 +161,12 @@ def tries() -> Iterator[Try]:
     yield Try("train", "resume", "made", [*line("train", BASES["train"]), "--resume"])
 
 
-def line(command: str, given: dict[str, list[str]]) -> list[str]:
+def line(command: str, arguments: dict[str, list[str]]) -> list[str]:
     """The words behind the command."""
     first: list[str] = []
     joined: list[str] = []
     last: list[str] = []
-    for option, words in given.items():
+    for option, words in arguments.items():
         name = f"--{option.replace('_', '-')}"
         if (command, option) in POSITIONAL:
             if words[0].startswith("-"):

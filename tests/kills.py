@@ -74,13 +74,13 @@ def benchmark(folder: Path) -> tuple[list[str], Callable[[], Outcome]]:
     results, work = folder / "results", folder / "work"
 
     def outcome() -> Outcome:
-        found = {}
+        result = {}
         for path in sorted(results.rglob("*.json")):
             report = json.loads(path.read_text())
             report.pop("seconds", None)  # of wall time
             text = json.dumps(report).replace(str(folder), "")
-            found[path.name] = text
-        return found | {"episodes": sorted(path.name for path in work.rglob("*.npz"))}
+            result[path.name] = text
+        return result | {"episodes": sorted(path.name for path in work.rglob("*.npz"))}
 
     config = small_suite(folder, timesteps=4096)
     arguments = ["--config", str(config), "--results", str(results), "--work", str(work)]
@@ -130,10 +130,10 @@ def main() -> None:
     parser.add_argument("command", choices=("train", "tune", "benchmark"))
     parser.add_argument("--kills", type=int, default=15)
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    make = {"train": train, "tune": tune, "benchmark": benchmark}[given.command]
-    importlib.import_module(f"fusion_gym.agents.{given.command}")
-    moments = random.Random(given.seed)
+    args = parser.parse_args()
+    make = {"train": train, "tune": tune, "benchmark": benchmark}[args.command]
+    importlib.import_module(f"fusion_gym.agents.{args.command}")
+    moments = random.Random(args.seed)
     verdict.RESAMPLES = 20
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
@@ -141,25 +141,25 @@ def main() -> None:
         (root / "whole").mkdir()
         arguments, outcome = make(root / "whole")
         began = time.perf_counter()
-        attempt(given.command, arguments, log, None)
+        attempt(args.command, arguments, log, None)
         lasts = time.perf_counter() - began
-        wanted, kills, rounds = outcome(), 0, 0
-        while kills < given.kills or rounds == 0:
+        expected, kills, rounds = outcome(), 0, 0
+        while kills < args.kills or rounds == 0:
             rounds += 1
             folder = root / f"round_{rounds}"
             folder.mkdir()
             arguments, outcome = make(folder)
             ended = "killed"
             while ended == "killed":
-                again = ["--resume"] if begun(given.command, folder) else []
-                last = kills >= given.kills
+                again = ["--resume"] if begun(args.command, folder) else []
+                last = kills >= args.kills
                 seconds = None if last else moments.uniform(0.0, 0.6 * lasts)
-                ended = attempt(given.command, [*arguments, *again], log, seconds)
+                ended = attempt(args.command, [*arguments, *again], log, seconds)
                 kills += ended == "killed"
-            assert outcome() == wanted, f"round {rounds}: not what the undisturbed run wrote"
+            assert outcome() == expected, f"round {rounds}: not what the undisturbed run wrote"
             left = list(folder.rglob("*.part*"))
             assert not left, left
-    print(f"{given.command}: {kills} kills in {rounds} rounds of {lasts:.1f} s, nothing lost")
+    print(f"{args.command}: {kills} kills in {rounds} rounds of {lasts:.1f} s, nothing lost")
 
 
 if __name__ == "__main__":

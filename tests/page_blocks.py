@@ -46,8 +46,8 @@ class Block:
     @property
     def file(self) -> str | None:
         """The name of the file that it is."""
-        found = re.match(r"# ([\w/]+\.(?:py|yaml))\n", self.text)
-        return found[1] if found else None
+        result = re.match(r"# ([\w/]+\.(?:py|yaml))\n", self.text)
+        return result[1] if result else None
 
     def commands(self) -> list[tuple[str, list[str]]]:
         """The lines of a shell block and their words: continued ones as one, comments none."""
@@ -64,8 +64,8 @@ class Block:
         if self.named:
             return self.named
         if self.language == "python":
-            found = {name: extra_of(name) for name in imported(self.text)}
-            extras = (name if extra is None else extra for name, extra in found.items())
+            result = {name: extra_of(name) for name in imported(self.text)}
+            extras = (name if extra is None else extra for name, extra in result.items())
             return frozenset(filter(None, extras))
         return frozenset({"agents"} if self.language == "shell" else ())
 
@@ -81,7 +81,7 @@ def imported(code: str) -> Iterator[str]:
 
 def blocks_of(page: Path, text: str) -> list[Block]:
     """The blocks of a page in their order; those of a session as one, where the last is."""
-    found: list[Block] = []
+    result: list[Block] = []
     sessions: dict[str, Block] = {}
     for block in _fenced(page, text):
         if block.language is None:
@@ -89,12 +89,12 @@ def blocks_of(page: Path, text: str) -> list[Block]:
         if block.session is not None:
             before = sessions.get(block.session)
             if before is not None:
-                found.remove(before)
+                result.remove(before)
                 named = before.named | block.named
                 block = replace(block, line=before.line, text=before.text + block.text, named=named)
             sessions[block.session] = block
-        found.append(block)
-    return found
+        result.append(block)
+    return result
 
 
 def stray_commands(page: Path, text: str) -> list[str]:
@@ -105,7 +105,7 @@ def stray_commands(page: Path, text: str) -> list[str]:
         if block.language is None
         for shift, line in enumerate(block.text.splitlines())
     ]
-    outside = re.sub(r"^```.*?^```", lambda found: "\n" * found[0].count("\n"), text, flags=_ALL)
+    outside = re.sub(r"^```.*?^```", lambda value: "\n" * value[0].count("\n"), text, flags=_ALL)
     lines += [
         (place, line)
         for place, line in enumerate(outside.splitlines(), 1)
@@ -124,8 +124,8 @@ def _fenced(page: Path, text: str) -> Iterator[Block]:
         elif opening:
             fence, word, rest = opening.groups()
             closing = next(at for at in range(place + 1, len(lines)) if lines[at].strip() == fence)
-            shown = [line for line in lines[place + 1 : closing] if HIDDEN not in line]
-            code = textwrap.dedent("\n".join(shown)) + "\n"
+            visible = [line for line in lines[place + 1 : closing] if HIDDEN not in line]
+            code = textwrap.dedent("\n".join(visible)) + "\n"
             session = re.search(r'session="(\w+)"', rest)
             yield Block(
                 page, place + 1, LANGUAGES.get(word), code, named, session[1] if session else None

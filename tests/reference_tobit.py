@@ -175,17 +175,17 @@ def exact_bound_update(
     omega2 = value * value.T
     omega3 = upsilon + q * q.T
     xi = mpmath.mpf(event) * eye
-    seen = matrix * omega1 * matrix.T
+    observed = matrix * omega1 * matrix.T
     missed = (eye - q) * tau
     psi = k[1] * covariance * matrix.T * q.T
     phi = (
         k[1] * q * matrix * covariance * matrix.T * q.T
         + k[2] * q * bias * bias.T * q.T
-        + theta**2 * (k[4] * q * seen * q.T + k[5] * omega2 + k[7] * missed * missed.T)
+        + theta**2 * (k[4] * q * observed * q.T + k[5] * omega2 + k[7] * missed * missed.T)
         + other
         * (
             hadamard(omega3, noise)
-            + k[3] * hadamard(upsilon, seen)
+            + k[3] * hadamard(upsilon, observed)
             + k[8] * hadamard(upsilon, tau * tau.T)
             + k[6] * xi
         )
@@ -196,8 +196,8 @@ def exact_bound_update(
         k[1] * keep * covariance * keep.T
         + other * gain * hadamard(omega3, noise) * gain.T
         + k[2] * gain * q * bias * bias.T * q.T * gain.T
-        + other * k[3] * gain * hadamard(upsilon, seen) * gain.T
-        + theta**2 * k[4] * gain * q * seen * q.T * gain.T
+        + other * k[3] * gain * hadamard(upsilon, observed) * gain.T
+        + theta**2 * k[4] * gain * q * observed * q.T * gain.T
         + theta**2 * k[5] * gain * omega2 * gain.T
         + other * k[6] * gain * xi * gain.T
         + theta**2 * k[7] * gain * missed * missed.T * gain.T
@@ -280,7 +280,7 @@ def simulate(
     for time in range(1, len(process_noise) + 1):
         state = example.transition @ state + process_noise[time - 1]
         values = measure(time)
-        asked, answered, spent = [], [], 0.0
+        count, answered, spent = [], [], 0.0
         for m in sensors:
             size = math.sqrt(float(np.sum((requested[m] - values[m]) ** 2)))
             ask = size >= eta[m] / example.chi[m] + example.sigma[m]
@@ -290,7 +290,7 @@ def simulate(
             if requests is not None:
                 ask = bool(requests[time - 1][m])
             allow = example.unlimited or example.token_cost[m] <= tokens / example.sensors
-            asked.append(ask)
+            count.append(ask)
             answered.append(ask and allow)
             spent += example.token_cost[m] if ask and allow else 0.0
         if not example.unlimited:
@@ -338,6 +338,6 @@ def simulate(
         run.covariance.append(fused)
         run.local_mean.append(new_mean)
         run.tokens.append(tokens)
-        run.requested.append(asked)
+        run.requested.append(count)
         run.granted.append(answered)
     return run

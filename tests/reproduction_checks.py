@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from fusion_gym.agents.output import palette
 from fusion_gym.agents.reproduction.paper import Paper
-from fusion_gym.agents.reproduction.shown import Shown
+from fusion_gym.agents.reproduction.piece_result import PieceResult
 
 PAGES = Path(__file__).parents[1] / "docs" / "reproduction"
 ERRORS = 4.5  # of both samples together
@@ -26,28 +26,28 @@ PNG, SVG = 100_000, 200_000  # bytes of a figure
 
 def committed(name: str) -> dict[str, Any]:
     """The numbers of the committed page of a paper."""
-    found: dict[str, Any] = json.loads((PAGES / f"{name}.json").read_text(encoding="utf-8"))
-    return found
+    content: dict[str, Any] = json.loads((PAGES / f"{name}.json").read_text(encoding="utf-8"))
+    return content
 
 
-def quick(one: Paper, episodes: int) -> dict[str, Shown]:
+def quick(paper: Paper, episodes: int) -> dict[str, PieceResult]:
     """What a fresh run of every piece shows, kept and read as the command does it."""
-    found = {}
-    for piece in one.pieces:
+    result = {}
+    for piece in paper.pieces:
         computed = piece.compute(episodes, SEED)
         plain = {name: value for name, value in computed.items() if not hasattr(value, "dtype")}
-        found[piece.name] = piece.show(computed | json.loads(json.dumps(plain)))
-    return found
+        result[piece.name] = piece.show(computed | json.loads(json.dumps(plain)))
+    return result
 
 
 def check_numbers(
-    page: dict[str, Any], fresh: dict[str, Shown], episodes: int, slack: float = 1e-9
+    page: dict[str, Any], fresh: dict[str, PieceResult], episodes: int, slack: float = 1e-9
 ) -> int:
     """Hold every number to the committed one; how many there are.
 
     ``slack`` is what else a number may be off, relative to its size (or absolute below 1).
     """
-    tables = {(piece, t.name): t for piece, shown in fresh.items() for t in shown.tables}
+    tables = {(piece, t.name): t for piece, entry in fresh.items() for t in entry.tables}
     assert set(tables) == {(t["piece"], t["name"]) for t in page["tables"]}
     count, far = 0, []
     for table in page["tables"]:
@@ -66,13 +66,13 @@ def check_numbers(
 
 
 def check_claims(
-    page: dict[str, Any], fresh: dict[str, Shown], name: str, uncertain: tuple[str, ...] = ()
+    page: dict[str, Any], fresh: dict[str, PieceResult], name: str, uncertain: tuple[str, ...] = ()
 ) -> None:
     """The same claims; the page's verdicts are the JSON's, and those of the fresh run.
 
     The verdicts of claims whose texts begin with one of ``uncertain`` need more episodes.
     """
-    claims = [claim for shown in fresh.values() for claim in shown.claims]
+    claims = [claim for piece in fresh.values() for claim in piece.claims]
     assert [c.text for c in claims] == [c["text"] for c in page["claims"]]
     text = (PAGES / f"{name}.md").read_text(encoding="utf-8")
     differing = []
@@ -84,9 +84,9 @@ def check_claims(
     assert not differing, "\n".join(differing)
 
 
-def check_pictures(fresh: dict[str, Shown], name: str) -> int:
+def check_pictures(fresh: dict[str, PieceResult], name: str) -> int:
     """Every figure draws, and its files are there and small; how many there are."""
-    pictures = [picture for shown in fresh.values() for picture in shown.pictures]
+    pictures = [picture for piece in fresh.values() for picture in piece.pictures]
     files = {picture.name for picture in pictures}
     assert len(files) == len(pictures)
     with palette.plt.rc_context(palette.READABLE):

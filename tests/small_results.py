@@ -18,8 +18,8 @@ CLASSES: dict[str, tuple[str, bool, str | None, str, float]] = {
     "centre": ("centre", False, None, "centre", 1.0),
     "local_none": ("local", False, "none", "own", 0.9),
     "local_packets_memory": ("local", True, "packets", "own_memory", 0.8),
-    "sensors": ("sensors", False, None, "coordinator", 0.75),
-    "sensors_memory": ("sensors", True, None, "coordinator_memory", 0.6),
+    "sensors": ("sensors", False, None, "scheduler", 0.75),
+    "sensors_memory": ("sensors", True, None, "scheduler_memory", 0.6),
 }
 
 
@@ -121,7 +121,7 @@ def small_results(
         "classes": fronts,
         "worth": [worth | {"rules": interval(-0.2), "agents": interval(0.0)}],
     }
-    places = [place for one in fronts.values() for place in one["envelope"]]
+    places = [place for item in fronts.values() for place in item["envelope"]]
     policies = {place["name"]: tested(place["rate"], place["mse"]) for place in places}
     baselines: dict[str, Any] = {
         "setting": setting,

@@ -23,16 +23,16 @@ from training_configs import ENV, SMALL, read_records, small_config
 
 import fusion_gym
 from fusion_gym.agents import demo, evaluate
-from fusion_gym.agents.command_line import read
+from fusion_gym.agents.command_line import read_command
 from fusion_gym.agents.suite.beside_rules import Ground, Trials
 from fusion_gym.agents.suite.config import Suite
-from fusion_gym.agents.suite.sweep import Comparison, Sweep
+from fusion_gym.agents.suite.sweep import Sweep, SweepSettings
 from fusion_gym.agents.suite.team import Team
 from fusion_gym.agents.training import run as train
 from fusion_gym.agents.training.algorithms import TABLE
-from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
-from fusion_gym.agents.training.constraint import score
+from fusion_gym.agents.training.constraint import rate_score
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.metrics import summarise
@@ -47,7 +47,7 @@ EXPERIMENTS = [f for f in sorted(CONFIGS.glob("*.yaml")) if "\ntraining:" in f.r
 
 @pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
 def test_committed_experiments_are_valid(path: Path) -> None:
-    experiment = load(Experiment, path)
+    experiment = load_checked(Experiment, path)
     task = fusion_gym.make_task(experiment.environment.id, **experiment.environment.options)
     needed = TABLE[experiment.algorithm.name].discrete_only and task.access != "single"
     assert needed == (task.action == "discrete")
@@ -65,13 +65,13 @@ def test_committed_sweep_and_comparison_name_policies_that_exist(
         ("tobit_oscillator", ENV),
         ("biased", "fusion_gym/BiasedOscillator-v0"),
     ):
-        sweep = load(Sweep, CONFIGS / f"{name}_sweep.yaml")
+        sweep = load_checked(Sweep, CONFIGS / f"{name}_sweep.yaml")
         task = fusion_gym.make_task(env_id)
         assert len(sweep.policies) == len(set(sweep.policies)) > 50
         for policy in sweep.policies:
             make_policy(policy, task)
     for file in CONFIGS.glob("*_reproduce.yaml"):
-        comparison = load(Comparison, file)
+        comparison = load_checked(SweepSettings, file)
         for row in comparison.rows:
             env_id = row.environment or comparison.environment
             make_policy(row.policy, fusion_gym.make_task(env_id, **row.options))
@@ -91,30 +91,30 @@ def test_a_config_that_is_not_allowed_names_the_field(
     tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ConfigurationError, match="is not allowed") as error:
-        load(Experiment, small_config(tmp_path, **changes))
+        load_checked(Experiment, small_config(tmp_path, **changes))
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
 def test_a_config_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"absent\.yaml"):
-        load(Experiment, tmp_path / "absent.yaml")
+        load_checked(Experiment, tmp_path / "absent.yaml")
     (tmp_path / "broken.yaml").write_text("a: [1,")
     with pytest.raises(ConfigurationError, match="no YAML") as caught:
-        load(Experiment, tmp_path / "broken.yaml")
+        load_checked(Experiment, tmp_path / "broken.yaml")
     assert "\n" not in str(caught.value)
     (tmp_path / "bytes.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigurationError, match="no text in UTF-8") as caught:
-        load(Experiment, tmp_path / "bytes.yaml")
+        load_checked(Experiment, tmp_path / "bytes.yaml")
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("kind", [Experiment, Suite, Sweep, Comparison])
+@pytest.mark.parametrize("kind", [Experiment, Suite, Sweep, SweepSettings])
 def test_a_key_that_is_given_twice_is_refused_in_every_config(tmp_path: Path, kind: Any) -> None:
     path = tmp_path / "twice.yaml"
     path.write_text("a: &base {seed: 1}\nb:\n  <<: *base\n  seed: 2\nc:\n  seed: 1\n  seed: 2\n")
     with pytest.raises(ConfigurationError, match="the key 'seed' is given twice") as caught:
-        load(kind, path)
+        load_checked(kind, path)
     assert "line 7" in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -123,7 +123,7 @@ def test_numbers_with_an_exponent_are_numbers(tmp_path: Path) -> None:
     """YAML 1.1 takes 1e-3 for a word."""
     path = small_config(tmp_path)
     path.write_text(path.read_text().replace("name: ppo", "name: ppo\n  learning_rate: 1e-3"))
-    assert load(Experiment, path).algorithm.learning_rate == 0.001
+    assert load_checked(Experiment, path).algorithm.learning_rate == 0.001
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_numbers_with_an_exponent_are_numbers(tmp_path: Path) -> None:
     ["ppo", *(pytest.param(name, marks=pytest.mark.slow) for name in SMALL if name != "ppo")],
 )
 def test_training_writes_its_results_and_resumes(tmp_path: Path, algorithm: str) -> None:
-    experiment = load(Experiment, small_config(tmp_path, algorithm))
+    experiment = load_checked(Experiment, small_config(tmp_path, algorithm))
     summary = train.train(experiment)
     folder = Path(experiment.output)
     assert summary["finished"]
@@ -160,14 +160,14 @@ def test_training_writes_its_results_and_resumes(tmp_path: Path, algorithm: str)
 def test_dqn_needs_the_discrete_action(tmp_path: Path) -> None:
     config = small_config(tmp_path, "dqn", environment={"id": ENV, "options": {}})
     with pytest.raises(ConfigurationError, match="action: discrete"):
-        train.train(load(Experiment, config))
+        train.train(load_checked(Experiment, config))
 
 
 def test_training_to_a_target_rate_moves_the_price(tmp_path: Path) -> None:
     """A target far above what the agent sends makes tokens cheaper, one far below dearer."""
     prices = {}
     for target in (0.001, 1.0):
-        experiment = load(
+        experiment = load_checked(
             Experiment,
             small_config(
                 tmp_path,
@@ -190,7 +190,7 @@ def test_validation_counts_episodes_by_their_price(tmp_path: Path) -> None:
     content["environment"]["options"] |= {"cost_weight": "random", "price_range": [0.01, 1.0]}
     content["training"]["price_exponent"] = 1.0
     path.write_text(yaml.safe_dump(content))
-    train.train(load(Experiment, path), quiet=True)
+    train.train(load_checked(Experiment, path), quiet=True)
     record = read_records(tmp_path / "run")[-1]
     task = fusion_gym.make_task(ENV, **content["environment"]["options"])
     batch = EpisodeBatch(task, 4)
@@ -198,9 +198,9 @@ def test_validation_counts_episodes_by_their_price(tmp_path: Path) -> None:
     batch.reset()
     price = batch.price.copy()
     final = make_policy(f"model:{tmp_path / 'run' / 'final_model.zip'}", task)
-    found = run_episodes(task, final, 4, 500_000_000)
-    assert record["return"] == pytest.approx(float((found.returns * 0.1 / price).mean()))
-    assert record["return"] != pytest.approx(float(found.returns.mean()), rel=0.01)
+    results = run_episodes(task, final, 4, 500_000_000)
+    assert record["return"] == pytest.approx(float((results.returns * 0.1 / price).mean()))
+    assert record["return"] != pytest.approx(float(results.returns.mean()), rel=0.01)
 
 
 def test_the_best_model_under_a_target_keeps_its_rate() -> None:
@@ -209,8 +209,8 @@ def test_the_best_model_under_a_target_keeps_its_rate() -> None:
         {"return": -3.0, "rate": 0.1},
         {"return": -2.0, "rate": 0.102},
     ]
-    assert max(records, key=lambda r: score(r, 0.1)) == records[2]
-    assert max(records, key=lambda r: score(r, None)) == records[0]
+    assert max(records, key=lambda r: rate_score(r, 0.1)) == records[2]
+    assert max(records, key=lambda r: rate_score(r, None)) == records[0]
 
 
 def test_a_target_rate_needs_a_fixed_price(tmp_path: Path) -> None:
@@ -220,7 +220,7 @@ def test_a_target_rate_needs_a_fixed_price(tmp_path: Path) -> None:
         training={"timesteps": 64, "num_envs": 8, "target_rate": 0.1},
     )  # fmt: skip
     with pytest.raises(ConfigurationError, match=r"target_rate = 0.1 is not allowed"):
-        train.train(load(Experiment, config))
+        train.train(load_checked(Experiment, config))
 
 
 @pytest.mark.parametrize(
@@ -237,8 +237,8 @@ def test_an_interrupted_training_loses_nothing(tmp_path: Path, number: signal.Si
     os.kill(process.pid, number)
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130
-    told, again = error.decode().splitlines()[-1].split("go on with: ")
-    assert told == "interrupted; "
+    message, again = error.decode().splitlines()[-1].split("go on with: ")
+    assert message == "interrupted; "
     assert shlex.split(again) == ["fusion-gym", *command[3:], "--resume"]
     summary = json.loads((folder / "summary.json").read_text())
     assert not summary["finished"]
@@ -254,7 +254,7 @@ def test_an_interrupted_training_loses_nothing(tmp_path: Path, number: signal.Si
 
 def run_evaluation(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> dict[str, Any]:
     monkeypatch.setattr(sys, "argv", ["program", *arguments])
-    return evaluate.evaluate(read(evaluate.Evaluate))
+    return evaluate.evaluate(read_command(evaluate.Evaluate))
 
 
 def test_evaluation_writes_the_promised_json(
@@ -327,7 +327,7 @@ def test_demo_from_training_to_figures(
     monkeypatch.setattr(sys, "argv", ["demo", *words])
     demo.main()
     assert learner.title in capsys.readouterr().out
-    folder, classes = tmp_path / learner.name, (learner.plain, learner.remembering)
+    folder, classes = tmp_path / learner.name, (learner.plain, learner.with_memory)
     for figure in ("front.png", "episode_agent.png", "episode_rule.png"):
         assert (folder / figure).stat().st_size > 20_000
     assert json.loads((folder / "agent" / "summary.json").read_text())["finished"]
@@ -337,19 +337,19 @@ def test_demo_from_training_to_figures(
     assert list(report["classes"]) == list(classes)
     agent = f"model:{folder / 'agent' / 'best_model.zip'},price={prices[3]}"
     task = fusion_gym.make_task(ENV, **report["options"], memory=True)
-    found, point = run_episodes(task, make_policy(agent, task), 2, 0), report["points"][3]
-    assert point["rate"] == pytest.approx(float(found.rate.mean()))
-    assert point["mse"]["mean"] == pytest.approx(float(found.mse.mean()))
+    results, point = run_episodes(task, make_policy(agent, task), 2, 0), report["points"][3]
+    assert point["rate"] == pytest.approx(float(results.rate.mean()))
+    assert point["mse"]["mean"] == pytest.approx(float(results.mse.mean()))
     # The line through the rules, once more.
     rules = []
-    for vertex in ground.envelopes["classes"][learner.remembering]["vertices"]:
+    for vertex in ground.envelopes["classes"][learner.with_memory]["vertices"]:
         task = fusion_gym.make_task(ENV, **report["options"], **vertex["options"])
         brought = run_episodes(task, make_policy(vertex["policy"], task), 2, 0)
         rules.append((float(brought.rate.mean()), float(brought.mse.mean())))
     below = np.interp(point["rate"], *np.array(sorted(rules)).T)
-    beside = point["rules"][learner.remembering]
+    beside = point["rules"][learner.with_memory]
     assert beside["mse"] == pytest.approx(below)
-    assert beside["difference"]["mean"] == pytest.approx(found.mse.mean() / below - 1.0)
+    assert beside["difference"]["mean"] == pytest.approx(results.mse.mean() / below - 1.0)
     # The same command again has nothing left to test; another model has all of its prices.
     assert Trials.of(ground, classes, folder).left() == []
     with (folder / "agent" / "best_model.zip").open("ab") as model:
@@ -362,14 +362,14 @@ def test_the_demo_trains_in_the_setting_of_its_rules() -> None:
     ground = Ground.read(demo.SETTING, 1)
     for learner in demo.LEARNERS:
         plain, remembering = (
-            ground.envelopes["classes"][name] for name in (learner.plain, learner.remembering)
+            ground.envelopes["classes"][name] for name in (learner.plain, learner.with_memory)
         )
         assert (plain["memory"], remembering["memory"]) == (False, True)
         assert plain["mode"] == remembering["mode"]
-        chosen = load(Experiment, learner.config).environment
-        assert (chosen.id, chosen.local) == (ENV, plain["mode"] == "local")
+        environment = load_checked(Experiment, learner.config).environment
+        assert (environment.id, environment.local) == (ENV, plain["mode"] == "local")
         price = {"cost_weight": "random", "price_range": ground.setting.price_range}
         rules = ground.setting.environment.options | remembering["options"]
-        assert json.dumps(chosen.options, sort_keys=True) == json.dumps(
+        assert json.dumps(environment.options, sort_keys=True) == json.dumps(
             rules | price, sort_keys=True
         )

@@ -44,7 +44,7 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
 RUNS = 4
 
 
-def made(name: str) -> Task:
+def build_parts(name: str) -> Task:
     env_id, options = TASKS[name]
     return fusion_gym.make_task(env_id, **options)
 
@@ -56,20 +56,20 @@ def contents(runs: Any) -> list[bytes]:
 
 
 def stepped(
-    before: Branch, batch: EpisodeBatch, requests: np.ndarray, wanted: np.ndarray
+    before: Branch, batch: EpisodeBatch, requests: np.ndarray, request: np.ndarray
 ) -> Alternatives:
-    """The batch's step on ``requests`` and the alternatives ``wanted``."""
+    """The batch's step on ``requests`` and the alternatives ``request``."""
     outcome = batch.step(requests)
-    return alternatives(before, wanted, batch.normals(), outcome, batch.observe(), batch.beliefs())
+    return alternatives(before, request, batch.normals(), outcome, batch.observe(), batch.beliefs())
 
 
 @pytest.mark.parametrize(
     ("name", "owner"),
-    [*((name, "coordinator") for name in TASKS), ("heard", "own"), ("unknown", "own")],
+    [*((name, "scheduler") for name in TASKS), ("heard", "own"), ("unknown", "own")],
 )
 def test_alternatives_are_the_steps_that_would_have_been(name: str, owner: Owner) -> None:
     """Also of runs that have finished; and neither the batch nor the branch moves."""
-    task = made(name)
+    task = build_parts(name)
     batch = EpisodeBatch.seeded(task, RUNS, 3, owner)
     rng = np.random.default_rng(0)
     for _ in range(6):
@@ -78,31 +78,31 @@ def test_alternatives_are_the_steps_that_would_have_been(name: str, owner: Owner
         requests = many[0]
         before, branches = batch.branch(), [batch.branch() for _ in many]
         stood = contents(before)
-        found = stepped(before, batch, requests, many)
+        result = stepped(before, batch, requests, many)
         assert contents(before) == stood
         went = contents(batch)
         for place, branch in enumerate(branches):
             outcome = branch.step(many[place], batch.normals())
-            np.testing.assert_array_equal(found.error[:, place], outcome.error)
-            np.testing.assert_array_equal(found.communication[place], outcome.reward_communication)
-            np.testing.assert_array_equal(found.observation[place], branch.observe())
+            np.testing.assert_array_equal(result.error[:, place], outcome.error)
+            np.testing.assert_array_equal(result.communication[place], outcome.reward_communication)
+            np.testing.assert_array_equal(result.observation[place], branch.observe())
         assert contents(batch) == went
 
 
 @pytest.mark.parametrize("sensors", [40, 60, 62, 64])
-def test_grants_of_many_sensors_are_told_apart(sensors: int) -> None:
+def test_grants_of_many_sensors_are_reported_apart(sensors: int) -> None:
     """However many bits they take: each alternative is the request of one of the last sensors."""
     task = fusion_gym.make_task(
         "fusion_gym/RemoteEstimation-v0", sensors=sensors, tokens="unlimited"
     )
     batch = EpisodeBatch.seeded(task, 512, 0)
-    wanted = np.zeros((6, sensors, 512), dtype=np.bool_)
-    wanted[np.arange(6), np.arange(sensors - 6, sensors)] = True
+    request = np.zeros((6, sensors, 512), dtype=np.bool_)
+    request[np.arange(6), np.arange(sensors - 6, sensors)] = True
     before = batch.branch()
-    found = stepped(batch.branch(), batch, np.zeros((sensors, 512), dtype=np.bool_), wanted)
-    for place, requests in enumerate(wanted):
+    values = stepped(batch.branch(), batch, np.zeros((sensors, 512), dtype=np.bool_), request)
+    for place, requests in enumerate(request):
         outcome = before.branch().step(requests, batch.normals())
-        np.testing.assert_array_equal(found.error[:, place], outcome.error)
+        np.testing.assert_array_equal(values.error[:, place], outcome.error)
 
 
 def test_requests_that_are_answered_alike_are_stepped_once(
@@ -120,12 +120,12 @@ def test_requests_that_are_answered_alike_are_stepped_once(
 
     monkeypatch.setattr(Branch, "step", step)
     everything = (np.arange(8)[:, None] >> np.arange(3) & 1).astype(np.bool_)[:, :, None]
-    wanted = np.broadcast_to(everything, (8, 3, 2))
+    request = np.broadcast_to(everything, (8, 3, 2))
     requests = np.zeros((3, 2), dtype=np.bool_)
     requests[0, 0] = True
-    stepped(batch.branch(), batch, requests, wanted)
+    stepped(batch.branch(), batch, requests, request)
     assert counted == [6]  # one packet can be paid: four answers in each run, one of them taken
-    stepped(batch.branch(), batch, requests, wanted)
+    stepped(batch.branch(), batch, requests, request)
     # The first run has nothing left; the second has had no use for its tokens.
     assert counted == [6, 3]
 
@@ -145,15 +145,15 @@ def test_the_reference_takes_in_every_measurement(name: str, local: bool) -> Non
     env_id, options = TASKS[name]
     options = {**options, "horizon": 4} | ({"information": "sensors"} if local else {})
     task = fusion_gym.make_task(env_id, **options)
-    owner: Owner | None = ("own" if local else "coordinator") if task.memory else None
+    owner: Owner | None = ("own" if local else "scheduler") if task.memory else None
     batch = EpisodeBatch(task, RUNS, owner, reference_system(env_id, options))
     plain = EpisodeBatch(task, RUNS, owner)
     free = fusion_gym.make_task(env_id, **options | {"tokens": "unlimited"})
     receiving = EpisodeBatch(free, RUNS, owner)
     every = (batch, plain, receiving)
-    for one in every:
-        one.seed(np.arange(RUNS), [5 + run for run in range(RUNS)])
-        one.reset(stagger=True)
+    for item in every:
+        item.seed(np.arange(RUNS), [5 + run for run in range(RUNS)])
+        item.reset(stagger=True)
     rng = np.random.default_rng(0)
     for _ in range(9):
         requests = rng.random((task.sensors, RUNS)) < 0.3
@@ -162,11 +162,11 @@ def test_the_reference_takes_in_every_measurement(name: str, local: bool) -> Non
         received = receiving.step(np.ones((task.sensors, RUNS), dtype=np.bool_)).error
         assert contents(batch) == contents(plain)
         # All packets arrive at it, and remote estimation has a perfect measurement in each.
-        wanted = np.zeros_like(received) if name == "remote" else received
-        np.testing.assert_allclose(batch.reference_error, wanted, rtol=1e-12, atol=1e-12)
+        request = np.zeros_like(received) if name == "remote" else received
+        np.testing.assert_allclose(batch.reference_error, request, rtol=1e-12, atol=1e-12)
         done = np.flatnonzero(batch.finished)
-        for one in every if done.size else ():
-            one.reset(done)
+        for item in every if done.size else ():
+            item.reset(done)
 
 
 @pytest.mark.parametrize("error", ["squared", "excess", "mismatch"])
@@ -182,7 +182,7 @@ def test_rewards_of_a_training_are_made_of_the_two_errors(error: str) -> None:
     true.seed(np.arange(RUNS), [7 + run for run in range(RUNS)])
     true.reset()
     rng = np.random.default_rng(0)
-    wanted = np.broadcast_to(
+    request = np.broadcast_to(
         np.array([[True, False, False], [False] * 3])[:, :, None], (2, 3, RUNS)
     )
     returns = np.zeros(RUNS)
@@ -190,10 +190,10 @@ def test_rewards_of_a_training_are_made_of_the_two_errors(error: str) -> None:
         actions = rng.integers(0, 2, (RUNS, 3))
         before = true.branch()
         outcome = true.step(actions.T == 1)
-        (_, reward, _, infos), branched = env.step_alternatives(actions, wanted)
+        (_, reward, _, infos), branched = env.step_alternatives(actions, request)
 
-        def term(found: np.ndarray) -> np.ndarray:
-            own, best = found, true.reference_error
+        def term(value: np.ndarray) -> np.ndarray:
+            own, best = value, true.reference_error
             squared = {
                 "squared": own**2, "excess": own**2 - best**2, "mismatch": (own - best) ** 2
             }[error]  # fmt: skip
@@ -201,7 +201,7 @@ def test_rewards_of_a_training_are_made_of_the_two_errors(error: str) -> None:
 
         own = term(outcome.error) + outcome.reward_communication
         np.testing.assert_allclose(reward, own, rtol=1e-6)
-        for place, requests in enumerate(wanted):
+        for place, requests in enumerate(request):
             other = before.branch().step(requests, true.normals())
             np.testing.assert_allclose(
                 branched.reward[place], term(other.error) + other.reward_communication, rtol=1e-9
@@ -228,18 +228,18 @@ def test_looking_at_alternatives_changes_nothing(local: bool) -> None:
     task = fusion_gym.make_task(OSCILLATOR, **options)
     plain = FusionSB3VecEnv(task, RUNS, local=local)
     env = PrivilegedVecEnv(task, RUNS, local=local)
-    for one in (plain, env):
-        one.seed(3)
+    for item in (plain, env):
+        item.seed(3)
     assert plain.reset().tobytes() == env.reset().tobytes()
     rng = np.random.default_rng(0)
     for _ in range(12):
         actions = rng.integers(0, 2, RUNS * 3 if local else (RUNS, 3))
-        wanted = rng.random((2, 3, RUNS)) < 0.5
-        one, (two, _) = plain.step(actions), env.step_alternatives(actions, wanted)
-        for left, right in zip(one[:3], two[:3], strict=True):
+        requests = rng.random((2, 3, RUNS)) < 0.5
+        item, (two, _) = plain.step(actions), env.step_alternatives(actions, requests)
+        for left, right in zip(item[:3], two[:3], strict=True):
             assert np.asarray(left).tobytes() == np.asarray(right).tobytes()
-        assert [info.keys() for info in one[3]] == [info.keys() for info in two[3]]
-        for left, right in zip(one[3], two[3], strict=True):
+        assert [info.keys() for info in item[3]] == [info.keys() for info in two[3]]
+        for left, right in zip(item[3], two[3], strict=True):
             if left:
                 assert (
                     left["terminal_observation"].tolist() == right["terminal_observation"].tolist()

@@ -96,7 +96,7 @@ def test_options(options: dict[str, Any], parts: tuple[str, ...]) -> None:
 
 def test_an_unknown_option() -> None:
     """Also a ``TypeError``, which gymnasium.make passes on with a remark of its own."""
-    for make in (make_task, gymnasium.make, lambda _, **given: make_vector(**given)):
+    for make in (make_task, gymnasium.make, lambda _, **value: make_vector(**value)):
         for kind in (ConfigurationError, TypeError):
             message = refused(
                 lambda make=make: make(ENV_ID, horizn=np.ones((2, 2))),

@@ -24,14 +24,15 @@ from fusion_gym.agents import benchmark, report, solved, tune, zoo
 from fusion_gym.agents.output.files import load_results, save_results
 from fusion_gym.agents.output.markup import code, page_of
 from fusion_gym.agents.suite import jobs
-from fusion_gym.agents.suite.classes import classes_of, trained
+from fusion_gym.agents.suite.classes import classes_of, trained_classes
 from fusion_gym.agents.suite.committed import read_envelopes
 from fusion_gym.agents.suite.config import load_suite
 from fusion_gym.agents.suite.envelopes import searches_of
-from fusion_gym.agents.suite.found import read_results
-from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.suite.setting_results import read_results
+from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.core.system import covers
+from fusion_gym.deprecation import replace_value
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.periodic_optimum import Schedule
 from fusion_gym.policies.registry import make_policy
@@ -88,16 +89,16 @@ def test_from_tuning_to_report_and_zoo(
     committed = json.loads((results / "envelopes" / "small.json").read_text())["classes"]
     front = verdict["classes"]["local_estimate"]
     assert front["sha256"] == committed["local_estimate"]["sha256"]
-    kept = json.loads((folder / "agent_local_estimate_1.json").read_text())["inputs"]["envelope"]
-    assert kept == {"class": "local_estimate", "sha256": front["sha256"]}
+    stored = json.loads((folder / "agent_local_estimate_1.json").read_text())["inputs"]["envelope"]
+    assert stored == {"class": "local_estimate", "sha256": front["sha256"]}
     in_local = {point["name"] for point in verdict["classes"]["local_estimate"]["envelope"]}
     assert not any(name.startswith("information_gain") for name in in_local)
     agent = json.loads((folder / "agent_local_estimate_1.json").read_text())
     assert agent["training"]["environment"]["local"]
     assert len(agent["points"]) == 3
     # The written numbers are those that the saved model reaches on the test seeds.
-    shown = ["difference", "value"]  # as rules without memory look at it
-    task = fusion_gym.make_task(ENV, filter="tobit", horizon=10, belief_features=shown)
+    visible = ["difference", "value"]  # as rules without memory look at it
+    task = fusion_gym.make_task(ENV, filter="tobit", horizon=10, belief_features=visible)
     path = work / "small" / "local_estimate_1" / "best_model.zip"
     model = f"model:{path},price={agent['prices'][1]!r}"
     again = run_episodes(task, make_policy(model, task), 12, seed=0)
@@ -125,10 +126,10 @@ def test_from_tuning_to_report_and_zoo(
     assert card["command"].endswith("benchmark --envs small --classes sensors, training seed " + (
         str(card["training"]["training"]["seed"])
     ))  # fmt: skip
-    told = json.loads((tmp_path / "zoo" / "small_local_packets_memory.json").read_text())
-    task = fusion_gym.make_task(ENV, **told["options"])
+    journal_entry = json.loads((tmp_path / "zoo" / "small_local_packets_memory.json").read_text())
+    task = fusion_gym.make_task(ENV, **journal_entry["options"])
     smaller = f"model:{tmp_path / 'zoo' / 'small_local_packets_memory.zip'},price=0.01"
-    seed = told["training"]["training"]["seed"]
+    seed = journal_entry["training"]["training"]["seed"]
     whole = f"model:{work / 'small' / f'local_packets_memory_{seed}' / 'best_model.zip'},price=0.01"
     first, second = (run_episodes(task, make_policy(p, task), 4, seed=0) for p in (smaller, whole))
     np.testing.assert_array_equal(first.mse, second.mse)
@@ -145,13 +146,13 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
     suite = load_suite(ROOT / "configs" / "benchmark.yaml")
     assert load_suite(ROOT / "configs" / "benchmark.yaml", quick=True).settings == suite.settings
     for setting in suite.settings:
-        task = jobs.task_of(setting)
+        task = jobs.envelope_task(setting)
         optima = [name for name in setting.informed if name.startswith("optimal:")]
         for name in (*setting.points, *setting.informed, *setting.references):
             if name not in optima[1:]:
                 make_policy(name, task)
-        for one in searches_of(suite, setting, list(classes_of(setting))):
-            one.check()
+        for search in searches_of(suite, setting, list(classes_of(setting))):
+            search.check()
         if setting.genie is not None:
             fusion_gym.make_task(
                 setting.environment.id, **(setting.environment.options | setting.genie.options)
@@ -171,17 +172,19 @@ def test_envelopes_hold_rules_that_know_no_more_than_their_class(path: Path) -> 
                 tasks[key] = fusion_gym.make_task(
                     stored["env"], **(stored["options"] | vertex["options"])
                 )
-            assert make_policy(vertex["policy"], tasks[key]).knowledge == vertex["knows"]
-            assert covers(content["knows"], vertex["knows"])
+            assert make_policy(vertex["policy"], tasks[key]).knowledge == replace_value(
+                vertex["knows"]
+            )
+            assert covers(replace_value(content["knows"]), replace_value(vertex["knows"]))
 
 
 def test_trainings_of_the_committed_suite(tmp_path: Path) -> None:
     """Agents see what their class knows and the price, nothing else; settings override."""
     suite = load_suite(ROOT / "configs" / "benchmark.yaml")
-    seen: set[tuple[str, str]] = set()
+    visited: set[tuple[str, str]] = set()
     for setting in suite.settings:
-        for of in trained(suite, setting):
-            seen.add((setting.name, of.name))
+        for of in trained_classes(suite, setting):
+            visited.add((setting.name, of.name))
             experiment = jobs.experiment_of(suite, setting, of, 3, tmp_path)
             options, training = experiment.environment.options, experiment.training
             assert experiment.environment.local == (of.mode == "local")
@@ -199,12 +202,12 @@ def test_trainings_of_the_committed_suite(tmp_path: Path) -> None:
             assert training.error == (setting.error or suite.error)
             changes = setting.algorithm | suite.algorithms.get(of.mode, {})
             changes |= setting.algorithms.get(of.mode, {})
-            given = experiment.algorithm.model_dump()
-            assert all(given[key] == changes[key] for key in changes.keys() - {"network"})
+            arguments = experiment.algorithm.model_dump()
+            assert all(arguments[key] == changes[key] for key in changes.keys() - {"network"})
     every = {(s.name, c.name) for s in suite.settings for c in classes_of(s)}
     # Nodes that remember by themselves, and sources that leave nothing to remember.
     left = ("markov_jump", "remote_estimation")
-    assert every - seen == {
+    assert every - visited == {
         (name, class_name)
         for name, class_name in every
         if name in left and class_name.endswith("_memory")
@@ -215,21 +218,21 @@ def test_a_class_that_a_setting_has_not_is_refused(tmp_path: Path) -> None:
     wrong = SMALL["settings"][0] | {"agents": ["local_none"]}
     suite = load_suite(small_suite(tmp_path, settings=[wrong]))
     with pytest.raises(ConfigurationError, match=r"agents of small = 'local_none' is not allowed"):
-        trained(suite, suite.settings[0])
+        trained_classes(suite, suite.settings[0])
     for field in ("envs", "lengths"):
         wrong = SMALL["settings"][0] | {field: {"locale": 2}}
         suite = load_suite(small_suite(tmp_path, settings=[wrong]))
         with pytest.raises(ConfigurationError, match=f"{field} of small = 'locale' is not"):
-            trained(suite, suite.settings[0])
+            trained_classes(suite, suite.settings[0])
 
 
 def test_results_survive_the_disk(tmp_path: Path) -> None:
     task = fusion_gym.make_task(ENV, filter="tobit", horizon=5)
-    found = {p: run_episodes(task, make_policy(p, task), 3, 0) for p in ("always", "never")}
-    save_results(tmp_path / "x.npz", found)
+    outcome = {p: run_episodes(task, make_policy(p, task), 3, 0) for p in ("always", "never")}
+    save_results(tmp_path / "x.npz", outcome)
     again = load_results(tmp_path / "x.npz")
     assert list(again) == ["always", "never"]
-    for name, results in found.items():
+    for name, results in outcome.items():
         for field in EpisodeResults.__dataclass_fields__:
             np.testing.assert_array_equal(getattr(again[name], field), getattr(results, field))
 
@@ -252,7 +255,7 @@ def test_a_suite_that_is_not_allowed(tmp_path: Path, changes: Any, message: str)
     assert message in str(caught.value)
 
 
-def test_the_report_shows_what_it_is_told_as_text(tmp_path: Path) -> None:
+def test_the_report_shows_what_it_is_reported_as_text(tmp_path: Path) -> None:
     """Titles, policies and folders in HTML, Markdown and with a table's bars stay what they are."""
     folder = small_results(tmp_path, "a<b>_[c](javascript:d)")
     for path in folder.glob("agent_*.json"):  # where no such name is allowed
@@ -272,10 +275,10 @@ def test_the_report_shows_what_it_is_told_as_text(tmp_path: Path) -> None:
     body = xml.etree.ElementTree.fromstring(inside)
     assert not {"script", "a", "b"} & {element.tag for element in body.iter()}
     assert not any("onerror" in element.attrib for element in body.iter())
-    said = "".join(body.itertext())
-    assert " ".join(verdict["title"].split()) in said
-    assert "a`<script>alert(4)</script>" in said
-    assert "<script>alert(5)</script>" in said
+    message = "".join(body.itertext())
+    assert " ".join(verdict["title"].split()) in message
+    assert "a`<script>alert(4)</script>" in message
+    assert "<script>alert(5)</script>" in message
     assert code("a|b``c") == "``` a\\|b``c ```"  # a bar would end the cell on other pages
 
 
@@ -287,11 +290,11 @@ def test_agents_of_the_zoo_reach_their_numbers(name: str) -> None:
     task = fusion_gym.make_task(card["env"], **(card["options"] | centre))
     place = len(card["test"]["prices"]) // 2
     policy = make_policy(f"zoo:{name},price={card['test']['prices'][place]!r}", task)
-    found = run_episodes(task, policy, 60, card["test"]["seed"])
-    told = card["test"]["points"][place]
-    deviation = found.mse.std() / np.sqrt(60)
-    assert found.mse.mean() == pytest.approx(told["mse"]["mean"], abs=4.5 * deviation)
-    assert np.mean(told["rate"]) == pytest.approx(found.rate.mean(), abs=0.03)
+    results = run_episodes(task, policy, 60, card["test"]["seed"])
+    received = card["test"]["points"][place]
+    deviation = results.mse.std() / np.sqrt(60)
+    assert results.mse.mean() == pytest.approx(received["mse"]["mean"], abs=4.5 * deviation)
+    assert np.mean(received["rate"]) == pytest.approx(results.rate.mean(), abs=0.03)
 
 
 def test_the_solved_case_is_trained_once_and_compared(
@@ -309,14 +312,14 @@ def test_the_solved_case_is_trained_once_and_compared(
     stamp = (tmp_path / "s" / "ppo_0" / "final_model.zip").stat().st_mtime_ns
     run_main(monkeypatch, solved, *arguments, "--seeds", "0", "1")
     assert (tmp_path / "s" / "ppo_0" / "final_model.zip").stat().st_mtime_ns == stamp
-    found = json.loads((tmp_path / "s" / "ppo.json").read_text())["agents"]
-    assert set(found) == {"0", "1"}
+    content = json.loads((tmp_path / "s" / "ppo.json").read_text())["agents"]
+    assert set(content) == {"0", "1"}
     # A folder with another training is refused, and kept.
     config.write_text(config.read_text().replace("batch_size: 64", "batch_size: 32"))
     with pytest.raises(SystemExit, match="batch_size = 32 differs"):
         run_main(monkeypatch, solved, *arguments, "--seeds", "0")
     # Hardly trained, an agent costs more than the optimum.
-    assert found["0"]["mean"] > 0.0
+    assert content["0"]["mean"] > 0.0
     assert "above the optimum" in capsys.readouterr().out
 
 
@@ -355,15 +358,15 @@ def test_processes_share_a_study(tmp_path: Path) -> None:
             assert process.exitcode == 0
     (name,) = optuna.get_all_study_names(storage)
     study = optuna.load_study(study_name=name, storage=storage)
-    folders = [path.name for one in ("one", "two") for path in (tmp_path / one).glob("trial_*")]
+    folders = [path.name for item in ("one", "two") for path in (tmp_path / item).glob("trial_*")]
     assert len(folders) == len(set(folders)) == len(study.trials)
     assert 4 <= len(study.trials) <= 5  # both may begin the last one
     assert not list((tmp_path / "three").glob("trial_*"))
-    told = yaml.safe_load((tmp_path / "three" / "best.yaml").read_text())
-    assert told["algorithm"]["learning_rate"] == study.best_params["learning_rate"]
+    content = yaml.safe_load((tmp_path / "three" / "best.yaml").read_text())
+    assert content["algorithm"]["learning_rate"] == study.best_params["learning_rate"]
     for wrong in ("nonsense://x", "sqlite:////nowhere/x.db"):
         with pytest.raises(ConfigurationError, match=f"storage = '{wrong}' is not allowed"):
-            tune.tune(load(Experiment, config), 1, tmp_path / "four", wrong)
+            tune.tune(load_checked(Experiment, config), 1, tmp_path / "four", wrong)
 
 
 def test_tuning_goes_on_with_its_study(

@@ -59,7 +59,7 @@ def test_a_vector_of_rewards_sums_to_the_reward() -> None:
         assert pair.tolist() == [info["reward_error"], info["reward_cost"]]
 
 
-def test_faces_of_one_number_refuse_two() -> None:
+def test_interfaces_of_one_number_refuse_two() -> None:
     for make in (lambda **o: fusion_gym.make_sb3_vec_env(TOBIT, 2, **o),
                  lambda **o: fusion_gym.parallel_env(TOBIT, **o)):  # fmt: skip
         with pytest.raises(ConfigurationError, match="reward = 'vector'"):

@@ -77,8 +77,8 @@ LIMITS = {"censoring_threshold": -1.0, "censoring_upper": 1.0}
 def test_oscillator_meets_its_figures(
     policy: str, options: dict[str, Any], figures: Any, tolerance: float
 ) -> None:
-    found = armse(evaluate(OSCILLATOR, policy, **options))
-    np.testing.assert_allclose(found[: len(figures)], figures, rtol=tolerance)
+    results = armse(evaluate(OSCILLATOR, policy, **options))
+    np.testing.assert_allclose(results[: len(figures)], figures, rtol=tolerance)
 
 
 def test_assumed_density_beats_the_papers_filter_far_beyond_chance() -> None:
@@ -163,7 +163,7 @@ def test_assumed_density_moments_are_those_of_the_posterior(
     """One state: the posterior's moments by quadrature over prior times likelihood."""
     sensors = CensoredSensors.create([[[1.0]]], noise, -1.0, 1, 1.5)
     value = {"below": -1.0, "above": 1.5, "inside": 0.4}[event]
-    found_mean, found = AssumedDensityFilter(sensors).update(
+    mean_result, values = AssumedDensityFilter(sensors).update(
         np.array([[mean]]),
         np.array([[[variance]]]),
         np.array([[[value]]]),
@@ -182,8 +182,8 @@ def test_assumed_density_moments_are_those_of_the_posterior(
     total = integrate.simpson(weight, x=grid)
     centre = integrate.simpson(weight * grid, x=grid) / total
     spread = integrate.simpson(weight * (grid - centre) ** 2, x=grid) / total
-    assert found_mean[0, 0] == pytest.approx(centre, rel=1e-7, abs=1e-7)
-    assert found[0, 0, 0] == pytest.approx(spread, rel=1e-6)
+    assert mean_result[0, 0] == pytest.approx(centre, rel=1e-7, abs=1e-7)
+    assert values[0, 0, 0] == pytest.approx(spread, rel=1e-6)
 
 
 def test_expected_reduction_is_the_mean_over_the_measurements() -> None:
@@ -245,7 +245,7 @@ def test_single_access_lets_one_request_through(bits: list[bool], step: int) -> 
         assert (passed[:, 0].argmax() - step) % len(bits) == distance.min()
 
 
-def test_divergence_is_told() -> None:
+def test_divergence_is_reported() -> None:
     """With little noise the paper's filter loses the state in a few runs; the target never."""
     results = evaluate(OSCILLATOR, "round_robin", measurement_variance=0.06)
     assert np.all(np.isfinite(results.mse))

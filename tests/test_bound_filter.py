@@ -84,12 +84,12 @@ PAPER_TRIGGER = {
 def test_event_error_follows_its_recursion_for_every_growth(decay: float) -> None:
     # The growth 7.5 λ² + 0.4 is below, at and above one.
     error = EventError.create(**(PAPER_TRIGGER | {"decay": decay}))
-    found = error.at(np.array([1.0, 2.0, 30.0, 100.0]))
+    values = error.at(np.array([1.0, 2.0, 30.0, 100.0]))
     example = Example(decay=(decay,) * 3)
     for sensor in range(3):
         for place, time in enumerate((1, 2, 30, 100)):
-            wanted = event_error(example, sensor, time)
-            assert found[sensor, place] == pytest.approx(wanted, rel=1e-9)
+            expected = event_error(example, sensor, time)
+            assert values[sensor, place] == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def check_against_print(
 ) -> None:
     """Both outcomes at every sensor and lane, mean and bound, against (22), (30) and (37)."""
     sensors, time = problem.sensors, 3
-    found = outcomes(make_bound_filter(sensors, with_event_error, epsilon), problem, time)
+    result = outcomes(make_bound_filter(sensors, with_event_error, epsilon), problem, time)
     count = sensors.count
     example = Example(
         matrices=(np.eye(1),) * count,
@@ -143,18 +143,18 @@ def check_against_print(
                         epsilon[13],
                         event,
                     )
-                mean = found[2 * silent][sensor, :, lane]
-                bound = found[2 * silent + 1][sensor, :, :, lane]
+                mean = result[2 * silent][sensor, :, lane]
+                bound = result[2 * silent + 1][sensor, :, :, lane]
                 where = f"sensor {sensor}, lane {lane}, {'held' if silent else 'delivered'}"
                 prior = problem.mean[sensor, :, lane]
-                wanted = exact_float(exact_mean)[:, 0]
-                room = tolerance * np.abs(wanted - prior).max() + 1e-12 * np.abs(prior).max()
-                assert np.abs(mean - wanted).max() <= room, f"mean: {where}"
+                expected = exact_float(exact_mean)[:, 0]
+                room = tolerance * np.abs(expected - prior).max() + 1e-12 * np.abs(prior).max()
+                assert np.abs(mean - expected).max() <= room, f"mean: {where}"
                 # Relative in every direction: the eigenvalues of wanted⁻¹ found are all one.
-                wanted = exact_float(exact_bound)
-                scale = 1.0 / np.sqrt(np.diagonal(wanted))
-                root = np.linalg.cholesky(scale[:, None] * wanted * scale)
-                excess = scale[:, None] * (bound - wanted) * scale
+                expected = exact_float(exact_bound)
+                scale = 1.0 / np.sqrt(np.diagonal(expected))
+                root = np.linalg.cholesky(scale[:, None] * expected * scale)
+                excess = scale[:, None] * (bound - expected) * scale
                 excess = np.linalg.solve(root, np.linalg.solve(root, excess).T)
                 assert np.abs(excess).max() <= tolerance, f"bound: {where}"
 

@@ -21,9 +21,9 @@ def test_where_packets_are_too_dear_it_is_the_cost_of_silence(
         exact += second / len(variances)
     noise = np.reshape(variances, (-1, 1, 1))
     problem = SilenceProblem.create([[coefficient]], [1.0], noise, 60.0)
-    found = solve_silence(problem, step).lower
-    assert found <= exact * (1.0 + 1e-9)
-    assert found == pytest.approx(exact, rel=0.05)
+    result = solve_silence(problem, step).lower
+    assert result <= exact * (1.0 + 1e-9)
+    assert result == pytest.approx(exact, rel=0.05)
 
 
 def test_the_floor_allows_for_what_lies_between_the_points() -> None:

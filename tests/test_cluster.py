@@ -37,21 +37,21 @@ def started(folder: Path, name: str, *words: str) -> Iterator[subprocess.Popen[b
 @contextlib.contextmanager
 def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
     """A scheduler's address, and its workers."""
-    told = folder / "scheduler.json"
+    received = folder / "scheduler.json"
     with contextlib.ExitStack() as stack:
         words = ["distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"]
-        stack.enter_context(started(folder, "scheduler", *words, "--scheduler-file", str(told)))
+        stack.enter_context(started(folder, "scheduler", *words, "--scheduler-file", str(received)))
         deadline = time.monotonic() + PATIENCE
-        while not told.exists():
+        while not received.exists():
             assert time.monotonic() < deadline
             time.sleep(0.1)
         words = ["distributed.cli.dask_worker", "--nthreads", "1", "--no-nanny", "--no-dashboard"]
-        words += ["--scheduler-file", str(told), "--local-directory", str(folder)]
+        words += ["--scheduler-file", str(received), "--local-directory", str(folder)]
         begun = [
             stack.enter_context(started(folder, f"worker{number}", *words))
             for number in range(workers)
         ]
-        yield json.loads(told.read_text())["address"], begun
+        yield json.loads(received.read_text())["address"], begun
 
 
 def benchmark(suite: Path, folder: Path, *words: str) -> list[str]:
@@ -68,7 +68,7 @@ def benchmark(suite: Path, folder: Path, *words: str) -> list[str]:
     ]
 
 
-def found(folder: Path) -> dict[str, Any]:
+def find(folder: Path) -> dict[str, Any]:
     """All that was found, without the seconds that it took."""
     content = {}
     for path in sorted((folder / "results").glob("*/*.json")):
@@ -80,8 +80,8 @@ def found(folder: Path) -> dict[str, Any]:
 @pytest.mark.slow
 def test_a_worker_that_ends_in_the_middle_loses_nothing(tmp_path: Path) -> None:
     suite = small_suite(tmp_path, timesteps=8_000, classes=["sensors"])
-    alone, many = tmp_path / "alone", tmp_path / "many"
-    subprocess.run(benchmark(suite, alone, "--workers", "2"), cwd=ROOT, check=True)
+    single, many = tmp_path / "alone", tmp_path / "many"
+    subprocess.run(benchmark(suite, single, "--workers", "2"), cwd=ROOT, check=True)
     with cluster(tmp_path, 2) as (address, workers):
         run = subprocess.Popen(
             benchmark(suite, many, "--backend", "dask", "--address", address), cwd=ROOT
@@ -98,8 +98,8 @@ def test_a_worker_that_ends_in_the_middle_loses_nothing(tmp_path: Path) -> None:
             run.kill()
             run.wait()
         assert workers[1].poll() is None
-    assert found(many) == found(alone)
-    assert {"agent_sensors_0.json", "agent_sensors_1.json", "verdict.json"} <= found(many).keys()
+    assert find(many) == find(single)
+    assert {"agent_sensors_0.json", "agent_sensors_1.json", "verdict.json"} <= find(many).keys()
 
 
 @pytest.mark.slow

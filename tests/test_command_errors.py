@@ -20,8 +20,8 @@ from hostile_folder import ROOT, contents, scratch
 from fusion_gym.agents import __main__ as everything
 from fusion_gym.agents.command_line import Command, start
 from fusion_gym.agents.demo import remove
-from fusion_gym.agents.output.ending import told
-from fusion_gym.agents.suite.sweep import Curve
+from fusion_gym.agents.output.ending import report_errors
+from fusion_gym.agents.suite.sweep import SweepCurve
 from fusion_gym.policies.settings import parse_value
 from fusion_gym.validation import ConfigurationError
 
@@ -39,35 +39,35 @@ def here(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def selected() -> list[Try]:
     """A few tries of each option, other values for each."""
-    found = collections.defaultdict(list)
+    result = collections.defaultdict(list)
     for tried in tries():
-        found[tried.command, tried.option].append(tried)
+        result[tried.command, tried.option].append(tried)
     return [
         values[(place * PER_OPTION + turn) % len(values)]
-        for place, values in enumerate(found.values())
+        for place, values in enumerate(result.values())
         for turn in range(min(PER_OPTION, len(values)))
     ]
 
 
 def test_every_option_of_every_command_is_tried() -> None:
     assert BASES.keys() == set(everything.COMMANDS)
-    tried = {(one.command, one.option) for one in tries()}
+    tried = {(item.command, item.option) for item in tries()}
     for name in BASES:
         for option, kind in options(name).items():
             assert (name, option) in tried or kind is bool, option
     assert len(list(tries())) > 500
 
 
-def test_what_is_not_allowed_is_told_in_one_line(here: Path) -> None:
-    assert {str(one): found for one in selected() if (found := flaw(one, here))} == {}
+def test_what_is_not_allowed_is_reported_in_one_line(here: Path) -> None:
+    assert {str(item): message for item in selected() if (message := flaw(item, here))} == {}
 
 
 @pytest.mark.slow
-def test_all_that_is_not_allowed_is_told_in_one_line(here: Path) -> None:
-    assert {str(one): found for one in tries() if (found := flaw(one, here))} == {}
+def test_all_that_is_not_allowed_is_reported_in_one_line(here: Path) -> None:
+    assert {str(item): message for item in tries() if (message := flaw(item, here))} == {}
 
 
-def test_a_full_disk_in_a_training_is_told(here: Path) -> None:
+def test_a_full_disk_in_a_training_is_reported(here: Path) -> None:
     """The config fits, the first model does not."""
     ended = call("train", line("train", BASES["train"]), limit=2_000)
     assert (ended.status, ended.trace) == (1, "")
@@ -78,7 +78,7 @@ def test_a_full_disk_in_a_training_is_told(here: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["evaluate", "report", "zoo"])
-def test_a_full_disk_is_told_and_leaves_nothing_half_written(here: Path, name: str) -> None:
+def test_a_full_disk_is_reported_and_leaves_nothing_half_written(here: Path, name: str) -> None:
     """Files of no byte, and of a few: once in the trial and once in the work."""
     before = contents(here)
     for limit, part in ((0, "is not allowed: it must be a f"), (16, os.strerror(errno.EFBIG))):
@@ -88,8 +88,8 @@ def test_a_full_disk_is_told_and_leaves_nothing_half_written(here: Path, name: s
         assert last.startswith("error: ")
         assert part in last
         assert "made" in last or "results" in last
-        assert {name for name, found in contents(here).items() if found is not None} == {
-            name for name, found in before.items() if found is not None
+        assert {name for name, content in contents(here).items() if content is not None} == {
+            name for name, value in before.items() if value is not None
         }
     assert call(name, line(name, BASES[name])).status == 0
 
@@ -123,8 +123,8 @@ def test_an_error_of_the_programs_own_keeps_its_traceback(monkeypatch: pytest.Mo
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_what_the_machine_refuses_is_told(error: BaseException, status: int | str) -> None:
-    with pytest.raises(SystemExit) as caught, told():
+def test_what_the_machine_refuses_is_reported(error: BaseException, status: int | str) -> None:
+    with pytest.raises(SystemExit) as caught, report_errors():
         raise error
     if isinstance(status, str):
         assert str(caught.value.code).startswith(status)
@@ -150,7 +150,7 @@ def test_output_that_nobody_reads_or_takes() -> None:
 
 def test_a_fresh_demo_removes_nothing_but_a_demo(here: Path) -> None:
     """Neither what is not its own, nor anything when it is refused."""
-    for name in ("coordinator", "alone"):
+    for name in ("scheduler", "alone"):
         (here / name / "agent").mkdir(parents=True)
         (here / name / "agent" / "config.yaml").touch()
     (here / "alone" / "agent" / "config.yaml").rename(here / "alone" / "notes")
@@ -160,9 +160,9 @@ def test_a_fresh_demo_removes_nothing_but_a_demo(here: Path) -> None:
     assert (ended.status, ended.trace) == (1, "")
     assert "fresh = True is not allowed: 'alone' holds no results of a demo" in ended.err
     assert (here / "alone" / "notes").exists()
-    assert (here / "coordinator" / "agent" / "config.yaml").exists()
-    remove([here / "coordinator", here / "absent"])
-    assert not (here / "coordinator").exists()
+    assert (here / "scheduler" / "agent" / "config.yaml").exists()
+    remove([here / "scheduler", here / "absent"])
+    assert not (here / "scheduler").exists()
 
 
 @pytest.mark.parametrize("text", ["{[]: 1}", "(" * 5000, "9" * 5000 + "x", "\0"])
@@ -171,5 +171,5 @@ def test_what_is_no_literal_stays_text(text: str) -> None:
 
 
 def test_braces_of_a_swept_policy_are_its_own() -> None:
-    curve = Curve(label="a", policy="p:a={value},b={0}{other}", values=(1, 2.5))
+    curve = SweepCurve(label="a", policy="p:a={value},b={0}{other}", values=(1, 2.5))
     assert curve.policies == ["p:a=1,b={0}{other}", "p:a=2.5,b={0}{other}"]

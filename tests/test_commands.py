@@ -16,7 +16,7 @@ from fusion_gym.agents import __main__ as everything
 from fusion_gym.agents import command_line
 from fusion_gym.agents.benchmark import Benchmark
 from fusion_gym.agents.training.algorithms import TABLE
-from fusion_gym.agents.training.checked import config_path, load, parse
+from fusion_gym.agents.training.checked import config_path, load_checked, parse
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.policies.model import ALGORITHMS
 from fusion_gym.validation import ConfigurationError
@@ -33,14 +33,14 @@ def test_help_shows_every_option(
     with pytest.raises(SystemExit) as caught:
         module.main()
     assert caught.value.code == 0
-    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert shown.startswith(f"usage: fusion-gym {name} ")
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert text.startswith(f"usage: fusion-gym {name} ")
     kind = getattr(module, name.capitalize())
     options = {field.name: field for field in dataclasses.fields(kind)}
     for own, option in (("options", "set"), ("of", "class")):
         if own in options:
             options[option] = options.pop(own)
-    listed = shown.partition("--help")[2]  # the usage above it may name options as well
+    listed = text.partition("--help")[2]  # the usage above it may name options as well
     hints = typing.get_type_hints(kind, include_extras=True)
     for option in options:
         if tyro.conf.Positional[int].__metadata__[0] not in getattr(
@@ -52,10 +52,10 @@ def test_help_shows_every_option(
 def test_lists_flags_and_negative_numbers_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
     words = "--envs a b --seeds -3 --quick --classes local_none --work deep/er --resume"
     monkeypatch.setattr(sys, "argv", ["program", *words.split()])
-    given = command_line.read(Benchmark)
-    assert (given.envs, given.classes, given.seeds) == (("a", "b"), ("local_none",), -3)
-    assert (given.quick, given.resume, given.work) == (True, True, Path("deep/er"))
-    assert (given.config, given.results, given.workers) == ("benchmark", None, 2)
+    command = command_line.read_command(Benchmark)
+    assert (command.envs, command.classes, command.seeds) == (("a", "b"), ("local_none",), -3)
+    assert (command.quick, command.resume, command.work) == (True, True, Path("deep/er"))
+    assert (command.config, command.results, command.workers) == ("benchmark", None, 2)
 
 
 def test_all_commands_under_one_name() -> None:
@@ -79,7 +79,7 @@ def test_configs_go_by_path_or_by_shipped_name(
 ) -> None:
     path = ROOT / "configs" / "tobit_oscillator_ppo.yaml"
     monkeypatch.chdir(tmp_path)
-    assert load(Experiment, "tobit_oscillator_ppo") == load(Experiment, path)
+    assert load_checked(Experiment, "tobit_oscillator_ppo") == load_checked(Experiment, path)
     Path("benchmark").mkdir()
     assert config_path("benchmark").samefile(ROOT / "configs" / "benchmark.yaml")
     Path("own").write_text("a: 1")

@@ -34,35 +34,35 @@ class Kalman:
         plant, self.sensors = system.plant, system.centre.sensors
         self.filters = []
         for run in range(batch.num_envs):
-            one = filterpy.kalman.KalmanFilter(dim_x=plant.size, dim_z=self.sensors.size)
-            one.F, one.Q = np.array(plant.transition)[..., 0], plant.process_covariance[..., 0]
-            one.x = np.array(batch.state.prior_mean)[:, run]
-            one.P = np.array(batch.state.prior_covariance)[..., run]
-            self.filters.append(one)
+            item = filterpy.kalman.KalmanFilter(dim_x=plant.size, dim_z=self.sensors.size)
+            item.F, item.Q = np.array(plant.transition)[..., 0], plant.process_covariance[..., 0]
+            item.x = np.array(batch.state.prior_mean)[:, run]
+            item.P = np.array(batch.state.prior_covariance)[..., run]
+            self.filters.append(item)
 
     def update(self, measurement: Array, taken: Array) -> tuple[Array, Array]:
         """Posterior means (n, N) and covariances (n, n, N) with what was ``taken`` (sensors, N)."""
-        for run, one in enumerate(self.filters):
+        for run, item in enumerate(self.filters):
             for sensor in np.flatnonzero(taken[:, run]):
                 noise = np.diag(np.ravel(self.sensors.variance[sensor]))
                 matrix = np.array(self.sensors.measurement_matrix[sensor])[..., 0]
-                one.update(measurement[sensor, :, run], R=noise, H=matrix)
-        means = np.stack([one.x for one in self.filters], -1)
-        return means, np.stack([one.P for one in self.filters], -1)
+                item.update(measurement[sensor, :, run], R=noise, H=matrix)
+        means = np.stack([item.x for item in self.filters], -1)
+        return means, np.stack([item.P for item in self.filters], -1)
 
     def predict(self) -> None:
         """One step on."""
-        for one in self.filters:
-            one.predict()
+        for item in self.filters:
+            item.predict()
 
 
-def linear(owner: Owner = "coordinator", **options: Any) -> EpisodeBatch:
+def linear(owner: Owner = "scheduler", **options: Any) -> EpisodeBatch:
     """Runs of an oscillator whose sensors censor nothing."""
     task = fusion_gym.make_task(TOBIT, **LINEAR | options)
     return EpisodeBatch.seeded(task, RUNS, 5, owner)
 
 
-def asked(batch: EpisodeBatch, rate: float = 0.15) -> Array:
+def requests_at(batch: EpisodeBatch, rate: float = 0.15) -> Array:
     """Random requests (steps, sensors, N)."""
     return np.random.default_rng(1).random((STEPS, batch.task.sensors, RUNS)) < rate
 
@@ -70,42 +70,42 @@ def asked(batch: EpisodeBatch, rate: float = 0.15) -> Array:
 def test_what_is_remembered_is_kalmans_estimate_from_every_measurement() -> None:
     batch = linear()
     kalman, everything = Kalman(batch), np.ones((3, RUNS), dtype=np.bool_)
-    for wanted in asked(batch):
+    for requests in requests_at(batch):
         mean, covariance = kalman.update(batch.signals()["measurement"], everything)
         best = batch.beliefs().best
         np.testing.assert_allclose(best.mean[0], mean, rtol=1e-9)
         np.testing.assert_allclose(best.covariance[0], covariance, rtol=1e-9)
         assert (batch.signals()["belief_difference"] != 0.0).any()
-        batch.step(wanted)
+        batch.step(requests)
         kalman.predict()
 
 
-def test_a_sensor_that_overhears_has_kalmans_estimate_from_its_own_and_what_it_heard() -> None:
+def test_a_sensor_that_receives_packets_has_kalmans_estimate_of_all_it_received() -> None:
     batch = linear("own", broadcast="packets")
     kalmans = [Kalman(batch) for _ in range(3)]
-    for wanted in asked(batch):
+    for requests in requests_at(batch):
         best, measurement = batch.beliefs().best, batch.signals()["measurement"]
         for sensor, kalman in enumerate(kalmans):
             itself = np.arange(3)[:, None] == np.full(RUNS, sensor)
             mean, covariance = kalman.update(measurement, itself)
             np.testing.assert_allclose(best.mean[sensor], mean, rtol=1e-9)
             np.testing.assert_allclose(best.covariance[sensor], covariance, rtol=1e-9)
-            kalman.update(measurement, wanted & ~itself)
+            kalman.update(measurement, requests & ~itself)
             kalman.predict()
-        batch.step(wanted)
+        batch.step(requests)
 
 
 def test_with_the_estimate_nothing_is_lost_by_silence() -> None:
     batch = linear(packet="estimate")
     kalman, everything, met = Kalman(batch), np.ones((3, RUNS), dtype=np.bool_), 0
-    for wanted in asked(batch):
+    for requests in requests_at(batch):
         mean, covariance = kalman.update(batch.signals()["measurement"], everything)
-        heard = batch.step(wanted).granted.any(0)
-        found = batch.task.system.fused(batch.delivered)
-        np.testing.assert_allclose(found[0][:, heard], mean[:, heard], rtol=1e-9)
-        np.testing.assert_allclose(found[1][..., heard], covariance[..., heard], rtol=1e-9)
+        received = batch.step(requests).granted.any(0)
+        result = batch.task.system.fused(batch.delivered)
+        np.testing.assert_allclose(result[0][:, received], mean[:, received], rtol=1e-9)
+        np.testing.assert_allclose(result[1][..., received], covariance[..., received], rtol=1e-9)
         kalman.predict()
-        met += int(heard.sum())
+        met += int(received.sum())
     assert met > RUNS
 
 
@@ -141,7 +141,7 @@ def test_what_has_no_meaning_is_refused(env_id: str, options: Any, message: str)
     assert "\n" not in str(caught.value)
 
 
-def test_a_sensor_by_itself_cannot_send_the_coordinators_estimate() -> None:
+def test_a_sensor_local_cannot_send_the_schedulers_estimate() -> None:
     options = {"memory": True, "packet": "estimate"}
     message = "packet = 'estimate' .*local view.* 'measurement'"
     for make in (
@@ -159,14 +159,16 @@ def test_a_sensor_by_itself_cannot_send_the_coordinators_estimate() -> None:
     ("env_id", "broadcast"),
     [(TOBIT, "estimate"), (CORRELATED, "none"), (JUMP, "none"), (INPUT, "none"), (REMOTE, "none")],
 )
-def test_nodes_hear_by_default_what_the_papers_let_them_hear(env_id: str, broadcast: str) -> None:
+def test_nodes_receive_by_default_what_the_papers_let_them_receive(
+    env_id: str, broadcast: str
+) -> None:
     task: Task = fusion_gym.make_task(env_id)
     assert task.broadcast == broadcast
-    assert (task.memory, task.packet, task.shadow) == (False, "measurement", None)
+    assert (task.memory, task.packet, task.memory_system) == (False, "measurement", None)
     assert EpisodeBatch(task, 1).memory.states is None
 
 
-def test_a_sensor_by_itself_looks_one_step_ahead() -> None:
+def test_a_sensor_local_looks_one_step_ahead() -> None:
     task = fusion_gym.make_task("fusion_gym/TobitOscillator-v0", filter="tobit", memory=True)
     beliefs = EpisodeBatch.seeded(task, 2, 0, "own").beliefs()
     for ask in (beliefs.loss, beliefs.value):

@@ -49,12 +49,12 @@ def test_threshold_follows_the_last_requested_innovation() -> None:
         if step in (0, 30):  # a new episode forgets
             last[:] = 0.0
         innovation = draw.normal(size=(2, 1, 5))
-        found = trigger(signals(innovation, step in (0, 30)))
+        requests = trigger(signals(innovation, step in (0, 30)))
         for sensor, (a, b, c) in enumerate(((0.6, 0.2, 0.9), (1.0, 0.0, 2.0))):
             for lane in range(5):
                 size = abs(innovation[sensor, 0, lane])
                 asks = size**2 >= a * math.exp(-(b + c * last[sensor, lane]))
-                assert found[sensor, lane] == asks
+                assert requests[sensor, lane] == asks
                 last[sensor, lane] = size if asks else last[sensor, lane]
 
 
@@ -102,11 +102,11 @@ def test_variance_signals_are_what_a_delivery_brings() -> None:
         for step in range(12):
             offered = batch.signals()
             silent, gain = offered["silent_variance"], offered["variance_reduction"]
-            asked = policy(offered)
+            requests = policy(offered)
             if step % 4 < 3:  # this sensor alone
-                asked = np.zeros((3, 4), dtype=bool)
-                asked[step % 4] = True
-            batch.step(asked)
+                requests = np.zeros((3, 4), dtype=bool)
+                requests[step % 4] = True
+            batch.step(requests)
             claimed = batch.delivered.covariance[0]
             trace = np.einsum("i,iir->r", weights, claimed)
             if step % 4 < 3:

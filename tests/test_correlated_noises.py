@@ -32,23 +32,23 @@ def shared() -> Array:
 
 
 def task_of(**options: Any) -> Task:
-    given = {
+    arguments = {
         "transition": A,
         "process_covariance": W,
         "measurement_matrices": ROWS,
         "joint_measurement_covariance": shared(),
         "tokens": "unlimited",
     }
-    return fusion_gym.make_task(LINEAR, **(given | options))
+    return fusion_gym.make_task(LINEAR, **(arguments | options))
 
 
 def optimal(granted: NDArray[np.bool_], prior: Array) -> Array:
     """Posterior covariance of all granted channels at once, in information form."""
-    kept = np.repeat(granted, SIZES)
-    if not kept.any():
+    mask = np.repeat(granted, SIZES)
+    if not mask.any():
         return prior
-    noise = shared()[np.ix_(kept, kept)]
-    return np.linalg.inv(np.linalg.inv(prior) + C[kept].T @ np.linalg.inv(noise) @ C[kept])
+    noise = shared()[np.ix_(mask, mask)]
+    return np.linalg.inv(np.linalg.inv(prior) + C[mask].T @ np.linalg.inv(noise) @ C[mask])
 
 
 def test_the_joint_filter_is_the_optimal_one() -> None:
@@ -77,8 +77,8 @@ def test_the_noise_has_the_covariance_that_was_given() -> None:
     measured = batch.signals()["measurement"]
     own = np.linalg.cholesky(shared()[1:3, 1:3])  # the second sensor reports F⁻¹ y
     second = own @ measured[1]
-    found = np.cov(np.vstack([measured[0, :1], second, measured[2, :1]]))
-    np.testing.assert_allclose(found, shared(), atol=0.03)
+    values = np.cov(np.vstack([measured[0, :1], second, measured[2, :1]]))
+    np.testing.assert_allclose(values, shared(), atol=0.03)
     assert not measured[0, 1].any()  # a channel that the sensor does not have
 
 
@@ -103,9 +103,9 @@ def test_covariance_intersection_keeps_its_bound(fusion: str) -> None:
         "joint_measurement_covariance": [[0.5, 0.45], [0.45, 0.5]],
     }
     joint, nodes = task_of(**pair), task_of(**pair, filter="kalman", fusion=fusion)
-    best, found = (run_episodes(t, make_policy("always", t), 500, 0) for t in (joint, nodes))
-    assert found.mse.mean() < 0.97 * found.bound_trace.mean()
-    assert best.mse.mean() < 0.9 * found.mse.mean()
+    best, results = (run_episodes(t, make_policy("always", t), 500, 0) for t in (joint, nodes))
+    assert results.mse.mean() < 0.97 * results.bound_trace.mean()
+    assert best.mse.mean() < 0.9 * results.mse.mean()
 
 
 def test_a_large_prior_keeps_its_digits() -> None:
@@ -129,7 +129,7 @@ def test_the_bounds_floor_counts_what_is_shared() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "broadcast"),
     [
         ({"joint_measurement_covariance": np.ones((4, 4))}, "positive definite"),
         ({"filter": "kalman", "fusion": "federated"}, "'ci' or 'sci'"),
@@ -140,8 +140,8 @@ def test_the_bounds_floor_counts_what_is_shared() -> None:
         ({"censoring_upper": [5.0, [4.0, np.inf], np.inf]}, "sensor 1, which is censored"),
     ],
 )
-def test_what_would_not_stay_right_is_refused(options: dict[str, Any], told: str) -> None:
+def test_what_would_not_stay_right_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         task_of(**options)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)

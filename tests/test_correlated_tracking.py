@@ -77,7 +77,7 @@ def reference(
     rule: str,
     order: tuple[int, ...],
     scale: float,
-    asked: Array | None,
+    requested: Array | None,
 ) -> tuple[Array, Array, Array, Array]:
     """Truth (T, 3), fused mean (T, 3), covariance (T, 3, 3), requests (T, 3) of a run."""
     x = np.array([0.3, 0.1, 0.2]) + math.sqrt(scale) * start
@@ -92,10 +92,10 @@ def reference(
         request = np.zeros(3, dtype=bool)
         for i in range(3):
             epsilon = y[i] - mean[i + 1][i]
-            if asked is None:
+            if requested is None:
                 request[i] = epsilon**2 >= 0.6 * math.exp(-(0.2 + 0.9 * abs(last[i])))
             else:
-                request[i] = asked[step, i]
+                request[i] = requested[step, i]
             if request[i]:
                 last[i] = epsilon
                 cross = cov[i + 1][:, i] + GAMMA * SIGMA_W**2 * BETA[i]
@@ -131,9 +131,9 @@ def test_library_and_plain_loop_walk_the_same_trajectories(
     draw = np.random.default_rng(8)
     start = draw.standard_normal((system.start_channels, runs))
     noise = draw.standard_normal((steps, system.noise_channels, runs))
-    asked = None if rate is None else draw.random((steps, 3, runs)) < rate
+    requests = None if rate is None else draw.random((steps, 3, runs)) < rate
     policy = AdaptiveInnovation()
-    state, found = system.start(start), []
+    state, result = system.start(start), []
     for step in range(steps):
         state = system.sense(state, noise[step])
         values = dict(system.read(state)) | {
@@ -141,23 +141,23 @@ def test_library_and_plain_loop_walk_the_same_trajectories(
             "tokens": np.zeros(runs),
             "token_cost": task.bucket.cost,
         }
-        granted = policy(Signals(values)) if asked is None else asked[step]
+        granted = policy(Signals(values)) if requests is None else requests[step]
         state = system.deliver(state, granted)
-        found.append((system.truth(state), *system.fused(state), granted))
+        result.append((system.truth(state), *system.fused(state), granted))
     for run in range(runs):
-        wanted = reference(
+        expected = reference(
             start[:3, run],
             noise[..., run],
             "ici" if fusion == "sici" else "ci",
             order or (0, 1, 2),
             scale,
-            None if asked is None else asked[..., run],
+            None if requests is None else requests[..., run],
         )
-        for mine, other in zip(zip(*found, strict=True), wanted, strict=True):
+        for mine, other in zip(zip(*result, strict=True), expected, strict=True):
             values = np.array([entry[..., run] for entry in mine], dtype=np.float64)
             room = 1e-9 * np.abs(other).max()
             np.testing.assert_allclose(values, other, rtol=0, atol=room)
-        assert 0.2 < wanted[3].mean() < 0.8
+        assert 0.2 < expected[3].mean() < 0.8
 
 
 # --- figures -------------------------------------------------------------------------------------
@@ -179,14 +179,14 @@ class Run:
 @cache
 def run(policy: str = "event", episodes: int = 80, horizon: int = 600, **options: Any) -> Run:
     task = build(horizon=horizon, track_actual=True, **options)
-    chosen: Policy = EVENT if policy == "event" else make_rule(policy)
+    rule: Policy = EVENT if policy == "event" else make_rule(policy)
     batch = EpisodeBatch(task, episodes)
     batch.seed(np.arange(episodes), list(range(9000, 9000 + episodes)))
     batch.reset()
-    chosen.reset(episodes, 1)
+    rule.reset(episodes, 1)
     sums = {name: [] for name in ("mse", "actual", "conservative", "rate", "worst", "inside")}
     for _ in range(horizon):
-        outcome = batch.step(chosen(batch.signals()))
+        outcome = batch.step(rule(batch.signals()))
         state = batch.delivered
         own = np.arange(4)
         actual = task.system.actual_covariance(state)[own, own]
@@ -224,16 +224,16 @@ TABLE = {  # scale: rates, then MSE, actual and conservative trace of SCI and of
 def test_figures_of_the_papers_trigger(scale: float) -> None:
     rates, *rows = TABLE[scale]
     for fusion, row in zip(("sci", "sici"), rows, strict=True):
-        found = run(fusion=fusion, noise_scale=scale)
+        results = run(fusion=fusion, noise_scale=scale)
         for sensor in range(3):
-            assert_figure(f"rate[{sensor}]", found.rate[sensor], rates[sensor], 400)
-            assert 0.015 < found.rate[sensor].std() < 0.028
-        assert_figure("MSE", found.mse, row[0])
-        assert_figure("actual trace", found.actual, row[1])
-        assert_figure("conservative trace", found.conservative, row[2])
-        assert found.inside.mean() > 0.995
+            assert_figure(f"rate[{sensor}]", results.rate[sensor], rates[sensor], 400)
+            assert 0.015 < results.rate[sensor].std() < 0.028
+        assert_figure("MSE", results.mse, row[0])
+        assert_figure("actual trace", results.actual, row[1])
+        assert_figure("conservative trace", results.conservative, row[2])
+        assert results.inside.mean() > 0.995
         # The tolerance is one: neighbouring figures are refused.
-        for samples, wrong in ((found.conservative, row[1]), (found.mse, row[1])):
+        for samples, wrong in ((results.conservative, row[1]), (results.mse, row[1])):
             with pytest.raises(AssertionError, match="standard errors"):
                 assert_figure("another figure", samples, wrong)
     assert (
@@ -259,9 +259,9 @@ def test_figures_of_event_always_and_random(
 @pytest.mark.slow
 def test_figures_of_the_reversed_order() -> None:
     for fusion, printed in (("sci", 0.355), ("sici", 0.274)):
-        found = run(fusion=fusion, order=(2, 1, 0))
-        assert_figure(fusion, found.mse, printed)
-        assert found.conservative.mean() < run(fusion=fusion).conservative.mean() - 0.01
+        results = run(fusion=fusion, order=(2, 1, 0))
+        assert_figure(fusion, results.mse, printed)
+        assert results.conservative.mean() < run(fusion=fusion).conservative.mean() - 0.01
 
 
 # --- consistency ---------------------------------------------------------------------------------
@@ -279,12 +279,12 @@ def test_locals_and_covariance_intersection_bound_the_actual_covariance(
 @pytest.mark.slow
 def test_inverse_covariance_intersection_does_not() -> None:
     """Theorem 5 fails; at the bounds in two steps of five, while the traces are in order."""
-    found = run(fusion="sici")
-    share = (found.worst[0] < -1e-9).mean()
+    results = run(fusion="sici")
+    share = (results.worst[0] < -1e-9).mean()
     assert 0.38 < share < 0.45
-    assert found.worst[1:].min() > -1e-9
-    assert found.worst[0].min() < -0.01
-    assert (found.actual < found.conservative).all()
+    assert results.worst[1:].min() > -1e-9
+    assert results.worst[0].min() < -0.01
+    assert (results.actual < results.conservative).all()
 
 
 @pytest.mark.parametrize(
@@ -293,7 +293,7 @@ def test_inverse_covariance_intersection_does_not() -> None:
 def test_squared_error_is_the_actual_trace_under_random_requests_only(fusion: str) -> None:
     spread = f"random:rate={'/'.join(map(str, RATES))}"
     for policy, equal in ((spread, True), ("event", False)):
-        found = run(policy, 80, 200 if fusion == "ci" else 600, fusion=fusion)
-        difference = found.mse - found.actual
+        results = run(policy, 80, 200 if fusion == "ci" else 600, fusion=fusion)
+        difference = results.mse - results.actual
         error = difference.std(ddof=1) / math.sqrt(len(difference))
         assert (abs(difference.mean()) <= 4 * error) == equal

@@ -13,9 +13,9 @@ from training_configs import ENV, small_config
 import fusion_gym
 from fusion_gym.agents.training import run
 from fusion_gym.agents.training.algorithms import TABLE
-from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
-from fusion_gym.agents.training.counterfactual import CounterfactualPPO, Rollout, _Step
+from fusion_gym.agents.training.counterfactual import CounterfactualPPO, RolloutBatch, _Step
 from fusion_gym.agents.training.decisions import Decisions
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
@@ -48,23 +48,23 @@ def test_choices_are_the_actions_of_the_space(name: str) -> None:
     rows, width = env.num_envs, 3 if decisions.binary else int(env.action_space.n)  # type: ignore[attr-defined]
     generator = torch.Generator().manual_seed(0)
     logits = torch.randn((rows, width), generator=generator)
-    found = decisions.log_probabilities(decisions.by_run(logits))
-    torch.testing.assert_close(found.exp().sum(-1), torch.ones(found.shape[:-1]))
+    values = decisions.log_probabilities(decisions.by_run(logits))
+    torch.testing.assert_close(values.exp().sum(-1), torch.ones(values.shape[:-1]))
     rng = np.random.default_rng(0)
     for _ in range(4):
-        chosen = rng.integers(0, decisions.choices, found.shape[:2])
-        actions = decisions.actions(chosen)
+        choice = rng.integers(0, decisions.choices, values.shape[:2])
+        actions = decisions.actions(choice)
         assert all(
             env.action_space.contains(action)
             for action in actions.astype(np.int8 if decisions.binary else np.int64)
         )
-        wanted = (
+        expected = (
             BERNOULLI(logits=logits).log_prob(torch.as_tensor(actions).float()).sum(-1)
             if decisions.binary
             else CATEGORICAL(logits=logits).log_prob(torch.as_tensor(actions))
         )
-        own = found.gather(-1, torch.as_tensor(chosen)[..., None]).sum((-1, -2))
-        torch.testing.assert_close(own, wanted.reshape(RUNS, -1).sum(-1))
+        own = values.gather(-1, torch.as_tensor(choice)[..., None]).sum((-1, -2))
+        torch.testing.assert_close(own, expected.reshape(RUNS, -1).sum(-1))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -77,19 +77,19 @@ def test_values_stand_at_the_choices_that_they_are_of(name: str) -> None:
     width = 3 if decisions.binary else int(env.action_space.n)  # type: ignore[attr-defined]
     logits = decisions.by_run(torch.zeros((env.num_envs, width)))
     factors = decisions.log_probabilities(logits).shape[1]
-    chosen = rng.integers(0, decisions.choices, (RUNS, factors))
+    action = rng.integers(0, decisions.choices, (RUNS, factors))
 
     def value_of(choices: Any) -> Any:
         return (worth * env.view.requests(decisions.actions(choices), RUNS)).sum(0)
 
-    wanted = decisions.alternatives(chosen)
-    stepped = (worth * wanted.transpose(1, 0, 2).reshape(sensors, -1)).sum(0).reshape(-1, RUNS)
-    found = decisions.arranged(chosen, value_of(chosen), stepped)
+    expected = decisions.alternatives(action)
+    stepped = (worth * expected.transpose(1, 0, 2).reshape(sensors, -1)).sum(0).reshape(-1, RUNS)
+    values = decisions.arranged(action, value_of(action), stepped)
     for factor in range(factors):
         for choice in range(decisions.choices):
-            other = chosen.copy()
+            other = action.copy()
             other[:, factor] = choice
-            np.testing.assert_array_equal(found[:, factor, choice], value_of(other))
+            np.testing.assert_array_equal(values[:, factor, choice], value_of(other))
 
 
 def test_where_sensors_decide_a_run_is_worth_the_sum_of_its_rows() -> None:
@@ -101,15 +101,15 @@ def test_where_sensors_decide_a_run_is_worth_the_sum_of_its_rows() -> None:
     for _ in range(3):
         with torch.no_grad():
             apart = predict(torch.as_tensor(rows)).numpy().reshape(RUNS, 3)
-        found = model._value(model._decisions.by_run(rows))
-        np.testing.assert_allclose(found, apart.sum(1), rtol=1e-5)
-        chosen = np.random.default_rng(0).integers(0, 2, (RUNS, 3))
+        values = model._value(model._decisions.by_run(rows))
+        np.testing.assert_allclose(values, apart.sum(1), rtol=1e-5)
+        choice = np.random.default_rng(0).integers(0, 2, (RUNS, 3))
         before = env.batch.branch()
-        actions = model._decisions.actions(chosen)
-        _, branched = env.step_alternatives(actions, model._decisions.alternatives(chosen))
+        actions = model._decisions.actions(choice)
+        _, branched = env.step_alternatives(actions, model._decisions.alternatives(choice))
         beyond = model._beyond(branched.observation)
         for sensor in range(3):
-            flipped = chosen.T == 1
+            flipped = choice.T == 1
             flipped[sensor] ^= True
             branch = before.branch()
             branch.step(flipped, env.batch.normals())
@@ -168,7 +168,7 @@ def test_returns_and_advantages_are_those_of_the_definition() -> None:
         for place in (2, 1, 0):
             step = steps[place]
             mean = [
-                (np.exp(step.old[run_, i].numpy()) * step.found[run_, i]).sum() for i in range(3)
+                (np.exp(step.old[run_, i].numpy()) * step.values[run_, i]).sum() for i in range(3)
             ]
             own = 0.0
             if ahead is not None and not step.dones[run_]:
@@ -178,8 +178,8 @@ def test_returns_and_advantages_are_those_of_the_definition() -> None:
             np.testing.assert_allclose(rollout.surplus[row], own, rtol=1e-5, atol=1e-7)
             np.testing.assert_allclose(rollout.returns[row], ahead, rtol=1e-5)
             for i in range(3):
-                wanted = step.found[run_, i] - mean[i]
-                np.testing.assert_allclose(rollout.advantages[row, i], wanted, rtol=1e-4, atol=1e-6)
+                target = step.values[run_, i] - mean[i]
+                np.testing.assert_allclose(rollout.advantages[row, i], target, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["all", "flips", "local"])
@@ -197,20 +197,20 @@ def test_the_first_step_climbs_the_expected_value(name: str) -> None:
     old = decisions.log_probabilities(model._logits(observations, None)).detach()
     values = torch.randn(old.shape, generator=generator)
     surplus = torch.randn(6, generator=generator)
-    chosen = torch.randint(0, decisions.choices, old.shape[:2], generator=generator)
+    choice = torch.randint(0, decisions.choices, old.shape[:2], generator=generator)
     mean = (old.exp() * values).sum(-1, keepdim=True)
-    rollout = Rollout(
-        observations, None, chosen, old, values - mean, surplus, torch.zeros(6), torch.zeros(6)
+    rollout = RolloutBatch(
+        observations, None, choice, old, values - mean, surplus, torch.zeros(6), torch.zeros(6)
     )
     loss, parts = model._loss(rollout, torch.arange(6), 0.5, 0.2)
     assert float(parts["clip_fraction"]) == 0.0
     new = decisions.log_probabilities(model._logits(observations, None))
     expected = (new.exp() * values).sum((-1, -2)).mean() / 0.5
-    path = (new.gather(-1, chosen[..., None]).sum((-1, -2)) * surplus).mean() / 0.5
+    path = (new.gather(-1, choice[..., None]).sum((-1, -2)) * surplus).mean() / 0.5
     weights = list(model.policy.action_net.parameters())
-    one = torch.autograd.grad(-loss, weights)
+    single = torch.autograd.grad(-loss, weights)
     two = torch.autograd.grad(expected + path, weights)
-    for left, right in zip(one, two, strict=True):
+    for left, right in zip(single, two, strict=True):
         torch.testing.assert_close(left, right, rtol=1e-4, atol=1e-6)
 
 
@@ -234,7 +234,7 @@ def test_its_models_are_ordinary_ones(
         tmp_path, kind, environment={"id": ENV, "options": options, **where},
         training={"timesteps": 1024, "num_envs": 8, **training},
     )  # fmt: skip
-    experiment = load(Experiment, config)
+    experiment = load_checked(Experiment, config)
     assert run.train(experiment, quiet=True)["finished"]
     model = Path(experiment.output) / "final_model.zip"
     priced = options | ({"cost_weight": 0.03} if "price_range" in options else {})
@@ -247,8 +247,8 @@ def test_its_models_are_ordinary_ones(
     loaded = plain.load(model, device="cpu")  # type: ignore[attr-defined]
     for name, weight in loaded.policy.state_dict().items():
         assert torch.equal(policy.model.policy.state_dict()[name], weight)
-    found = run_episodes(task, policy, 4, 0)
-    assert np.isfinite(found.mse).all()
+    results = run_episodes(task, policy, 4, 0)
+    assert np.isfinite(results.mse).all()
 
 
 def test_flips_of_one_number_are_refused(tmp_path: Path) -> None:
@@ -263,7 +263,7 @@ def test_flips_of_one_number_are_refused(tmp_path: Path) -> None:
             algorithm={"name": "counterfactual_ppo", "alternatives": wrong},
         )  # fmt: skip
         with pytest.raises(ConfigurationError, match=f"alternatives = '{wrong}' .*{reason}"):
-            run.train(load(Experiment, config), quiet=True)
+            run.train(load_checked(Experiment, config), quiet=True)
 
 
 def test_it_needs_an_environment_that_can_branch() -> None:
@@ -278,7 +278,7 @@ def test_an_error_filter_needs_an_error_that_uses_it(tmp_path: Path, filter_: st
     error = {"error": "mismatch"} if filter_ is None else {}
     config = small_config(tmp_path, "ppo", training=training | error)
     with pytest.raises(ConfigurationError, match="filter"):
-        run.train(load(Experiment, config), quiet=True)
+        run.train(load_checked(Experiment, config), quiet=True)
 
 
 def test_it_learns_what_ppo_does_not_see_yet(tmp_path: Path) -> None:
@@ -296,7 +296,7 @@ def test_it_learns_what_ppo_does_not_see_yet(tmp_path: Path) -> None:
             training={"timesteps": 10_000, "num_envs": 64, "error": "mismatch"},
             validation={"every": 10_000, "episodes": 4}, output=str(tmp_path / kind),
         )  # fmt: skip
-        run.train(load(Experiment, config), quiet=True)
+        run.train(load_checked(Experiment, config), quiet=True)
         policy = make_policy(f"model:{tmp_path / kind / 'final_model.zip'}", task)
         returns[kind] = run_episodes(task, policy, 100, 0).returns.mean()
     chance = run_episodes(task, make_policy("random:rate=0.06", task), 100, 0).returns.mean()

@@ -58,8 +58,8 @@ def test_the_trace_is_optimal_and_the_formulas_hold(rule: str, size: int, kind: 
         assert best * (1 - 1e-8) <= np.trace(p) <= best * (1 + 1e-6)
         unit = np.sqrt(np.diag(a))
         units = unit[:, None] * unit
-        wanted = combined(rule, weight, a, b) / units
-        np.testing.assert_allclose(p / units, wanted, rtol=1e-7, atol=1e-8 * np.abs(wanted).max())
+        target = combined(rule, weight, a, b) / units
+        np.testing.assert_allclose(p / units, target, rtol=1e-7, atol=1e-8 * np.abs(target).max())
         inside = np.linalg.inv(b)
         if rule == "ici":
             inside = inside - (1 - weight) * np.linalg.inv(weight * a + (1 - weight) * b)
@@ -104,8 +104,8 @@ def test_a_covariance_that_is_none_spoils_only_its_own_lane(rule: str) -> None:
         warnings.simplefilter("error")
         spoiled = RULES[rule](mean[0], covariance[0], mean[1], covariance[1])
     assert np.all(np.isnan(spoiled.covariance[..., 1]))
-    for one, other in zip(parts(spoiled), parts(clean), strict=True):
-        assert np.array_equal(one[..., [0, 2]], other[..., [0, 2]])
+    for first, other in zip(parts(spoiled), parts(clean), strict=True):
+        assert np.array_equal(first[..., [0, 2]], other[..., [0, 2]])
 
 
 def actual(fused: Any, first: Array, second: Array, cross: Array) -> Array:
@@ -195,8 +195,8 @@ def test_information_fusion_is_the_optimum_for_independent_errors(kind: str) -> 
             whiten[2 * s : 2 * s + 2, 2 * s : 2 * s + 2] = np.linalg.inv(root)
         unit = np.sqrt(np.diag(covariance[0, :, :, run]))
         left, right = whiten @ design * unit, whiten @ mean[..., run].ravel()
-        wanted = np.linalg.lstsq(left, right, rcond=None)[0]
-        np.testing.assert_allclose(fused_mean[:, run] / unit, wanted, rtol=1e-6)
+        expected = np.linalg.lstsq(left, right, rcond=None)[0]
+        np.testing.assert_allclose(fused_mean[:, run] / unit, expected, rtol=1e-6)
         units = unit[:, None] * unit
         np.testing.assert_allclose(
             fused[..., run] / units, np.linalg.inv(left.T @ left), rtol=1e-6, atol=1e-9

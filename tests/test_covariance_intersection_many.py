@@ -57,8 +57,8 @@ def test_many_estimates_reach_the_optimum(count: int, size: int, kind: str) -> N
         gradient = [np.trace(p @ np.linalg.inv(c) @ p) for c in each]
         assert max(gradient) - np.trace(p) <= 1.1e-6 * np.trace(p)
         unit = np.sqrt(np.diag(p))
-        wanted = np.sum([part @ mean[s, :, run] for s, part in enumerate(parts)], axis=0)
-        np.testing.assert_allclose(fused_mean[:, run] / unit, p @ wanted / unit, atol=1e-7)
+        expected = np.sum([part @ mean[s, :, run] for s, part in enumerate(parts)], axis=0)
+        np.testing.assert_allclose(fused_mean[:, run] / unit, p @ expected / unit, atol=1e-7)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -67,8 +67,8 @@ def test_of_two_estimates_the_many_form_is_the_pair(size: int, kind: str) -> Non
     mean, covariance = estimates(kind, 2, size, 60)
     pair = covariance_intersection(mean[0], covariance[0], mean[1], covariance[1])
     _, fused, weights = many(mean, covariance)
-    wanted = np.einsum("iiN->N", pair.covariance)
-    np.testing.assert_allclose(np.einsum("iiN->N", fused), wanted, rtol=1e-6)
+    expected = np.einsum("iiN->N", pair.covariance)
+    np.testing.assert_allclose(np.einsum("iiN->N", fused), expected, rtol=1e-6)
     np.testing.assert_allclose(weights[0], pair.weights[0], atol=2e-3)
 
 
@@ -111,13 +111,13 @@ def test_the_gap_closes_for_alike_and_for_extreme_estimates(
     allowed = 1.1e-6 if count > 2 else 1e-9  # of more than two the search ends at a gap
     if count > 2:
         assert np.all(gap(covariance, fused) <= allowed)
-    alone = np.einsum("siiN->sN", covariance)
-    assert np.all(np.einsum("iiN->N", fused) <= alone.min(0) * (1 + allowed))
+    single_values = np.einsum("siiN->sN", covariance)
+    assert np.all(np.einsum("iiN->N", fused) <= single_values.min(0) * (1 + allowed))
     for run in (0, runs - 1):
-        one = slice(run, run + 1)
-        single = many(mean[..., one], covariance[..., one])
-        np.testing.assert_array_equal(single[1], fused[..., one])
-        np.testing.assert_array_equal(single[2], weights[:, one])
+        lane = slice(run, run + 1)
+        single = many(mean[..., lane], covariance[..., lane])
+        np.testing.assert_array_equal(single[1], fused[..., lane])
+        np.testing.assert_array_equal(single[2], weights[:, lane])
 
 
 def test_lanes_of_every_number_of_active_estimates_stand_side_by_side() -> None:
@@ -136,10 +136,10 @@ def test_lanes_of_every_number_of_active_estimates_stand_side_by_side() -> None:
     assert set(active[:, ~broken].sum(0)) == {1, 2, 3, 4}
     assert np.all(batch[2][~active] == 0.0)
     for run in range(120):
-        one = slice(run, run + 1)
-        alone = many(mean[..., one], covariance[..., one], active[:, one])
-        for single, batched in zip(alone, batch, strict=True):
-            np.testing.assert_array_equal(single, batched[..., one])
+        lane = slice(run, run + 1)
+        single_values = many(mean[..., lane], covariance[..., lane], active[:, lane])
+        for single, batched in zip(single_values, batch, strict=True):
+            np.testing.assert_array_equal(single, batched[..., lane])
 
 
 @pytest.mark.parametrize("count", [3, 4])

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 import fusion_gym
-from fusion_gym.agents.training.counterfactual import CounterfactualPPO, Rollout
+from fusion_gym.agents.training.counterfactual import CounterfactualPPO, RolloutBatch
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 
 ENV = "fusion_gym/TobitOscillator-v0"
@@ -29,16 +29,16 @@ def test_the_surrogate_is_clipped_from_below() -> None:
     old = (new + torch.randn(new.shape, generator=generator)).log_softmax(-1)
     advantages = torch.randn(new.shape, generator=generator)
     surplus = torch.randn(6, generator=generator)
-    chosen = torch.randint(0, decisions.choices, new.shape[:2], generator=generator)
-    rollout = Rollout(
-        observations, None, chosen, old, advantages, surplus, torch.zeros(6), torch.zeros(6)
+    choice = torch.randint(0, decisions.choices, new.shape[:2], generator=generator)
+    rollout = RolloutBatch(
+        observations, None, choice, old, advantages, surplus, torch.zeros(6), torch.zeros(6)
     )
     loss, _ = model._loss(rollout, torch.arange(6), 1.0, 0.2)
 
     def clipped(ratio: Any, credit: Any) -> Any:
         return np.where(credit > 0.0, np.minimum(ratio, 1.2), np.maximum(ratio, 0.8)) * credit
 
-    ratio, taken = (new - old).exp().numpy(), (new - old).gather(-1, chosen[..., None])
+    ratio, taken = (new - old).exp().numpy(), (new - old).gather(-1, choice[..., None])
     gain = (old.exp().numpy() * clipped(ratio, advantages.numpy())).sum((-1, -2))
     late = clipped(taken.sum((-1, -2)).exp().numpy(), surplus.numpy())
     np.testing.assert_allclose(float(loss.detach()), -(gain + late).mean(), rtol=1e-4)

@@ -11,7 +11,7 @@ import pytest
 from command_runs import call
 from training_configs import small_config
 
-from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.agents.training.models import make_env
 from fusion_gym.agents.training.run import train
@@ -34,32 +34,32 @@ def measured(
     episodes: int = 60, seed: int = 0,
 ) -> dict[str, CrossTerm]:  # fmt: skip
     task = make_task(env_id, **options)
-    made = {name: make_policy(name, task) for name in policies}
-    return cross_terms(task, reference_system(env_id, options, filter), made, episodes, seed)
+    built = {name: make_policy(name, task) for name in policies}
+    return cross_terms(task, reference_system(env_id, options, filter), built, episodes, seed)
 
 
 def test_error_and_floor_are_what_an_evaluation_finds_and_the_parts_add_up() -> None:
     """Independent of how they are measured: the error is the policy's MSE, the floor that of a
     centre to which everything is delivered."""
-    found = measured(OSCILLATOR, ORDINARY, ["random:rate=0.2"])["random:rate=0.2"]
+    result = measured(OSCILLATOR, ORDINARY, ["random:rate=0.2"])["random:rate=0.2"]
     task = make_task(OSCILLATOR, **ORDINARY)
     policy = run_episodes(task, make_policy("random:rate=0.2", task), 60, 0)
     free = make_task(OSCILLATOR, **ORDINARY, tokens="unlimited")
     everything = run_episodes(free, make_policy("always", free), 60, 0)
-    assert found.error == pytest.approx(float(policy.mse.mean()))
-    assert found.rate == pytest.approx(float(policy.rate.mean()))
-    assert found.floor == pytest.approx(float(everything.mse.mean()))
-    parts = found.floor + found.mismatch + found.share.mean * found.error
-    assert parts == pytest.approx(found.error)
-    assert found.share.low < found.share.mean < found.share.high
+    assert result.error == pytest.approx(float(policy.mse.mean()))
+    assert result.rate == pytest.approx(float(policy.rate.mean()))
+    assert result.floor == pytest.approx(float(everything.mse.mean()))
+    parts = result.floor + result.mismatch + result.share.mean * result.error
+    assert parts == pytest.approx(result.error)
+    assert result.share.low < result.share.mean < result.share.high
 
 
 def test_the_weights_are_the_rewards() -> None:
     task = make_task(OSCILLATOR, **ORDINARY, state_weights=[2.0, 0.0])
     system = reference_system(OSCILLATOR, ORDINARY)
-    found = cross_terms(task, system, {"a": make_policy("always", task)}, 20, 0)["a"]
+    requests = cross_terms(task, system, {"a": make_policy("always", task)}, 20, 0)["a"]
     results = run_episodes(task, make_policy("always", task), 20, 0)
-    assert found.error == pytest.approx(2.0 * float(results.squared_error[:, 0].mean()))
+    assert requests.error == pytest.approx(2.0 * float(results.squared_error[:, 0].mean()))
 
 
 @pytest.mark.parametrize(
@@ -69,20 +69,20 @@ def test_the_weights_are_the_rewards() -> None:
         (INPUT, {"tokens": "limited", "token_rate": 2, "horizon": 60}, None, -0.13),
     ],
 )
-def test_where_the_filter_is_approximate_the_cross_term_is_told(
+def test_where_the_filter_is_approximate_the_cross_term_is_reported(
     env_id: str, options: dict[str, Any], filter: str | None, share: float
 ) -> None:
-    found = measured(env_id, options, ["always"], filter, episodes=150)["always"]
-    assert not found.compatible
-    assert found.share.mean == pytest.approx(share, abs=0.08)
-    assert found.share.low <= found.share.mean <= found.share.high < 0.0
+    result = measured(env_id, options, ["always"], filter, episodes=150)["always"]
+    assert not result.compatible
+    assert result.share.mean == pytest.approx(share, abs=0.08)
+    assert result.share.low <= result.share.mean <= result.share.high < 0.0
 
 
-def test_where_the_filter_is_good_none_is_told_under_any_policy() -> None:
+def test_where_the_filter_is_good_none_is_reported_under_any_policy() -> None:
     task = make_task(OSCILLATOR, **ORDINARY)
-    found = measured(OSCILLATOR, ORDINARY, usual_policies(task), episodes=150)
-    assert all(part.compatible for part in found.values())
-    assert found["random:rate=0.03"].rate < found["random:rate=0.3"].rate < 0.3
+    result = measured(OSCILLATOR, ORDINARY, usual_policies(task), episodes=150)
+    assert all(part.compatible for part in result.values())
+    assert result["random:rate=0.03"].rate < result["random:rate=0.3"].rate < 0.3
     exact = measured("fusion_gym/RemoteEstimation-v0", {"horizon": 20}, ["always"])["always"]
     assert (exact.floor, exact.share) == (0.0, Interval(0.0, 0.0, 0.0))
 
@@ -95,26 +95,26 @@ def test_what_is_beside_an_episode_does_not_matter(monkeypatch: pytest.MonkeyPat
 
 
 def test_more_policies_and_a_higher_level_make_wider_intervals() -> None:
-    def width(found: dict[str, CrossTerm]) -> float:
-        return found["always"].share.high - found["always"].share.low
+    def width(terms: dict[str, CrossTerm]) -> float:
+        return terms["always"].share.high - terms["always"].share.low
 
-    alone = measured(OSCILLATOR, ORDINARY, ["always"])
-    assert width(measured(OSCILLATOR, ORDINARY, ["always", "never", "random"])) > width(alone)
+    single = measured(OSCILLATOR, ORDINARY, ["always"])
+    assert width(measured(OSCILLATOR, ORDINARY, ["always", "never", "random"])) > width(single)
     task = make_task(OSCILLATOR, **ORDINARY)
     system, policies = (
         reference_system(OSCILLATOR, ORDINARY),
         {"always": make_policy("always", task)},
     )
-    assert width(cross_terms(task, system, policies, 60, 0, level=0.999)) > width(alone)
-    assert width(cross_terms(task, system, policies, 60, 0)) == width(alone)
+    assert width(cross_terms(task, system, policies, 60, 0, level=0.999)) > width(single)
+    assert width(cross_terms(task, system, policies, 60, 0)) == width(single)
 
 
-def test_the_worst_is_one_that_is_told_from_zero() -> None:
+def test_the_worst_is_one_that_is_reported_from_zero() -> None:
     def part(low: float, high: float) -> CrossTerm:
         return CrossTerm(0.1, 1.0, 0.5, 0.5, Interval((low + high) / 2, low, high))
 
-    found = {"wide": part(-1.0, 3.0), "told": part(-0.2, -0.1), "less": part(0.01, 0.02)}
-    assert worst(found)[0] == "told"
+    result = {"wide": part(-1.0, 3.0), "broadcast": part(-0.2, -0.1), "less": part(0.01, 0.02)}
+    assert worst(result)[0] == "broadcast"
     assert worst({"near": part(-0.2, 0.1), "far": part(-0.2, 0.4)})[0] == "far"
 
 
@@ -154,7 +154,9 @@ def test_the_command_takes_a_trainings_environment_and_filter(tmp_path: Path) ->
 def mismatch_config(folder: Path, error: str = "mismatch", **options: Any) -> Experiment:
     environment = {"id": OSCILLATOR, "options": PAPER | options}
     training = {"timesteps": 128, "num_envs": 8, "error": error, "error_filter": "paper"}
-    return load(Experiment, small_config(folder, environment=environment, training=training))
+    return load_checked(
+        Experiment, small_config(folder, environment=environment, training=training)
+    )
 
 
 def test_a_training_on_the_mismatch_is_warned_once_where_that_is_not_the_error(
@@ -162,9 +164,9 @@ def test_a_training_on_the_mismatch_is_warned_once_where_that_is_not_the_error(
 ) -> None:
     experiment = mismatch_config(tmp_path)
     train(experiment)
-    told = [line for line in capsys.readouterr().err.splitlines() if "cross term" in line]
-    assert len(told) == 1
-    assert told[0].startswith("warning: training.error = 'mismatch' leaves out a cross term of -")
+    text = [line for line in capsys.readouterr().err.splitlines() if "cross term" in line]
+    assert len(text) == 1
+    assert text[0].startswith("warning: training.error = 'mismatch' leaves out a cross term of -")
     train(experiment.changed(None, timesteps=256), resume=True)
     assert "cross term" not in capsys.readouterr().err
 
@@ -173,12 +175,12 @@ def test_a_memory_that_is_there_is_the_reference_and_changes_no_reward(tmp_path:
     options = ORDINARY | {"memory": True, "memory_filter": "adf"}
     training = {"timesteps": 64, "num_envs": 4, "error": "mismatch"}
     environment = {"id": OSCILLATOR, "options": options}
-    experiment = load(
+    experiment = load_checked(
         Experiment, small_config(tmp_path, environment=environment, training=training)
     )
     task = make_task(OSCILLATOR, **options)
     env = make_env(experiment, task)
-    assert env.batch.reference is task.shadow
+    assert env.batch.reference is task.memory_system
 
     def rewards(env: Any) -> list[Any]:
         env.seed(5)

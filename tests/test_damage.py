@@ -91,13 +91,13 @@ def call(command: str, words: list[str]) -> str:
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, int], Path]:
     """Folders of finished runs by command and seed, made when they are asked for."""
-    made: dict[tuple[str, int], Path] = {}
+    jobs: dict[tuple[str, int], Path] = {}
 
     def find(command: str, seed: int) -> Path:
-        if (command, seed) not in made:
-            made[command, seed] = folder = tmp_path_factory.mktemp(command)
+        if (command, seed) not in jobs:
+            jobs[command, seed] = folder = tmp_path_factory.mktemp(command)
             assert call(command, arguments(command, folder, seed)) == ""
-        return made[command, seed]
+        return jobs[command, seed]
 
     return find
 
@@ -115,7 +115,7 @@ def cases() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize(("command", "file", "kind"), list(cases()))
-def test_a_damaged_file_is_told_or_mended(
+def test_a_damaged_file_is_reported_or_mended(
     runs: Callable[[str, int], Path], tmp_path: Path, command: str, file: str, kind: str
 ) -> None:
     folder = tmp_path / "run"
@@ -125,14 +125,14 @@ def test_a_damaged_file_is_told_or_mended(
     damaged = folder / file
     damaged.write_bytes(DAMAGES[kind](damaged.read_bytes(), other.read_bytes()))
     before = contents(folder)
-    said = call(command, words if command == "tune" else [*words, "--resume"])
-    if not said:
+    output = call(command, words if command == "tune" else [*words, "--resume"])
+    if not output:
         assert file not in READ[command] or kind == "a changed byte", "it went unnoticed"
         assert meaning(folder) == meaning(runs(command, 0))
         return
-    assert file in READ[command], said
-    assert said.startswith("error: ")
-    assert "\n" not in said
+    assert file in READ[command], output
+    assert output.startswith("error: ")
+    assert "\n" not in output
     assert contents(folder) == before, "the rest is untouched"
 
 
@@ -144,7 +144,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def meaning(folder: Path) -> dict[str, Any]:
     """What the results of a run say, without what says where and how fast it was."""
-    found: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for path in sorted(folder.rglob("*.json*")):
         lines = [json.loads(line) for line in path.read_text().splitlines()] if (
             path.suffix == ".jsonl"
@@ -152,5 +152,5 @@ def meaning(folder: Path) -> dict[str, Any]:
         for line in lines:
             for key in ("seconds", "steps_per_second"):
                 line.pop(key, None)
-        found[str(path.relative_to(folder))] = json.dumps(lines).replace(str(folder), "")
-    return found
+        result[str(path.relative_to(folder))] = json.dumps(lines).replace(str(folder), "")
+    return result

@@ -20,12 +20,12 @@ DECLARED = [part for kind in parts.KIND_NAMES for part in parts.parts(kind)]
 
 @pytest.mark.parametrize("part", DECLARED, ids=lambda part: part.name)
 def test_a_declaration_is_complete(part: parts.Part) -> None:
-    found = read(part.owner)
-    wanted = {"Equation", "Assumes", "Source"} | ({"Example"} if part.kind else set())
-    assert found.summary.endswith((".", ":"))
-    assert wanted <= found.labelled.keys()
-    assert all(found.labelled[label].strip() for label in wanted)
-    assert found.labelled["Equation"].count("$$") in range(2, 99, 2)
+    result = read(part.owner)
+    expected = {"Equation", "Assumes", "Source"} | ({"Example"} if part.kind else set())
+    assert result.summary.endswith((".", ":"))
+    assert expected <= result.labelled.keys()
+    assert all(result.labelled[label].strip() for label in expected)
+    assert result.labelled["Equation"].count("$$") in range(2, 99, 2)
 
 
 @pytest.mark.parametrize("name", [*policy_names("rule"), *policy_names("reference")])
@@ -43,7 +43,7 @@ def test_rows_say_what_they_mean() -> None:
     assert all(row.source for row in TABLE.values())
 
 
-def test_sections_are_told_apart() -> None:
+def test_sections_are_reported_apart() -> None:
     def bare() -> None:
         """What it *is*: all of it.
 
@@ -58,8 +58,8 @@ def test_sections_are_told_apart() -> None:
         nowhere.
         """
 
-    found = read(bare)
-    assert found.summary == "What it *is*: all of it."
-    assert found.text.endswith("More.")
-    assert found.arguments == {"a": "one thing in two lines.", "b": "another."}
-    assert found.labelled["Source"] == "nobody;\nnowhere."
+    result = read(bare)
+    assert result.summary == "What it *is*: all of it."
+    assert result.text.endswith("More.")
+    assert result.arguments == {"a": "one thing in two lines.", "b": "another."}
+    assert result.labelled["Source"] == "nobody;\nnowhere."

@@ -12,7 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from training_configs import ENV, SMALL, read_records, small_config
 
 from fusion_gym.agents.training.algorithms import TABLE
-from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.agents.training.diagnosis import by_price, prices_of
 from fusion_gym.agents.training.run import train
@@ -26,25 +26,25 @@ COUNTERFACTUAL = {"n_steps": 8, "batch_size": 32, "n_epochs": 1}
 
 def trained(folder: Path, kind: str, local: bool = False, **options: Any) -> Experiment:
     """A short training on drawn prices."""
-    chosen = SMALL.get(kind, {"name": kind, **COUNTERFACTUAL})
+    choice = SMALL.get(kind, {"name": kind, **COUNTERFACTUAL})
     if TABLE[kind].discrete_only:
         options["action"] = "discrete"
     environment = {"id": ENV, "options": FRONT | options, "local": local}
     training = {"timesteps": 512, "num_envs": 8, "price_exponent": 0.5}
     validation = {"every": 256, "episodes": 40}
     config = small_config(
-        folder, environment=environment, algorithm=chosen, training=training, validation=validation
+        folder, environment=environment, algorithm=choice, training=training, validation=validation
     )
-    experiment = load(Experiment, config)
+    experiment = load_checked(Experiment, config)
     train(experiment, quiet=True)
     return experiment
 
 
 def lines(folder: Path) -> dict[str, list[float]]:
     """All values of every line that TensorBoard shows."""
-    found = EventAccumulator(str(folder / "tensorboard"))
-    found.Reload()
-    return {tag: [e.value for e in found.Scalars(tag)] for tag in found.Tags()["scalars"]}
+    result = EventAccumulator(str(folder / "tensorboard"))
+    result.Reload()
+    return {tag: [e.value for e in result.Scalars(tag)] for tag in result.Tags()["scalars"]}
 
 
 @pytest.mark.parametrize(
@@ -55,21 +55,21 @@ def test_traffic_entropy_and_validation_at_each_price_are_shown(
     tmp_path: Path, kind: str, local: bool
 ) -> None:
     trained(tmp_path, kind, local, tokens="limited", token_rate=0.5, initial_tokens=0.0)
-    shown = lines(tmp_path / "run")
-    requested, granted = shown["rollout/requested"], shown["rollout/granted"]
+    visible = lines(tmp_path / "run")
+    requested, granted = visible["rollout/requested"], visible["rollout/granted"]
     assert all(0.0 <= few < many < 1.0 for few, many in zip(granted, requested, strict=True))
     assert max(granted) > 0.0
     assert max(granted) <= 0.5 / 3 / 3 + 0.05  # tokens a step, cost, sensors
     if kind != "dqn":
-        entropy = shown["train/entropy_per_sensor"]
+        entropy = visible["train/entropy_per_sensor"]
         assert all(0.0 < value <= math.log(2) + 1e-6 for value in entropy)
     if kind == "counterfactual_ppo":
         for name in ("advantage_spread", "surplus_share", "explained_variance"):
-            assert shown[f"train/{name}"]
+            assert visible[f"train/{name}"]
     for part in read_records(tmp_path / "run")[-1]["prices"]:
         where = f"price_{part['low']:.3g}-{part['high']:.3g}"
         for key in ("mse", "rate"):
-            assert shown[f"validation/{key}_{where}"][-1] == pytest.approx(part[key])
+            assert visible[f"validation/{key}_{where}"][-1] == pytest.approx(part[key])
 
 
 def test_the_records_at_each_price_are_those_of_the_whole(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_the_records_at_each_price_are_those_of_the_whole(tmp_path: Path) -> Non
             assert mean == pytest.approx(record[key])
 
 
-def test_episodes_are_told_apart_by_their_price() -> None:
+def test_episodes_are_reported_apart_by_their_price() -> None:
     """Against each episode by itself, with a rule that asks for less at higher prices."""
     task = make_task(ENV, **FRONT)
     prices = prices_of(task, 30, 7)

@@ -18,11 +18,11 @@ from fusion_gym.agents import report
 from fusion_gym.agents.output.files import read_json
 from fusion_gym.agents.suite import envelope_table, learning_table
 from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.found import read_results
 from fusion_gym.agents.suite.learning import load_learning
-from fusion_gym.agents.suite.report_pages import documented
+from fusion_gym.agents.suite.report_pages import update_pages
 from fusion_gym.agents.suite.robust_table import write_table
 from fusion_gym.agents.suite.robustness import load_robustness
+from fusion_gym.agents.suite.setting_results import read_results
 from fusion_gym.envs import pages
 from fusion_gym.envs.option_text import options_in
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
@@ -109,12 +109,12 @@ def test_files_and_names_of_the_library_that_the_texts_name_exist() -> None:
 
 
 def test_the_committed_report_says_what_the_results_say() -> None:
-    found = read_results(ROOT / "results")
+    settings = read_results(ROOT / "results")
     written = (ROOT / "results" / "README.md").read_text()
-    assert written == report.text_of(found, "fusion-gym benchmark")
+    assert written == report.text_of(settings, "fusion-gym benchmark")
     for path in (ROOT / "README.md", *DOCS):
         text = path.read_text()
-        assert documented(text, found, ROOT / "results") == text, path.name
+        assert update_pages(text, settings, ROOT / "results") == text, path.name
 
 
 def test_the_committed_table_of_perturbed_cases_is_that_of_the_verdicts(tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_the_committed_table_of_perturbed_cases_is_that_of_the_verdicts(tmp_path
     command = re.search(r"^Made by `(.*?)`", written, re.M)
     assert command is not None
     suite = {setting.name: setting.title for setting in load_suite("benchmark").settings}
-    titles = {one.setting: suite[one.setting] for one in load_robustness("robustness").settings}
+    titles = {item.setting: suite[item.setting] for item in load_robustness("robustness").settings}
     assert write_table(tmp_path, titles, command[1]).read_text() == written
     tried = {path.parts[-3] for path in folder.glob("*/*/verdict.json")}
     assert tried == set(titles)
@@ -133,8 +133,8 @@ def test_the_committed_table_of_perturbed_cases_is_that_of_the_verdicts(tmp_path
 def test_the_committed_envelopes_are_what_the_pages_say() -> None:
     results = ROOT / "results"
     written = (results / "envelopes" / "README.md").read_text()
-    assert written == envelope_table.text_of(results, "fusion-gym envelope")
-    missing = [line for line in envelope_table.headline_table(results) if line not in TEXTS]
+    assert written == envelope_table.envelope_text(results, "fusion-gym envelope")
+    missing = [line for line in envelope_table.envelope_headline(results) if line not in TEXTS]
     assert not missing
 
 
@@ -146,7 +146,7 @@ def test_the_committed_fronts_are_what_the_pages_say() -> None:
     written = (folder / "README.md").read_text()
     command = re.search("Made by `(.*)`;", written)
     assert command
-    assert written == learning_table.text_of(reports, command.group(1))
+    assert written == learning_table.learning_text(reports, command.group(1))
     missing = [line for line in learning_table.headline(reports) if line not in TEXTS]
     assert not missing
 
@@ -172,7 +172,7 @@ def test_every_option_and_entry_has_a_meaning_and_a_table(env_id: str) -> None:
 @pytest.mark.parametrize("path", DOCS, ids=lambda path: path.stem)
 def test_tables_in_the_docs_are_those_of_the_code(path: Path) -> None:
     text = path.read_text()
-    assert text == pages.documented(text), "run python -m fusion_gym.envs.pages docs/*.md"
+    assert text == pages.update_tables(text), "run python -m fusion_gym.envs.pages docs/*.md"
 
 
 def test_the_citation_is_of_this_version() -> None:

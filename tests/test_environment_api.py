@@ -51,18 +51,19 @@ def test_extreme_entries_are_clipped_to_their_bounds() -> None:
 
 
 @pytest.mark.parametrize(
-    ("package", "face"), [("stable_baselines3", "make_sb3_vec_env"), ("pettingzoo", "parallel_env")]
+    ("package", "interface"),
+    [("stable_baselines3", "make_sb3_vec_env"), ("pettingzoo", "parallel_env")],
 )
-def test_a_face_without_its_package_says_what_to_install(
-    package: str, face: str, monkeypatch: pytest.MonkeyPatch
+def test_a_interface_without_its_package_says_what_to_install(
+    package: str, interface: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module = {"make_sb3_vec_env": "sb3", "parallel_env": "parallel"}[face]
+    module = {"make_sb3_vec_env": "sb3", "parallel_env": "parallel"}[interface]
     monkeypatch.delitem(sys.modules, f"fusion_gym.envs.{module}", raising=False)
     for name in [name for name in sys.modules if name.partition(".")[0] == package]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'fusion-gym\[agents\]'$"):
-        getattr(fusion_gym, face)
+        getattr(fusion_gym, interface)
 
 
 def test_silence_costs_about_one_a_step() -> None:

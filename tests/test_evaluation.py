@@ -166,15 +166,15 @@ def test_interval_is_reproducible_and_narrows() -> None:
 
 
 def test_pairing_removes_the_noise_that_policies_share(task: Task) -> None:
-    one = evaluate(task, "innovation_threshold:threshold=1", 300)
+    results = evaluate(task, "innovation_threshold:threshold=1", 300)
     other = evaluate(task, "innovation_threshold:threshold=1.1", 300)
     elsewhere = evaluate(task, "innovation_threshold:threshold=1.1", 300, seed=5000)
-    paired, unpaired = paired_difference(one, other), paired_difference(one, elsewhere)
-    assert paired.mean == pytest.approx(np.mean(one.mse - other.mse))
+    paired, unpaired = paired_difference(results, other), paired_difference(results, elsewhere)
+    assert paired.mean == pytest.approx(np.mean(results.mse - other.mse))
     assert (paired.high - paired.low) < 0.5 * (unpaired.high - unpaired.low)
-    assert paired_difference(one, one) == (0.0, 0.0, 0.0)
+    assert paired_difference(results, results) == (0.0, 0.0, 0.0)
     with pytest.raises(ConfigurationError, match="episodes = 300 and 5"):
-        paired_difference(one, evaluate(task, "never", 5))
+        paired_difference(results, evaluate(task, "never", 5))
 
 
 clouds = st.lists(st.tuples(st.integers(0, 20), st.integers(1, 40)), min_size=1, max_size=12).map(

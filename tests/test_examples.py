@@ -30,9 +30,9 @@ def module(name: str) -> ModuleType:
     specification = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
     assert specification is not None
     assert specification.loader is not None
-    found = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(found)
-    return found
+    result = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(result)
+    return result
 
 
 def held(name: str) -> dict[str, Any]:
@@ -42,7 +42,7 @@ def held(name: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", ["vehicle", "tanks"])
-def test_it_runs_by_itself_and_keeps_its_budget(name: str, tmp_path: Path) -> None:
+def test_it_runs_local_and_keeps_its_budget(name: str, tmp_path: Path) -> None:
     """The script beside its file, here with shorter episodes."""
     content = held(name) | {"horizon": 12}
     (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
@@ -120,16 +120,16 @@ def test_the_tanks_are_johanssons() -> None:
 def test_where_limits_are_far_the_default_filter_still_learns() -> None:
     """The Tobit Kalman filter weighs reports by what it expects: here it hears nothing at all."""
     path = str(EXAMPLES / "vehicle.yaml")
-    given = held("vehicle")
-    del given["filter"]
-    task = fusion_gym.make_task(LINEAR, **given)
+    value = held("vehicle")
+    del value["filter"]
+    task = fusion_gym.make_task(LINEAR, **value)
     assert task.settings["filter"] == "adf"
     tobit = fusion_gym.make_task(LINEAR, system=path, filter="tobit")
     silent = run_episodes(tobit, make_policy("never", tobit), 50, 0)
     deaf = run_episodes(tobit, make_policy("always", tobit), 50, 0)
-    found = run_episodes(task, make_policy("always", task), 50, 0)
+    results = run_episodes(task, make_policy("always", task), 50, 0)
     assert deaf.mse.mean() == pytest.approx(silent.mse.mean(), rel=0.01)
-    assert found.mse.mean() < 0.3 * silent.mse.mean()
+    assert results.mse.mean() < 0.3 * silent.mse.mean()
 
 
 @pytest.mark.slow

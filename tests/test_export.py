@@ -27,7 +27,7 @@ from fusion_gym.agents.export import Export, export, spec
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.evaluation.onnx_check import agreement
+from fusion_gym.evaluation.onnx_check import onnx_agreement
 from fusion_gym.policies.base import owner_of
 from fusion_gym.policies.model import ModelPolicy, tag_model
 from fusion_gym.policies.onnx_card import onnx_card
@@ -58,7 +58,7 @@ MODELS: dict[str, tuple[Any, str, dict[str, Any], dict[str, Any]]] = {
 }
 
 
-def made(name: str) -> tuple[BaseAlgorithm, Task, bool]:
+def build_parts(name: str) -> tuple[BaseAlgorithm, Task, bool]:
     """A new model whose weights are far enough from zero that decisions differ."""
     kind, policy, options, arguments = MODELS[name]
     env = fusion_gym.make_sb3_vec_env(ENV, 2, **OPTIONS, **options)
@@ -69,8 +69,8 @@ def made(name: str) -> tuple[BaseAlgorithm, Task, bool]:
     return model, env.task, options.get("local", False)
 
 
-def asked(name: str) -> tuple[ModelPolicy, Task]:
-    model, task, local = made(name)
+def requests_at(name: str) -> tuple[ModelPolicy, Task]:
+    model, task, local = build_parts(name)
     return ModelPolicy(model, task, local=local), task
 
 
@@ -80,73 +80,73 @@ def written(agent: ModelPolicy, path: Path) -> DecisionGraph:
     return graph
 
 
-def told(path: Path) -> dict[str, Any]:
+def describe(path: Path) -> dict[str, Any]:
     """The metadata as a node reads it."""
     session = onnxruntime.InferenceSession(str(path))
-    found = dict(session.get_modelmeta().custom_metadata_map)
+    result = dict(session.get_modelmeta().custom_metadata_map)
     words = {"decides", "knows", "model", "environment", "algorithm", "observation_version"}
     words |= {"format", "fusion_gym_version"}
-    return found | {key: json.loads(found[key]) for key in found.keys() - words}
+    return result | {key: json.loads(result[key]) for key in result.keys() - words}
 
 
 def played(task: Task, decide: Callable[[Any], Any], owner: Any, runs: int = 30) -> Any:
     """Requests (steps, sensors, N) of whole episodes."""
-    batch, found = EpisodeBatch.seeded(task, runs, 3, owner), []
+    batch, result = EpisodeBatch.seeded(task, runs, 3, owner), []
     for _ in range(task.horizon):
-        found.append(decide(batch))
-        batch.step(found[-1])
-    return np.array(found)
+        result.append(decide(batch))
+        batch.step(result[-1])
+    return np.array(result)
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_the_file_decides_as_stable_baselines_does(name: str, tmp_path: Path) -> None:
     """Played by onnxruntime alone, on rows made by hand: the same requests in all steps."""
-    agent, task = asked(name)
+    agent, task = requests_at(name)
     path = tmp_path / "agent.onnx"
     graph = written(agent, path)
     session = onnxruntime.InferenceSession(str(path))
     view, memory = agent.view, {}
-    for one in session.get_inputs():
-        if one.name in ("hidden", "cell"):
-            shape = (one.shape[0], 30 * view.rows_per_run, one.shape[2])
-            memory[one.name] = np.zeros(shape, dtype=np.float32)
+    for item in session.get_inputs():
+        if item.name in ("hidden", "cell"):
+            shape = (item.shape[0], 30 * view.rows_per_run, item.shape[2])
+            memory[item.name] = np.zeros(shape, dtype=np.float32)
 
     def by_file(batch: EpisodeBatch) -> Any:
-        given = {"observation": view.rows(batch.observe())} | memory
+        arguments = {"observation": view.rows(batch.observe())} | memory
         if "grantable" in graph.inputs:
-            given["grantable"] = batch.grantable().T.reshape(len(given["observation"]), -1)
-        found = dict(zip(graph.outputs, session.run(None, given), strict=True))
-        memory.update({key: found[f"{key}_next"] for key in memory})
-        assert found["request"].dtype == np.int8
+            arguments["grantable"] = batch.grantable().T.reshape(len(arguments["observation"]), -1)
+        result = dict(zip(graph.outputs, session.run(None, arguments), strict=True))
+        memory.update({key: result[f"{key}_next"] for key in memory})
+        assert result["request"].dtype == np.int8
         if graph.choices is None:
-            np.testing.assert_array_equal(found["request"], found["probability"] > 0.5)
-        return found["request"].reshape(30, task.sensors).T == 1
+            np.testing.assert_array_equal(result["request"], result["probability"] > 0.5)
+        return result["request"].reshape(30, task.sensors).T == 1
 
     agent.reset(30)
-    wanted = played(task, lambda batch: agent(batch.signals()), owner_of(agent))
-    np.testing.assert_array_equal(played(task, by_file, owner_of(agent)), wanted)
-    assert 0.0 < wanted.mean() < 1.0
-    found = agreement(agent, graph, path, task, observations=500)
-    assert found.holds
-    assert 500 <= found.observations == found.episodes * 20 * view.rows_per_run
-    assert found.difference < 1e-4
+    expected = played(task, lambda batch: agent(batch.signals()), owner_of(agent))
+    np.testing.assert_array_equal(played(task, by_file, owner_of(agent)), expected)
+    assert 0.0 < expected.mean() < 1.0
+    result = onnx_agreement(agent, graph, path, task, observations=500)
+    assert result.holds
+    assert 500 <= result.observations == result.episodes * 20 * view.rows_per_run
+    assert result.difference < 1e-4
 
 
 def test_probabilities_are_those_that_the_agent_draws_with(tmp_path: Path) -> None:
     """The share of requests of 4,000 draws at one observation, within four deviations."""
     for name in ("ppo", "ppo_discrete", "maskable_single"):
-        agent, task = asked(name)
+        agent, task = requests_at(name)
         graph = written(agent, tmp_path / "agent.onnx")
         batch = EpisodeBatch.seeded(task, 1, 0)
         rows = np.repeat(agent.view.rows(batch.observe()), 4000, axis=0)
         masks = {}
-        given = {"observation": rows[:1]}
+        arguments = {"observation": rows[:1]}
         if "grantable" in graph.inputs:
             allowed = np.array([[True], [False], [True]])
             masks = {"action_masks": agent.view.masks(allowed.repeat(4000, axis=1))}
-            given["grantable"] = allowed.T
+            arguments["grantable"] = allowed.T
         session = onnxruntime.InferenceSession(str(tmp_path / "agent.onnx"))
-        probability = session.run(["probability"], given)[0][0]
+        probability = session.run(["probability"], arguments)[0][0]
         action, _ = agent.model.predict(rows, deterministic=False, **masks)
         drawn = agent.view.requests(action, 4000).mean(1)
         slack = 4.0 * np.sqrt(probability * (1.0 - probability) / 4000) + 1e-6
@@ -155,26 +155,28 @@ def test_probabilities_are_those_that_the_agent_draws_with(tmp_path: Path) -> No
             assert probability[1] == 0.0
 
 
-def test_another_file_is_told_apart(tmp_path: Path) -> None:
-    agent, task = asked("ppo")
-    other, _ = asked("ppo")
+def test_another_file_is_reported_apart(tmp_path: Path) -> None:
+    agent, task = requests_at("ppo")
+    other, _ = requests_at("ppo")
     with torch.no_grad():
         other.model.policy.action_net.bias.add_(torch.tensor([0.0, 0.3, 0.0]))
     written(other, tmp_path / "other.onnx")
-    found = agreement(agent, DecisionGraph(agent), tmp_path / "other.onnx", task, observations=500)
-    assert not found.holds
-    assert found.different > 0
-    assert found.difference == pytest.approx(0.3, abs=1e-3)
+    value = onnx_agreement(
+        agent, DecisionGraph(agent), tmp_path / "other.onnx", task, observations=500
+    )
+    assert not value.holds
+    assert value.different > 0
+    assert value.difference == pytest.approx(0.3, abs=1e-3)
 
 
 def test_what_lies_beyond_the_bounds_is_clipped_inside(tmp_path: Path) -> None:
-    agent, _ = asked("ppo")
+    agent, _ = requests_at("ppo")
     written(agent, tmp_path / "agent.onnx")
     session = onnxruntime.InferenceSession(str(tmp_path / "agent.onnx"))
     space = agent.view.space
     rows = np.random.default_rng(0).normal(0.0, 8.0, (50, *space.shape)).astype(np.float32)
     inside = np.clip(rows, space.low, space.high)
-    both = [session.run(["logits"], {"observation": given})[0] for given in (rows, inside)]
+    both = [session.run(["logits"], {"observation": value})[0] for value in (rows, inside)]
     np.testing.assert_array_equal(*both)
     assert (rows != inside).any()
 
@@ -185,12 +187,12 @@ def test_what_lies_beyond_the_bounds_is_clipped_inside(tmp_path: Path) -> None:
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """The command's own check, on fewer observations."""
-    shorter = functools.partial(agreement, observations=500)
+    shorter = functools.partial(onnx_agreement, observations=500)
     monkeypatch.setattr("fusion_gym.evaluation.onnx_export.agreement", shorter)
 
 
-def command(model: str, path: Path, *options: str, **given: Any) -> list[str]:
-    return export(Export(model, path, options=(options,) if options else (), **given))
+def command(model: str, path: Path, *options: str, **value: Any) -> list[str]:
+    return export(Export(model, path, options=(options,) if options else (), **value))
 
 
 AGENTS = ["remote_estimation_local_none", "biased_oscillator_sensors_memory"]
@@ -206,30 +208,30 @@ def test_agents_of_the_zoo_are_exported_with_what_they_see(name: str, tmp_path: 
     assert "µs in the median" in lines[4]
     trained = zoo.card(name)["training"]["environment"]
     task = fusion_gym.make_task(trained["id"], **trained["options"])
-    found, local = told(path), "local" in name
+    result, local = describe(path), "local" in name
     if local:
         env: Any = fusion_gym.parallel_env(trained["id"], **trained["options"])
         names, space = env.observation_names, env.observation_space("sensor_0")
     else:
         env = gym.make(trained["id"], **trained["options"]).unwrapped
         names, space = env.observation_names, env.observation_space
-    assert found["observation_names"] == list(names)
-    np.testing.assert_array_equal(np.float32(found["observation_low"]), space.low)
-    np.testing.assert_array_equal(np.float32(found["observation_high"]), space.high)
-    assert found["inputs"]["observation"]["shape"] == ["batch", len(names)]
-    assert found["outputs"]["request"]["shape"] == ["batch", 1 if local else task.sensors]
-    assert {one["name"] for one in found["observation_blocks"]} == {
-        one.partition("[")[0] for one in names
+    assert result["observation_names"] == list(names)
+    np.testing.assert_array_equal(np.float32(result["observation_low"]), space.low)
+    np.testing.assert_array_equal(np.float32(result["observation_high"]), space.high)
+    assert result["inputs"]["observation"]["shape"] == ["batch", len(names)]
+    assert result["outputs"]["request"]["shape"] == ["batch", 1 if local else task.sensors]
+    assert {observation_block["name"] for observation_block in result["observation_blocks"]} == {
+        name.partition("[")[0] for name in names
     }
-    assert found["environment"] == trained["id"]
-    assert found["options"]["token_rate"] == trained["options"]["token_rate"]
-    assert found["price_range"] == trained["options"]["price_range"]
-    assert found["fixed_price"] is None
-    assert (found["algorithm"], found["format"]) == ("ppo", "1")
-    assert found["fusion_gym_version"] == fusion_gym.__version__
-    assert found["observation_version"].startswith(f"{trained['id']}:")
-    assert found["action"]["sensors"] == task.sensors
-    assert found["decides"].startswith("each sensor" if local else "a coordinator")
+    assert result["environment"] == trained["id"]
+    assert result["options"]["token_rate"] == trained["options"]["token_rate"]
+    assert result["price_range"] == trained["options"]["price_range"]
+    assert result["fixed_price"] is None
+    assert (result["algorithm"], result["format"]) == ("ppo", "1")
+    assert result["fusion_gym_version"] == fusion_gym.__version__
+    assert result["observation_version"].startswith(f"{trained['id']}:")
+    assert result["action"]["sensors"] == task.sensors
+    assert result["decides"].startswith("each sensor" if local else "a scheduler")
     onnx.checker.check_model(onnx.load(path), full_check=True)
 
 
@@ -242,27 +244,27 @@ def test_a_node_in_an_environment_does_what_run_episodes_does(tmp_path: Path) ->
     session = onnxruntime.InferenceSession(str(path))
     trained = zoo.card(name)["training"]["environment"]
     env = fusion_gym.parallel_env(trained["id"], **trained["options"])
-    names = told(path)["observation_names"]
+    names = describe(path)["observation_names"]
     assert set(env.observation_names) - set(names) == {"price"}
-    columns = [env.observation_names.index(one) for one in names]
+    columns = [env.observation_names.index(name) for name in names]
 
     def request(row: Any) -> int:
         return int(session.run(["request"], {"observation": row[None, columns]})[0][0, 0])
 
     shares = []
     for seed in (5, 6):
-        seen, _ = env.reset(seed=seed)
-        made = []
+        visited, _ = env.reset(seed=seed)
+        result = []
         while env.agents:
-            actions = {agent: request(seen[agent]) for agent in env.agents}
-            made.append(list(actions.values()))
-            seen = env.step(actions)[0]
-        shares.append(np.mean(made, axis=0))
+            actions = {agent: request(visited[agent]) for agent in env.agents}
+            result.append(list(actions.values()))
+            visited = env.step(actions)[0]
+        shares.append(np.mean(result, axis=0))
     task = fusion_gym.make_task(trained["id"], **trained["options"])
     policy = make_policy(f"zoo:{name},price={price}", task)
-    wanted = run_episodes(task, policy, 2, 5).requests
-    np.testing.assert_allclose(shares, wanted, atol=1e-12)
-    assert 0.0 < wanted.mean() < 0.9
+    expected = run_episodes(task, policy, 2, 5).requests
+    np.testing.assert_allclose(shares, expected, atol=1e-12)
+    assert 0.0 < expected.mean() < 0.9
 
 
 @pytest.mark.usefixtures("few")
@@ -270,18 +272,18 @@ def test_one_price_is_inside_the_file(tmp_path: Path) -> None:
     name = "zoo:tobit_oscillator_sensors"
     command(name, tmp_path / "all.onnx")
     command(f"{name},price=0.03", tmp_path / "one.onnx")
-    every, one = (onnxruntime.InferenceSession(str(tmp_path / f"{n}.onnx")) for n in ("all", "one"))
-    about = told(tmp_path / "one.onnx")
+    every, row = (onnxruntime.InferenceSession(str(tmp_path / f"{n}.onnx")) for n in ("all", "one"))
+    about = describe(tmp_path / "one.onnx")
     assert "price" not in about["observation_names"]
     assert about["fixed_price"] == pytest.approx(0.03)
     assert about["price_range"] is None
     task = fusion_gym.make_task(ENV, **zoo.card(name[4:])["training"]["environment"]["options"])
     rows = EpisodeBatch.seeded(task, 64, 0).observe()
-    place = told(tmp_path / "all.onnx")["observation_names"].index("price")
-    low, high = told(tmp_path / "all.onnx")["price_range"]
+    place = describe(tmp_path / "all.onnx")["observation_names"].index("price")
+    low, high = describe(tmp_path / "all.onnx")["price_range"]
     rows[:, place] = np.log(0.03 / low) / np.log(high / low)
     first = every.run(["logits"], {"observation": rows})[0]
-    second = one.run(["logits"], {"observation": np.delete(rows, place, axis=1)})[0]
+    second = row.run(["logits"], {"observation": np.delete(rows, place, axis=1)})[0]
     np.testing.assert_allclose(first, second, atol=1e-5)
     rows[:, place] = 1.0
     assert (every.run(["probability"], {"observation": rows})[0].mean() < 0.9 * torch.sigmoid(
@@ -290,7 +292,7 @@ def test_one_price_is_inside_the_file(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("few")
 def test_a_training_of_ones_own_says_its_environment(tmp_path: Path) -> None:
-    model, task, _ = made("ppo")
+    model, task, _ = build_parts("ppo")
     tag_model(model, task)
     model.save(tmp_path / "best_model.zip")
     text = f"environment: {{id: {ENV}, options: {{filter: tobit, horizon: 20}}}}\n"
@@ -302,7 +304,7 @@ def test_a_training_of_ones_own_says_its_environment(tmp_path: Path) -> None:
     )
     lines = command(str(tmp_path / "best_model.zip"), path)
     assert f"of {ENV}" in lines[3]
-    assert told(path)["options"]["horizon"] == 20
+    assert describe(path)["options"]["horizon"] == 20
     by_hand = command(f"model:{tmp_path / 'best_model.zip'}", path, "filter=tobit", env=ENV)
     assert by_hand[3] != lines[3]  # its episodes are longer
 
@@ -316,12 +318,12 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("model", "given", "message"), REFUSED)
+@pytest.mark.parametrize(("model", "arguments", "message"), REFUSED)
 def test_what_cannot_be_exported_is_refused(
-    model: str, given: dict[str, Any], message: str, tmp_path: Path
+    model: str, arguments: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ConfigurationError, match=message):
-        command(model, tmp_path / "agent.onnx", **given)
+        command(model, tmp_path / "agent.onnx", **arguments)
     assert not list(tmp_path.iterdir())
 
 
@@ -349,9 +351,9 @@ def test_a_file_that_decides_otherwise_is_not_kept(
 def test_a_missing_extra_is_named(
     package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = importlib.util.find_spec
+    result = importlib.util.find_spec
     monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name == package else found(name)
+        importlib.util, "find_spec", lambda name: None if name == package else result(name)
     )
     with pytest.raises(ConfigurationError, match=rf"{package}, .*'fusion-gym\[onnx\]'"):
         command("zoo:tobit_oscillator_centre", tmp_path / "agent.onnx")

@@ -35,12 +35,12 @@ def nodes(generator: np.random.Generator, sensors: int, states: int, runs: int) 
 def test_what_is_distributed_fuses_to_what_it_was(share: Any) -> None:
     generator = np.random.default_rng(2)
     mean, covariance = (value[0] for value in nodes(generator, 1, 3, runs=5))
-    given_mean, given = Feedback.in_shares(share, 3).distribute(mean, covariance)
+    mean_argument, values = Feedback.in_shares(share, 3).distribute(mean, covariance)
     weights = EQUAL if share is None else share
     for sensor, weight in enumerate(weights):
-        np.testing.assert_allclose(given[sensor], covariance / weight, rtol=1e-15)
-        assert np.array_equal(given_mean[sensor], mean)
-    back = InformationFusion().fuse(given_mean, given)
+        np.testing.assert_allclose(values[sensor], covariance / weight, rtol=1e-15)
+        assert np.array_equal(mean_argument[sensor], mean)
+    back = InformationFusion().fuse(mean_argument, values)
     np.testing.assert_allclose(back.covariance, covariance, rtol=1e-9)
     np.testing.assert_allclose(back.mean, mean, rtol=1e-9)
 
@@ -86,12 +86,12 @@ def test_uncensored_federation_is_the_centralised_kalman_filter(
         mean, covariance = system.fused(state)
         for run, other in enumerate(central):
             other.predict()
-            kept = granted[:, run]
-            if kept.any():
+            mask = granted[:, run]
+            if mask.any():
                 other.update(
-                    state.measurement[kept, :, run].reshape(-1, 1),
-                    R=np.diag(VARIANCES[kept].ravel()),
-                    H=MATRICES[kept].reshape(-1, 2),
+                    state.measurement[mask, :, run].reshape(-1, 1),
+                    R=np.diag(VARIANCES[mask].ravel()),
+                    H=MATRICES[mask].reshape(-1, 2),
                 )
             np.testing.assert_allclose(mean[:, run], other.x[:, 0], rtol=1e-9, atol=1e-9)
             np.testing.assert_allclose(covariance[..., run], other.P, rtol=1e-9, atol=1e-11)

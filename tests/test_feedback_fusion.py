@@ -89,18 +89,18 @@ def test_a_single_delivery_is_taken_as_it_is(rule: str, seed: int) -> None:
 
 @pytest.mark.parametrize("rule", ["federated", "ci", "ici", "sci", "sici"])
 def test_deliveries_of_each_node_alone(rule: str) -> None:
-    """``fuse_alone`` against ``fuse`` of the covariances that it stands for."""
+    """``fuse_single`` against ``fuse`` of the covariances that it stands for."""
     fusion = choose_rule(rule, STRUCTURE, 2)
     generator = np.random.default_rng(3)
     silent = np.stack([positive_definite(generator, 3) for _ in range(2)])[..., None]
     delivered = 0.3 * silent
-    nobody, alone = fusion.fuse_alone(silent, delivered)
+    nobody, single = fusion.fuse_single(silent, delivered)
     zero = np.zeros((2, 3, 1))
     np.testing.assert_allclose(nobody, fusion.fuse(zero, silent).covariance, rtol=1e-9)
     for node in range(2):
-        chosen = silent.copy()
-        chosen[node] = delivered[node]
-        np.testing.assert_allclose(alone[node], fusion.fuse(zero, chosen).covariance, rtol=1e-9)
+        selected = silent.copy()
+        selected[node] = delivered[node]
+        np.testing.assert_allclose(single[node], fusion.fuse(zero, selected).covariance, rtol=1e-9)
 
 
 def results(env_id: str, policy: str, **options: Any) -> EpisodeResults:
@@ -114,9 +114,9 @@ def test_intersection_is_conservative_where_federation_is_exact() -> None:
     exact = results(TRACKING, "always", **settings_)
     assert exact.nees.mean() == pytest.approx(1.0, abs=0.03)
     for rule in ("ci", "ici"):
-        found = results(TRACKING, "always", fusion=rule, **settings_)
-        assert found.nees.mean() < 0.9
-        assert exact.mse.mean() < found.mse.mean() < 1.15 * exact.mse.mean()
+        result = results(TRACKING, "always", fusion=rule, **settings_)
+        assert result.nees.mean() < 0.9
+        assert exact.mse.mean() < result.mse.mean() < 1.15 * exact.mse.mean()
 
 
 @pytest.mark.parametrize("env_id", [TOBIT, BIASED, TRACKING])

@@ -47,11 +47,11 @@ def test_a_link_stays_a_link_and_a_device_a_device(tmp_path: Path) -> None:
 
 
 def test_what_killed_processes_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
-    kept = [tmp_path / name for name in ("a.part.json", "a.1.partly", "part", "1.part of.zip")]
-    for path in (*kept, tmp_path / "model.123.part.zip", tmp_path / "study.7.part"):
+    names = [tmp_path / name for name in ("a.part.json", "a.1.partly", "part", "1.part of.zip")]
+    for path in (*names, tmp_path / "model.123.part.zip", tmp_path / "study.7.part"):
         path.write_text("x")
     remove_partials(tmp_path)
-    assert sorted(tmp_path.iterdir()) == sorted(kept)
+    assert sorted(tmp_path.iterdir()) == sorted(names)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_what_killed_processes_left_is_removed_and_nothing_else(tmp_path: Path) 
         (None, "cannot be read: No such file or directory"),
     ],
 )
-def test_json_that_cannot_be_read_is_told_in_one_line(
+def test_json_that_cannot_be_read_is_reported_in_one_line(
     tmp_path: Path, content: bytes | None, message: str
 ) -> None:
     path = tmp_path / "x.json"

@@ -52,15 +52,15 @@ def test_the_silent_are_not_read_and_count_for_nothing(rule: str) -> None:
     dirty, pairs = np.where(active[:, None], means, np.nan), active[:, None] & active
     fused = fusion.fuse(dirty, np.where(pairs[:, :, None, None], joint, np.nan), active)
     for run in range(RUNS):
-        who, one = np.flatnonzero(active[:, run]), slice(run, run + 1)
+        who, lane = np.flatnonzero(active[:, run]), slice(run, run + 1)
         if not who.size:
             assert np.isnan(fused.mean[:, run]).all()
             assert np.isnan(fused.covariance[..., run]).all()
             continue
-        wanted = fusion.fuse(means[who][..., one], joint[np.ix_(who, who)][..., one])
-        np.testing.assert_allclose(fused.mean[:, one], wanted.mean, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(fused.covariance[..., one], wanted.covariance, rtol=1e-9)
-        np.testing.assert_allclose(fused.gains[who][..., one], wanted.gains, atol=1e-9)
+        expected = fusion.fuse(means[who][..., lane], joint[np.ix_(who, who)][..., lane])
+        np.testing.assert_allclose(fused.mean[:, lane], expected.mean, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(fused.covariance[..., lane], expected.covariance, rtol=1e-9)
+        np.testing.assert_allclose(fused.gains[who][..., lane], expected.gains, atol=1e-9)
         assert not fused.gains[~active[:, run]][..., run].any()
 
 

@@ -25,20 +25,20 @@ def shapes(kind: str) -> dict[str, tuple[int, ...]]:
     return {"single": own, "vector": (RUNS, *own), "sb3": (RUNS, *own), "local": (RUNS * 3,)}
 
 
-def made(face: str, kind: str) -> Callable[[Any], tuple[Any, ...]]:
+def build_parts(interface: str, kind: str) -> Callable[[Any], tuple[Any, ...]]:
     """A reset environment's step."""
     options: dict[str, Any] = {"horizon": 2_000, **KINDS[kind]}
-    if face == "single":
+    if interface == "single":
         single = gymnasium.make(ENV_ID, **options).unwrapped
         single.reset(seed=0)
         return single.step
-    if face == "vector":
+    if interface == "vector":
         vector = gymnasium.make_vec(
             ENV_ID, RUNS, vectorization_mode="vector_entry_point", **options
         ).unwrapped
         vector.reset(seed=0)
         return vector.step
-    rows = fusion_gym.make_sb3_vec_env(ENV_ID, RUNS, local=face == "local", **options)
+    rows = fusion_gym.make_sb3_vec_env(ENV_ID, RUNS, local=interface == "local", **options)
     rows.seed(0)
     rows.reset()
     return rows.step
@@ -67,12 +67,12 @@ def numbers(shape: tuple[int, ...]) -> st.SearchStrategy[Any]:
 def allowed(action: Any, shape: tuple[int, ...], highest: int) -> bool:
     """Whether an action is whole numbers from 0 to the highest, in this shape."""
     try:
-        given = np.asarray(action)
+        values = np.asarray(action)
     except ValueError:
         return False
-    if given.dtype.kind not in "biuf" or given.shape != shape:
+    if values.dtype.kind not in "biuf" or values.shape != shape:
         return False
-    return bool(np.isin(given, np.arange(highest + 1)).all())
+    return bool(np.isin(values, np.arange(highest + 1)).all())
 
 
 def flaw(step: Callable[[Any], tuple[Any, ...]], action: Any, good: bool) -> str | None:
@@ -91,11 +91,11 @@ def flaw(step: Callable[[Any], tuple[Any, ...]], action: Any, good: bool) -> str
 
 @pytest.mark.parametrize("tries", [40, pytest.param(1500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("face", ["single", "vector", "sb3", "local"])
+@pytest.mark.parametrize("interface", ["single", "vector", "sb3", "local"])
 @pytest.mark.filterwarnings("error")
-def test_any_action(face: str, kind: str, tries: int) -> None:
-    step, shape = made(face, kind), shapes(kind)[face]
-    highest = {"binary": 1, "discrete": 7, "single": 3}[kind] if face != "local" else 1
+def test_any_action(interface: str, kind: str, tries: int) -> None:
+    step, shape = build_parts(interface, kind), shapes(kind)[interface]
+    highest = {"binary": 1, "discrete": 7, "single": 3}[kind] if interface != "local" else 1
 
     @settings(max_examples=tries, derandomize=True, phases=[Phase.generate], **FREE)
     @given(action=numbers(shape) | numbers(shape) | HOSTILE)

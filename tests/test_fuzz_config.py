@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 from fusion_gym import ConfigurationError
 from fusion_gym.agents.training.algorithms import TABLE
-from fusion_gym.agents.training.checked import load, parse
+from fusion_gym.agents.training.checked import load_checked, parse
 from fusion_gym.agents.training.config import Experiment
-from fusion_gym.agents.training.run import check
+from fusion_gym.agents.training.run import check_run
 
 Content = dict[str, Any]
 _UNKNOWN = ("nobody_knows_this",)
@@ -27,7 +27,7 @@ SMALL |= {"buffer_size": 100, "n_steps": 8}
 
 def plain(kind: str) -> Content:
     """A config of this algorithm with all its fields, small enough to make in no time."""
-    content = load(Experiment, "remote_estimation_ppo").model_dump(mode="json")
+    content = load_checked(Experiment, "remote_estimation_ppo").model_dump(mode="json")
     content["environment"]["options"]["horizon"] = 20
     if TABLE[kind].discrete_only:
         content["environment"]["options"]["action"] = "discrete"
@@ -62,7 +62,7 @@ def values(default: Any) -> st.SearchStrategy[Any]:
 def flaw(content: Content, path: tuple[str, ...]) -> str | None:
     """What is wrong with how a config is taken whose field at this path was changed."""
     try:
-        model, env, _ = check(parse(Experiment, content, "fuzz.yaml"))
+        model, env, _ = check_run(parse(Experiment, content, "fuzz.yaml"))
     except ConfigurationError as error:
         message = str(error)
         named = any(name in message for name in (*path[-2:], *_UNKNOWN))
@@ -89,8 +89,8 @@ def test_any_value_in_any_field(kind: str, tries: int, tmp_path: Path) -> None:
         for name in path[:-1]:
             place = place[name]
         place[path[-1]] = data.draw(values(place[path[-1]]))
-        found = flaw(content, path)
-        assert found is None, (found, path, place[path[-1]])
+        message = flaw(content, path)
+        assert message is None, (message, path, place[path[-1]])
         assert not (tmp_path / "run").exists()
 
     sound()

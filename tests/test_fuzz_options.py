@@ -19,8 +19,8 @@ SEEDS = st.integers(0, 2**31 - 1)
 @pytest.mark.parametrize("env_id", list(ENVIRONMENTS))
 def test_any_options_are_refused_by_name_or_work(env_id: str, tries: int) -> None:
     @settings(max_examples=tries, derandomize=True, phases=[Phase.generate, Phase.shrink], **FREE)
-    @given(chosen=options(env_id), seed=SEEDS)
-    def sound(chosen: Options, seed: int) -> None:
-        assert flaw(env_id, chosen, seed) is None
+    @given(selection=options(env_id), seed=SEEDS)
+    def sound(selection: Options, seed: int) -> None:
+        assert flaw(env_id, selection, seed) is None
 
     sound()

@@ -97,8 +97,8 @@ def test_density_and_upper_tail() -> None:
 def test_moments_beyond_z(function: Callable[[Any], Any], position: int) -> None:
     expected = [exact_beyond(z)[position] for z in Z_GRID]
     assert worst(function(Z_GRID), expected) < TOLERANCE
-    alone = [function(float(z)) for z in Z_GRID]
-    np.testing.assert_array_equal(alone, function(Z_GRID))
+    single = [function(float(z)) for z in Z_GRID]
+    np.testing.assert_array_equal(single, function(Z_GRID))
 
 
 def excess_beyond(z: Any) -> Any:
@@ -164,8 +164,8 @@ def test_interval_moments(width: float) -> None:
     for m, n, d, e in zip(mean, near, distance, expected, strict=True):
         slack = 4 * np.spacing(abs(float(e[1])))
         assert abs(mpmath.mpf(float(m)) - mpmath.mpf(n) - d) < TOLERANCE / 10 * abs(d) + slack
-    alone = [gaussian.interval_moments(a, b) for a, b in zip(lows, highs, strict=True)]
-    np.testing.assert_array_equal(np.transpose(alone), [probability, mean, variance])
+    single = [gaussian.interval_moments(a, b) for a, b in zip(lows, highs, strict=True)]
+    np.testing.assert_array_equal(np.transpose(single), [probability, mean, variance])
 
 
 def test_interval_moments_of_half_lines_and_the_line() -> None:

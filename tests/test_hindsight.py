@@ -61,18 +61,18 @@ def test_it_finds_the_cheapest_of_all_schedules(
     env_id: str, options: dict[str, Any], price: float
 ) -> None:
     task = fusion_gym.make_task(env_id, **options)
-    found = find_schedules(task, price, width=5000, episodes=4, seed=3)
-    assert found.exact.all()
-    assert found.granted.any()
+    result = find_schedules(task, price, width=5000, episodes=4, seed=3)
+    assert result.exact.all()
+    assert result.granted.any()
     best = [cheapest(task, price, seed) for seed in range(3, 7)]
-    np.testing.assert_allclose(found.cost, best, rtol=1e-9)
+    np.testing.assert_allclose(result.cost, best, rtol=1e-9)
     played = run_hindsight(task, price, width=5000, episodes=4, seed=3)
     np.testing.assert_allclose(-played.returns, best, rtol=1e-9)
     assert played.denied.max() == 0.0
     # A beam of one drops candidates, says so, and is no better.
     narrow = find_schedules(task, price, width=1, episodes=4, seed=3)
     assert not narrow.exact.any()
-    assert (narrow.cost >= found.cost * (1.0 - 1e-9)).all()
+    assert (narrow.cost >= result.cost * (1.0 - 1e-9)).all()
 
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
@@ -88,18 +88,18 @@ def test_its_episodes_are_those_of_other_policies(env_id: str) -> None:
     assert free.granted.any()
 
 
-def test_each_episode_is_searched_by_itself() -> None:
+def test_each_episode_is_searched_local() -> None:
     """Also where the episodes do not fit side by side, and where noise is drawn in blocks."""
     task = fusion_gym.make_task(REMOTE, max_episode_steps=300)
     wide = 3000
     together = find_schedules(task, 3.0, wide // 1000, 5, seed=20)
     for place in range(5):
-        alone = find_schedules(task, 3.0, wide // 1000, 1, seed=20 + place)
-        np.testing.assert_array_equal(together.granted[..., place], alone.granted[..., 0])
+        single = find_schedules(task, 3.0, wide // 1000, 1, seed=20 + place)
+        np.testing.assert_array_equal(together.granted[..., place], single.granted[..., 0])
     short = fusion_gym.make_task(REMOTE, max_episode_steps=20)
     split = find_schedules(short, 3.0, wide, 5, seed=20)
-    alone = find_schedules(short, 3.0, wide, 1, seed=24)
-    np.testing.assert_array_equal(split.granted[..., 4], alone.granted[..., 0])
+    single = find_schedules(short, 3.0, wide, 1, seed=24)
+    np.testing.assert_array_equal(split.granted[..., 4], single.granted[..., 0])
     played = run_hindsight(task, 3.0, 3, 5, seed=20)
     np.testing.assert_allclose(-played.returns, together.cost, rtol=1e-9)
 
@@ -121,9 +121,9 @@ def test_in_the_solved_case_a_small_beam_reaches_the_optimum() -> None:
         before_next = np.concatenate([np.zeros((1, 8)), silent[:-1]])
         again = before_next + price + to_go[sent + 1 :]
         to_go[sent] = np.minimum(again.min(0), silent[-1])
-    found = find_schedules(task, price, width=64, episodes=8, seed=0)
-    np.testing.assert_allclose(found.cost, to_go[0], rtol=1e-9)
-    assert not found.exact.any()
+    result = find_schedules(task, price, width=64, episodes=8, seed=0)
+    np.testing.assert_allclose(result.cost, to_go[0], rtol=1e-9)
+    assert not result.exact.any()
 
 
 def test_it_costs_less_than_policies_that_do_not_know_the_noise() -> None:
@@ -138,8 +138,8 @@ def test_it_costs_less_than_policies_that_do_not_know_the_noise() -> None:
         "innovation_threshold:threshold=1.5,whitened=true",
         f"zoo:tobit_oscillator_sensors,price={price}",
     ):
-        seen = {"belief_features": True} if name.startswith("zoo:") else {}
-        own = fusion_gym.make_task(TOBIT, **BENCHMARK, **options, **seen)
+        observed = {"belief_features": True} if name.startswith("zoo:") else {}
+        own = fusion_gym.make_task(TOBIT, **BENCHMARK, **options, **observed)
         results = run_episodes(own, make_policy(name, own), 30, seed=0)
         difference = best + results.returns
         assert difference.mean() < -5 * difference.std() / np.sqrt(30), name

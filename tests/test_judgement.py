@@ -15,8 +15,8 @@ from fusion_gym.agents.reproduction.round_robin_tobit.judging import always_belo
 from fusion_gym.agents.suite import envelopes
 from fusion_gym.agents.suite.classes import classes_of
 from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.robust_summary import summary
-from fusion_gym.evaluation.envelope import chosen_mse
+from fusion_gym.agents.suite.robust_summary import robustness_summary
+from fusion_gym.evaluation.envelope import best_mse
 
 NOISE = np.array([-3.0, 1.0, -2.0, 3.5])
 
@@ -35,14 +35,14 @@ def test_a_mean_below_another_is_not_yet_below() -> None:
 
 
 def test_cases_are_counted_by_their_intervals_and_the_worst_is_named() -> None:
-    found = {
+    result = {
         "as_assumed": interval(-0.3, -0.4, -0.2),
         "clear": interval(-0.2, -0.3, -0.1),
         "open": interval(0.1, -0.1, 0.3),
         "worse": interval(0.2, 0.1, 0.3),
     }
-    cases = {name: {"title": name, "agents": {"middle": one}} for name, one in found.items()}
-    lines = summary([{"setting": "small", "cases": cases}], {"small": "a setting"})
+    cases = {name: {"title": name, "agents": {"middle": item}} for name, item in result.items()}
+    lines = robustness_summary([{"setting": "small", "cases": cases}], {"small": "a setting"})
     (row,) = (line for line in lines if "as they are" in line)
     assert [cell.strip() for cell in row.split("|")][4:7] == ["1", "1", "1"]
     assert row.rstrip(" |").endswith("worse")
@@ -59,7 +59,7 @@ RESULTS: dict[str, Any] = {
 
 
 def test_all_policies_of_an_envelope_count_where_it_is_measured() -> None:
-    np.testing.assert_allclose(chosen_mse(RESULTS, 0.5), 0.6)
+    np.testing.assert_allclose(best_mse(RESULTS, 0.5), 0.6)
 
 
 def test_vertices_are_those_of_the_tuning_episodes(
@@ -75,6 +75,6 @@ def test_vertices_are_those_of_the_tuning_episodes(
     monkeypatch.setattr(envelopes, "candidates_of", lambda *_: (candidates, 4))
     monkeypatch.setattr(envelopes.Test, "read", lambda test, work: RESULTS[test.policy])
     of = next(iter(classes_of(suite.settings[0])))
-    found = envelopes.content_of(suite, suite.settings[0], of, [], tmp_path)
-    assert [vertex["policy"] for vertex in found["vertices"]] == ["a", "b", "c"]
-    assert [vertex["convex"] for vertex in found["vertices"]] == [True, False, True]
+    result = envelopes.content_of(suite, suite.settings[0], of, [], tmp_path)
+    assert [vertex["policy"] for vertex in result["vertices"]] == ["a", "b", "c"]
+    assert [vertex["convex"] for vertex in result["vertices"]] == [True, False, True]

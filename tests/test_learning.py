@@ -23,7 +23,7 @@ from fusion_gym.agents.output.files import write, write_text
 from fusion_gym.agents.suite.committed import complete
 from fusion_gym.agents.suite.config import load_suite
 from fusion_gym.agents.suite.fronts import excess_over, is_below
-from fusion_gym.agents.suite.learned import closed, judged, reached
+from fusion_gym.agents.suite.learned import closed, judge_fronts, reached
 from fusion_gym.agents.suite.learning import load_learning
 from fusion_gym.agents.suite.lessons import beyond, run_lesson
 from fusion_gym.agents.suite.study import Lesson, Study
@@ -96,8 +96,8 @@ def test_the_first_moment_below_and_what_came_after() -> None:
         }
         for place, (excess, below) in enumerate(states)
     ]
-    found = reached({"seed": 3, "curve": curve})["first"]
-    assert (found["timesteps"], found["excess"], found["above_later"]) == (100, -0.1, 1)
+    result = reached({"seed": 3, "curve": curve})["first"]
+    assert (result["timesteps"], result["excess"], result["above_later"]) == (100, -0.1, 1)
     assert "first" not in reached({"seed": 3, "curve": curve[:1]})
 
 
@@ -123,9 +123,9 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
     }
     gain = [family for family in SMALL["families"] if family["label"] == "gain"]
     suite = small_suite(folder, settings=[*SMALL["settings"], source], families=gain)
-    chosen = load_suite(suite)
+    choice = load_suite(suite)
     classes = ["sensors", "sensors_memory"]
-    complete(chosen, chosen.settings[:1], classes, folder / "results", folder / "tuning", Team(1))
+    complete(choice, choice.settings[:1], classes, folder / "results", folder / "tuning", Team(1))
     options = {
         "small": {"filter": "tobit", "horizon": 10, "memory": True},
         "centre": {"filter": "tobit", "horizon": 10, "information": "centre"},
@@ -174,7 +174,7 @@ def fewer_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fusion_gym.agents.suite.verdict.RESAMPLES", 20)
 
 
-def given(school: Path, folder: Path, **changes: Any) -> argparse.Namespace:
+def arguments_of(school: Path, folder: Path, **changes: Any) -> argparse.Namespace:
     plain = {
         "settings": [],
         "config": school / "learning.yaml",
@@ -189,11 +189,11 @@ def given(school: Path, folder: Path, **changes: Any) -> argparse.Namespace:
     return argparse.Namespace(**(plain | changes))
 
 
-def without_seconds(found: Any) -> Any:
-    if isinstance(found, dict):
+def without_seconds(value: Any) -> Any:
+    if isinstance(value, dict):
         dropped = ("cpu_seconds", "throughput")
-        return {key: without_seconds(v) for key, v in found.items() if key not in dropped}
-    return [without_seconds(v) for v in found] if isinstance(found, list) else found
+        return {key: without_seconds(v) for key, v in value.items() if key not in dropped}
+    return [without_seconds(v) for v in value] if isinstance(value, list) else value
 
 
 def test_an_interrupted_run_ends_as_an_undisturbed_one(
@@ -204,27 +204,27 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
 ) -> None:
     monkeypatch.setattr("benchmarks.throughput.TURNS", 1)
     monkeypatch.setattr(learning.measure_throughput, "__defaults__", (0.01,))
-    whole = given(school, tmp_path / "whole")
+    whole = arguments_of(school, tmp_path / "whole")
     learning.run(whole)
-    found = json.loads((whole.output / "small.json").read_text())
-    assert [front["seed"] for front in found["fronts"]] == [0, 1]
-    assert found["fronts"][0]["curve"] != found["fronts"][1]["curve"]
-    for front in found["fronts"]:
+    content = json.loads((whole.output / "small.json").read_text())
+    assert [front["seed"] for front in content["fronts"]] == [0, 1]
+    assert content["fronts"][0]["curve"] != content["fronts"][1]["curve"]
+    for front in content["fronts"]:
         assert [point["timesteps"] for point in front["curve"]] == [64, 128]
         seconds = [point["cpu_seconds"] for point in front["curve"]]
         assert 0.0 < seconds[0] < seconds[1]
-        assert [point["price"] for point in front["points"]] == found["prices"]
-    assert [one["algorithm"] for one in found["plain"]] == ["ppo"], "fewer seeds of it"
-    assert [point["timesteps"] for point in found["plain"][0]["curve"]] == [128, 256]
-    assert found["throughput"]["values"] < found["throughput"]["without"]
-    assert found["finished"]["compared"] == 2, "the inner one of three prices, of two seeds"
+        assert [point["price"] for point in front["points"]] == content["prices"]
+    assert [item["algorithm"] for item in content["plain"]] == ["ppo"], "fewer seeds of it"
+    assert [point["timesteps"] for point in content["plain"][0]["curve"]] == [128, 256]
+    assert content["throughput"]["values"] < content["throughput"]["without"]
+    assert content["finished"]["compared"] == 2, "the inner one of three prices, of two seeds"
     assert "`python -m benchmarks.learning --seeds 2" in (whole.output / "README.md").read_text()
     assert "small" in capsys.readouterr().out
 
     with pytest.raises(ConfigurationError, match=r"holds small.json already: go on with --resume"):
         learning.run(whole)
 
-    broken = given(school, tmp_path / "broken")
+    broken = arguments_of(school, tmp_path / "broken")
     before, counted = PrivilegedVecEnv.step_alternatives, 0
 
     def step_alternatives(self: PrivilegedVecEnv, *arguments: Any) -> Any:
@@ -237,13 +237,13 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
     monkeypatch.setattr(PrivilegedVecEnv, "step_alternatives", step_alternatives)
     with pytest.raises(KeyboardInterrupt):
         learning.run(broken)
-    kept = json.loads((broken.output / "small.json").read_text())
-    assert [front["seed"] for front in kept["fronts"]] == [0]
+    stored = json.loads((broken.output / "small.json").read_text())
+    assert [front["seed"] for front in stored["fronts"]] == [0]
     broken.resume = True
     learning.run(broken)
     assert counted == 64, "nothing is trained twice"
     again = json.loads((broken.output / "small.json").read_text())
-    assert without_seconds(again) == without_seconds(found)
+    assert without_seconds(again) == without_seconds(content)
     learning.run(broken)
     assert counted == 64
 
@@ -256,9 +256,9 @@ def test_plain_ppo_ends_with_its_budget_or_below_the_rules(
     study = replace(study_of(school), work=tmp_path, output=tmp_path)
     lesson = Lesson(study, "plain", 0, budget)
     run_lesson(lesson, 1)
-    found = lesson.result()
-    assert found is not None
-    assert [point["timesteps"] for point in found["curve"]] == [128], "not the whole 256"
+    result = lesson.result()
+    assert result is not None
+    assert [point["timesteps"] for point in result["curve"]] == [128], "not the whole 256"
     changed = study.learning.model_copy(update={"episodes": 5})
     with pytest.raises(ConfigurationError, match=r"^episodes = 5 differs from that of .*: 4$"):
         Lesson(replace(study, learning=changed), "plain", 0).result()
@@ -282,17 +282,17 @@ def test_a_front_beside_the_optimum_or_the_best_of_schedules(
     plain = yaml.safe_load((school / "learning.yaml").read_text())
     course |= {"front": str(school / course["front"] / "config.yaml")}
     (tmp_path / "learning.yaml").write_text(yaml.safe_dump(plain | {"settings": [course]}))
-    chosen = given(school, tmp_path, config=tmp_path / "learning.yaml", seeds=1)
-    chosen.work.mkdir()
-    (chosen.work / course["setting"]).mkdir()
-    (chosen.work / course["setting"] / "throughput.json").write_text("{}")
-    learning.run(chosen)
-    found = json.loads((chosen.output / f"{course['setting']}.json").read_text())
-    assert found["plain"] == []
-    assert found["finished"]["compared"] == 3, "all prices"
+    selection = arguments_of(school, tmp_path, config=tmp_path / "learning.yaml", seeds=1)
+    selection.work.mkdir()
+    (selection.work / course["setting"]).mkdir()
+    (selection.work / course["setting"] / "throughput.json").write_text("{}")
+    learning.run(selection)
+    content = json.loads((selection.output / f"{course['setting']}.json").read_text())
+    assert content["plain"] == []
+    assert content["finished"]["compared"] == 3, "all prices"
     suite = load_suite(school / "suite.yaml")
     where = next(s.environment for s in suite.settings if s.name == course["setting"])
-    for point in found["fronts"][0]["points"]:
+    for point in content["fronts"][0]["points"]:
         task = make_task(where.id, **where.options, cost_weight=point["price"])
         best = min(
             -run_episodes(task, make_policy(policy, task), 12, 0).returns.mean()
@@ -303,7 +303,7 @@ def test_a_front_beside_the_optimum_or_the_best_of_schedules(
 
 
 @pytest.mark.parametrize(
-    ("course", "wanted"),
+    ("course", "expected"),
     [
         ({"against": "sensors"}, r"memory = True is not allowed in small: .* has False"),
         ({"front": "centre"}, r"memory = False is not allowed in small: .* has True"),
@@ -317,25 +317,25 @@ def test_a_front_beside_the_optimum_or_the_best_of_schedules(
     ],
 )
 def test_a_front_is_compared_with_what_knows_the_same(
-    school: Path, course: dict[str, Any], wanted: str
+    school: Path, course: dict[str, Any], expected: str
 ) -> None:
     study_of(school).check()
     if "front" in course:
         course = course | {"front": str(school / course["front"] / "config.yaml")}
-    with pytest.raises(ConfigurationError, match=wanted):
+    with pytest.raises(ConfigurationError, match=expected):
         study_of(school, **course).check()
 
 
 def test_seeds_and_prices_that_lie_above_are_counted(school: Path) -> None:
     def point(mean: float, low: float, mse: float) -> dict[str, Any]:
-        found = {"mean": mean, "low": low, "high": mean + 1.0}
+        result = {"mean": mean, "low": low, "high": mean + 1.0}
         return {
             "price": 0.01,
             "rate": 0.1 * mse,
             "mse": mse,
             "envelope": 2.0,
             "bound": 1.0,
-            "difference": found,
+            "difference": result,
         }
 
     bad = point(9.0, 8.0, 9.0)  # outside the inner part
@@ -343,15 +343,15 @@ def test_seeds_and_prices_that_lie_above_are_counted(school: Path) -> None:
         {"seed": 0, "points": [bad, point(0.02, 0.011, 1.8), bad]},
         {"seed": 1, "points": [bad, point(0.03, 0.009, 1.4), bad]},
     ]
-    found = judged(study_of(school), fronts)
-    assert found is not None
-    assert found["compared"] == 2
-    assert [(p["seed"], p["difference"]["low"]) for p in found["above"]] == [(0, 0.011)]
-    assert (found["worst"]["seed"], found["mean"]) == (1, pytest.approx(0.025))
-    assert found["rates"] == pytest.approx([0.14, 0.18])
-    assert found["closed"] == {"rollout": None, "bound": pytest.approx((0.2 + 0.6) / 2.0)}
+    result = judge_fronts(study_of(school), fronts)
+    assert result is not None
+    assert result["compared"] == 2
+    assert [(p["seed"], p["difference"]["low"]) for p in result["above"]] == [(0, 0.011)]
+    assert (result["worst"]["seed"], result["mean"]) == (1, pytest.approx(0.025))
+    assert result["rates"] == pytest.approx([0.14, 0.18])
+    assert result["closed"] == {"rollout": None, "bound": pytest.approx((0.2 + 0.6) / 2.0)}
     assert closed([{"envelope": 1.0, "bound": 1.0, "mse": 1.0}], "bound") is None
-    assert judged(study_of(school), []) is None
+    assert judge_fronts(study_of(school), []) is None
 
 
 def test_a_rollout_counts_on_its_own_episodes_and_only_where_it_was_run(

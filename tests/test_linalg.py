@@ -256,14 +256,14 @@ def test_a_lane_is_the_same_alone_and_in_the_batch(seed: int, n: int, count: int
     a = definite(rng, (2,), n, count)
     v = rng.normal(size=(2, n, count))
     lane = int(rng.integers(count))
-    one, vector = a[..., lane : lane + 1].copy(), v[..., lane : lane + 1].copy()
+    item, vector = a[..., lane : lane + 1].copy(), v[..., lane : lane + 1].copy()
     for unary in (linalg.cholesky, linalg.inverse, linalg.trace, linalg.symmetrise):
-        np.testing.assert_array_equal(unary(a)[..., lane], unary(one)[..., 0])
+        np.testing.assert_array_equal(unary(a)[..., lane], unary(item)[..., 0])
     for binary in (linalg.matmul, linalg.solve, linalg.congruence):
-        np.testing.assert_array_equal(binary(a, a)[..., lane], binary(one, one)[..., 0])
+        np.testing.assert_array_equal(binary(a, a)[..., lane], binary(item, item)[..., 0])
     for mixed in (linalg.matvec, linalg.solve_vector):
-        np.testing.assert_array_equal(mixed(a, v)[..., lane], mixed(one, vector)[..., 0])
+        np.testing.assert_array_equal(mixed(a, v)[..., lane], mixed(item, vector)[..., 0])
     np.testing.assert_array_equal(
-        linalg.quadratic(v, a)[..., lane], linalg.quadratic(vector, one)[..., 0]
+        linalg.quadratic(v, a)[..., lane], linalg.quadratic(vector, item)[..., 0]
     )
     np.testing.assert_array_equal(linalg.dot(v, v)[..., lane], linalg.dot(vector, vector)[..., 0])

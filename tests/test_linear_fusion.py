@@ -124,9 +124,9 @@ def test_a_plant_that_no_noise_moves() -> None:
     """What is unknown at the start is all that there is: measured often enough, it is known."""
     still = {"transition": [[1, 0.1], [0, 1]], "process_covariance": np.zeros((2, 2))}
     task = fusion_gym.make_task(LINEAR, tokens="unlimited", horizon=200, **still)
-    found = run_episodes(task, make_policy("always", task), 200, 0)
-    assert found.squared_error[-1].sum() < 0.05 * found.squared_error[0].sum()
-    assert found.nees.mean() == pytest.approx(1.0, abs=0.2)
+    results = run_episodes(task, make_policy("always", task), 200, 0)
+    assert results.squared_error[-1].sum() < 0.05 * results.squared_error[0].sum()
+    assert results.nees.mean() == pytest.approx(1.0, abs=0.2)
 
 
 def test_every_rule_and_the_best_schedule_run() -> None:
@@ -135,9 +135,9 @@ def test_every_rule_and_the_best_schedule_run() -> None:
     names = ("always", "innovation_threshold:threshold=1", "information_gain:threshold=0.05",
              "value_of_information:threshold=0.02,at_most=1", "lookahead:price=0.02", clock,
              schedule)  # fmt: skip
-    found = {name: run_episodes(task, make_policy(name, task), 300, 0) for name in names}
-    errors = {name: one.mse.mean() for name, one in found.items()}
-    assert found[clock].rate.mean() == pytest.approx(found[schedule].rate.mean(), rel=0.05)
+    results = {name: run_episodes(task, make_policy(name, task), 300, 0) for name in names}
+    errors = {name: result.mse.mean() for name, result in results.items()}
+    assert results[clock].rate.mean() == pytest.approx(results[schedule].rate.mean(), rel=0.05)
     assert errors[schedule] <= errors[clock] * 1.01
     wise = ("value_of_information:threshold=0.02,at_most=1", "lookahead:price=0.02")
     assert max(errors[name] for name in wise) < errors[schedule]
@@ -145,7 +145,7 @@ def test_every_rule_and_the_best_schedule_run() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "broadcast"),
     [
         ({"measurement_matrices": []}, "measurement_matrices = []"),
         ({"state_names": "ab"}, "state_names = 'ab'"),
@@ -171,10 +171,10 @@ def test_every_rule_and_the_best_schedule_run() -> None:
         ),
     ],
 )
-def test_bad_systems_are_told_in_one_error(options: dict[str, Any], told: str) -> None:
+def test_bad_systems_are_reported_in_one_error(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         fusion_gym.make_task(LINEAR, **options)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -198,7 +198,7 @@ def test_a_system_from_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "broadcast"),
     [
         ("transitions: [[1]]", "transitions"),
         ("- 1", "a mapping"),
@@ -207,10 +207,10 @@ def test_a_system_from_a_file(tmp_path: Path) -> None:
         ("transition: [[1, 2]]", "transition"),
     ],
 )
-def test_a_bad_file_is_told_by_name(tmp_path: Path, text: str, told: str) -> None:
+def test_a_bad_file_is_reported_by_name(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "plant.yaml"
     path.write_text(text)
-    with pytest.raises(ConfigurationError, match=told):
+    with pytest.raises(ConfigurationError, match=message):
         fusion_gym.make_task(LINEAR, system=str(path))
     with pytest.raises(ConfigurationError, match=r"absent\.yaml"):
         fusion_gym.make_task(LINEAR, system=str(tmp_path / "absent.yaml"))

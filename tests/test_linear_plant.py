@@ -70,10 +70,10 @@ def test_full_noise_and_initial_state_have_their_covariances() -> None:
         np.abs(moved @ moved.T / draws - covariance) <= monte_carlo_room(covariance, draws)
     )
     start = plant.start(np.array([[5.0], [0.0]]), generator.normal(size=(2, draws)))
-    wanted = np.array(GOOD["initial_covariance"])
+    target = np.array(GOOD["initial_covariance"])
     centred = start - [[5.0], [0.0]]
-    assert np.all(np.abs(centred.mean(1)) <= 5 * np.sqrt(np.diagonal(wanted) / draws))
-    assert np.all(np.abs(centred @ centred.T / draws - wanted) <= monte_carlo_room(wanted, draws))
+    assert np.all(np.abs(centred.mean(1)) <= 5 * np.sqrt(np.diagonal(target) / draws))
+    assert np.all(np.abs(centred @ centred.T / draws - target) <= monte_carlo_room(target, draws))
 
 
 def test_prediction_is_the_formula() -> None:
@@ -83,8 +83,8 @@ def test_prediction_is_the_formula() -> None:
     prior_mean, prior = make().predict(mean, covariance)
     np.testing.assert_allclose(prior_mean, TURN @ mean, rtol=1e-14)
     for run in range(5):
-        wanted = TURN @ covariance[..., run] @ TURN.T + RANK_ONE
-        np.testing.assert_allclose(prior[..., run], wanted, rtol=1e-13)
+        expected = TURN @ covariance[..., run] @ TURN.T + RANK_ONE
+        np.testing.assert_allclose(prior[..., run], expected, rtol=1e-13)
 
 
 def test_open_loop_of_a_scalar_plant_is_a_geometric_sum() -> None:

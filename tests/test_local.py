@@ -54,15 +54,15 @@ def test_a_row_has_what_the_sensor_knows_and_nothing_else(env_id: str) -> None:
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_without_its_number_a_row_is_the_same_but_for_that(env_id: str) -> None:
     """And sensors of one kind in the same place are told nothing apart."""
-    told, untold = (fusion_gym.make_task(env_id, own_number=number) for number in (True, False))
-    view, other = SensorView(told), SensorView(untold)
-    batch = EpisodeBatch.seeded(told, 4, 0)
-    kept = len(other.names)
-    assert view.names[:kept] == other.names
-    assert view.names[kept:] == tuple(f"sensor[{sensor}]" for sensor in range(told.sensors))
-    assert other.space.shape == (kept,)
+    received, untold = (fusion_gym.make_task(env_id, own_number=number) for number in (True, False))
+    view, other = SensorView(received), SensorView(untold)
+    batch = EpisodeBatch.seeded(received, 4, 0)
+    stored = len(other.names)
+    assert view.names[:stored] == other.names
+    assert view.names[stored:] == tuple(f"sensor[{sensor}]" for sensor in range(received.sensors))
+    assert other.space.shape == (stored,)
     rows, fewer = view.rows(batch.observe()), other.rows(batch.observe())
-    np.testing.assert_array_equal(rows[:, :kept], fewer, strict=True)
+    np.testing.assert_array_equal(rows[:, :stored], fewer, strict=True)
     with pytest.raises(ConfigurationError, match="own_number = 1 "):
         fusion_gym.make_task(env_id, own_number=1)
 

@@ -36,7 +36,7 @@ def test_its_choice_is_the_cheapest_of_all_sets() -> None:
     options: dict[str, Any] = {"filter": "kalman", "access": "any", "tokens": "unlimited"}
     task = fusion_gym.make_task(TRACKING, token_cost=(3.0, 5.0), **options)
     batch, price, steps = played(task), 0.002, 4
-    chosen = Lookahead(task, price, steps)(batch.signals())
+    selected = Lookahead(task, price, steps)(batch.signals())
     system, weights = task.system, task.reward.state_weights[:, 0]
     transition = system.plant.transition[..., 0]
     best, _ = system.fused(system.deliver(batch.state, np.ones((2, 30), dtype=np.bool_)))
@@ -52,7 +52,7 @@ def test_its_choice_is_the_cheapest_of_all_sets() -> None:
                 total += weights @ distance**2
                 distance = transition @ distance
             costs[pattern] = total
-        assert tuple(chosen[:, run]) == min(costs, key=lambda key: costs[key])
+        assert tuple(selected[:, run]) == min(costs, key=lambda key: costs[key])
 
 
 def test_coming_losses_do_not_matter() -> None:
@@ -66,10 +66,10 @@ def test_coming_losses_do_not_matter() -> None:
         granted = batch.step(policy(batch.signals())).granted
         sent, lost = sent + granted.sum(), lost + (granted & coming).sum()
     assert abs(lost - 0.5 * sent) < 4 * np.sqrt(0.25 * sent)
-    found = run_episodes(task, policy, 300, seed=0).returns
+    results = run_episodes(task, policy, 300, seed=0).returns
     best = run_episodes(task, make_policy("optimal", task), 300, seed=0).returns
-    assert (found - best).mean() < 2 * (found - best).std() / np.sqrt(300)
-    assert found.mean() > 1.05 * best.mean()  # both are negative
+    assert (results - best).mean() < 2 * (results - best).std() / np.sqrt(300)
+    assert results.mean() > 1.05 * best.mean()  # both are negative
 
 
 @pytest.mark.parametrize("access", ["any", "single"])
@@ -84,13 +84,13 @@ def test_losses_are_weighed_by_their_probabilities(access: str) -> None:
     error = (state.truth - state.prior) ** 2 * task.reward.state_weights
     arrives = 1.0 - (channel.transition @ channel.drop)[state.channel, np.arange(3)[:, None]]
     policy = Lookahead(task, price, steps=1)
-    asked = policy(batch.signals())
+    requests = policy(batch.signals())
     every = [p for p in product((0, 1), repeat=3) if access == "any" or sum(p) <= 1]
     for run in range(runs):
 
         def expected(sent: tuple[int, ...], run: int = run) -> float:
             total = price * sum(sent)
-            for arrived in product(*[(0, 1) if one else (0,) for one in sent]):
+            for arrived in product(*[(0, 1) if item else (0,) for item in sent]):
                 chance = 1.0
                 for i in range(3):
                     p = arrives[i, run] if sent[i] else 0.0
@@ -98,8 +98,8 @@ def test_losses_are_weighed_by_their_probabilities(access: str) -> None:
                 total += chance * sum(error[i, run] for i in range(3) if not arrived[i])
             return total
 
-        assert tuple(asked[:, run].astype(int)) == min(every, key=expected)
-    assert 0.1 < asked.mean() < 0.9 if access == "any" else asked.sum(0).max() == 1
+        assert tuple(requests[:, run].astype(int)) == min(every, key=expected)
+    assert 0.1 < requests.mean() < 0.9 if access == "any" else requests.sum(0).max() == 1
 
 
 def test_it_weighs_errors_as_the_reward_does() -> None:
@@ -161,7 +161,7 @@ def test_with_memory_it_aims_at_what_was_never_sent() -> None:
     for memory, price in ((False, 0.015), (True, 0.03)):
         task = fusion_gym.make_task(TOBIT, **options, memory=memory, horizon=60, cost_weight=0.03)
         policy = make_policy(f"lookahead:steps=2,price={price}", task)
-        assert policy.knowledge == ("coordinator_memory" if memory else "coordinator")
+        assert policy.knowledge == ("scheduler_memory" if memory else "scheduler")
         results.append(run_episodes(task, policy, 40, seed=0))
     forgets, remembers = results
     better = remembers.returns - forgets.returns
@@ -175,14 +175,14 @@ def test_a_packet_with_an_estimate_leaves_nothing_to_a_second_one() -> None:
     options: dict[str, Any] = {"filter": "kalman", "access": "any", "tokens": "unlimited"}
     task = fusion_gym.make_task(TRACKING, **options, memory=True, packet="estimate")
     batch, price, steps = played(task), 0.01, 3
-    asked = Lookahead(task, price, steps)(batch.signals())
-    assert set(asked.sum(0)) == {0, 1}
+    requests = Lookahead(task, price, steps)(batch.signals())
+    assert set(requests.sum(0)) == {0, 1}
     transition = task.system.plant.transition[..., 0]  # type: ignore[attr-defined]
     distance, total = batch.beliefs().difference[0], np.zeros(30)
     for _ in range(steps):
         total += (task.reward.state_weights * distance**2).sum(0)
         distance = transition @ distance
-    np.testing.assert_array_equal(asked.any(0), total > price * task.bucket.cost[0, 0])
+    np.testing.assert_array_equal(requests.any(0), total > price * task.bucket.cost[0, 0])
 
 
 @pytest.mark.parametrize(
@@ -209,8 +209,8 @@ def test_adding_one_after_another_is_nearly_as_good(
     several = whole(signals).sum(0) > 1
     assert several.any()
     assert same.mean() > (0.999 if env_id == REMOTE else 0.8)
-    best, found = (run_episodes(task, policy, 40, seed=0) for policy in (whole, greedy))
-    cost = [price * r.tokens * task.horizon + task.error_scale * r.mse * 30 for r in (best, found)]
+    best, result = (run_episodes(task, policy, 40, seed=0) for policy in (whole, greedy))
+    cost = [price * r.tokens * task.horizon + task.error_scale * r.mse * 30 for r in (best, result)]
     assert abs(cost[1].mean() / cost[0].mean() - 1.0) < 0.02
 
 

@@ -23,8 +23,8 @@ def test_the_floor_of_sources_that_are_alike_is_that_of_all_together() -> None:
     task = task_of()
     bound = lagrangian_bound(source_problems(task), (1.0,) * 3, 0.5, horizon=5, initial_tokens=1.0)
     assert floor(task) == pytest.approx(-bound.cost, rel=1e-3)
-    found = run_episodes(task, make_policy("innovation_threshold:threshold=2", task), 100, 0)
-    assert found.returns.mean() < floor(task)
+    results = run_episodes(task, make_policy("innovation_threshold:threshold=2", task), 100, 0)
+    assert results.returns.mean() < floor(task)
     with pytest.raises(ValueError, match="alike"):
         floor(task_of(noise_deviation=[1.0, 1.0, 1.5]))
 

@@ -47,10 +47,10 @@ def test_two_hundred_sensors_run_under_every_rule_that_is_no_worse_than_square()
         "value_of_information:price=0.001,own=true", "innovation_threshold:threshold=2",
     ):  # fmt: skip
         task = linear(MANY)
-        found = run_episodes(task, make_policy(policy, task), 2, 0)
-        assert np.isfinite(found.mse).all()
-        assert found.rate.shape == (2, MANY)
-        assert found.rate.mean() > 0.0, policy
+        results = run_episodes(task, make_policy(policy, task), 2, 0)
+        assert np.isfinite(results.mse).all()
+        assert results.rate.shape == (2, MANY)
+        assert results.rate.mean() > 0.0, policy
     task = linear(MANY, fusion="sci")
     assert np.isfinite(run_episodes(task, make_policy("always", task), 1, 0).mse).all()
 
@@ -131,8 +131,8 @@ def test_one_sensor_at_a_time_has_as_many_alternatives_as_sensors() -> None:
 
 def test_the_optimum_of_many_sources_that_share_nothing_is_solved_one_by_one() -> None:
     """30 alike cost 30 times one; all sets of them were once counted up."""
-    one, many = (solve_task(sources(count), "average") for count in (1, 30))
-    assert many.cost == pytest.approx(30.0 * one.cost)
+    first, many = (solve_task(sources(count), "average") for count in (1, 30))
+    assert many.cost == pytest.approx(30.0 * first.cost)
     task = sources(30)
-    found = run_episodes(task, make_policy("optimal", task), 4, 0)
-    assert found.rate.shape == (4, 30)
+    results = run_episodes(task, make_policy("optimal", task), 4, 0)
+    assert results.rate.shape == (4, 30)

@@ -23,10 +23,10 @@ def test_exponents_are_those_of_powers() -> None:
     ]
     costs += [Cost(REMOTE, n, n, part, 0.1 * n**1.75) for n in (3, 25, 200) for part in PARTS]
     costs[0] = costs[0]._replace(microseconds=1e9)  # a floor below counts for nothing
-    found = exponents(costs)
+    result = exponents(costs)
     for part in PARTS:
-        assert found[LINEAR][part] == pytest.approx({"sensors": 1.5, "states": 2.0})
-        assert found[REMOTE][part] == pytest.approx({"sensors": 1.75})
+        assert result[LINEAR][part] == pytest.approx({"sensors": 1.5, "states": 2.0})
+        assert result[REMOTE][part] == pytest.approx({"sensors": 1.75})
 
 
 def test_a_run_writes_figures_and_table(
@@ -38,10 +38,10 @@ def test_a_run_writes_figures_and_table(
     many_sensors_step.main()
     report = json.loads((tmp_path / "step.json").read_text())
     assert len(report["costs"]) == 3 * (2 + 1) * len(PARTS)
-    assert all(0.0 < one["microseconds"] < 1e6 for one in report["costs"])
+    assert all(0.0 < cost["microseconds"] < 1e6 for cost in report["costs"])
     assert set(report["exponents"]) == {LINEAR, REMOTE}
-    shown = capsys.readouterr().out
-    assert "exponent, states" in shown
+    text = capsys.readouterr().out
+    assert "exponent, states" in text
     for name in ("step.png", "step.svg"):
         assert (tmp_path / name).stat().st_size > 10_000
 
@@ -52,9 +52,9 @@ def test_the_page_says_what_was_measured() -> None:
     for env, along in ((LINEAR, "sensors"), (LINEAR, "states"), (REMOTE, "sensors")):
         cells = [f"{report['exponents'][env][part][along]:.2f}" for part in PARTS]
         assert f"| {env} | {along} | | {' | '.join(cells)} |" in page
-    for one in report["costs"]:
-        if (one["sensors"], one["part"]) == (200, "step") and one["states"] != 5:
-            row = f"| {one['env']} | 200 | {one['states']} | {one['microseconds']:,.0f} |"
+    for cost in report["costs"]:
+        if (cost["sensors"], cost["part"]) == (200, "step") and cost["states"] != 5:
+            row = f"| {cost['env']} | 200 | {cost['states']} | {cost['microseconds']:,.0f} |"
             assert row in page
-    found = [parts["sensors"] for env in report["exponents"].values() for parts in env.values()]
-    assert max(found) <= 2.0  # nothing that is measured grows faster than the square
+    result = [parts["sensors"] for env in report["exponents"].values() for parts in env.values()]
+    assert max(result) <= 2.0  # nothing that is measured grows faster than the square

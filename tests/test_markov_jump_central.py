@@ -45,8 +45,8 @@ def test_references_that_know_all_measurements(where: str, errors: tuple[float, 
 
 
 def test_the_more_a_filter_knows_the_better() -> None:
-    found = [run_episodes(build(filter=f), Always(), 1500, 7) for f in ("local", *FILTERS)]
-    for worse, better in itertools.pairwise(found):
+    results = [run_episodes(build(filter=f), Always(), 1500, 7) for f in ("local", *FILTERS)]
+    for worse, better in itertools.pairwise(results):
         gain = worse.mse - better.mse  # paired: the same noise
         assert gain.mean() > 4 * gain.std() / np.sqrt(1500)
 
@@ -58,8 +58,8 @@ def test_the_linear_filters_covariance_is_that_of_its_errors(seed: int | None) -
     policy = Always() if seed is None else Random(0.4)
     task = build(filter="centralised", horizon=40, **options(model))
     results = run_episodes(task, policy, 4000, 3)
-    for found, expected in ((results.nees, 1.0), (results.mse - results.bound_trace, 0.0)):
-        assert abs(found.mean() - expected) <= 4 * found.std() / np.sqrt(4000)
+    for value, expected in ((results.nees, 1.0), (results.mse - results.bound_trace, 0.0)):
+        assert abs(value.mean() - expected) <= 4 * value.std() / np.sqrt(4000)
     assert results.nees.mean() == pytest.approx(1.0, abs=0.03)
     assert results.bound_trace.mean() < 0.95 * task.system.open_loop(40).sum()
 
@@ -197,17 +197,17 @@ def test_a_mode_that_never_jumps_is_identified_exactly() -> None:
     system = build(filter="imm", horizon=12, **options(model)).system
     draw, steps = np.random.default_rng(3), 8
     state = system.start(draw.standard_normal((system.start_channels, 1)))
-    seen: list[float] = []
+    observed: list[float] = []
     for time in range(1, steps + 1):
         state = system.sense(state, draw.standard_normal((system.noise_channels, 1)))
         y = Signals(system.read(state))["measurement"][:, 0, 0]
-        seen += y[time % np.array([1, 2]) == 0].tolist()
+        observed += y[time % np.array([1, 2]) == 0].tolist()
         state = system.deliver(state, np.ones((2, 1), dtype=bool))
     weights, means, spreads = [], [], []
     for j in range(2):
         # Everything is linear in u = (x0, w(0), …, w(steps), η): rows of x and of the y in u.
         f, g, h = model["transitions"][j], model["gains"][j], model["matrices"][:, j]
-        count = len(seen)
+        count = len(observed)
         size = 2 + steps + 1 + count
         x, rows, number = np.eye(2, size), [], 0
         for time in range(1, steps + 1):
@@ -227,8 +227,8 @@ def test_a_mode_that_never_jumps_is_identified_exactly() -> None:
         every = np.vstack((x, rows))
         mean, cov = every @ start, every @ unit @ every.T
         back = np.linalg.inv(cov[2:, 2:])
-        weights.append(model["pi"][j] * multivariate_normal(mean[2:], cov[2:, 2:]).pdf(seen))
-        means.append(mean[:2] + cov[:2, 2:] @ back @ (np.array(seen) - mean[2:]))
+        weights.append(model["pi"][j] * multivariate_normal(mean[2:], cov[2:, 2:]).pdf(observed))
+        means.append(mean[:2] + cov[:2, 2:] @ back @ (np.array(observed) - mean[2:]))
         spreads.append(cov[:2, :2] - cov[:2, 2:] @ back @ cov[2:, :2])
     share = np.array(weights) / sum(weights)
     assert 0.0 < share.min() < 0.5

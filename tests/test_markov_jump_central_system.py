@@ -46,12 +46,12 @@ def test_nothing_that_was_not_sampled_leaks(where: str) -> None:
         for block in system.observation:
             np.testing.assert_array_equal(block.fill(other), block.fill(state))
         everyone = np.ones((3, runs), dtype=bool)
-        for found, expected in zip(
+        for entry, expected in zip(
             system.fused(system.deliver(other, everyone)),
             system.fused(system.deliver(state, everyone)),
             strict=True,
         ):
-            np.testing.assert_array_equal(found, expected)
+            np.testing.assert_array_equal(entry, expected)
         state = system.deliver(state, nobody)
 
 
@@ -136,16 +136,16 @@ def test_forecasts_have_the_innovations_moments(where: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("arguments", "message"),
     [
         ({"filter": "central"}, r"filter = 'central' .*did you mean 'centralised'"),
         ({"filter": "imm", "fusion": "matrix"}, r"fusion = 'matrix' .* filter='imm': .* left out"),
         ({"filter": "centralised", "fusion": "ci"}, r"fusion = 'ci' .* filter='centralised'"),
     ],
 )
-def test_what_is_not_allowed_is_said_in_one_error(given: dict[str, Any], message: str) -> None:
+def test_what_is_not_allowed_is_said_in_one_error(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
-        build(**given)
+        build(**arguments)
 
 
 def test_the_nodes_trigger_has_no_meaning_at_the_centre() -> None:

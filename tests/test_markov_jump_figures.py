@@ -106,7 +106,7 @@ def test_intersection_is_the_same_where_only_one_node_sends() -> None:
 def agreement(policy: Policy, runs: int, steps: int, seed: int) -> tuple[Array, Array]:
     """Second moments of the fused error over all runs, and what the centre claims, by time."""
     task = build(horizon=steps)
-    found, claimed = np.zeros((steps, 2, 2)), np.zeros((steps, 2, 2))
+    values, claimed = np.zeros((steps, 2, 2)), np.zeros((steps, 2, 2))
     for part in range(runs // 2000):
         batch = EpisodeBatch(task, 2000)
         batch.seed(np.arange(2000), [seed + 2000 * part + run for run in range(2000)])
@@ -116,20 +116,20 @@ def agreement(policy: Policy, runs: int, steps: int, seed: int) -> tuple[Array, 
             batch.step(policy(batch.signals()))
             mean, covariance = task.system.fused(batch.delivered)
             error = task.system.truth(batch.delivered) - mean
-            found[step] += linalg.outer(error, error).sum(-1) / runs
+            values[step] += linalg.outer(error, error).sum(-1) / runs
             claimed[step] += covariance.sum(-1) / runs
-    return found, claimed
+    return values, claimed
 
 
 @pytest.mark.parametrize("kind", ["trigger", "random"])
 def test_claimed_covariance_is_that_of_the_errors(kind: str) -> None:
     """20,000 runs: within 5 % of the deviations at each time, within 1.5 % over all times."""
     policy = papers_trigger(0.9) if kind == "trigger" else Random((0.2, 0.3, 0.4))
-    found, claimed = agreement(policy, 20_000, 18, 100)
+    result, claimed = agreement(policy, 20_000, 18, 100)
     variance = np.einsum("tii->ti", claimed)
     scale = np.sqrt(variance[:, :, None] * variance[:, None])
-    assert (np.abs(found - claimed) / scale).max() <= 0.05
-    overall = np.abs(found.mean(0) - claimed.mean(0)) / scale.mean(0)
+    assert (np.abs(result - claimed) / scale).max() <= 0.05
+    overall = np.abs(result.mean(0) - claimed.mean(0)) / scale.mean(0)
     assert overall.max() <= 0.015
 
 

@@ -76,11 +76,11 @@ def test_moments_and_modes_of_samples_follow_an_asymmetric_chain() -> None:
     assert (np.abs(state.mean(1) - means[-1]) <= 5 * deviation).all()
     spread = (state**2).std(1) / np.sqrt(runs)
     assert (np.abs((state**2).mean(1) - squares[-1]) <= 5 * spread).all()
-    found = np.bincount(mode, minlength=3) / runs
-    np.testing.assert_allclose(found, share, atol=5 * 0.5 / np.sqrt(runs))
+    values = np.bincount(mode, minlength=3) / runs
+    np.testing.assert_allclose(values, share, atol=5 * 0.5 / np.sqrt(runs))
     # The other direction of the chain would not fit.
     wrong = model["pi"] @ np.linalg.matrix_power(model["chain"].T, steps)
-    assert np.abs(found - wrong).max() > 0.05
+    assert np.abs(values - wrong).max() > 0.05
 
 
 def test_fading_has_the_papers_moments_and_frequencies() -> None:
@@ -91,8 +91,8 @@ def test_fading_has_the_papers_moments_and_frequencies() -> None:
     fading = sensors.fading(np.random.default_rng(2).standard_normal((3, runs)))
     for sensor in range(3):
         for value, share in zip(PAPER["values"][sensor], PAPER["shares"][sensor], strict=True):
-            found = (fading[sensor] == value).mean()
-            assert found == pytest.approx(share, abs=5 * 0.5 / np.sqrt(runs))
+            result = (fading[sensor] == value).mean()
+            assert result == pytest.approx(share, abs=5 * 0.5 / np.sqrt(runs))
 
 
 def test_measurements_carry_the_noise_that_moves_the_plant_next() -> None:
@@ -104,20 +104,20 @@ def test_measurements_carry_the_noise_that_moves_the_plant_next() -> None:
     mode = np.zeros(runs, dtype=np.int64)
     zero = np.zeros((plant.size, runs))
     own = draw.standard_normal((sensors.noise_channels, runs))
-    found = np.cov(np.concatenate((noise, sensors.measure(zero, mode, noise, own))))
+    values = np.cov(np.concatenate((noise, sensors.measure(zero, mode, noise, own))))
     q, alpha = model["noise"], model["coupling"]
     expected = np.block([[q, q @ alpha.T], [alpha @ q, alpha @ q @ alpha.T]])
     expected[2:, 2:] += np.diag(model["variance"])
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    assert (np.abs(found - expected) / scale).max() <= 5 * np.sqrt(2 / runs)
+    assert (np.abs(values - expected) / scale).max() <= 5 * np.sqrt(2 / runs)
     state = draw.standard_normal((plant.size, runs))
     for number in range(plant.modes):
         mode[:] = number
-        seen = sensors.measure(state, mode, 0.0 * noise, own)
-        seen -= sensors.deviation * own[sensors.count :]
+        observed = sensors.measure(state, mode, 0.0 * noise, own)
+        observed -= sensors.deviation * own[sensors.count :]
         matrix = model["matrices"][:, number]
         np.testing.assert_allclose(
-            seen, sensors.fading(own[: sensors.count]) * (matrix @ state), atol=1e-12
+            observed, sensors.fading(own[: sensors.count]) * (matrix @ state), atol=1e-12
         )
 
 
@@ -155,8 +155,8 @@ def test_one_mode_without_fading_and_coupling_is_filterpys_kalman_filter() -> No
             if sampled[sensor, 0]:
                 other.update(measurement[sensor])
             np.testing.assert_allclose(mean[sensor, :, 0], other.x, rtol=1e-9)
-            found = filters.covariance[sensor, sensor, ..., place[0]]
-            np.testing.assert_allclose(found, other.P, rtol=1e-9, atol=1e-12)
+            values = filters.covariance[sensor, sensor, ..., place[0]]
+            np.testing.assert_allclose(values, other.P, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -209,10 +209,10 @@ def compare(model: dict[str, Any], pattern: NDArray[np.bool_], tolerance: float 
         fused = fusion.fuse(np.zeros((len(sent), n, runs)), joint).covariance
         for run, other in enumerate(dense):
             expected = other.copies(sent[:, run])
-            found = joint[..., run].transpose(0, 2, 1, 3).reshape(expected.shape)
+            result = joint[..., run].transpose(0, 2, 1, 3).reshape(expected.shape)
             scale = np.abs(expected).max()
-            np.testing.assert_allclose(found, expected, atol=tolerance * scale)
-            assert np.linalg.eigvalsh(found)[0] >= -1e-10 * scale
+            np.testing.assert_allclose(result, expected, atol=tolerance * scale)
+            assert np.linalg.eigvalsh(result)[0] >= -1e-10 * scale
             best = best_weights(expected, n)[1]
             np.testing.assert_allclose(fused[..., run], best, atol=1e-3 * scale)
             assert np.trace(fused[..., run]) <= np.trace(best) + 2e-5 * scale
@@ -271,8 +271,8 @@ def test_weights_are_optimal_for_a_regular_joint_covariance(
         information = np.linalg.inv(sigma)
         best = np.linalg.inv(e.T @ information @ e)
         expected = best @ e.T @ information @ (means[..., run].reshape(-1) / scale)
-        found = covariance[..., run] / np.outer(units, units)
-        np.testing.assert_allclose(found, best, rtol=1e-6, atol=1e-7 * np.abs(best).max())
+        result = covariance[..., run] / np.outer(units, units)
+        np.testing.assert_allclose(result, best, rtol=1e-6, atol=1e-7 * np.abs(best).max())
         np.testing.assert_allclose(mean[:, run] / units, expected, rtol=1e-4, atol=1e-4)
 
 

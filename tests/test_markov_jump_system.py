@@ -136,10 +136,10 @@ def test_whitened_differences_have_unit_variance_under_random_requests() -> None
         known = deviation > 1e-6
         whitened = np.where(known, offered["innovation"] / deviation, 0.0)
         share = known.mean(-1)
-        found = (whitened**2).sum(-1) / np.maximum(known.sum(-1), 1)
+        result = (whitened**2).sum(-1) / np.maximum(known.sum(-1), 1)
         spread = np.sqrt(((whitened**4).sum(-1) / np.maximum(known.sum(-1), 1)) / 20_000)
         limit = 5 * spread / np.sqrt(np.maximum(share, 1e-3))
-        assert (np.abs(found - 1.0) <= np.where(share > 0.05, limit, np.inf)).all(), step
+        assert (np.abs(result - 1.0) <= np.where(share > 0.05, limit, np.inf)).all(), step
         assert (share > 0.05).any()
         batch.step(policy(offered))
 
@@ -175,7 +175,7 @@ def test_open_loop_is_what_never_costs() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("arguments", "message"),
     [
         ({"fusion": "information"}, r"fusion = 'information' .* correlated"),
         ({"fusion": "federated"}, r"fusion = 'federated' .* fed back"),
@@ -196,9 +196,9 @@ def test_open_loop_is_what_never_costs() -> None:
         ({"sampling_period": 2}, "unknown option .*sampling_periods"),
     ],
 )
-def test_what_is_not_allowed_is_said_in_one_error(given: dict[str, Any], message: str) -> None:
+def test_what_is_not_allowed_is_said_in_one_error(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
-        build(**given)
+        build(**arguments)
 
 
 # --- the triggers --------------------------------------------------------------------------------
@@ -207,8 +207,8 @@ def test_what_is_not_allowed_is_said_in_one_error(given: dict[str, Any], message
 def test_local_variance_follows_the_papers_rule() -> None:
     variance = np.array([[1.0, 2.0], [2.1, 3.0], [0.5, 2.2]])
     offered = Signals({"local_variance": variance})
-    found = LocalVariance(m=0.9, reference=1.2)(offered)
-    np.testing.assert_array_equal(found, variance >= 2.1)
+    requests = LocalVariance(m=0.9, reference=1.2)(offered)
+    np.testing.assert_array_equal(requests, variance >= 2.1)
     each = LocalVariance(m=(-0.5, 5.0, 1.0), reference=1.0)(offered)
     np.testing.assert_array_equal(each, [[True, True], [False, False], [False, True]])
 
@@ -217,9 +217,9 @@ def test_centre_variance_takes_the_fewest() -> None:
     before = np.array([[3.0, 3.0, 1.0], [2.0, 1.2, 0.5], [1.0, 1.5, 0.9]])
     offered = Signals({"greedy_variance": before, "age": np.ones((3, 3))})
     np.testing.assert_array_equal(CentreVariance(1.5)(offered), before >= 1.5)
-    found = CentreVariance(1.5, at_most=1)(offered)
-    np.testing.assert_array_equal(found.sum(0), [1, 1, 0])
-    assert found[0, :2].all()
+    requests = CentreVariance(1.5, at_most=1)(offered)
+    np.testing.assert_array_equal(requests.sum(0), [1, 1, 0])
+    assert requests[0, :2].all()
 
 
 @pytest.mark.parametrize(

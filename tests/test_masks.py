@@ -13,7 +13,7 @@ from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_suppo
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
-from fusion_gym.envs.views import CoordinatorView
+from fusion_gym.envs.views import SchedulerView
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.model import ModelPolicy, tag_model
 from fusion_gym.policies.registry import make_policy
@@ -48,21 +48,21 @@ def test_grantable_is_what_the_network_grants_alone(options: dict[str, Any], ste
     grantable = played(steps, **(SCARCE | options)).grantable()
     for sensor in range(3):
         batch = played(steps, **(SCARCE | options))
-        alone = np.zeros((3, 40), dtype=np.bool_)
-        alone[sensor] = True
-        np.testing.assert_array_equal(batch.step(alone).granted[sensor], grantable[sensor])
+        single = np.zeros((3, 40), dtype=np.bool_)
+        single[sensor] = True
+        np.testing.assert_array_equal(batch.step(single).granted[sensor], grantable[sensor])
 
 
 @pytest.mark.parametrize("options", [{}, {"action": "discrete"}, {"access": "single"}])
 def test_masks_close_exactly_the_actions_with_closed_sensors(options: dict[str, Any]) -> None:
     task = fusion_gym.make_task(ENV_ID, **options)
     patterns = np.array(list(product((False, True), repeat=3))).T
-    view = CoordinatorView(task)
+    view = SchedulerView(task)
     masks = view.masks(patterns)
     if options.get("action") == "discrete" or options.get("access") == "single":
         for action in range(masks.shape[1]):
-            chosen = view.requests(np.full(8, action), 8)
-            np.testing.assert_array_equal(masks[:, action], ~(chosen & ~patterns).any(0))
+            selection = view.requests(np.full(8, action), 8)
+            np.testing.assert_array_equal(masks[:, action], ~(selection & ~patterns).any(0))
     else:
         np.testing.assert_array_equal(masks.reshape(8, 3, 2)[..., 0], True)
         np.testing.assert_array_equal(masks.reshape(8, 3, 2)[..., 1], patterns.T)

@@ -64,7 +64,7 @@ MODELS: dict[str, tuple[type[BaseAlgorithm], str, dict[str, Any], dict[str, Any]
 }
 
 
-def made(
+def build_parts(
     algorithm: type[BaseAlgorithm], policy: Any, options: dict[str, Any], arguments: dict[str, Any]
 ) -> tuple[BaseAlgorithm, Task]:
     env = fusion_gym.make_sb3_vec_env(ENV, 2, **OPTIONS, **options)
@@ -86,7 +86,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Saved]:
 
     def get(name: str) -> Saved:
         if name not in done:
-            model, task = made(*MODELS[name])
+            model, task = build_parts(*MODELS[name])
             if isinstance(model, DQN):
                 model.exploration_rate = 0.5  # a coin that decisions by chance throw
             with torch.no_grad():  # far enough from zero that decisions differ
@@ -132,11 +132,11 @@ def streams() -> list[Any]:
 
 def decisions(policy: Any, task: Task) -> list[Any]:
     policy.reset(20, 5)
-    batch, found = EpisodeBatch.seeded(task, 20, 0), []
+    batch, result = EpisodeBatch.seeded(task, 20, 0), []
     for _ in range(12):
-        found.append(policy(batch.signals()))
-        batch.step(found[-1])
-    return found
+        result.append(policy(batch.signals()))
+        batch.step(result[-1])
+    return result
 
 
 @pytest.mark.parametrize("carded", [True, False], ids=["card", "plain"])
@@ -152,14 +152,14 @@ def test_a_rebuilt_policy_decides_as_the_model_did(
     policy: Any = make_policy(f"model:{path}", agent.task)
     assert streams() == before
     assert type(policy.model) is type(agent.model)
-    wanted, found = agent.model.policy.state_dict(), policy.model.policy.state_dict()
-    assert wanted.keys() == found.keys()
-    assert all(torch.equal(weight, found[key]) for key, weight in wanted.items())
+    expected, result = agent.model.policy.state_dict(), policy.model.policy.state_dict()
+    assert expected.keys() == result.keys()
+    assert all(torch.equal(weight, result[key]) for key, weight in expected.items())
     chance: Any = make_policy(f"model:{path},deterministic=false", agent.task)
-    for one in (policy, chance):
+    for item in (policy, chance):
         other: Any = make_policy(f"model:{path}", agent.task)
-        other.model, other.deterministic = agent.model, one.deterministic
-        first, second = decisions(one, agent.task), decisions(other, agent.task)
+        other.model, other.deterministic = agent.model, item.deterministic
+        first, second = decisions(item, agent.task), decisions(other, agent.task)
         np.testing.assert_array_equal(first, second)
     assert 0.0 < np.mean(decisions(policy, agent.task)) < 1.0
 
@@ -171,9 +171,9 @@ def test_the_file_with_a_card_is_an_ordinary_one(saved: Callable[[str], Saved]) 
         torch.equal(weight, again.policy.state_dict()[name])
         for name, weight in agent.model.policy.state_dict().items()
     )
-    told = again.fusion_gym_model
-    assert told["network"] == {"pi": [8], "vf": [6, 5]}
-    assert (told["activation"], told["actions"]) == ("relu", "Discrete(8)")
+    card_entry = again.fusion_gym_model
+    assert card_entry["network"] == {"pi": [8], "vf": [6, 5]}
+    assert (card_entry["activation"], card_entry["actions"]) == ("relu", "Discrete(8)")
     memory = saved("recurrent_ppo_shared").model.fusion_gym_model["network"]["memory"]  # type: ignore[attr-defined]
     assert memory == {"size": 6, "layers": 2, "critic": "shared"}
 
@@ -182,15 +182,17 @@ def test_the_file_with_a_card_is_an_ordinary_one(saved: Callable[[str], Saved]) 
 def test_agents_of_the_zoo_decide_as_stable_baselines_loads_them(
     name: str, request: pytest.FixtureRequest
 ) -> None:
-    told = fusion_gym.zoo.card(name)
-    task = fusion_gym.make_task(told["env"], **told["options"])
-    algorithm = told["training"]["algorithm"]["name"].removeprefix("counterfactual_")
+    card_entry = fusion_gym.zoo.card(name)
+    task = fusion_gym.make_task(card_entry["env"], **card_entry["options"])
+    algorithm = card_entry["training"]["algorithm"]["name"].removeprefix("counterfactual_")
     loaded = ALGORITHMS[algorithm].load(fusion_gym.zoo.model_path(name), device="cpu")
     request.getfixturevalue("no_unpickling")
     policy: Any = make_policy(f"zoo:{name}", task)
     loaded.observation_space.seed(0)
-    seen = np.array([loaded.observation_space.sample() for _ in range(500)])
-    first, second = (model.predict(seen, deterministic=True)[0] for model in (loaded, policy.model))
+    observed = np.array([loaded.observation_space.sample() for _ in range(500)])
+    first, second = (
+        model.predict(observed, deterministic=True)[0] for model in (loaded, policy.model)
+    )
     np.testing.assert_array_equal(first, second)
     assert len(np.unique(first, axis=0)) > 1
 
@@ -218,8 +220,8 @@ def repacked(path: Path, source: Path, **parts: bytes | None) -> Path:
 
 def data_of(path: Path) -> dict[str, Any]:
     with zipfile.ZipFile(path) as packed:
-        found: dict[str, Any] = json.loads(packed.read("data"))
-    return found
+        content: dict[str, Any] = json.loads(packed.read("data"))
+    return content
 
 
 def dumped(thing: Any, **options: Any) -> bytes:
@@ -292,7 +294,7 @@ class OwnExtractor(FlattenExtractor):
 
 @pytest.mark.parametrize("carded", [True, False], ids=["card", "plain"])
 @pytest.mark.parametrize(
-    ("given", "reason"),
+    ("value", "reason"),
     [
         ((QRDQN, "MlpPolicy", DISCRETE, {"buffer_size": 10}), "its policy is none of"),
         ((PPO, OwnPolicy, {}, {}), "its policy is none of"),
@@ -308,9 +310,9 @@ class OwnExtractor(FlattenExtractor):
     ids=["algorithm", "policy", "extractor", "activation"],
 )
 def test_what_weights_do_not_make_needs_trust(
-    tmp_path: Path, given: Any, reason: str, carded: bool
+    tmp_path: Path, value: Any, reason: str, carded: bool
 ) -> None:
-    model, task = made(*given)
+    model, task = build_parts(*value)
     if carded:
         tag_model(model, task)
     path = tmp_path / "model.zip"
@@ -431,7 +433,7 @@ def test_a_damaged_file_is_refused_or_harmless(
     repacked(path, agent.carded, data=b"[" * 100_000)
     with pytest.raises(ConfigurationError, match="its data is no JSON"):
         make_policy(f"model:{path}", agent.task)
-    said = []
+    text = []
     for trial in range(40):
         content = bytearray(whole[: stream.randrange(len(whole))] if trial % 2 else whole)
         for _ in range(20):
@@ -440,10 +442,10 @@ def test_a_damaged_file_is_refused_or_harmless(
         try:
             make_policy(f"model:{path}", agent.task)
         except ConfigurationError as error:
-            said.append(str(error))
-    assert len(said) > 20
-    assert max(map(len, said)) < 600
-    assert not any("\n" in line for line in said)
+            text.append(str(error))
+    assert len(text) > 20
+    assert max(map(len, text)) < 600
+    assert not any("\n" in line for line in text)
 
 
 def test_a_file_of_the_zoo_is_the_one_that_its_card_describes(
@@ -467,7 +469,7 @@ def test_a_file_of_the_zoo_is_the_one_that_its_card_describes(
 def test_commands_load_foreign_code_with_trust_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, _ = made(QRDQN, "MlpPolicy", DISCRETE, {"buffer_size": 10})
+    model, _ = build_parts(QRDQN, "MlpPolicy", DISCRETE, {"buffer_size": 10})
     policy = f"model:{tmp_path / 'model.zip'}"
     model.save(tmp_path / "model.zip")
     files: dict[str, Any] = {

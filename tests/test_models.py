@@ -46,10 +46,10 @@ def experiment(algorithm: str = "ppo", local: bool = False, **options: Any) -> E
 def test_an_untrained_policy_requests_at_the_initial_rate(
     algorithm: str, local: bool, options: dict[str, Any]
 ) -> None:
-    chosen = experiment(algorithm, local, **options)
+    suggestion = experiment(algorithm, local, **options)
     task = make_task(ENV, tokens="unlimited", **options)
     env = FusionSB3VecEnv(task, 64, local=local)
-    model = make_model(chosen, env)
+    model = make_model(suggestion, env)
     torch.manual_seed(0)
     env.seed(0)
     observation: Any = env.reset()
@@ -63,21 +63,21 @@ def test_an_untrained_policy_requests_at_the_initial_rate(
 
 
 def test_without_an_initial_rate_half_of_the_choices_are_requests() -> None:
-    chosen = experiment().model_dump()
-    chosen["algorithm"]["initial_rate"] = None
+    suggestion = experiment().model_dump()
+    suggestion["algorithm"]["initial_rate"] = None
     env = FusionSB3VecEnv(make_task(ENV), 64)
-    model = make_model(Experiment.model_validate(chosen), env)
+    model = make_model(Experiment.model_validate(suggestion), env)
     env.seed(0)
     actions = np.concatenate([model.predict(env.reset())[0] for _ in range(20)])
     assert actions.mean() == pytest.approx(0.5, abs=0.03)
 
 
 def test_one_sensor_a_step_bounds_the_initial_rate() -> None:
-    chosen = experiment().model_dump()
-    chosen["algorithm"]["initial_rate"] = 0.34
+    suggestion = experiment().model_dump()
+    suggestion["algorithm"]["initial_rate"] = 0.34
     env = FusionSB3VecEnv(make_task(ENV, access="single"), 8)
     with pytest.raises(ConfigurationError, match=r"initial_rate = 0.34 .* must be < 1/3"):
-        make_model(Experiment.model_validate(chosen), env)
+        make_model(Experiment.model_validate(suggestion), env)
 
 
 @pytest.mark.parametrize(("algorithm", "value"), [("ppo", 0.0), ("ppo", 1.0), ("dqn", 0.1)])

@@ -14,7 +14,7 @@ import yaml
 from command_runs import call
 
 from fusion_gym.agents.compare import Compare
-from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.envs.registration import make_task
 from fusion_gym.validation import ConfigurationError
@@ -57,8 +57,8 @@ def test_the_lines_of_the_page_lead_to_a_front(
     assert prices[0] == 0.01
     assert prices[-1] == 1.0
     # The plant of the file belongs to the training, wherever the file has gone.
-    kept = yaml.safe_load((tmp_path / "runs/front/config.yaml").read_text())["environment"]
-    assert kept["options"] == {
+    content = yaml.safe_load((tmp_path / "runs/front/config.yaml").read_text())["environment"]
+    assert content["options"] == {
         "memory": True, "cost_weight": "random", "price_range": [0.01, 1.0], "horizon": 8,
         **yaml.safe_load(text),
     }  # fmt: skip
@@ -71,23 +71,23 @@ def test_the_lines_of_the_page_lead_to_a_front(
 
 
 def front(**options: Any) -> Any:
-    experiment = load(Experiment, "linear_fusion_front").changed(None, options)
+    experiment = load_checked(Experiment, "linear_fusion_front").changed(None, options)
     return make_task(experiment.environment.id, **experiment.environment.options)
 
 
-def asked(policy: str, prices: int | None) -> Compare:
+def requests_at(policy: str, prices: int | None) -> Compare:
     return Compare(config="a", sweep="b", policy=policy, output=Path("c"), prices=prices)
 
 
 def test_prices_are_for_agents_that_see_one() -> None:
     task = front()
-    assert asked("always", None).asked(task) == ["always"]
-    assert asked("model:a.zip", 3).asked(task) == [
+    assert requests_at("always", None).policies_of(task) == ["always"]
+    assert requests_at("model:a.zip", 3).policies_of(task) == [
         "model:a.zip,price=0.01", "model:a.zip,price=0.1", "model:a.zip,price=1.0"
     ]  # fmt: skip
     narrow = front(price_range=[0.0123456789, 0.2])
-    assert asked("zoo:x", 2).asked(narrow)[0] == "zoo:x,price=0.0123456789"
+    assert requests_at("zoo:x", 2).policies_of(narrow)[0] == "zoo:x,price=0.0123456789"
     with pytest.raises(ConfigurationError, match=r"prices = 3 .* no agent"):
-        asked("always", 3).asked(task)
+        requests_at("always", 3).policies_of(task)
     with pytest.raises(ConfigurationError, match=r"prices = 3 .* no price_range"):
-        asked("model:a.zip", 3).asked(make_task("fusion_gym/LinearFusion-v0"))
+        requests_at("model:a.zip", 3).policies_of(make_task("fusion_gym/LinearFusion-v0"))

@@ -116,7 +116,7 @@ def test_expectation_is_that_of_the_censored_normal(
 ) -> None:
     sensors = CensoredSensors.create([[[2.0]]], variance, threshold, 1)
     expectation = TobitKalmanFilter(sensors).expect(np.array([[[latent / 2.0]]]))
-    found = {name: float(value[0, 0, 0]) for name, value in expectation._asdict().items()}
+    result = {name: float(value[0, 0, 0]) for name, value in expectation._asdict().items()}
     with mpmath.workdps(30):
         root = mpmath.sqrt(variance)
         nearest = mpmath.mpf(max(latent, threshold))
@@ -132,7 +132,7 @@ def test_expectation_is_that_of_the_censored_normal(
         total_variance = censored * (threshold - mean) ** 2 + beyond(2, mean)
         truncated_mean = beyond(1, 0) / inside
         truncated_variance = beyond(2, truncated_mean) / inside
-        wanted = {
+        expected = {
             "latent": latent,
             "uncensored_probability": float(inside),
             "value": float(mean),
@@ -140,8 +140,8 @@ def test_expectation_is_that_of_the_censored_normal(
             "hazard": float((truncated_mean - latent) / root),
             "truncated_variance": float(truncated_variance / variance),
         }
-    assert found == pytest.approx(wanted, rel=1e-8, abs=1e-14)
-    assert found["uncensored_probability"] == pytest.approx(float(inside), rel=1e-9, abs=0.0)
+    assert result == pytest.approx(expected, rel=1e-8, abs=1e-14)
+    assert result["uncensored_probability"] == pytest.approx(float(inside), rel=1e-9, abs=0.0)
 
 
 # --- Joseph form -------------------------------------------------------------------------------
@@ -166,12 +166,12 @@ def test_posterior_equals_its_joseph_form(kind: Any) -> None:
         for lane in range(10):
             q = expectation.uncensored_probability[sensor, :, lane]
             v = expectation.truncated_variance[sensor, :, lane]
-            wanted = joseph(
+            expected = joseph(
                 outcomes.correction[sensor, :, :, lane],
                 q[:, None] * matrix,
                 problem.covariance[sensor, :, :, lane],
                 np.diag(problem.sensors.variance[sensor, :, 0] * v),
             )
-            found = outcomes.delivered_covariance[sensor, :, :, lane]
-            np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
-            assert np.array_equal(found, found.T)
+            result = outcomes.delivered_covariance[sensor, :, :, lane]
+            np.testing.assert_allclose(result, expected, rtol=1e-9, atol=1e-12)
+            assert np.array_equal(result, result.T)

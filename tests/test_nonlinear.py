@@ -68,8 +68,8 @@ def linear(monkeypatch: pytest.MonkeyPatch) -> Any:
     return fusion_gym.make_task("me/Linear-v0", tokens="unlimited")
 
 
-def build(chosen: CommonOptions) -> Scenario:
-    return Scenario(chosen, Linear())
+def build(options: CommonOptions) -> Scenario:
+    return Scenario(options, Linear())
 
 
 @pytest.fixture(scope="module")
@@ -99,14 +99,14 @@ def test_a_linear_case_is_filterpys(linear: Any) -> None:
         reduction = signals["variance_reduction"][:, 0]
         requests = generator.random((2, 1)) < 0.4
         for sensor in range(2):
-            kept = beside.P.copy(), beside.x.copy()
+            stored = beside.P.copy(), beside.x.copy()
             prior = np.trace(beside.P)
             measured = signals["measurement"][sensor, :, 0]
             beside.update(measured, R=DEVIATION[sensor] ** 2, H=C[sensor][None])
             if sensor == 0:
                 assert reduction[0] == pytest.approx(prior - np.trace(beside.P))
             if not requests[sensor, 0]:
-                beside.P, beside.x = kept
+                beside.P, beside.x = stored
         batch.step(requests)
         mean, covariance = linear.system.fused(batch.delivered)
         np.testing.assert_allclose(mean[:, 0], beside.x, atol=1e-10)
@@ -120,7 +120,7 @@ def test_open_loop_by_simulation(linear: Any) -> None:
     assert linear.system.open_loop(30).tolist() == Linear().open_loop(30).tolist()
 
 
-def test_the_example_runs_by_itself() -> None:
+def test_the_example_runs_local() -> None:
     root = EXAMPLE.parent.parent
     done = subprocess.run([sys.executable, EXAMPLE], cwd=root, capture_output=True, text=True,
                           env={"PYTHONPATH": str(root), "PATH": ""}, check=True)  # fmt: skip
@@ -135,12 +135,12 @@ def test_the_pendulums_filter_is_consistent(pendulum: ModuleType) -> None:
         assert not results.diverged.any()
     watchful = make_policy("value_of_information:threshold=0.02,at_most=1", task)
     periodic = run_episodes(task, make_policy("periodic:period=6", task), 400, 0)
-    found = run_episodes(task, watchful, 400, 0)
-    assert found.mse.mean() < periodic.mse.mean()
-    assert found.rate.mean() < 1.1 * periodic.rate.mean()
+    outcome = run_episodes(task, watchful, 400, 0)
+    assert outcome.mse.mean() < periodic.mse.mean()
+    assert outcome.rate.mean() < 1.1 * periodic.rate.mean()
 
 
-def test_the_pendulum_has_every_face(pendulum: ModuleType) -> None:
+def test_the_pendulum_has_every_interface(pendulum: ModuleType) -> None:
     name = "examples/Pendulum-v0"
     check_env(gym.make(name, memory=True, horizon=20).unwrapped, skip_render_check=True)
     rows = fusion_gym.make_sb3_vec_env(name, num_envs=3, local=True, memory=True, horizon=20)
@@ -156,7 +156,7 @@ def test_the_pendulum_has_every_face(pendulum: ModuleType) -> None:
         assert np.isfinite(run_episodes(task, make_policy(policy, task), 4, 0).mse).all()
 
 
-def test_what_does_not_fit_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_does_not_fit_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigurationError, match="initial_covariance"):
         Shaped(initial_covariance=-np.eye(2))
     with pytest.raises(ConfigurationError, match="sensors = 0"):
@@ -170,12 +170,12 @@ class Shaped(Linear):
     """Other arguments, and measurements without an axis for the channels."""
 
     def __init__(self, **changes: Any) -> None:
-        given = {"sensors": 2, "initial_covariance": START} | changes
-        NonlinearSystem.__init__(self, ("a", "b"), process_channels=2, initial_mean=MEAN, **given)
+        content = {"sensors": 2, "initial_covariance": START} | changes
+        NonlinearSystem.__init__(self, ("a", "b"), process_channels=2, initial_mean=MEAN, **content)
 
     def measure(self, state: Array, noise: Array) -> Array:
         return C @ state
 
 
-def build_flat(chosen: CommonOptions) -> Scenario:
-    return Scenario(chosen, Shaped())
+def build_flat(options: CommonOptions) -> Scenario:
+    return Scenario(options, Shaped())

@@ -25,17 +25,17 @@ def batch_of(env_id: str, **options: Any) -> EpisodeBatch:
     return batch
 
 
-def shown(batch: EpisodeBatch) -> dict[str, tuple[Block, Array]]:
+def visible_entries(batch: EpisodeBatch) -> dict[str, tuple[Block, Array]]:
     """Blocks by name with their entries, (…, N), nan where they are clipped."""
-    rows, place, found = batch.observe(), 0, {}
+    rows, place, result = batch.observe(), 0, {}
     for block in batch.layout.blocks:
         count = len(block_entries(block))
         entries = rows[:, place : place + count].T.astype(np.float64)
         low, high = block.bounds
         entries[(entries == low) | (entries == high)] = np.nan
-        found[block.name] = block, entries.reshape(*block.shape, -1)
+        result[block.name] = block, entries.reshape(*block.shape, -1)
         place += count
-    return found
+    return result
 
 
 def diagonal(covariance: Array) -> Array:
@@ -80,7 +80,7 @@ LAST = ("log_deviation", "UnknownInput-v0")
 def check(batch: EpisodeBatch, env_id: str) -> set[tuple[str, str]]:
     signals: Signals = batch.signals()
     done = set()
-    for name, (block, entries) in shown(batch).items():
+    for name, (block, entries) in visible_entries(batch).items():
         for word, value in block.constants.items():
             # In UnknownInput-v0 that is of the last estimate, which no signal has.
             if (name, word) not in PHYSICAL or (name, env_id[11:]) == LAST:
@@ -89,12 +89,12 @@ def check(batch: EpisodeBatch, env_id: str) -> set[tuple[str, str]]:
             ours, theirs = PHYSICAL[name, word](entries, column, signals)
             size = min(len(ours), len(theirs))  # an input stands behind the states
             ours, theirs = ours[:size], theirs[:size]
-            seen = np.isfinite(ours)
+            observed = np.isfinite(ours)
             np.testing.assert_allclose(
-                ours[seen], np.broadcast_to(theirs, ours.shape)[seen], rtol=2e-5, atol=2e-5,
+                ours[observed], np.broadcast_to(theirs, ours.shape)[observed], rtol=2e-5, atol=2e-5,
                 err_msg=f"{env_id}: {name}",
             )  # fmt: skip
-            if seen.any():
+            if observed.any():
                 done.add((name, word))
     return done
 
@@ -111,9 +111,9 @@ def test_entries_give_back_what_was_measured(env_id: str) -> None:
 
 def test_the_clock_and_the_price_are_decoded() -> None:
     batch = batch_of("fusion_gym/TobitOscillator-v0")
-    found = shown(batch)
-    block, left = found["time_left"]
+    result = visible_entries(batch)
+    block, left = result["time_left"]
     np.testing.assert_allclose(left * block.constants["horizon"], 100 - 7, rtol=1e-6)
-    block, place = found["price"]
+    block, place = result["price"]
     low, high = np.asarray(block.constants["range"])
     np.testing.assert_allclose(low * (high / low) ** place, batch.price, rtol=1e-5)

@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import fusion_gym
-from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.envs.one_batch import one_batch
 from fusion_gym.validation import ConfigurationError
@@ -26,16 +26,16 @@ TOBIT = "fusion_gym/TobitOscillator-v0"
 
 def play(envs: Any, steps: int) -> list[Any]:
     """Observations, rewards, ends, last observations, returns and lengths of all episodes."""
-    random, found = np.random.default_rng(0), [envs.reset().tolist()]
+    random, result = np.random.default_rng(0), [envs.reset().tolist()]
     for _ in range(steps):
         actions = random.integers(0, 2, (envs.num_envs, *envs.action_space.shape))
         observation, reward, done, infos = envs.step(actions)
-        found += [observation.tolist(), reward.tolist(), done.tolist()]
+        result += [observation.tolist(), reward.tolist(), done.tolist()]
         for info in (infos[run] for run in np.flatnonzero(done)):
             episode = info["episode"]
-            found += [info["terminal_observation"].tolist(), info["TimeLimit.truncated"]]
-            found += [round(episode["r"], 5), episode["l"]]
-    return found
+            result += [info["terminal_observation"].tolist(), info["TimeLimit.truncated"]]
+            result += [round(episode["r"], 5), episode["l"]]
+    return result
 
 
 @pytest.mark.parametrize("limit", [None, 3])
@@ -90,7 +90,7 @@ def test_the_file_of_hyper_parameters_says_what_the_configs_say() -> None:
     assert list(named.values()) == list(entries)
     assert len(entries) == 7
     for config, env_id in named.items():
-        experiment = load(Experiment, config)
+        experiment = load_checked(Experiment, config)
         entry, algorithm = entries[env_id], experiment.algorithm
         ((name, options),) = entry.pop("vec_env_wrapper")[0].items()
         assert (name, env_id) == (EXCHANGE, experiment.environment.id)

@@ -37,25 +37,25 @@ def test_runs_have_the_attributes_of_single_environments(options: dict[str, Any]
     for name in NAMES:
         assert native.get_attr(name) == tuple(env.get_wrapper_attr(name) for env in others), name
     assert native.get_attr("task") == (native.task,) * 3
-    (spec, *_), wanted = native.get_attr("spec"), others[0].spec
-    assert (spec.id, spec.max_episode_steps) == (wanted.id, wanted.max_episode_steps)
+    (spec, *_), expected = native.get_attr("spec"), others[0].spec
+    assert (spec.id, spec.max_episode_steps) == (expected.id, expected.max_episode_steps)
     native.reset(seed=5)
     for run, env in enumerate(others):
         env.reset(seed=5 + run)
     random = np.random.default_rng(0)
-    seen = set()
+    visited = set()
     for _ in range(6):
         masks = native.call("action_masks")
         np.testing.assert_array_equal(masks, native.action_masks())
         for mask, env in zip(masks, others, strict=True):
             assert mask.tolist() == env.get_wrapper_attr("action_masks")().tolist()
-        seen.add(str(plain(np.array(masks))))
+        visited.add(str(plain(np.array(masks))))
         requests = random.integers(0, 8, 3)
         actions = requests if "action" in options else requests[:, None] >> np.arange(3) & 1
         native.step(actions)
         for action, env in zip(actions, others, strict=True):
             env.step(action)
-    assert len(seen) > 1
+    assert len(visited) > 1
 
 
 def test_infos_have_types_and_stack_to_plain_arrays() -> None:
@@ -65,14 +65,14 @@ def test_infos_have_types_and_stack_to_plain_arrays() -> None:
     for kind, infos in (("reset", env.reset()[1]), ("step", env.step(np.ones(3, dtype=int))[-1])):
         assert all(isinstance(value, (np.ndarray, np.floating)) for value in infos.values())
         if kind == "reset":
-            found, wanted = native.reset(seed=0)[1], stacked.reset(seed=0)[1]
+            result, expected = native.reset(seed=0)[1], stacked.reset(seed=0)[1]
         else:
             actions = np.ones((3, 3), dtype=np.int8)
-            found, wanted = native.step(actions)[-1], stacked.step(actions)[-1]
-        assert found.keys() == wanted.keys()
-        for key, value in wanted.items():
-            assert value.dtype == found[key].dtype != object, key
-            np.testing.assert_array_equal(value, found[key])
+            result, expected = native.step(actions)[-1], stacked.step(actions)[-1]
+        assert result.keys() == expected.keys()
+        for key, value in expected.items():
+            assert value.dtype == result[key].dtype != object, key
+            np.testing.assert_array_equal(value, result[key])
 
 
 def test_what_runs_do_not_have_is_refused() -> None:
@@ -112,38 +112,38 @@ def test_the_joint_state_is_what_all_agents_see_together(
     with pytest.raises(gym.error.ResetNeeded):
         env.state()
     pettingzoos_check_of_states(env)
-    coordinator = gym.make(env_id, horizon=12, **options)
-    common = [n for n in coordinator.unwrapped.observation_names if n in env.state_names]  # type: ignore[attr-defined]
+    scheduler = gym.make(env_id, horizon=12, **options)
+    common = [n for n in scheduler.unwrapped.observation_names if n in env.state_names]  # type: ignore[attr-defined]
     assert len(common) > 5
-    seen = [env.state_names.index(name) for name in common]
-    theirs = [coordinator.unwrapped.observation_names.index(name) for name in common]  # type: ignore[attr-defined]
+    observed = [env.state_names.index(name) for name in common]
+    theirs = [scheduler.unwrapped.observation_names.index(name) for name in common]  # type: ignore[attr-defined]
     observations, infos = env.reset(seed=4)
-    observation, _ = coordinator.reset(seed=4)
+    observation, _ = scheduler.reset(seed=4)
     assert set(map(str, infos.values())) == {str({"granted": False, "cost": 0.0})}
     random = np.random.default_rng(1)
     while env.agents:
         state = env.state()
         assert env.state_space.contains(state)
-        np.testing.assert_array_equal(state[seen], observation[theirs])
+        np.testing.assert_array_equal(state[observed], observation[theirs])
         every = np.concatenate(list(observations.values()))
         numbers = np.isin(every, [0.0, 1.0])  # a sensor's own number is no part of the state
         assert np.isin(every[~numbers], state).all()
-        chosen = int(random.integers(len(env.agents)))
-        bits = np.eye(len(env.agents), dtype=np.int8)[chosen]
+        choice = int(random.integers(len(env.agents)))
+        bits = np.eye(len(env.agents), dtype=np.int8)[choice]
         observations, _, _, _, infos = env.step(dict(zip(env.agents, bits.tolist(), strict=True)))
-        single = isinstance(coordinator.action_space, gym.spaces.Discrete)  # 0 is for nobody
-        observation, *_ = coordinator.step(chosen + 1 if single else bits)
+        single = isinstance(scheduler.action_space, gym.spaces.Discrete)  # 0 is for nobody
+        observation, *_ = scheduler.step(choice + 1 if single else bits)
     assert not np.array_equal(state, env.state())
 
 
 @pytest.mark.parametrize("kind", ["single", "vector", "parallel"])
 def test_a_copy_goes_on_alike(kind: str) -> None:
-    made: dict[str, Any] = {
+    jobs: dict[str, Any] = {
         "single": lambda: gym.make(TOBIT, horizon=9),
         "vector": lambda: vector("vector_entry_point", horizon=9),
         "parallel": lambda: fusion_gym.parallel_env(TOBIT, horizon=9),
     }
-    env = made[kind]()
+    env = jobs[kind]()
     env.reset(seed=0)
     twins = [env, copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
     for _ in range(4):
@@ -177,5 +177,5 @@ def test_a_child_process_finds_an_id_with_its_module() -> None:
     finally:
         envs.close()
     env = gym.make(TOBIT, **options)
-    wanted = [env.reset(seed=3)[0]] + [env.step(action[0])[0] for _ in range(3)]
-    np.testing.assert_array_equal(np.concatenate(rows), wanted)
+    expected = [env.reset(seed=3)[0]] + [env.step(action[0])[0] for _ in range(3)]
+    np.testing.assert_array_equal(np.concatenate(rows), expected)

@@ -167,7 +167,7 @@ def test_an_error_of_ones_own(own: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "broadcast"),
     [
         (lambda task: fusion_gym.make_task("own_names:me/Other-v0"), "me/Other-v0"),
         (lambda task: fusion_gym.make_task("absent_names:me/OwnCart-v0"), "'absent_names' cannot"),
@@ -180,11 +180,11 @@ def test_an_error_of_ones_own(own: Path) -> None:
         (lambda task: fusion_gym.make_task(TOBIT, error="own_names:below"), ">= 0"),
     ],
 )
-def test_what_cannot_be_had_is_told_in_one_line(own: Path, make: Any, told: str) -> None:
+def test_what_cannot_be_had_is_reported_in_one_line(own: Path, make: Any, message: str) -> None:
     task = fusion_gym.make_task(TOBIT, filter="tobit")
     with pytest.raises(ConfigurationError) as caught:
         make(task)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -230,12 +230,12 @@ def test_a_variant_is_its_environment_with_the_options_of_its_registration(own: 
 def test_a_registration_goes_before_a_file_of_options(own: Path) -> None:
     """As Gymnasium joins the options: registered beneath given ones, a file beneath both."""
     (own / "file.yaml").write_text("{filter: kalman, token_rate: 1.5, cost_weight: 0.2}")
-    given = {"system": "file.yaml", "token_rate": 3.0}
-    single: Any = gym.make(VARIANT, **given)
+    arguments = {"system": "file.yaml", "token_rate": 3.0}
+    single: Any = gym.make(VARIANT, **arguments)
     settings = single.unwrapped.task.settings
     assert [settings[key] for key in ("filter", "token_rate", "cost_weight")] == ["tobit", 3.0, 0.2]
-    assert fusion_gym.make_task(VARIANT, **given).settings == settings
-    config = EnvironmentConfig(id=VARIANT, options=given)
+    assert fusion_gym.make_task(VARIANT, **arguments).settings == settings
+    config = EnvironmentConfig(id=VARIANT, options=arguments)
     assert "system" not in config.options
     assert fusion_gym.make_task(VARIANT, **config.options).settings == settings
 

@@ -67,8 +67,8 @@ def test_known_optima(packets: int, best: float) -> None:
 def test_traces_are_those_of_the_recursion_alone(period: int) -> None:
     """With a period of 4 and sampling that repeats after 6 steps the traces repeat after 12."""
     schedules = np.random.default_rng(0).random((period, 3, 40)) < 0.3
-    found = steady_traces(markov().system, schedules)
-    np.testing.assert_allclose(found, recursion_traces(schedules, 144, 12), rtol=1e-6)
+    result = steady_traces(markov().system, schedules)
+    np.testing.assert_allclose(result, recursion_traces(schedules, 144, 12), rtol=1e-6)
 
 
 def test_the_trace_is_that_of_dense_matrices() -> None:
@@ -95,11 +95,11 @@ def test_the_policy_reaches_its_trace_and_no_schedule_a_lower_one(options: Any) 
     assert sent.sum() == 2 * 2 * 120 / 3
     np.testing.assert_allclose(np.mean(traces[-6:], axis=0), policy.trace, rtol=1e-6)
     others = np.zeros((9, 36), dtype=bool)
-    for number, chosen in enumerate(itertools.combinations(range(9), 2)):
-        others[list(chosen), number] = True
-    found = steady_traces(task.system, others.reshape(3, 3, -1))
-    assert policy.trace == pytest.approx(found.min(), rel=1e-9)
-    assert found.max() > 1.2 * found.min()
+    for number, selected in enumerate(itertools.combinations(range(9), 2)):
+        others[list(selected), number] = True
+    result = steady_traces(task.system, others.reshape(3, 3, -1))
+    assert policy.trace == pytest.approx(result.min(), rel=1e-9)
+    assert result.max() > 1.2 * result.min()
 
 
 @pytest.mark.slow
@@ -172,7 +172,7 @@ def test_a_broken_or_foreign_file_is_replaced(tmp_path: Path, text: str) -> None
         {"requests": [[1, 0, 0], [0, 0, 0]], "trace": -1.0},
     ],
 )
-def test_an_entry_that_cannot_be_true_is_found_anew(
+def test_an_entry_that_cannot_be_true_is_reproduced(
     tmp_path: Path, entry: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "schedules.json"
@@ -181,9 +181,9 @@ def test_an_entry_that_cannot_be_true_is_found_anew(
     (key,) = saved["periodic_optimum"]
     path.write_text(json.dumps({"periodic_optimum": {key: entry, "another": 1}}))
     monkeypatch.setattr(periodic_optimum, "_found", {})
-    found = PeriodicOptimum(markov(), 1, 2, str(path))
-    np.testing.assert_array_equal(found.schedule, right.schedule)
-    assert found.trace == right.trace
+    result = PeriodicOptimum(markov(), 1, 2, str(path))
+    np.testing.assert_array_equal(result.schedule, right.schedule)
+    assert result.trace == right.trace
     after = json.loads(path.read_text())["periodic_optimum"]
     assert after == saved["periodic_optimum"] | {"another": 1}
 

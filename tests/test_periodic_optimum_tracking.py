@@ -47,9 +47,9 @@ def biased(name: str = "Tracking", **options: Any) -> Task:
 
 
 def all_schedules(packets: int, period: int, sensors: int) -> NDArray[np.bool_]:
-    chosen = list(itertools.combinations(range(period * sensors), packets))
-    result = np.zeros((period * sensors, len(chosen)), dtype=bool)
-    for number, places in enumerate(chosen):
+    selected = list(itertools.combinations(range(period * sensors), packets))
+    result = np.zeros((period * sensors, len(selected)), dtype=bool)
+    for number, places in enumerate(selected):
         result[list(places), number] = True
     return result.reshape(period, sensors, -1)
 
@@ -80,8 +80,8 @@ def assert_searched(
     schedules = all_schedules(packets, period, task.sensors)
     assert policy.trace == pytest.approx(traces[best], rel=rtol)
     np.testing.assert_array_equal(policy.schedule, schedules[..., best])
-    found = episode_traces(task.system, schedules, task.horizon)
-    np.testing.assert_allclose(found, traces, rtol=rtol)
+    result = episode_traces(task.system, schedules, task.horizon)
+    np.testing.assert_allclose(result, traces, rtol=rtol)
 
 
 @pytest.mark.parametrize("options", [{}, {"fusion": "sci"}, {"fusion": "ci", "noise_scale": 0.5}])
@@ -110,10 +110,10 @@ def test_the_mean_over_drawn_noise_scales() -> None:
     """2,000 episodes: the MSE is the trace to 4 standard errors, which are below 3 % of it."""
     task = correlated(noise_scale="random", horizon=60)
     policy = PeriodicOptimum(task, 3, 4, average="episode")
-    found = run_episodes(task, policy, 2000, 0).mse
-    error = found.std() / np.sqrt(2000)
+    results = run_episodes(task, policy, 2000, 0).mse
+    error = results.std() / np.sqrt(2000)
     assert error < 0.03 * policy.trace
-    assert abs(found.mean() - policy.trace) <= 4 * error
+    assert abs(results.mean() - policy.trace) <= 4 * error
     fixed = PeriodicOptimum(correlated(horizon=60), 3, 4, average="episode")
     np.testing.assert_array_equal(policy.schedule, fixed.schedule)
     assert policy.trace == pytest.approx(0.7 * fixed.trace, rel=1e-9)
@@ -129,7 +129,7 @@ def test_a_system_that_tracks_already_has_the_same_optimum() -> None:
 @pytest.mark.slow
 def test_an_input_as_the_filter_believes_it_makes_the_claim_true() -> None:
     """One sensor, so that nothing is fused; 2,000 episodes, 4 standard errors of 0.5 %."""
-    kept = np.exp(-1.0 / 5.0)
+    retention = np.exp(-1.0 / 5.0)
     task = unknown(
         horizon=240,
         measurement_matrices=[[[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]],
@@ -137,17 +137,17 @@ def test_an_input_as_the_filter_believes_it_makes_the_claim_true() -> None:
         input_signal="random_walk",
         input_amplitude=0.5,
         input_period=5.0,
-        input_memory=kept,
-        input_change=0.5 * np.sqrt(1.0 - kept**2),
+        input_memory=retention,
+        input_change=0.5 * np.sqrt(1.0 - retention**2),
         input_deviation=0.5,
     )
     for average, transient in (("episode", 0), ("steady", 40)):
         policy = PeriodicOptimum(task, 2, 4, average=average)
         results = run_episodes(task, policy, 2000, 0)
-        found = results.squared_error[transient:].sum(1).mean()
+        result = results.squared_error[transient:].sum(1).mean()
         error = results.mse.std() / np.sqrt(2000 * (1.0 - transient / 240))
         assert error < 0.005 * policy.trace
-        assert abs(found - policy.trace) <= 4 * error
+        assert abs(result - policy.trace) <= 4 * error
 
 
 def intersected(a: Array, b: Array) -> Array:
@@ -156,13 +156,13 @@ def intersected(a: Array, b: Array) -> Array:
     def join(share: float) -> Array:
         return np.linalg.inv(share * np.linalg.inv(a) + (1.0 - share) * np.linalg.inv(b))
 
-    found = minimize_scalar(
+    optimum = minimize_scalar(
         lambda share: np.trace(join(share)),
         bounds=(0, 1),
         method="bounded",
         options={"xatol": 1e-9},
     )
-    return min((join(found.x), a, b), key=np.trace)
+    return min((join(optimum.x), a, b), key=np.trace)
 
 
 def test_brute_force_of_fused_input_nodes() -> None:

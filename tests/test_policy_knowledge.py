@@ -29,7 +29,7 @@ from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.docstrings import read
 from fusion_gym.policies.base import Rule
-from fusion_gym.policies.believing import BelievingRule
+from fusion_gym.policies.belief_rule import BeliefRule
 from fusion_gym.policies.registry import (
     make_policy,
     policy_maker,
@@ -55,7 +55,7 @@ ENVIRONMENTS: dict[str, tuple[str, Values]] = {
         {"sensors": 2, "cost_weight": 0.3, "access": "single", "noise_deviation": (1.0, 1.5)},
     ),
 }
-# What a sensor remembers and hears, and what a coordinator does.
+# What a sensor remembers and hears, and what a scheduler does.
 REMEMBERING: dict[str, tuple[str, Values]] = {
     "tobit, memory": ("TobitOscillator-v0", {"filter": "tobit", "memory": True}),
     "biased, memory, estimates": ("BiasedTracking-v0", {"memory": True, "packet": "estimate"}),
@@ -119,7 +119,7 @@ def task_of(name: str) -> Task:
 def believes(name: str) -> bool:
     """Whether a policy looks at what is believed, and is tried where that differs."""
     maker = policy_maker(name)
-    believing = isinstance(maker, type) and issubclass(maker, BelievingRule)
+    believing = isinstance(maker, type) and issubclass(maker, BeliefRule)
     return believing or hasattr(maker, "remember") or name == "zoo"
 
 
@@ -135,8 +135,8 @@ def tried(name: str) -> list[tuple[str, Knowledge, set[str]]]:
                 policy = make_policy(spec, task_of(place))
             except ConfigurationError:
                 continue
-            found = what_matters(policy, task_of(place))
-            results.append((f"{place}: {spec}", policy.knowledge, found))
+            result = what_matters(policy, task_of(place))
+            results.append((f"{place}: {spec}", policy.knowledge, result))
     return results
 
 
@@ -147,11 +147,11 @@ def test_it_looks_at_what_its_class_has_and_at_nothing_else(name: str) -> None:
     results = tried(name)
     assert results
     by_class: dict[Knowledge, set[str]] = {}
-    for where, knowledge, found in results:
-        assert found <= may_matter(knowledge), (where, knowledge)
-        by_class.setdefault(knowledge, set()).update(found)
-    for knowledge, found in by_class.items():
-        assert CHARACTERISTIC[knowledge] <= found, knowledge
+    for where, knowledge, value in results:
+        assert value <= may_matter(knowledge), (where, knowledge)
+        by_class.setdefault(knowledge, set()).update(value)
+    for knowledge, value in by_class.items():
+        assert CHARACTERISTIC[knowledge] <= value, knowledge
 
 
 # --- policies that lie --------------------------------------------------------------------------
@@ -182,9 +182,9 @@ class Rememberer(Liar):
         self.last: Any = 0.0
 
     def __call__(self, signals: Signals) -> Any:
-        asked = np.broadcast_to(self.last, signals["measurement"][:, 0].shape) > 0.0
+        requests = np.broadcast_to(self.last, signals["measurement"][:, 0].shape) > 0.0
         self.last = signals["measurement"][:, 0]
-        return asked
+        return requests
 
 
 def dug_up(signals: Signals, name: str) -> Any:
@@ -199,10 +199,10 @@ LIARS: dict[str, tuple[Liar, str]] = {
     "sees_others": (Liar("own", lambda s: s["innovation"][::-1, 0]), OTHERS),
     "sees_the_centre": (Liar("own", lambda s: s["prior_mean"][0]), OTHERS),
     "remembers": (Rememberer("own", lambda s: 0.0), PAST),
-    "remembers_all": (Rememberer("coordinator", lambda s: 0.0), PAST),
+    "remembers_all": (Rememberer("scheduler", lambda s: 0.0), PAST),
     "keeps_what_it_measured": (Liar("own", lambda s: s["own_value"] - 0.1, "own"), PAST),
     "keeps_what_all_measured": (
-        Liar("coordinator", lambda s: s["transmission_value"] - 0.1, "coordinator"),
+        Liar("scheduler", lambda s: s["transmission_value"] - 0.1, "scheduler"),
         PAST,
     ),
     "believes_with_others": (
@@ -210,11 +210,11 @@ LIARS: dict[str, tuple[Liar, str]] = {
         OTHERS,
     ),
     "remembers_with_all": (
-        Liar("own_memory", lambda s: s["transmission_value"] - 0.1, "coordinator"),
+        Liar("own_memory", lambda s: s["transmission_value"] - 0.1, "scheduler"),
         OTHERS,
     ),
-    "knows_the_truth": (Liar("coordinator", lambda s: dug_up(s, "truth")), HIDDEN),
-    "knows_losses": (Liar("coordinator_memory", lambda s: dug_up(s, "lost")), HIDDEN),
+    "knows_the_truth": (Liar("scheduler", lambda s: dug_up(s, "truth")), HIDDEN),
+    "knows_losses": (Liar("scheduler_memory", lambda s: dug_up(s, "lost")), HIDDEN),
 }
 
 
@@ -226,6 +226,6 @@ def test_a_policy_that_lies_is_caught(name: str) -> None:
     task = task_of("remote, losses" if name == "knows_losses" else "tobit")
     if liar.remember is not None:
         task = task_of("tobit, memory")
-    found = what_matters(make_policy(name, task), task)
-    assert what in found
+    requests = what_matters(make_policy(name, task), task)
+    assert what in requests
     assert what not in may_matter(liar.knowledge)

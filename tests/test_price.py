@@ -65,10 +65,10 @@ def test_an_agent_is_asked_at_any_price(tmp_path: Any) -> None:
     path = tmp_path / "model.zip"
     model.save(path)
     fixed = fusion_gym.make_task(ENV_ID, **(options | {"cost_weight": 0.05}))
-    asked = make_policy(f"model:{path},price=0.05", task)
+    requests = make_policy(f"model:{path},price=0.05", task)
     own = make_policy(f"model:{path}", fixed)
     np.testing.assert_array_equal(
-        run_episodes(task, asked, 5, seed=0).mse, run_episodes(fixed, own, 5, seed=0).mse
+        run_episodes(task, requests, 5, seed=0).mse, run_episodes(fixed, own, 5, seed=0).mse
     )
     unseen = fusion_gym.make_task(ENV_ID, filter="tobit", cost_weight=0.002)
     for price in (0.05, 0.01):

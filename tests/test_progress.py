@@ -47,7 +47,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return Clock(monkeypatch)
 
 
-def test_what_remains_is_told_by_the_mean_speed_and_counts_down(clock: Clock) -> None:
+def test_what_remains_is_reported_by_the_mean_speed_and_counts_down(clock: Clock) -> None:
     bar = progress.Bar("training", 1000, "steps", initial=200)
     assert bar.left is None
     clock.now += 10.0
@@ -67,20 +67,20 @@ def test_what_remains_is_told_by_the_mean_speed_and_counts_down(clock: Clock) ->
 def test_where_nobody_watches_a_line_is_printed_now_and_then(
     clock: Clock, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = []
+    received = []
     with progress_bar(10_000, "evaluating") as bar:
         bar.say("always")
         for _ in range(10_000):
             clock.now += 1.0
             bar.update()
-            said = capsys.readouterr().err
-            if said:
-                told.append((clock.now - 1000.0, said))
-    assert told[0] == (20.0, "evaluating: 0 %, 20/10,000 steps, 0:20, 2:46:20 left, always\n")
-    gaps = [later - earlier for (earlier, _), (later, _) in itertools.pairwise(told)]
+            output = capsys.readouterr().err
+            if output:
+                received.append((clock.now - 1000.0, output))
+    assert received[0] == (20.0, "evaluating: 0 %, 20/10,000 steps, 0:20, 2:46:20 left, always\n")
+    gaps = [later - earlier for (earlier, _), (later, _) in itertools.pairwise(received)]
     assert all(20.0 <= gap <= 600.0 for gap in gaps)
     assert gaps == sorted(gaps)
-    assert len(told) < 70
+    assert len(received) < 70
     assert capsys.readouterr() == ("", "evaluating: 100 %, 10,000/10,000 steps, 2:46:40, always\n")
 
 
@@ -94,14 +94,14 @@ def test_the_command_that_goes_on_is_one(name: str, monkeypatch: pytest.MonkeyPa
     words = [*line(name, BASES[name]), "--quiet"]
     kind = getattr(importlib.import_module(f"fusion_gym.agents.{name}"), name.capitalize())
     monkeypatch.setattr(sys, "argv", [f"agents/{name}.py", *words])
-    given = command_line.read(kind)
-    program, *again = shlex.split(given.again())
+    command = command_line.read_command(kind)
+    program, *again = shlex.split(command.again())
     assert (program, again[0]) == ("fusion-gym", name)
     resumes = "resume" in {field.name for field in dataclasses.fields(kind)}
     assert again[1:] == [*words, *(["--resume"] if resumes else [])]
     monkeypatch.setattr(sys, "argv", [f"agents/{name}.py", *again[1:]])
-    read = command_line.read(kind)
-    assert read == (dataclasses.replace(given, resume=True) if resumes else given)
+    read = command_line.read_command(kind)
+    assert read == (dataclasses.replace(command, resume=True) if resumes else command)
     assert shlex.split(read.again()) == [program, *again]
 
 
@@ -110,19 +110,19 @@ def test_an_interrupted_evaluation_says_how_to_go_on(
 ) -> None:
     file, ran = tmp_path / "evaluation.json", []
 
-    def run_episodes(task: Any, policy: Any, *given: Any) -> Any:
+    def run_episodes(task: Any, policy: Any, *value: Any) -> Any:
         ran.append(policy)
         if len(ran) == 2:
             raise KeyboardInterrupt
-        return whole(task, policy, *given)
+        return whole(task, policy, *value)
 
     whole = evaluate.run_episodes
     monkeypatch.setattr(evaluate, "run_episodes", run_episodes)
     ended = call("evaluate", [*EVALUATE, "--json", str(file)])
     assert (ended.status, ended.trace) == (130, "")
     assert ended.err.splitlines()[0] == f"writing the results of each policy into {file}"
-    told, again = ended.err.splitlines()[-1].split(": ", 1)
-    assert told == "interrupted; go on with"
+    message, again = ended.err.splitlines()[-1].split(": ", 1)
+    assert message == "interrupted; go on with"
     assert list(json.loads(file.read_text())["policies"]) == ["always"]
     program, name, *words = shlex.split(again)
     assert (program, name) == ("fusion-gym", "evaluate")

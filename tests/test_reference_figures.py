@@ -126,8 +126,8 @@ def walk(
                 "start": steps == 0,
             }
         )
-        asked = policy(signals) if requests is None else requests[step]
-        granted, _, tokens = task.bucket.grant(tokens, asked, steps)
+        request = policy(signals) if requests is None else requests[step]
+        granted, _, tokens = task.bucket.grant(tokens, request, steps)
         state = system.deliver(state, granted)
         mean, covariance = system.fused(state)
         for run, entry in enumerate(record):
@@ -136,7 +136,7 @@ def walk(
             entry.covariance.append(covariance[..., run])
             entry.local_mean.append(list(system.local_means(state)[..., run]))
             entry.tokens.append(float(tokens[run]))
-            entry.requested.append(asked[:, run].tolist())
+            entry.requested.append(request[:, run].tolist())
             entry.granted.append(granted[:, run].tolist())
     return record, initial
 
@@ -154,7 +154,7 @@ def test_library_and_reference_walk_the_same_trajectories(case: str) -> None:
     requests = None
     if "random" in how:
         requests = generator.random((steps, 3, runs)) < how["random"]
-    found, initial = walk(task, start, noise, requests)
+    result, initial = walk(task, start, noise, requests)
 
     # Standard normals in physical units: the factor of a covariance is a convention, its square
     # isn't; the measurement noises come last, sensor by sensor.
@@ -166,7 +166,7 @@ def test_library_and_reference_walk_the_same_trajectories(case: str) -> None:
         first = root * start[4:, run].reshape(3, 2)
         later = root * noise[:, rank:, run].reshape(steps, 3, 2)
         with mpmath.workdps(120):
-            wanted = simulate(
+            expected = simulate(
                 example,
                 initial[:, run],
                 noise[:, :rank, run] @ factor.T,
@@ -176,20 +176,20 @@ def test_library_and_reference_walk_the_same_trajectories(case: str) -> None:
                 with_event_error=options.get("event_error", True),
                 requests=None if requests is None else requests[..., run],
             )
-        mine = found[run]
-        assert mine.requested == wanted.requested
-        assert mine.granted == wanted.granted
-        assert any(any(row) for row in wanted.granted)
-        assert not all(all(row) for row in wanted.granted)
-        np.testing.assert_allclose(mine.tokens, wanted.tokens, rtol=1e-12)
-        np.testing.assert_allclose(mine.truth, wanted.truth, rtol=1e-9, atol=1e-9)
+        mine = result[run]
+        assert mine.requested == expected.requested
+        assert mine.granted == expected.granted
+        assert any(any(row) for row in expected.granted)
+        assert not all(all(row) for row in expected.granted)
+        np.testing.assert_allclose(mine.tokens, expected.tokens, rtol=1e-12)
+        np.testing.assert_allclose(mine.truth, expected.truth, rtol=1e-9, atol=1e-9)
         for step in range(steps):
             where = f"run {run}, time {step + 1}"
             for name in ("mean", "covariance"):
-                left, right = getattr(mine, name)[step], getattr(wanted, name)[step]
+                left, right = getattr(mine, name)[step], getattr(expected, name)[step]
                 room = 1e-6 * np.abs(right).max()
                 assert np.abs(left - right).max() <= room, f"{name}: {where}"
-            for left, right in zip(mine.local_mean[step], wanted.local_mean[step], strict=True):
+            for left, right in zip(mine.local_mean[step], expected.local_mean[step], strict=True):
                 assert np.abs(left - right).max() <= 1e-6 * np.abs(right).max(), where
 
 
@@ -268,21 +268,21 @@ def details() -> Details:
 
 
 def test_requests_and_transmissions_of_the_papers_trigger() -> None:
-    found = evaluate("dynamic_event", {})
+    outcome = evaluate("dynamic_event", {})
     for sensor, printed in enumerate((0.700, 0.650, 0.602)):
-        assert_figure(f"requests[{sensor}]", found.requests[:, sensor], printed, 1e-3)
+        assert_figure(f"requests[{sensor}]", outcome.requests[:, sensor], printed, 1e-3)
     for sensor, printed in enumerate((0.513, 0.474, 0.438)):
-        assert_figure(f"rate[{sensor}]", found.rate[:, sensor], printed, 1e-3)
-    assert_rows_differ(found.requests[:, 0], 0.650, 1e-3)
-    assert_rows_differ(found.rate[:, 2], 0.474, 1e-3)
+        assert_figure(f"rate[{sensor}]", outcome.rate[:, sensor], printed, 1e-3)
+    assert_rows_differ(outcome.requests[:, 0], 0.650, 1e-3)
+    assert_rows_differ(outcome.rate[:, 2], 0.474, 1e-3)
 
 
 def test_tokens_of_the_papers_trigger() -> None:
     assert_figure("tokens", details().tokens, 16.0, 0.1)
     assert_figure("share of steps that grant", details().share, 0.797, 1e-3)
-    found = evaluate("dynamic_event", {})
+    outcome = evaluate("dynamic_event", {})
     # It is not the granted part of the requests: they come when the bucket is empty.
-    assert_rows_differ(found.rate.sum(1) / found.requests.sum(1), 0.797, 1e-3)
+    assert_rows_differ(outcome.rate.sum(1) / outcome.requests.sum(1), 0.797, 1e-3)
 
 
 def test_local_errors_of_the_papers_filter() -> None:
@@ -320,10 +320,10 @@ ROWS: dict[str, tuple[dict[str, Any], str, float, float, float, float, float]] =
 @pytest.mark.parametrize("row", ROWS)
 def test_filters_meet_their_figures(row: str) -> None:
     options, policy, rate, mse, mse_digit, trace, trace_digit = ROWS[row]
-    found = evaluate(policy, options)
-    assert_figure("rate", found.rate.mean(1), rate, 1e-3)
-    assert_figure("MSE", found.mse, mse, mse_digit)
-    assert_figure("trace", found.bound_trace, trace, trace_digit)
+    outcome = evaluate(policy, options)
+    assert_figure("rate", outcome.rate.mean(1), rate, 1e-3)
+    assert_figure("MSE", outcome.mse, mse, mse_digit)
+    assert_figure("trace", outcome.bound_trace, trace, trace_digit)
 
 
 def test_the_figures_of_the_filters_cannot_be_mistaken() -> None:
@@ -335,8 +335,8 @@ def test_the_figures_of_the_filters_cannot_be_mistaken() -> None:
 
 
 def test_event_error_alone_costs_a_third() -> None:
-    found = evaluate("dynamic_event", {"event_error": False})
-    assert_figure("MSE", found.mse, 0.176, 1e-3)
+    outcome = evaluate("dynamic_event", {"event_error": False})
+    assert_figure("MSE", outcome.mse, 0.176, 1e-3)
 
 
 class Evenly(Policy):
@@ -385,9 +385,9 @@ POLICIES: list[tuple[dict[str, Any], str, float, float]] = [
 def test_policies_meet_their_figures(
     options: dict[str, Any], policy: str, rate: float, mse: float
 ) -> None:
-    found = evaluate(policy, options)
-    assert found.rate.mean() == pytest.approx(rate, abs=0.006)
-    assert_figure("MSE", found.mse, mse, 1e-2 if mse > 5 else 1e-3)
+    outcome = evaluate(policy, options)
+    assert outcome.rate.mean() == pytest.approx(rate, abs=0.006)
+    assert_figure("MSE", outcome.mse, mse, 1e-2 if mse > 5 else 1e-3)
 
 
 @pytest.mark.parametrize(
@@ -395,9 +395,9 @@ def test_policies_meet_their_figures(
 )
 def test_periodic_requests_meet_their_figures(options: dict[str, Any], mse: float) -> None:
     task = make_task(**options)
-    found = run_episodes(task, Evenly(0.475, shift=1 / 3), EPISODES, SEED)
-    assert found.rate.mean() == pytest.approx(0.475, abs=0.002)
-    assert_figure("MSE", found.mse, mse, 1e-3)
+    outcome = run_episodes(task, Evenly(0.475, shift=1 / 3), EPISODES, SEED)
+    assert outcome.rate.mean() == pytest.approx(0.475, abs=0.002)
+    assert_figure("MSE", outcome.mse, mse, 1e-3)
 
 
 # --- consistency -------------------------------------------------------------------------------
@@ -434,8 +434,8 @@ def misinformed_task(factor: float, **options: Any) -> Task:
 
 def consistency(task: Task, policy: str) -> tuple[float, float]:
     """Mean normalised squared error a state over episodes, and its standard error."""
-    found = run_episodes(task, make_policy(policy, task), 3000, SEED)
-    return float(found.nees.mean()), float(found.nees.std(ddof=1) / math.sqrt(3000))
+    outcome = run_episodes(task, make_policy(policy, task), 3000, SEED)
+    return float(outcome.nees.mean()), float(outcome.nees.std(ddof=1) / math.sqrt(3000))
 
 
 # An approximate filter is not exactly consistent: two per cent of bias are let pass.
@@ -460,10 +460,10 @@ def test_consistency_test_fails_for_a_wrong_measurement_variance(factor: float) 
 
 def test_tobit_filter_is_overconfident_under_the_event_trigger() -> None:
     """The selection by the trigger is not modelled; the figure is from another implementation."""
-    found = evaluate("dynamic_event", TOBIT)
-    assert_figure("NEES/n", found.nees, 1.09, 1e-2)
-    error = found.nees.std(ddof=1) / math.sqrt(EPISODES)
-    assert found.nees.mean() - 1.0 > 4 * error
+    outcome = evaluate("dynamic_event", TOBIT)
+    assert_figure("NEES/n", outcome.nees, 1.09, 1e-2)
+    error = outcome.nees.std(ddof=1) / math.sqrt(EPISODES)
+    assert outcome.nees.mean() - 1.0 > 4 * error
 
 
 def test_kalman_filter_that_ignores_censoring_is_far_from_consistent() -> None:

@@ -69,10 +69,10 @@ def test_a_policy_of_ones_own_is_in_every_list(task: Task) -> None:
 
 @pytest.mark.usefixtures("own_table")
 def test_a_maker_is_given_the_task_and_says_what_is_missing(task: Task) -> None:
-    given = task
+    value = task
 
     def make(task: Task, gain: float) -> Policy:
-        assert task is given
+        assert task is value
         return Steady("clock", gain)
 
     register_policy("gains", make, "reference")

@@ -121,12 +121,12 @@ def test_sources_have_the_stated_law_whatever_is_sent() -> None:
     task = build(coefficient=0.9, noise_deviation=2.0, initial_deviation=5.0, horizon=40)
     truths = []
     for policy in ("never", "always"):
-        batch, chosen = EpisodeBatch(task, 4000), make_rule(policy)
+        batch, rule = EpisodeBatch(task, 4000), make_rule(policy)
         batch.seed(np.arange(4000), list(range(4000)))
         batch.reset()
         path = [task.system.truth(batch.state)[0]]
         for _ in range(30):
-            batch.step(chosen(batch.signals()))
+            batch.step(rule(batch.signals()))
             path.append(task.system.truth(batch.state)[0])
         truths.append(np.array(path))
     np.testing.assert_array_equal(*truths)
@@ -209,13 +209,13 @@ CASES: dict[str, dict[str, Any]] = {
 def test_simulated_cost_of_the_optimal_policy_is_the_computed_one(case: str) -> None:
     task = build(**CASES[case])
     policy = OptimalPolicy(task)
-    found = simulate(task, policy)
-    room = 4.0 * found.returns.std() / math.sqrt(found.episodes)
-    assert abs(found.returns.mean() + policy.optimum.cost) < room
+    results = simulate(task, policy)
+    room = 4.0 * results.returns.std() / math.sqrt(results.episodes)
+    assert abs(results.returns.mean() + policy.optimum.cost) < room
     assert room < 0.06 * policy.optimum.cost
-    assert found.denied.sum() == 0.0
+    assert results.denied.sum() == 0.0
     if math.isfinite(policy.optimum.rate):
-        assert found.rate.mean(0).sum() == pytest.approx(policy.optimum.rate, rel=0.03)
+        assert results.rate.mean(0).sum() == pytest.approx(policy.optimum.rate, rel=0.03)
 
 
 def test_nothing_beats_the_optimal_policy_and_rules_on_age_cost_far_more() -> None:
@@ -239,9 +239,9 @@ def test_nothing_beats_the_optimal_policy_and_rules_on_age_cost_far_more() -> No
 def test_stationary_policy_loses_nothing_in_long_episodes() -> None:
     task = build(**CASES["states"])
     finite, average = OptimalPolicy(task), OptimalPolicy(task, "average")
-    one, two = (simulate(task, policy, 3000).returns for policy in (finite, average))
-    gain = one - two
-    assert -3.0 * gain.std() / math.sqrt(3000) < gain.mean() < 0.01 * abs(one.mean())
+    first, two = (simulate(task, policy, 3000).returns for policy in (finite, average))
+    gain = first - two
+    assert -3.0 * gain.std() / math.sqrt(3000) < gain.mean() < 0.01 * abs(first.mean())
     assert average.optimum.cost * task.horizon == pytest.approx(finite.optimum.cost, rel=0.05)
 
 
@@ -253,8 +253,8 @@ def test_optimum_of_several_sources_that_share_nothing_is_the_sum() -> None:
     ]
     assert both.cost == pytest.approx(sum(parts))
     task = build(sensors=2, access="single", cost_weight=0.0)
-    alone = SourceProblem.create(price=0.0)
-    joint = solve_joint_average(JointProblem.create((alone, alone), at_most=1))
+    single = SourceProblem.create(price=0.0)
+    joint = solve_joint_average(JointProblem.create((single, single), at_most=1))
     assert solve_task(task, "average").cost == pytest.approx(joint.cost)
 
 

@@ -11,8 +11,8 @@ import pytest
 from small_results import small_results
 
 from fusion_gym.agents import report
-from fusion_gym.agents.suite.found import read_results
-from fusion_gym.agents.suite.report_pages import documented
+from fusion_gym.agents.suite.report_pages import update_pages
+from fusion_gym.agents.suite.setting_results import read_results
 
 PAGE = """# A page
 
@@ -31,8 +31,8 @@ def test_the_command_writes_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     words = ["report", "--results", str(results), "--pages", str(page)]
     monkeypatch.setattr(sys, "argv", words)
     report.main()
-    found = read_results(results)
-    assert page.read_text() == documented(PAGE.format(name="headline"), found, results)
+    settings = read_results(results)
+    assert page.read_text() == update_pages(PAGE.format(name="headline"), settings, results)
     page.write_text(PAGE.format(name="nobody"))
     with pytest.raises(SystemExit, match="results = 'nobody'"):
         report.main()
@@ -57,9 +57,9 @@ def test_perturbed_cases_are_counted(tmp_path: Path) -> None:
     folder.mkdir(parents=True)
     report = {"setting": "tobit_oscillator", "class": "sensors", "cases": cases}
     (folder / "verdict.json").write_text(json.dumps(report))
-    text = documented(PAGE.format(name="robustness"), {}, tmp_path)
-    wanted = "| Tobit oscillator | as they are | -20.0% [-30.0%, -10.0%] | 1 | 1 | 1 | "
-    assert f"{wanted}+2.0% [+1.0%, +3.0%], louder |" in text
+    text = update_pages(PAGE.format(name="robustness"), {}, tmp_path)
+    expected = "| Tobit oscillator | as they are | -20.0% [-30.0%, -10.0%] | 1 | 1 | 1 | "
+    assert f"{expected}+2.0% [+1.0%, +3.0%], louder |" in text
     assert "trained over draws" not in text
-    nothing = documented(PAGE.format(name="robustness"), {}, tmp_path / "absent")
+    nothing = update_pages(PAGE.format(name="robustness"), {}, tmp_path / "absent")
     assert "- Nothing has been tried so far." in nothing

@@ -17,9 +17,9 @@ from fusion_gym.agents.output import pareto_figure
 from fusion_gym.agents.output.palette import AGENTS, RULES
 from fusion_gym.agents.output.pareto_figure import Differences, Limits, Panel, Series
 from fusion_gym.agents.suite.comparison import comparison_table
-from fusion_gym.agents.suite.found import read_setting
+from fusion_gym.agents.suite.setting_results import read_setting
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.envelope import Comparison
+from fusion_gym.evaluation.envelope import BaselineComparison
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.intervals import Interval
 from fusion_gym.policies.registry import make_policy
@@ -174,10 +174,10 @@ def test_no_error_at_all_can_be_drawn_and_compared(tmp_path: Path) -> None:
     )
     limits = Limits((0.04, 1.0), (0.5, 2.0))
     paths = [tmp_path / "x.png", tmp_path / "x.svg"]
-    pareto_figure.draw(paths, "a title", panel, [panel], limits)
+    pareto_figure.draw_pareto(paths, "a title", panel, [panel], limits)
     assert all(path.stat().st_size > 10_000 for path in paths)
     task = make_task(ENV, horizon=3)
-    found = run_episodes(task, make_policy("always", task), 2, 0)
-    nothing = Comparison(Interval(0.0, 0.0, 0.0), 0.0, ("always",))
-    table = comparison_table({"always": nothing}, {"always": found})
+    results = run_episodes(task, make_policy("always", task), 2, 0)
+    nothing = BaselineComparison(Interval(0.0, 0.0, 0.0), 0.0, ("always",))
+    table = comparison_table({"always": nothing}, {"always": results})
     assert list(table.columns[4].cells) == ["–"]

@@ -8,7 +8,7 @@ import pytest
 from fusion_gym.agents.reproduction.adaptive_innovation.errors import _largest, _whitened
 
 
-def test_a_bound_is_told_from_what_is_none() -> None:
+def test_a_bound_is_reported_from_what_is_none() -> None:
     rng = np.random.default_rng(0)
     root = rng.normal(size=(3, 3))
     claimed = root @ root.T + np.eye(3)
@@ -16,8 +16,8 @@ def test_a_bound_is_told_from_what_is_none() -> None:
     more = claimed + 0.3 * np.outer(direction, direction)
     ratio = 1.0 + 0.3 * direction @ np.linalg.solve(claimed, direction)
     both = np.stack((0.7 * claimed, more), axis=-1)
-    found = _largest(both, np.stack((claimed, claimed), axis=-1))
-    assert found == pytest.approx([0.7, ratio])
+    values = _largest(both, np.stack((claimed, claimed), axis=-1))
+    assert values == pytest.approx([0.7, ratio])
 
 
 def test_whitened_errors_sum_to_the_normalised_square() -> None:

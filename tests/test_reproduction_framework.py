@@ -18,9 +18,15 @@ from hostile_folder import contents
 from scipy import stats
 
 from fusion_gym.agents.reproduction import page, papers
-from fusion_gym.agents.reproduction.making import Job, make
+from fusion_gym.agents.reproduction.making import PieceJob, compute_jobs
 from fusion_gym.agents.reproduction.paper import Paper, Piece
-from fusion_gym.agents.reproduction.shown import Claim, Number, Picture, Shown, Table
+from fusion_gym.agents.reproduction.piece_result import (
+    Claim,
+    Number,
+    NumbersTable,
+    Picture,
+    PieceResult,
+)
 from fusion_gym.validation import ConfigurationError
 
 USUAL = 30
@@ -42,24 +48,26 @@ def a_paper(name: str, calls: Calls, drawn: bool) -> Paper:
 
         return compute
 
-    def showing(piece: str) -> Callable[[dict[str, Any]], Shown]:
-        def show(kept: dict[str, Any]) -> Shown:
-            assert kept["nested"] == {"list": [1.0, None]}
-            number = Number.of(f"mean of {piece}", kept["sample"], printed=0.0, runs=10, unit="m")
+    def showing(piece: str) -> Callable[[dict[str, Any]], PieceResult]:
+        def show(stored: dict[str, Any]) -> PieceResult:
+            assert stored["nested"] == {"list": [1.0, None]}
+            number = Number.of(f"mean of {piece}", stored["sample"], printed=0.0, runs=10, unit="m")
             picture = Picture(
                 f"figure_{piece}", f"Figure of {piece}", "What to see.",
-                lambda figure: figure.subplots().plot(kept["sample"]), (2.0, 1.5),
+                lambda figure: figure.subplots().plot(stored["sample"]), (2.0, 1.5),
             )  # fmt: skip
             pictures = [picture] if drawn and piece == "first" else []
-            evidence = f"{kept['count']} drawn"
+            evidence = f"{stored['count']} drawn"
             claim = Claim(f"{name} claims | {piece}", "Section 1", "holds", evidence)
-            return Shown(pictures, [Table(piece, f"Table of {piece}", [number])], [claim], ["So."])
+            return PieceResult(
+                pictures, [NumbersTable(piece, f"Table of {piece}", [number])], [claim], ["So."]
+            )
 
         return show
 
     return Paper(
         name, f"The paper {name}", f"A. Author, “{name}”, 2020.",
-        [Piece(one, f"Piece {one}", computing(one), showing(one), 1.0, USUAL) for one in PIECES],
+        [Piece(row, f"Piece {row}", computing(row), showing(row), 1.0, USUAL) for row in PIECES],
     )  # fmt: skip
 
 
@@ -76,20 +84,20 @@ def drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calls:
 
 
 def put(monkeypatch: pytest.MonkeyPatch, folder: Path, drawn: bool) -> Calls:
-    found: Calls = []
+    result: Calls = []
     texts = folder.with_name(f"{folder.name}_texts")
     for name in ("one", "two"):
         (texts / name).mkdir(parents=True)
         (texts / name / "introduction.md").write_text("Words.")
         module = types.ModuleType(f"fusion_gym.agents.reproduction.{name}.pieces")
-        module.PAPER = a_paper(name, found, drawn)  # type: ignore[attr-defined]
+        module.PAPER = a_paper(name, result, drawn)  # type: ignore[attr-defined]
         monkeypatch.setitem(sys.modules, module.__name__, module)
     for module in (papers, page):
         monkeypatch.setattr(module, "NAMES", ("one", "two"))
     (texts / "overview.md").write_text("# The papers\n")
     monkeypatch.setattr(page, "TEXTS", texts)
     monkeypatch.chdir(folder)
-    return found
+    return result
 
 
 def reproduce(*words: str) -> Ended:
@@ -99,7 +107,7 @@ def reproduce(*words: str) -> Ended:
     return ended
 
 
-def made(calls: Calls) -> list[str]:
+def build_parts(calls: Calls) -> list[str]:
     """What was simulated since the last look."""
     names = [name for name, _, _ in calls]
     calls.clear()
@@ -107,8 +115,8 @@ def made(calls: Calls) -> list[str]:
 
 
 def pages(start: str = "") -> dict[str, bytes | None]:
-    found = contents(Path("pages"))
-    return {name: raw for name, raw in found.items() if name.startswith(start)}
+    result = contents(Path("pages"))
+    return {name: raw for name, raw in result.items() if name.startswith(start)}
 
 
 # --- what is kept -------------------------------------------------------------------------------
@@ -116,19 +124,19 @@ def pages(start: str = "") -> dict[str, bytes | None]:
 
 def test_resume_keeps_what_is_finished(calls: Calls) -> None:
     reproduce("one")
-    assert made(calls) == ["one/first", "one/second"]
+    assert build_parts(calls) == ["one/first", "one/second"]
     before = pages()
     reproduce("one", "--resume")
-    assert made(calls) == []
+    assert build_parts(calls) == []
     assert pages() == before
     reproduce("all", "--resume")
-    assert made(calls) == ["two/first", "two/second"]
+    assert build_parts(calls) == ["two/first", "two/second"]
     reproduce("one")  # without it everything is made
-    assert made(calls) == ["one/first", "one/second"]
+    assert build_parts(calls) == ["one/first", "one/second"]
 
 
 @pytest.mark.parametrize("words", [["--episodes", "7"], ["--seed", "3"]])
-def test_resume_makes_anew_what_was_made_otherwise(calls: Calls, words: list[str]) -> None:
+def test_resume_reproduces_what_was_made_otherwise(calls: Calls, words: list[str]) -> None:
     reproduce("one")
     first = pages()
     calls.clear()
@@ -145,8 +153,8 @@ def test_resume_makes_anew_what_was_made_otherwise(calls: Calls, words: list[str
 
 def robbed(path: Path) -> None:
     with np.load(path) as arrays:
-        kept = {name: arrays[name] for name in arrays.files if name != "plain"}
-    np.savez(path, **kept)
+        names = {name: arrays[name] for name in arrays.files if name != "plain"}
+    np.savez(path, **names)
 
 
 DAMAGES: dict[str, Callable[[Path], Any]] = {
@@ -158,13 +166,13 @@ DAMAGES: dict[str, Callable[[Path], Any]] = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
-def test_resume_makes_anew_what_is_damaged(calls: Calls, damage: Callable[[Path], None]) -> None:
+def test_resume_reproduces_what_is_damaged(calls: Calls, damage: Callable[[Path], None]) -> None:
     reproduce("all")
     before = pages()
     calls.clear()
     damage(Path("work/one/second.npz"))
     reproduce("all", "--resume")
-    assert made(calls) == ["one/second"]
+    assert build_parts(calls) == ["one/second"]
     assert pages() == before
 
 
@@ -173,20 +181,20 @@ def test_what_a_killed_process_left_is_removed(calls: Calls) -> None:
     left = Path("work/one/first.123.part.npz")
     left.write_bytes(b"half")
     reproduce("one", "--resume")
-    assert made(calls) == ["one/first", "one/second"]
+    assert build_parts(calls) == ["one/first", "one/second"]
     assert not left.exists()
 
 
 def test_what_is_read_is_what_was_computed(calls: Calls, tmp_path: Path) -> None:
-    job = Job("one", "first", 5, 11, tmp_path)
+    job = PieceJob("one", "first", 5, 11, tmp_path)
     assert not job.finished()
     with pytest.raises(FileNotFoundError):
         job.read()
-    make(job)
-    found = job.read()
-    np.testing.assert_array_equal(found["sample"], np.random.default_rng(11).normal(size=5))
-    assert found.keys() == {"sample", "count", "nested"}
-    other = Job("one", "first", 6, 11, tmp_path)
+    compute_jobs(job)
+    result = job.read()
+    np.testing.assert_array_equal(result["sample"], np.random.default_rng(11).normal(size=5))
+    assert result.keys() == {"sample", "count", "nested"}
+    other = PieceJob("one", "first", 6, 11, tmp_path)
     with pytest.raises(ConfigurationError, match="made from something else"):
         other.read()
     assert not other.finished()
@@ -210,7 +218,7 @@ def test_a_piece_that_fails_leaves_the_others(
     assert not Path("pages").exists() or pages() == {}
     calls.clear()
     reproduce("one", "--resume")
-    assert made(calls) == ["one/second"]
+    assert build_parts(calls) == ["one/second"]
 
 
 # --- verdicts -----------------------------------------------------------------------------------
@@ -242,8 +250,8 @@ def test_true_reprints_agree_in_95_of_100(runs: int, episodes: int) -> None:
     for shift in (0.0, off):
         agreed = np.mean(
             [
-                Number("x", one, one - half, one + half, other + shift, spread).verdict == "agrees"
-                for one, other in zip(ours, theirs, strict=True)
+                Number("x", our, our - half, our + half, other + shift, spread).verdict == "agrees"
+                for our, other in zip(ours, theirs, strict=True)
             ]
         )
         distance = 4.0 if shift else 0.0
@@ -304,7 +312,7 @@ def test_a_page_has_all_that_is_shown(drawn: Calls) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "text"),
     [
         (["three"], ["paper = 'three'", "one", "two", "all"]),
         (["one", "three"], ["paper = 'three'"]),
@@ -313,13 +321,13 @@ def test_a_page_has_all_that_is_shown(drawn: Calls) -> None:
     ],
 )
 def test_one_clear_error_before_anything_runs(
-    calls: Calls, words: list[str], said: list[str]
+    calls: Calls, words: list[str], text: list[str]
 ) -> None:
     ended = call("reproduce", words)
     assert ended.status != 0
     assert ended.trace == ""
     (line,) = ended.err.splitlines()
     assert line.startswith("error: ")
-    assert all(part in line for part in said), line
+    assert all(part in line for part in text), line
     assert calls == []
     assert contents(Path()) == {}

@@ -7,7 +7,12 @@ import pytest
 
 import fusion_gym
 from fusion_gym.agents.reproduction.markov_jump.printed import covariances
-from fusion_gym.agents.reproduction.markov_jump.runs import THRESHOLDS, example, run, trigger
+from fusion_gym.agents.reproduction.markov_jump.runs import (
+    THRESHOLDS,
+    example,
+    run_markov_jump,
+    trigger,
+)
 from fusion_gym.agents.reproduction.markov_jump.schedule import period_of
 from fusion_gym.evaluation import run_episodes
 
@@ -15,17 +20,20 @@ from fusion_gym.evaluation import run_episodes
 def test_recorded_episodes_are_those_of_the_evaluation() -> None:
     task = example()
     for policy in (trigger(0.9), "never"):
-        found = run(task, policy, 4, 7)
+        result = run_markov_jump(task, policy, 4, 7)
         results = run_episodes(task, fusion_gym.make_policy(policy, task), 4, 7)
-        np.testing.assert_allclose(found.squared.sum(1).mean(0), results.mse, rtol=1e-12)
-        np.testing.assert_allclose(found.trace.mean(), results.bound_trace, rtol=1e-12)
-        np.testing.assert_array_equal(found.sent.mean(0), results.rate[0])
+        np.testing.assert_allclose(result.squared.sum(1).mean(0), results.mse, rtol=1e-12)
+        np.testing.assert_allclose(result.trace.mean(), results.bound_trace, rtol=1e-12)
+        np.testing.assert_array_equal(result.sent.mean(0), results.rate[0])
 
 
 def test_the_trigger_is_a_schedule_that_no_seed_changes() -> None:
     task = example(horizon=30)
     for m in THRESHOLDS[1:3]:
-        first, second = run(task, trigger(m), 2, 0), run(task, trigger(m), 2, 99)
+        first, second = (
+            run_markov_jump(task, trigger(m), 2, 0),
+            run_markov_jump(task, trigger(m), 2, 99),
+        )
         np.testing.assert_array_equal(first.sent, second.sent)
         np.testing.assert_array_equal(first.trace, second.trace)
 
@@ -39,7 +47,7 @@ def test_printed_recursion_is_exact_where_its_third_term_is_put_right() -> None:
     exact = exact.transpose(4, 0, 2, 1, 3).reshape(21, 6, 6)
     np.testing.assert_allclose(covariances(system, everything, False), exact, atol=1e-13)
     assert np.abs(covariances(system, everything, True) - exact).max() > 1e-3
-    silent = run(task, trigger(0.9), 1, 0).sent
+    silent = run_markov_jump(task, trigger(0.9), 1, 0).sent
     printed = covariances(system, silent, False)
     np.testing.assert_allclose(printed, printed.transpose(0, 2, 1), atol=1e-13)
     assert np.linalg.eigvalsh(printed).min() < -1.0

@@ -36,10 +36,10 @@ PAPERS: dict[str, tuple[int, int, int, tuple[str, ...]]] = {
 def test_the_page_is_that_of_a_fresh_run(name: str) -> None:
     """Without round-robin readings, which have no numbers, claims or figures of the page."""
     episodes, numbers, figures, uncertain = PAPERS[name]
-    one = paper(name)
+    single = paper(name)
     apart = ("round_robin_tobit", "readings")
-    pieces = [piece for piece in one.pieces if (name, piece.name) != apart]
-    fresh, page = quick(replace(one, pieces=pieces), episodes), committed(name)
+    pieces = [piece for piece in single.pieces if (name, piece.name) != apart]
+    fresh, page = quick(replace(single, pieces=pieces), episodes), committed(name)
     assert check_numbers(page, fresh, episodes) > numbers
     check_claims(page, fresh, name, uncertain)
     assert check_pictures(fresh, name) == figures

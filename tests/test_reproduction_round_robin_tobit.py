@@ -10,12 +10,17 @@ from reproduction_checks import SEED
 from scipy import stats
 
 import fusion_gym
-from fusion_gym.agents.reproduction.round_robin_tobit.bounds import Lower, Seen, Upper, below
+from fusion_gym.agents.reproduction.round_robin_tobit.bounds import (
+    Censoring,
+    Lower,
+    Upper,
+    matrix_below,
+)
 from fusion_gym.agents.reproduction.round_robin_tobit.judging import always_below, explained
 from fusion_gym.agents.reproduction.round_robin_tobit.readings import (
     READINGS,
     PrintedTobitFilter,
-    task_of,
+    reading_task,
 )
 from fusion_gym.agents.reproduction.round_robin_tobit.runs import (
     OSCILLATOR,
@@ -33,14 +38,14 @@ from fusion_gym.evaluation.episodes import run_episodes
 
 def test_squared_errors_are_those_of_the_evaluation() -> None:
     task = fusion_gym.make_task(OSCILLATOR)
-    found = squares(task, round_robin(task), 5, SEED)
+    result = squares(task, round_robin(task), 5, SEED)
     results = run_episodes(task, round_robin(task), 5, SEED)
-    np.testing.assert_allclose(found.mean(0), results.squared_error, rtol=1e-12)
-    np.testing.assert_allclose(found.sum(2).mean(1), results.mse, rtol=1e-12)
-    np.testing.assert_allclose(armse(found)["mean"], np.sqrt(results.squared_error).mean(0))
+    np.testing.assert_allclose(result.mean(0), results.squared_error, rtol=1e-12)
+    np.testing.assert_allclose(result.sum(2).mean(1), results.mse, rtol=1e-12)
+    np.testing.assert_allclose(armse(result)["mean"], np.sqrt(results.squared_error).mean(0))
 
 
-def test_a_sensor_by_itself_transmits_at_its_turns_alone() -> None:
+def test_a_sensor_local_transmits_at_its_turns_alone() -> None:
     task = fusion_gym.make_task(OSCILLATOR)
     for sensor in range(2):
         rate = run_episodes(task, Turn(sensor), 2, 0).rate
@@ -61,32 +66,32 @@ def test_no_filter_is_below_the_floor() -> None:
         covariance = covariance - np.outer(gain, row @ covariance)
         roots.append(np.sqrt(np.diag(covariance)))
     np.testing.assert_allclose(floor(TRACKING), np.mean(roots, axis=0), rtol=1e-9)
-    found = armse(squares(task, round_robin(task), 400, SEED))
-    np.testing.assert_allclose(found["mean"], floor(TRACKING), rtol=0.08)
+    result = armse(squares(task, round_robin(task), 400, SEED))
+    np.testing.assert_allclose(result["mean"], floor(TRACKING), rtol=0.08)
     assert floor(OSCILLATOR)[2] > 0.5  # √Ξ
     assert np.all(np.less(floor(OSCILLATOR, access="any"), floor(OSCILLATOR)))
 
 
 def test_intervals_of_the_armse_cover() -> None:
     """Gaussian errors of deviation 2: the ARMSE is 2; 4.5 errors of 100 samples."""
-    rng, covered, spreads, seen = np.random.default_rng(3), 0, [], []
+    rng, covered, spreads, visible = np.random.default_rng(3), 0, [], []
     for _ in range(100):
-        found = armse((2.0 * rng.normal(size=(400, 3, 1))) ** 2)
-        covered += found["low"][0] <= 2.0 <= found["high"][0]
-        spreads.append(found["spread"][0])
-        seen.append(found["mean"][0])
+        result = armse((2.0 * rng.normal(size=(400, 3, 1))) ** 2)
+        covered += result["low"][0] <= 2.0 <= result["high"][0]
+        spreads.append(result["spread"][0])
+        visible.append(result["mean"][0])
     assert covered >= 95 - 4.5 * np.sqrt(100 * 0.95 * 0.05)
     # Of 1,000 runs, where these have 400.
-    assert np.mean(spreads) == pytest.approx(np.std(seen) * np.sqrt(0.4), rel=4.5 / np.sqrt(200))
+    assert np.mean(spreads) == pytest.approx(np.std(visible) * np.sqrt(0.4), rel=4.5 / np.sqrt(200))
 
 
-def test_a_paired_increase_is_told_from_none() -> None:
+def test_a_paired_increase_is_reported_from_none() -> None:
     rng = np.random.default_rng(4)
     errors = rng.normal(size=(300, 5, 3)) ** 2
-    found = increase(errors, errors * np.array([1.0, 1.02, 0.98]))
-    assert found["low"][0] == found["high"][0] == 0.0
-    assert found["low"][1] > 0.0
-    assert found["high"][2] < 0.0
+    values = increase(errors, errors * np.array([1.0, 1.02, 0.98]))
+    assert values["low"][0] == values["high"][0] == 0.0
+    assert values["low"][1] > 0.0
+    assert values["high"][2] < 0.0
 
 
 def test_curves_are_judged_by_what_is_clear() -> None:
@@ -108,8 +113,8 @@ def test_printed_equations_are_as_printed(latent: float) -> None:
     root = np.sqrt(0.6)
 
     def printed(name: str) -> tuple[float, float]:
-        found = PrintedTobitFilter(sensors, name).expect(mean)
-        return float(found.value[0, 0, 0]), float(found.truncated_variance[0, 0, 0])
+        result = PrintedTobitFilter(sensors, name).expect(mean)
+        return float(result.value[0, 0, 0]), float(result.truncated_variance[0, 0, 0])
 
     for name, scale in (("theta", 0.6), ("sign", root), ("argument", root), ("variance", root)):
         low, high = (-5 - latent) / scale, (5 - latent) / scale
@@ -130,7 +135,7 @@ def test_readings_are_run() -> None:
     """Each is another filter or another system; the first is the environment's own."""
     errors = {}
     for reading in READINGS:
-        task = task_of(reading)
+        task = reading_task(reading)
         name = "always" if task.access == "any" else "round_robin"
         errors[reading] = squares(task, fusion_gym.make_policy(name, task), 3, 0).mean()
     assert len(set(errors.values())) == len(READINGS)
@@ -144,7 +149,7 @@ def test_bounds_of_a_filter_that_is_never_censored() -> None:
     system = censored(task)
     covariance = system.plant.initial_covariance.copy()
     upper, lower = Upper(task, 0, 1.0, -1.0, True), Lower(task, 0, 1.0, False, False)
-    seen = Seen(np.zeros(1), np.ones(1), np.zeros(1))
+    observed = Censoring(np.zeros(1), np.ones(1), np.zeros(1))
     upper.begin(covariance)
     lower.begin(covariance)
     transition, process = system.plant.transition[..., 0], system.plant.process_covariance[..., 0]
@@ -153,8 +158,8 @@ def test_bounds_of_a_filter_that_is_never_censored() -> None:
         if step % 2 == 0:
             gain = plain[:, 0] / (plain[0, 0] + 0.1)
             plain = plain - np.outer(gain, plain[0])
-        upper.advance(covariance, seen, step % 2 == 0)
-        lower.advance(covariance, seen, step % 2 == 0)
+        upper.advance(covariance, observed, step % 2 == 0)
+        lower.advance(covariance, observed, step % 2 == 0)
         covariance = (transition @ plain @ transition.T + process)[..., None]
         np.testing.assert_allclose(upper.value, covariance, rtol=1e-9)
         np.testing.assert_allclose(lower.value[..., 0], process, atol=1e-12)
@@ -174,8 +179,10 @@ def test_matrices_are_ordered_by_their_eigenvalues() -> None:
     rng = np.random.default_rng(0)
     first, gap = rng.normal(size=(2, 40, 3, 3))
     first, gap = first @ first.transpose(0, 2, 1), gap + gap.transpose(0, 2, 1)
-    found = below(np.moveaxis(first, 0, -1), np.moveaxis(first + gap + 1.5 * np.eye(3), 0, -1))
+    value = matrix_below(
+        np.moveaxis(first, 0, -1), np.moveaxis(first + gap + 1.5 * np.eye(3), 0, -1)
+    )
     expected = np.linalg.eigvalsh(gap + 1.5 * np.eye(3))[:, 0] >= 0
     assert 0 < expected.sum() < 40
-    np.testing.assert_array_equal(found, expected)
-    assert not below(np.eye(3)[..., None], np.full((3, 3, 1), np.nan)).any()
+    np.testing.assert_array_equal(value, expected)
+    assert not matrix_below(np.eye(3)[..., None], np.full((3, 3, 1), np.nan)).any()

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 
 import fusion_gym
-from fusion_gym.agents.reproduction.judging import below, percent, told, verdict
-from fusion_gym.agents.reproduction.tobit_token_bucket.runs import TRIGGER, Failing, record, scheme
+from fusion_gym.agents.reproduction.judging import below, cite, percent, verdict
+from fusion_gym.agents.reproduction.tobit_token_bucket.runs import (
+    TRIGGER,
+    Failing,
+    record_history,
+    scheme,
+)
 from fusion_gym.agents.reproduction.tobit_token_bucket.theory import claimed, perturbed, terms
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.evaluation.intervals import Interval
@@ -15,31 +20,31 @@ from fusion_gym.evaluation.intervals import Interval
 
 def test_recorded_episodes_are_those_of_the_evaluation() -> None:
     task = scheme()
-    found = record(task, 5, 3)
+    result = record_history(task, 5, 3)
     results = run_episodes(task, fusion_gym.make_policy(TRIGGER, task), 5, 3)
-    np.testing.assert_allclose(found.fused_error.mean(0), results.mse, rtol=1e-12)
-    np.testing.assert_allclose(found.fused_trace.mean(0), results.bound_trace, rtol=1e-12)
-    np.testing.assert_array_equal(found.granted.mean(0).T, results.rate)
-    sums = np.linalg.inv(np.moveaxis(found.local_bound, -1, 2)).sum(1)  # (50)
-    fused = np.linalg.inv(np.moveaxis(found.bound, -1, 1))
+    np.testing.assert_allclose(result.fused_error.mean(0), results.mse, rtol=1e-12)
+    np.testing.assert_allclose(result.fused_trace.mean(0), results.bound_trace, rtol=1e-12)
+    np.testing.assert_array_equal(result.granted.mean(0).T, results.rate)
+    sums = np.linalg.inv(np.moveaxis(result.local_bound, -1, 2)).sum(1)  # (50)
+    fused = np.linalg.inv(np.moveaxis(result.bound, -1, 1))
     np.testing.assert_allclose(sums, fused, rtol=1e-6)
 
 
 def test_a_failed_sensor_never_sends() -> None:
     task = scheme()
-    found = record(task, 3, 0, Failing(fusion_gym.make_policy(TRIGGER, task), 1))
-    assert not found.requested[:, 1].any()
-    assert found.granted[:, [0, 2]].any()
+    requests = record_history(task, 3, 0, Failing(fusion_gym.make_policy(TRIGGER, task), 1))
+    assert not requests.requested[:, 1].any()
+    assert requests.granted[:, [0, 2]].any()
 
 
-def test_a_wrong_gain_is_told_from_the_best() -> None:
+def test_a_wrong_gain_is_reported_from_the_best() -> None:
     task = scheme()
-    history = record(task, 3, 0)
-    found = terms(task, history)
-    least = found.bound(found.gain)
-    assert np.all(found.bound(1.01 * found.gain) > least)
-    assert np.all(found.bound(np.zeros_like(found.gain)) > least)
-    result = perturbed(found, history, 0)
+    history = record_history(task, 3, 0)
+    results = terms(task, history)
+    least = results.bound(results.gain)
+    assert np.all(results.bound(1.01 * results.gain) > least)
+    assert np.all(results.bound(np.zeros_like(results.gain)) > least)
+    result = perturbed(results, history, 0)
     assert result["larger"] == pytest.approx(np.ones(3))
     assert result["difference"].max() < 1e-9
 
@@ -59,7 +64,7 @@ def test_verdicts_and_their_words() -> None:
     assert verdict([True, True]) == "holds"
     assert verdict([True, False]) == "holds partly"
     assert verdict([False]) == "does not hold"
-    assert told(Interval(0.7, 0.6991, 100.0)) == "0.700 [0.699, 100]"
+    assert cite(Interval(0.7, 0.6991, 100.0)) == "0.700 [0.699, 100]"
     assert [percent(share) for share in (0.0, 0.4567, 0.9996, 1.0)] == [
         "0 %",
         "46 %",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fusion_gym.agents.reproduction.unknown_input.printed import gains, models
-from fusion_gym.agents.reproduction.unknown_input.runs import CARTS, leading, make
+from fusion_gym.agents.reproduction.unknown_input.runs import CARTS, leading, make_example
 
 
 def test_errors_of_the_bound_itself_fill_it() -> None:
@@ -22,24 +22,24 @@ def test_errors_of_the_bound_itself_fill_it() -> None:
 
 def test_no_gain_that_hides_the_input_has_a_smaller_bound() -> None:
     """(18) under random gains that meet (14), against the best one and the printed one."""
-    _, system = make(example=CARTS, filter="paper")
+    _, system = make_example(example=CARTS, filter="paper")
     model = models(system, 0.2, 0.09)[0]
-    found = gains(model, model.covariance[None], np.array([False]), 0.5)
+    values = gains(model, model.covariance[None], np.array([False]), 0.5)
     a, b, c = model.transition, model.inputs, model.matrix
     phi = 1.2 * a @ model.covariance @ a.T + model.process
     noise = model.noise + 6.0 * 0.09 * np.eye(2)
     free = np.linalg.svd(c @ b)[0][:, 1:]
 
     def trace(gain: np.ndarray) -> float:
-        kept = np.eye(4) - gain @ c
-        return float(np.trace(kept @ phi @ kept.T + gain @ noise @ gain.T))
+        retention = np.eye(4) - gain @ c
+        return float(np.trace(retention @ phi @ retention.T + gain @ noise @ gain.T))
 
-    best = found["best"][0]
-    assert trace(best) == pytest.approx(float(np.trace(found["best_bound"][0])))
+    best = values["best"][0]
+    assert trace(best) == pytest.approx(float(np.trace(values["best_bound"][0])))
     assert best @ c @ b == pytest.approx(b)
-    assert found["gain"][0] @ c @ b == pytest.approx(b)
+    assert values["gain"][0] @ c @ b == pytest.approx(b)
     rng = np.random.default_rng(1)
     for _ in range(200):
         other = best + 0.3 * rng.normal(size=(4, 1)) @ free.T
         assert trace(other) >= trace(best)
-    assert trace(found["gain"][0]) > trace(best)
+    assert trace(values["gain"][0]) > trace(best)

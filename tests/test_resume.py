@@ -17,7 +17,7 @@ from training_configs import small_config
 
 from fusion_gym.agents.training import run
 from fusion_gym.agents.training.algorithms import TABLE
-from fusion_gym.agents.training.checked import load
+from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import ConfigurationError
@@ -39,7 +39,7 @@ def experiment_of(folder: Path, kind: str, price: str = "fixed", **training: Any
         content["environment"]["options"] |= {"cost_weight": "random", "price_range": [0.01, 0.1]}
         content["training"]["price_exponent"] = 0.5
     path.write_text(yaml.safe_dump(content))
-    return load(Experiment, path)
+    return load_checked(Experiment, path)
 
 
 def end_at(monkeypatch: pytest.MonkeyPatch, step: int, how: str) -> None:
@@ -75,13 +75,13 @@ def outcome(folder: Path, kind: str) -> dict[str, Any]:
     }
 
 
-def assert_same(found: dict[str, Any], wanted: dict[str, Any]) -> None:
-    assert found.keys() == wanted.keys()
-    for key, value in wanted.items():
+def assert_same(content: dict[str, Any], expected: dict[str, Any]) -> None:
+    assert content.keys() == expected.keys()
+    for key, value in expected.items():
         if isinstance(value, torch.Tensor):
-            assert torch.equal(found[key], value), key
+            assert torch.equal(content[key], value), key
         else:
-            assert found[key] == value, key
+            assert content[key] == value, key
 
 
 CASES = [
@@ -185,7 +185,7 @@ def die_with_records(count: int) -> Any:
 
 def test_a_training_that_diverges_says_so(tmp_path: Path) -> None:
     algorithm = {"name": "a2c", "n_steps": 8, "learning_rate": 1e30}
-    experiment = load(Experiment, small_config(tmp_path, algorithm=algorithm))
+    experiment = load_checked(Experiment, small_config(tmp_path, algorithm=algorithm))
     with pytest.raises(ConfigurationError, match="diverged after 128 steps") as caught:
         run.train(experiment, quiet=True)
     assert "\n" not in str(caught.value)
@@ -195,11 +195,11 @@ def test_a_finished_training_is_not_repeated_and_its_files_are_mended(tmp_path: 
     experiment = experiment_of(tmp_path / "a", "ppo", timesteps=256)
     folder = Path(experiment.output)
     summary = run.train(experiment, quiet=True)
-    wanted = outcome(folder, "ppo")
+    expected = outcome(folder, "ppo")
     for name in ("best_model.zip", "final_model.zip", "summary.json", "validation.jsonl"):
         (folder / name).write_text("damaged")
     assert run.train(experiment, quiet=True, resume=True) == summary
-    assert_same(outcome(folder, "ppo"), wanted)
+    assert_same(outcome(folder, "ppo"), expected)
 
 
 def test_two_trainings_in_one_folder_are_refused(
@@ -241,7 +241,7 @@ def test_a_refused_config_leaves_no_folder(
     tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ConfigurationError) as caught:
-        run.train(load(Experiment, small_config(tmp_path, **changes)), quiet=True)
+        run.train(load_checked(Experiment, small_config(tmp_path, **changes)), quiet=True)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "run").exists()

@@ -140,7 +140,7 @@ def test_posterior_is_the_papers_lyapunov_form_and_its_gain_the_best() -> None:
     outcomes = RobustKalmanFilter(sensors).outcomes(prior)
 
     def lyapunov(sensor: int, gain: Array) -> Array:
-        kept = np.eye(plant.size) - gain @ sensors.measurement_matrix[sensor, ..., 0]
+        retention = np.eye(plant.size) - gain @ sensors.measurement_matrix[sensor, ..., 0]
         cross = sensors.cross_covariance[sensor, ..., 0]
         noise = np.block(
             [
@@ -148,7 +148,7 @@ def test_posterior_is_the_papers_lyapunov_form_and_its_gain_the_best() -> None:
                 [cross.T, sensors.covariance[sensor, sensor, ..., 0]],
             ]
         )
-        psi, through = kept @ plant.transition[..., 0], np.hstack([kept, -gain])
+        psi, through = retention @ plant.transition[..., 0], np.hstack([retention, -gain])
         result: Array = psi @ before[sensor, ..., 0] @ psi.T + through @ noise @ through.T
         return result
 
@@ -221,9 +221,9 @@ def dense_step(
         noise[every[estimate], :r] = plant.process_factor[..., 0]
     for node in range(count):
         rows, own = every[node + 1], r + m * node + np.arange(m)
-        kept = np.eye(n) - gain[node] @ sensors.measurement_matrix[node, ..., 0]
-        moving[rows] = kept @ moving[rows]
-        noise[rows] = kept @ noise[rows]
+        retention = np.eye(n) - gain[node] @ sensors.measurement_matrix[node, ..., 0]
+        moving[rows] = retention @ moving[rows]
+        noise[rows] = retention @ noise[rows]
         noise[rows, :r] -= gain[node] @ sensors.coupling[node, ..., 0]
         noise[np.ix_(rows, own)] -= gain[node] * sensors.deviation[node, :, 0]
     joined = np.eye(n * (count + 1))

@@ -18,12 +18,12 @@ from fusion_gym.agents.suite import verdict
 from fusion_gym.agents.suite.classes import classes_of
 from fusion_gym.agents.suite.config import load_suite
 from fusion_gym.agents.suite.jobs import experiment_of
-from fusion_gym.agents.suite.robust_table import change
+from fusion_gym.agents.suite.robust_table import error_change
 from fusion_gym.agents.suite.robustness import Case, load_robustness, world
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.agents.training.run import train
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.envelope import chosen_mse
+from fusion_gym.evaluation.envelope import best_mse
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
@@ -43,7 +43,7 @@ def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def build_parts(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a suite, its envelope, an agent and a config of cases."""
     folder = tmp_path_factory.mktemp("robust")
     suite_path = small_suite(folder)
@@ -52,7 +52,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ended = call("envelope", words, seconds=120.0)
     assert ended.status == 0, ended.err + ended.trace
     suite = load_suite(suite_path)
-    of = next(one for one in classes_of(suite.settings[0]) if one.name == "sensors")
+    of = next(item for item in classes_of(suite.settings[0]) if item.name == "sensors")
     experiment: Experiment = experiment_of(suite, suite.settings[0], of, 0, folder / "models")
     train(experiment, quiet=True)
     write_config(folder / "robust.yaml", suite_path)
@@ -71,33 +71,33 @@ def write_config(path: Path, suite: Path, **changes: Any) -> Path:
     return path
 
 
-def words_of(made: Path, results: Path, *more: str) -> list[str]:
-    given = {"--config": made / "robust.yaml", "--models": made / "models", "--results": results}
-    given |= {"--work": results / "work"}
-    return [*COMMON, *(str(word) for pair in given.items() for word in pair), *more]
+def words_of(path: Path, results: Path, *more: str) -> list[str]:
+    settings = {"--config": path / "robust.yaml", "--models": path / "models", "--results": results}
+    settings |= {"--work": results / "work"}
+    return [*COMMON, *(str(word) for pair in settings.items() for word in pair), *more]
 
 
-def with_envelopes(made: Path, folder: Path) -> Path:
+def with_envelopes(result: Path, folder: Path) -> Path:
     target = folder / "envelopes"
     target.mkdir()
-    for path in (made / "results" / "envelopes").glob("*.json"):
+    for path in (result / "results" / "envelopes").glob("*.json"):
         (target / path.name).write_bytes(path.read_bytes())
     return folder
 
 
-def test_all_of_it(made: Path, tmp_path: Path) -> None:
+def test_all_of_it(folder: Path, tmp_path: Path) -> None:
     """Rules, an agent and one trained over draws in three cases; then a piece that was lost."""
-    results = with_envelopes(made, tmp_path)
-    line = words_of(made, results, "--trained", "--seeds", "1")
+    results = with_envelopes(folder, tmp_path)
+    line = words_of(folder, results, "--trained", "--seeds", "1")
     ended = call("robustness", line, seconds=300.0)
     assert (ended.status, ended.trace) == (0, ""), ended.err
     place = results / "robustness" / "small" / "sensors"
     pieces = sorted(str(path.relative_to(place)) for path in place.glob("*/*.json"))
     labels = ("agent_0", "rules", "trained_0")
     assert pieces == [f"{c}/{p}.json" for c in ("as_assumed", "loud", "poor") for p in labels]
-    found = json.loads((place / "verdict.json").read_text())
-    assert list(found["cases"]) == ["as_assumed", "loud", "poor"]
-    nominal, loud, poor = found["cases"].values()
+    content = json.loads((place / "verdict.json").read_text())
+    assert list(content["cases"]) == ["as_assumed", "loud", "poor"]
+    nominal, loud, poor = content["cases"].values()
     assert nominal["rules"]["mean"] == 0.0
     assert loud["rules"]["low"] > 0.0
     assert poor["always"] < nominal["always"]
@@ -120,7 +120,7 @@ def test_all_of_it(made: Path, tmp_path: Path) -> None:
     assert (ended.status, ended.trace) == (0, ""), ended.err
     changed = [path for path, time in before.items() if path.stat().st_mtime_ns != time]
     assert changed == [lost]
-    assert json.loads((place / "verdict.json").read_text()) == found
+    assert json.loads((place / "verdict.json").read_text()) == content
     assert (results / "robustness" / "README.md").read_text() == table
 
     other = [word if word != "8" else "9" for word in line]
@@ -129,20 +129,20 @@ def test_all_of_it(made: Path, tmp_path: Path) -> None:
     assert "episodes = 9 differs from that of" in ended.err
 
 
-def test_a_piece_holds_what_a_rule_does_in_its_case(made: Path, tmp_path: Path) -> None:
-    results = with_envelopes(made, tmp_path)
-    ended = call("robustness", words_of(made, results), seconds=120.0)
+def test_a_piece_holds_what_a_rule_does_in_its_case(folder: Path, tmp_path: Path) -> None:
+    results = with_envelopes(folder, tmp_path)
+    ended = call("robustness", words_of(folder, results), seconds=120.0)
     assert (ended.status, ended.trace) == (0, ""), ended.err
     place = results / "robustness" / "small" / "sensors"
     report = json.loads((place / "loud" / "rules.json").read_text())
-    suite = load_suite(made / "suite.yaml")
-    chosen = suite.settings[0].environment
-    for name, found in report["policies"].items():
+    suite = load_suite(folder / "suite.yaml")
+    environment = suite.settings[0].environment
+    for name, policy in report["policies"].items():
         entry = report["inputs"]["policies"][name]
-        options = chosen.options | entry["options"] | {"true_measurement_noise": 2.0}
-        task = make_task(chosen.id, **options)
+        options = environment.options | entry["options"] | {"true_measurement_noise": 2.0}
+        task = make_task(environment.id, **options)
         results_of = run_episodes(task, make_policy(entry["policy"], task), 8, suite.seed)
-        assert found["mse"]["mean"] == pytest.approx(float(results_of.mse.mean()))
+        assert policy["mse"]["mean"] == pytest.approx(float(results_of.mse.mean()))
     assert "trained_0.json" not in [path.name for path in place.glob("*/*")]
 
 
@@ -152,24 +152,24 @@ def test_change_is_the_ratio_of_the_errors() -> None:
     loud = make_task("fusion_gym/RemoteEstimation-v0", horizon=20, true_process_noise=2.0)
     names = ("never", "always")
     before, after = (
-        {name: run_episodes(one, make_policy(name, one), 50, 0) for name in names}
-        for one in (task, loud)
+        {name: run_episodes(item, make_policy(name, item), 50, 0) for name in names}
+        for item in (task, loud)
     )
-    found = change(before, after, 0.5)
-    assert found is not None
-    assert found["mean"] == pytest.approx(3.0)  # four times the variance, on the same noise
-    assert found["high"] - found["low"] < 1e-6
+    result = error_change(before, after, 0.5)
+    assert result is not None
+    assert result["mean"] == pytest.approx(3.0)  # four times the variance, on the same noise
+    assert result["high"] - result["low"] < 1e-6
     other = {name: run_episodes(loud, make_policy(name, loud), 50, 900) for name in names}
-    found = change(before, other, 0.5)
-    assert found is not None
-    assert found["low"] < 3.0 < found["high"]
-    below = chosen_mse(before, 0.5)
+    result = error_change(before, other, 0.5)
+    assert result is not None
+    assert result["low"] < 3.0 < result["high"]
+    below = best_mse(before, 0.5)
     assert below is not None
-    assert change({"always": before["always"]}, after, 0.5) is None
+    assert error_change({"always": before["always"]}, after, 0.5) is None
 
 
 @pytest.mark.parametrize(
-    ("words", "changes", "said"),
+    ("words", "changes", "text"),
     [
         ([], {"own": [ODD | {"options": {"true_transition": -1.0}}]},
          "odd of small: true_transition = -1.0 is not allowed"),
@@ -181,16 +181,16 @@ def test_change_is_the_ratio_of_the_errors() -> None:
         (["--agents", "absent/*.zip"], {}, "agents = 'absent/*.zip'"),
     ],
 )  # fmt: skip
-def test_what_is_not_allowed_is_told_before_anything_runs(
-    made: Path, tmp_path: Path, words: list[str], changes: dict[str, Any], said: str
+def test_what_is_not_allowed_is_reported_before_anything_runs(
+    folder: Path, tmp_path: Path, words: list[str], changes: dict[str, Any], text: str
 ) -> None:
-    results = with_envelopes(made, tmp_path)
-    config = write_config(tmp_path / "other.yaml", made / "suite.yaml", **changes)
-    line = [str(config) if one == str(made / "robust.yaml") else one
-            for one in words_of(made, results, *words)]  # fmt: skip
+    results = with_envelopes(folder, tmp_path)
+    config = write_config(tmp_path / "other.yaml", folder / "suite.yaml", **changes)
+    line = [str(config) if word == str(folder / "robust.yaml") else word
+            for word in words_of(folder, results, *words)]  # fmt: skip
     ended = call("robustness", line)
     assert (ended.status, ended.trace) == (1, "")
-    assert said in ended.err.splitlines()[-1]
+    assert text in ended.err.splitlines()[-1]
     assert not list((results / "robustness").glob("*/*/*"))
 
 
@@ -199,21 +199,21 @@ def test_shipped_cases_fit_the_shipped_suite() -> None:
     config = load_robustness("robustness")
     suite = load_suite(config.suite)
     by_name = {setting.name: setting for setting in suite.settings}
-    assert {one.setting for one in config.settings} == set(by_name)
-    for one in config.settings:
-        for case in config.cases_of(one):
-            changed = world(by_name[one.setting], case).environment
+    assert {setting.setting for setting in config.settings} == set(by_name)
+    for item in config.settings:
+        for case in config.cases_of(item):
+            changed = world(by_name[item.setting], case).environment
             make_task(changed.id, **changed.options)
-            same = changed == by_name[one.setting].environment
+            same = changed == by_name[item.setting].environment
             assert same == (case.name == "as_assumed")
-        drawn = by_name[one.setting].environment.options | one.drawn
-        assert make_task(by_name[one.setting].environment.id, **drawn)
+        drawn = by_name[item.setting].environment.options | item.drawn
+        assert make_task(by_name[item.setting].environment.id, **drawn)
 
 
 def test_scaled_options_have_defaults() -> None:
     """An option that the setting does not name is scaled from the environment's default."""
     suite = load_suite("benchmark")
-    setting = next(one for one in suite.settings if one.name == "tobit_oscillator")
+    setting = next(setting for setting in suite.settings if setting.name == "tobit_oscillator")
     case = Case(name="a", title="a", scaled={"token_capacity": 0.5, "token_rate": 0.5})
     options = world(setting, case).environment.options
     assert (options["token_capacity"], options["token_rate"]) == (15.0, 1.0)
@@ -222,7 +222,7 @@ def test_scaled_options_have_defaults() -> None:
     assert np.isfinite(options["token_rate"])
 
 
-def test_without_a_class_it_takes_the_coordinator_that_knows_most() -> None:
+def test_without_a_class_it_takes_the_scheduler_that_knows_most() -> None:
     suite = load_suite("benchmark")
     taken = {setting.name: _usual_class(suite, setting) for setting in suite.settings}
     assert {name for name, of in taken.items() if of == "sensors"} == {

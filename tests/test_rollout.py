@@ -46,14 +46,14 @@ def test_runs_and_seeds_are_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     env_id, options, base = CASES["tobit"]
     task = fusion_gym.make_task(env_id, **options, horizon=12)
     policy = make_policy(f"rollout:samples=3,steps=2,base={base}", task)
-    found = run_episodes(task, policy, 4, seed=5)
+    results = run_episodes(task, policy, 4, seed=5)
     again = run_episodes(task, policy, 4, seed=5)
-    np.testing.assert_array_equal(found.returns, again.returns)
-    alone = run_episodes(task, policy, 1, seed=7)
-    np.testing.assert_array_equal(found.returns[2], alone.returns[0])
+    np.testing.assert_array_equal(results.returns, again.returns)
+    single = run_episodes(task, policy, 1, seed=7)
+    np.testing.assert_array_equal(results.returns[2], single.returns[0])
     monkeypatch.setattr(rollout, "_LANES", 24)
     cut = run_episodes(task, policy, 4, seed=5)
-    np.testing.assert_array_equal(found.returns, cut.returns)
+    np.testing.assert_array_equal(results.returns, cut.returns)
     batch = EpisodeBatch.seeded(task, 40, 0)
     batch.step(np.zeros((3, 40), dtype=np.bool_))
     answers = []
@@ -72,7 +72,7 @@ def test_it_asks_for_what_is_worth_its_price() -> None:
     text = f"rollout:samples=400,steps={steps},price={price},doubt=0,base=never"
     policy = make_policy(text, task)
     policy.reset(80)
-    asked = policy(batch.signals())
+    requests = policy(batch.signals())
     error = (batch.state.truth - batch.state.prior) ** 2 * task.reward.state_weights
     worth = error * sum(0.8 ** (2 * step) for step in range(steps + 1)) - price
     best = np.where(worth.max(0) > 0.0, worth.argmax(0), -1)
@@ -80,7 +80,7 @@ def test_it_asks_for_what_is_worth_its_price() -> None:
     expected = np.arange(2)[:, None] == best
     assert clear.sum() > 20
     assert 0 < expected[:, clear].sum() < clear.sum()
-    np.testing.assert_array_equal(asked[:, clear], expected[:, clear])
+    np.testing.assert_array_equal(requests[:, clear], expected[:, clear])
 
 
 @pytest.mark.parametrize(
@@ -101,20 +101,20 @@ def test_it_costs_no_more_than_its_base(
 ) -> None:
     task = fusion_gym.make_task(env_id, **({"cost_weight": 0.03} | options), horizon=40)
     policy = make_policy(f"rollout:samples=16,steps=5,base={base}", task)
-    found = run_episodes(task, policy, 24, seed=0).returns
+    results = run_episodes(task, policy, 24, seed=0).returns
     plain = run_episodes(task, make_policy(base, task), 24, seed=0).returns
-    better = found - plain
+    better = results - plain
     assert better.mean() > gain - 2.0 * better.std() / np.sqrt(24)
 
 
 def test_only_the_ratio_of_price_and_error_weight_counts() -> None:
-    asked = []
+    requested = []
     for weight, price in ((1.0, 0.1), (10.0, 1.0)):
         task = fusion_gym.make_task(REMOTE, sensors=2, error_weight=weight, cost_weight=price)
         batch = EpisodeBatch.seeded(task, 30, 0)
-        asked.append(make_policy("rollout:samples=4,steps=2,base=never", task)(batch.signals()))
-    np.testing.assert_array_equal(*asked)
-    assert asked[0].any(0).sum() > 5
+        requested.append(make_policy("rollout:samples=4,steps=2,base=never", task)(batch.signals()))
+    np.testing.assert_array_equal(*requested)
+    assert requested[0].any(0).sum() > 5
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -141,20 +141,24 @@ def test_what_is_imagined_follows_what_is_believed(name: str) -> None:
             assert (ratio < 1.1).all()
     else:
         last = task.system.signal.value(state.signal, state.time - 1.0)  # type: ignore[attr-defined]
-        kept = np.isclose(last, task.system.truth(state)[-1:])
-        assert kept.mean() > (0.99 if name == "unknown input" else 0.9)  # steps may have jumped
+        mask = np.isclose(last, task.system.truth(state)[-1:])
+        assert mask.mean() > (0.99 if name == "unknown input" else 0.9)  # steps may have jumped
         apart = np.abs(truth.mean(-1) - best.mean[0]) / deviation
         assert (apart < 1.0).all()
     if name == "remote":
         arrives = task.system.arrival_probability(state)  # type: ignore[attr-defined]
         lost = state.lost.reshape(-1, 2, count).mean(-1)
         np.testing.assert_allclose(1.0 - lost, arrives[:, [0, count]], atol=0.03)
-    if task.shadow is not None:
-        shadow = imagined.memory.states.every
-        np.testing.assert_array_equal(task.shadow.truth(shadow), task.system.truth(state))
+    if task.memory_system is not None:
+        memory_system = imagined.memory.states.every
+        np.testing.assert_array_equal(
+            task.memory_system.truth(memory_system), task.system.truth(state)
+        )
         for hidden in ("mode", "process_noise", "scale", "signal"):
-            if hasattr(state, hidden) and hasattr(shadow, hidden):
-                np.testing.assert_array_equal(getattr(shadow, hidden), getattr(state, hidden))
+            if hasattr(state, hidden) and hasattr(memory_system, hidden):
+                np.testing.assert_array_equal(
+                    getattr(memory_system, hidden), getattr(state, hidden)
+                )
     assert noise.shape == (1, batch.channels, 2 * count)
 
 
@@ -165,7 +169,7 @@ def test_the_base_is_the_rest_of_the_text() -> None:
     )
     assert (policy.samples, policy.steps, policy.price) == (2, 3, None)
     assert (policy.base.threshold, policy.base.at_most) == (0.03, 1)
-    assert policy.knowledge == "coordinator_memory"
+    assert policy.knowledge == "scheduler_memory"
     nested: Any = make_policy("rollout:samples=1,steps=1,base=lookahead:price=0.1,steps=2", task)
     assert (nested.base.price, nested.base.steps) == (0.1, 2)
     free = make_policy("rollout:samples=2,steps=1,price=0,base=never", task)
@@ -182,7 +186,7 @@ def test_the_base_is_the_rest_of_the_text() -> None:
         ("rollout:steps=0,base=never", {}, "steps = 0"),
         ("rollout:base=dynamic_event", {}, "base = 'dynamic_event' .* the present step alone"),
         ("rollout:base=rollout:base=never", {}, "base = 'rollout:base=never' .* present step"),
-        ("rollout:base=value_of_information:own=true", {}, "base = .* a coordinator's policy"),
+        ("rollout:base=value_of_information:own=true", {}, "base = .* a scheduler's policy"),
         ("rollout:base=never", {"information": "centre"}, "information = 'centre'"),
     ],
 )

@@ -50,19 +50,19 @@ def test_it_is_the_two_sensor_rule_again_and_again(rule: str, order: Any) -> Non
     mean, covariance = estimates(runs)
     result = fuse(rule, order, mean, covariance, PATTERNS)
     for run in range(runs):
-        one = slice(run, run + 1)
-        wanted_mean, wanted = mean[0][:, one], covariance[0][..., one]
+        lane = slice(run, run + 1)
+        expected_mean, expected = mean[0][:, lane], covariance[0][..., lane]
         for sensor in (0, 1, 2) if order is None else order:
             if PATTERNS[sensor, run]:
                 pair = RULES[rule](
-                    wanted_mean,
-                    wanted,
-                    mean[sensor + 1][:, one],
-                    covariance[sensor + 1][..., one],
+                    expected_mean,
+                    expected,
+                    mean[sensor + 1][:, lane],
+                    covariance[sensor + 1][..., lane],
                 )
-                wanted_mean, wanted = pair.mean, pair.covariance
-        np.testing.assert_allclose(result.mean[:, one], wanted_mean, rtol=1e-9)
-        np.testing.assert_allclose(result.covariance[..., one], wanted, rtol=1e-9)
+                expected_mean, expected = pair.mean, pair.covariance
+        np.testing.assert_allclose(result.mean[:, lane], expected_mean, rtol=1e-9)
+        np.testing.assert_allclose(result.covariance[..., lane], expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("rule", RULES)

@@ -27,7 +27,7 @@ from fusion_gym.solvers.silence import (
     simulate,
     solve_silence,
 )
-from fusion_gym.solvers.silence.lattice import Coordinates, hat_weights, spread
+from fusion_gym.solvers.silence.lattice import Coordinates, hat_weights, spread_values
 from fusion_gym.solvers.silence.survival import Survival
 from fusion_gym.solvers.single import solve_finite
 from fusion_gym.solvers.source import SourceProblem
@@ -75,9 +75,9 @@ def test_two_steps_in_the_plane_by_quadrature() -> None:
     exact = 0.5 * edge * weight @ (silent(outer) * 0.5 * np.exp(-0.5 * outer))
     exact += packet * np.exp(-0.5 * edge)
     problem = SilenceProblem.create(TURN, [1.0, 1.0], np.tile(np.eye(2), (2, 1, 1)), price)
-    found = solve_silence(problem, 0.02).lower
-    assert found < 0.5 * exact
-    assert found == pytest.approx(0.5 * exact, rel=2e-3)
+    result = solve_silence(problem, 0.02).lower
+    assert result < 0.5 * exact
+    assert result == pytest.approx(0.5 * exact, rel=2e-3)
 
 
 def test_unequal_weights_are_a_change_of_units() -> None:
@@ -139,25 +139,25 @@ def oscillator_bound() -> Any:
 def test_never_above_the_interval_of_a_policy(policy: str, tokens: str) -> None:
     options = OSCILLATOR | {"token_rate": 2.0, "tokens": tokens}
     task = make_task("fusion_gym/TobitOscillator-v0", **options)
-    found = run_episodes(task, make_policy(policy, task), 300, 0)
-    bound, _ = oscillator_bound().at(float(found.rate.mean()))
-    assert bound < mean_interval(found.mse).low
+    results = run_episodes(task, make_policy(policy, task), 300, 0)
+    bound, _ = oscillator_bound().at(float(results.rate.mean()))
+    assert bound < mean_interval(results.mse).low
     assert bound >= oscillator_bound().floor
 
 
 def test_the_bound_is_tight_where_every_measurement_arrives_uncensored() -> None:
     """The Kalman filter of all measurements is the floor, but for the first measurement."""
     options = {"filter": "kalman", "censoring_threshold": -np.inf, "horizon": 100}
-    found = everything_delivered("fusion_gym/TobitOscillator-v0", options, (), 200)
+    result = everything_delivered("fusion_gym/TobitOscillator-v0", options, (), 200)
     model = silence_model(make_task("fusion_gym/TobitOscillator-v0", **options))
-    assert 0.9 * found["own"].mean < model.floor < found["own"].mean
+    assert 0.9 * result["own"].mean < model.floor < result["own"].mean
 
 
 def test_a_better_filter_leaves_less_where_everything_is_delivered() -> None:
-    found = everything_delivered(
+    result = everything_delivered(
         "fusion_gym/TobitOscillator-v0", {"random_start": True}, ("paper", "adf"), 100
     )
-    assert found["adf"].high < found["paper"].low
+    assert result["adf"].high < result["paper"].low
 
 
 def test_halving_the_lattice_moves_the_bound_by_less_than_one_per_cent() -> None:
@@ -195,7 +195,7 @@ def test_hats_keep_the_mean_and_widen_the_noise(deviation: float) -> None:
     assert weights[0] + 2.0 * weights[1:].sum() == pytest.approx(1.0, abs=1e-13)
     variance = 2.0 * weights @ np.arange(len(weights)) ** 2
     assert deviation**2 <= variance < deviation**2 + 0.25
-    values, added = spread(np.array([0.0, -1.0, 0.0]), np.array([deviation]))
+    values, added = spread_values(np.array([0.0, -1.0, 0.0]), np.array([deviation]))
     assert variance == pytest.approx(deviation**2 + added)
     assert -values.sum() == pytest.approx(1.0, abs=1e-12)
     # A concave function has its mean bounded from below: here that of -|X|.
@@ -225,10 +225,10 @@ def test_coordinates_make_noise_and_curvature_diagonal() -> None:
     draw = np.random.default_rng(1)
     root, factor = draw.standard_normal((3, 3)), draw.standard_normal((3, 2))
     curvature, noise = root @ root.T, factor @ factor.T
-    found = Coordinates.create(curvature, noise)
-    assert found.basis.T @ curvature @ found.basis == pytest.approx(np.eye(3), abs=1e-9)
-    assert found.basis @ np.diag(found.variance) @ found.basis.T == pytest.approx(noise, abs=1e-9)
-    assert (found.variance == 0.0).sum() == 1
+    value = Coordinates.create(curvature, noise)
+    assert value.basis.T @ curvature @ value.basis == pytest.approx(np.eye(3), abs=1e-9)
+    assert value.basis @ np.diag(value.variance) @ value.basis.T == pytest.approx(noise, abs=1e-9)
+    assert (value.variance == 0.0).sum() == 1
 
 
 # --- where it does not apply ----------------------------------------------------------------------

@@ -60,10 +60,10 @@ def test_the_navigation_has_every_page_once() -> None:
         parts_ = tree.values() if isinstance(tree, dict) else tree
         return [page for part in parts_ for page in pages(part)]  # type: ignore[union-attr]
 
-    found = pages(navigation())
-    assert len(found) == len(set(found))
+    result = pages(navigation())
+    assert len(result) == len(set(result))
     written = {str(path.relative_to(places.DOCS)) for path in places.DOCS.rglob("*.md")}
-    assert written <= set(found)
+    assert written <= set(result)
 
 
 def test_what_is_wrong_with_a_site_is_found(tmp_path: Path) -> None:
@@ -86,5 +86,5 @@ def test_a_page_that_scrolls_sideways_is_found(tmp_path: Path) -> None:
     wide = '<div style="width: 600px">wide</div>'
     (tmp_path / "a.html").write_text(f"<!doctype html>{wide}")
     (tmp_path / "b.html").write_text(f'<!doctype html><div style="overflow: auto">{wide}</div>')
-    found = too_wide(tmp_path, str(shutil.which("chromium")))
-    assert [line.partition(" ")[0] for line in found] == ["a.html"]
+    result = too_wide(tmp_path, str(shutil.which("chromium")))
+    assert [line.partition(" ")[0] for line in result] == ["a.html"]

@@ -139,12 +139,12 @@ def test_cost_scales_with_the_units(sigma: float, weight: float, price: float) -
 
 def test_cost_is_concave_and_rises_with_price_and_losses() -> None:
     prices = np.linspace(1.0, 25.0, 9)
-    found = [solve_average(SourceProblem.create(price=float(price))) for price in prices]
-    cost, rate = (np.array([getattr(s, name) for s in found]) for name in ("cost", "rate"))
+    result = [solve_average(SourceProblem.create(price=float(price))) for price in prices]
+    cost, rate = (np.array([getattr(s, name) for s in result]) for name in ("cost", "rate"))
     assert (np.diff(cost) > 0).all()
     assert (np.diff(cost, 2) < 0).all()
     assert (np.diff(rate) < 0).all()
-    assert (np.diff([s.error for s in found]) > 0).all()
+    assert (np.diff([s.error for s in result]) > 0).all()
     # The slope of the cost is the rate.
     around = [solve_average(SourceProblem.create(price=price)).cost for price in (12.5, 13.5)]
     assert around[1] - around[0] == pytest.approx(rate[4], rel=2e-3)
@@ -353,10 +353,10 @@ def test_joint_optimum_lies_between_the_dual_bound_and_the_best_schedule(drop: f
     # With one packet a step the larger error goes first where all else is equal.
     same = (sources[0], sources[0])
     choice = solve_joint_average(JointProblem.create(same, at_most=1)).choice[..., 0]
-    one, two = np.indices(choice.shape)
-    inner = np.maximum(one, two) < 20
-    assert (choice[inner & (one > two)] == 1).all()
-    assert (choice[inner & (two > one)] == 2).all()
+    first, two = np.indices(choice.shape)
+    inner = np.maximum(first, two) < 20
+    assert (choice[inner & (first > two)] == 1).all()
+    assert (choice[inner & (two > first)] == 2).all()
 
 
 def test_dual_bound_of_an_episode() -> None:
@@ -395,13 +395,13 @@ def test_dual_bound_of_channels_that_start_in_a_state(start: str) -> None:
     assert scarce.multiplier > 0.0
 
 
-def test_a_channel_starts_in_its_stationary_law_unless_told() -> None:
+def test_a_channel_starts_in_its_stationary_law_unless_reported() -> None:
     transition = ((0.9, 0.1, 0.0), (0.2, 0.7, 0.1), (0.0, 0.4, 0.6))
     problem = SourceProblem.create(drop=(0.9, 0.3, 0.0), transition=transition)
     assert problem.initial @ problem.transition == pytest.approx(problem.initial)
     assert problem.initial.sum() == pytest.approx(1.0)
-    given = SourceProblem.create(drop=(0.9, 0.3, 0.0), transition=transition, initial=(0, 0, 1))
-    assert solve_finite(given, 10).cost < solve_finite(problem, 10).cost
+    value = SourceProblem.create(drop=(0.9, 0.3, 0.0), transition=transition, initial=(0, 0, 1))
+    assert solve_finite(value, 10).cost < solve_finite(problem, 10).cost
 
 
 # --- what is refused -----------------------------------------------------------------------------

@@ -25,12 +25,12 @@ def follow(
     steps, _, runs = requests.shape
     task = fusion_gym.make_task(TOBIT, tokens="unlimited", horizon=steps + 1, **options)
     batch = EpisodeBatch.seeded(task, runs, seed)
-    states, found = [], []
-    for wanted in requests:
+    states, result = [], []
+    for request in requests:
         states.append(batch.state)
-        batch.step(wanted)
-        found.append(task.system.fused(batch.delivered))
-    return states, found
+        batch.step(request)
+        result.append(task.system.fused(batch.delivered))
+    return states, result
 
 
 def smallest(covariance: Array) -> Array:
@@ -48,8 +48,8 @@ def sparse_requests(runs: int) -> Flags:
 
 def test_long_silence_leaves_estimates_and_covariances_sound() -> None:
     """Where P - P Cᵀ S⁻¹ C P loses all its digits: in 10 of these 200 runs."""
-    _, found = follow(sparse_requests(200))
-    for mean, covariance in found:
+    _, result = follow(sparse_requests(200))
+    for mean, covariance in result:
         assert np.isfinite(mean).all()
         assert smallest(covariance).min() > 0.0
 
@@ -69,8 +69,8 @@ def test_a_prior_of_any_size_beside_any_noise(kind: str, pattern: str) -> None:
     requests = np.ones((40, 2, 50), dtype=np.bool_)
     if pattern == "in turn":
         requests[::2, 0] = requests[1::2, 1] = False
-    _, found = follow(requests, filter=kind, **UNKNOWN)
-    for mean, covariance in found:
+    _, result = follow(requests, filter=kind, **UNKNOWN)
+    for mean, covariance in result:
         assert np.isfinite(mean).all()
         assert smallest(covariance).min() > -1e-12
 
@@ -80,7 +80,7 @@ def test_the_first_look_from_an_unknown_start(kind: str) -> None:
     """Uncensored, all three are the Kalman filter; here against its information form."""
     requests = np.ones((1, 2, 5), dtype=np.bool_)
     options = UNKNOWN | {"filter": kind, "censoring_threshold": -np.inf}
-    states, found = follow(requests, **options)
+    states, result = follow(requests, **options)
     for run in range(5):
         with mpmath.workdps(60):
             information = exact_matrix(states[0].prior_covariance[..., run]) ** -1
@@ -90,7 +90,7 @@ def test_the_first_look_from_an_unknown_start(kind: str) -> None:
                 information += weight * exact_matrix(matrix)
                 total += weight * exact_matrix(value)
             exact = information**-1
-            wanted = exact_float(exact * total)[:, 0]
-        mean, covariance = (values[..., run] for values in found[0])
+            expected = exact_float(exact * total)[:, 0]
+        mean, covariance = (values[..., run] for values in result[0])
         np.testing.assert_allclose(covariance, exact_float(exact), rtol=1e-5)
-        np.testing.assert_allclose(mean, wanted, rtol=1e-5)
+        np.testing.assert_allclose(mean, expected, rtol=1e-5)

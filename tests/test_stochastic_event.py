@@ -62,8 +62,8 @@ SYSTEMS = [
 
 
 def task_of(system: dict[str, Any], weight: Any, **options: Any) -> Task:
-    chosen = {"filter": "stochastic", "stochastic_weight": weight} | system | options
-    return make_task(chosen.pop("env_id"), **chosen)
+    selection = {"filter": "stochastic", "stochastic_weight": weight} | system | options
+    return make_task(selection.pop("env_id"), **selection)
 
 
 def evaluate(task: Task, policy: str = "stochastic_event", episodes: int = 2000) -> EpisodeResults:
@@ -177,18 +177,18 @@ def test_silence_adds_information(size: int) -> None:
     problem = random_problem(5 + size, size, 3, lanes=6, threshold=-INFINITY)
     weight = (0.7, 4.0)
     node = StochasticEventFilter.create(problem.sensors, weight)
-    found = outcomes(node, problem)
+    result = outcomes(node, problem)
     plain = outcomes(KalmanFilter(problem.sensors), problem)
     for place in (0, 1, 2):  # deliveries, and the silent mean
-        np.testing.assert_array_equal(found[place], plain[place])
+        np.testing.assert_array_equal(result[place], plain[place])
     for sensor in range(2):
         matrix = problem.sensors.measurement_matrix[sensor, :, :, 0]
         noise = np.diag(problem.sensors.variance[sensor, :, 0] + 1 / weight[sensor])
         for lane in range(6):
             prior = np.linalg.inv(problem.covariance[sensor, :, :, lane])
-            wanted = np.linalg.inv(prior + matrix.T @ np.linalg.solve(noise, matrix))
-            silent = found[3][sensor, :, :, lane]
-            np.testing.assert_allclose(silent, wanted, rtol=1e-9, atol=1e-11)
+            expected = np.linalg.inv(prior + matrix.T @ np.linalg.solve(noise, matrix))
+            silent = result[3][sensor, :, :, lane]
+            np.testing.assert_allclose(silent, expected, rtol=1e-9, atol=1e-11)
             np.testing.assert_array_equal(silent, silent.T)
 
 
@@ -220,9 +220,9 @@ def test_federation_is_one_filter_that_takes_silence_as_a_measurement() -> None:
         mean, covariance = task.system.fused(batch.delivered)
         for run, other in enumerate(filters):
             other.predict()
-            told = np.repeat(granted[:, run], 2)
-            value = np.where(told, measurement[..., run].ravel(), other.H @ other.x)
-            noise = sensors.variance[..., 0].ravel() + ~told / np.repeat(weight, 2)
+            received = np.repeat(granted[:, run], 2)
+            value = np.where(received, measurement[..., run].ravel(), other.H @ other.x)
+            noise = sensors.variance[..., 0].ravel() + ~received / np.repeat(weight, 2)
             other.update(value, R=np.diag(noise))
             np.testing.assert_allclose(mean[:, run], other.x, rtol=1e-8, atol=1e-10)
             np.testing.assert_allclose(covariance[..., run], other.P, rtol=1e-8, atol=1e-12)
@@ -285,12 +285,12 @@ def test_the_probability_of_silence(whitened: bool) -> None:
     repeat = np.ones(runs)
     signals = signals_of(innovation[..., None] * repeat, scale[..., None] * repeat)
     taken = np.array([policy(signals) for _ in range(steps)])
-    seen = innovation / scale if whitened else innovation
-    wanted = np.exp(-weights * (seen**2).sum(1) / 2)
-    tolerance = DEVIATIONS * np.sqrt(wanted * (1 - wanted) / (runs * steps))
-    assert np.all(np.abs(1 - taken.mean((0, 2)) - wanted) < tolerance)
+    observed = innovation / scale if whitened else innovation
+    expected = np.exp(-weights * (observed**2).sum(1) / 2)
+    tolerance = DEVIATIONS * np.sqrt(expected * (1 - expected) / (runs * steps))
+    assert np.all(np.abs(1 - taken.mean((0, 2)) - expected) < tolerance)
     # Draws of other sensors, of other steps and of other runs have nothing to do with each other.
-    excess = taken - (1 - wanted)[:, None]
+    excess = taken - (1 - expected)[:, None]
     others = (
         excess[:, 0] * excess[:, 1],
         excess[1:, :2] * excess[:-1, :2],
@@ -329,10 +329,10 @@ def test_a_run_decides_alone() -> None:
     generator, runs, steps = np.random.default_rng(4), 5, 150
     innovation = generator.normal(size=(steps, 3, 2, runs))
 
-    def decide(seed: int, chosen: slice) -> NDArray[np.bool_]:
+    def decide(seed: int, selected: slice) -> NDArray[np.bool_]:
         policy = StochasticEvent((0.5, 1.0, 2.0))
-        policy.reset(len(range(runs)[chosen]), seed)
-        return np.array([policy(signals_of(part[..., chosen])) for part in innovation])
+        policy.reset(len(range(runs)[selected]), seed)
+        return np.array([policy(signals_of(part[..., selected])) for part in innovation])
 
     together = decide(11, slice(None))
     for run in range(runs):

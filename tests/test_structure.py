@@ -12,6 +12,7 @@ ROOT = Path(__file__).parent.parent
 # Each room may import from the floors below its own, and from itself.
 FLOORS = {
     "arrays": 0,
+    "deprecation": 0,
     "declaration": 0,
     "docstrings": 0,
     "errors": 0,
@@ -43,29 +44,29 @@ def modules() -> dict[str, Path]:
 @functools.cache
 def imports(module: str) -> frozenset[str]:
     """The library's modules that a module imports, wherever in its text."""
-    every, found = modules(), set()
+    every, result = modules(), set()
     for node in ast.walk(ast.parse(every[module].read_text())):
         if isinstance(node, ast.ImportFrom) and node.module:
             assert node.level == 0, f"{module} has a relative import"
             for alias in node.names:
                 inner = f"{node.module}.{alias.name}"
-                found.add(inner if inner in every else node.module)
+                result.add(inner if inner in every else node.module)
         elif isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-    return frozenset(found & every.keys())
+            result |= {alias.name for alias in node.names}
+    return frozenset(result & every.keys())
 
 
 @functools.cache
 def reached(module: str) -> set[str]:
     """All that a module imports, directly or not, and itself."""
-    seen: set[str] = set()
+    visited: set[str] = set()
     waiting = [module]
     while waiting:
         name = waiting.pop()
-        if name not in seen:
-            seen.add(name)
+        if name not in visited:
+            visited.add(name)
             waiting += imports(name)
-    return seen
+    return visited
 
 
 def floor(module: str) -> int | None:

@@ -77,12 +77,12 @@ def test_random_buckets_agree_with_the_scalar_loop(bucket: TokenBucket, seed: in
     requests = random_requests(bucket, 3, 12, seed)
     tokens = bucket.start(3)
     costs = bucket.cost[:, 0].tolist()
-    for number, asked in enumerate(requests):
-        answer = bucket.grant(tokens, asked, np.full(3, number))
+    for number, request in enumerate(requests):
+        answer = bucket.grant(tokens, request, np.full(3, number))
         for run in range(3):
             granted, spent, left = scalar_step(
                 tokens[run],
-                asked[:, run].tolist(),
+                request[:, run].tolist(),
                 costs,
                 bucket.rate,
                 bucket.capacity,
@@ -107,19 +107,21 @@ def test_limits_hold_for_any_numbers_up_to_rounding(
     capacity = 1.5 * sensors * cost
     bucket = TokenBucket.create(rate, capacity, capacity, cost, sensors)
     tokens = bucket.start(2)
-    for number, asked in enumerate(random_requests(bucket, 2, 20, seed)):
-        answer = bucket.grant(tokens, asked, np.full(2, number))
+    for number, requests in enumerate(random_requests(bucket, 2, 20, seed)):
+        answer = bucket.grant(tokens, requests, np.full(2, number))
         assert np.all(answer.spent <= tokens * (1 + 1e-14))
         assert np.all(answer.tokens >= -1e-14 * capacity)
         assert np.all(answer.tokens <= capacity)
         tokens = answer.tokens
 
 
-@given(tokens=st.floats(0.0, 30.0), asked=st.lists(st.booleans(), min_size=3, max_size=3))
+@given(tokens=st.floats(0.0, 30.0), request=st.lists(st.booleans(), min_size=3, max_size=3))
 @settings(max_examples=200, deadline=None)
-def test_equal_sharing_with_equal_costs_is_all_or_nothing(tokens: float, asked: list[bool]) -> None:
+def test_equal_sharing_with_equal_costs_is_all_or_nothing(
+    tokens: float, request: list[bool]
+) -> None:
     bucket = TokenBucket.create(**PAPER)
-    requests = np.array(asked)[:, None]
+    requests = np.array(request)[:, None]
     granted = bucket.grant(np.array([tokens]), requests, np.array([0])).granted
     # Three sensors at three tokens each: from nine tokens on, however few of them ask.
     assert np.array_equal(granted, requests if tokens >= 9.0 else np.zeros_like(requests))
@@ -171,14 +173,14 @@ def test_at_most_five_ninths_of_all_requests_are_sustained() -> None:
 @given(bucket=buckets(unlimited=True), seed=st.integers(0, 2**31))
 @settings(max_examples=50, deadline=None)
 def test_unlimited_grants_everything_and_counts_it(bucket: TokenBucket, seed: int) -> None:
-    asked = random_requests(bucket, 4, 1, seed)[0]
+    requests = random_requests(bucket, 4, 1, seed)[0]
     tokens = bucket.start(4)
-    answer = bucket.grant(tokens, asked, np.zeros(4, dtype=np.int64))
-    assert np.array_equal(answer.granted, asked)
-    assert np.array_equal(answer.spent, asked.T.astype(float) @ bucket.cost[:, 0])
+    answer = bucket.grant(tokens, requests, np.zeros(4, dtype=np.int64))
+    assert np.array_equal(answer.granted, requests)
+    assert np.array_equal(answer.spent, requests.T.astype(float) @ bucket.cost[:, 0])
     assert answer.tokens.tolist() == [bucket.capacity] * 4
     answer.granted[:] = False  # the caller's requests are not shared
-    assert np.array_equal(asked, random_requests(bucket, 4, 1, seed)[0])
+    assert np.array_equal(requests, random_requests(bucket, 4, 1, seed)[0])
 
 
 def test_an_unlimited_bucket_needs_no_capacity_for_a_transmission() -> None:

@@ -106,10 +106,10 @@ def test_dynamic_event(text: str, sigma: Any, decay: Any, divisor: Any, initial:
     assert lost > 0
 
 
-def limited(score: list[float], wanted: list[bool], age: list[float], at_most: int) -> list[bool]:
+def limited(score: list[float], requests: list[bool], age: list[float], at_most: int) -> list[bool]:
     """The highest scores; the longer silent of equals, then the first."""
     order = sorted(range(SENSORS), key=lambda s: (-score[s], -age[s], s))
-    best = [s for s in order if wanted[s]][:at_most]
+    best = [s for s in order if requests[s]][:at_most]
     return [s in best for s in range(SENSORS)]
 
 
@@ -196,7 +196,7 @@ LOOKED_AT += ("age", "variance_reduction", "silent_variance", "step")
 
 @pytest.mark.parametrize(("spec", "rule"), RULES, ids=[spec for spec, _ in RULES])
 def test_triggers_against_their_rules(spec: str, rule: Rule) -> None:
-    runs, asked = 4, 0
+    runs, count = 4, 0
     for kind in ("paper", "tobit"):
         env = make_vector(
             runs,
@@ -216,13 +216,13 @@ def test_triggers_against_their_rules(spec: str, rule: Rule) -> None:
             assert requests.dtype == np.bool_
             assert requests.shape == (SENSORS, runs)
             for run in range(runs):
-                given = {name: signals[name][..., run] for name in LOOKED_AT}
-                given["token_cost"] = signals["token_cost"][:, 0]
-                assert requests[:, run].tolist() == rule(given)
-            asked += int(requests.sum())
+                arguments = {name: signals[name][..., run] for name in LOOKED_AT}
+                arguments["token_cost"] = signals["token_cost"][:, 0]
+                assert requests[:, run].tolist() == rule(arguments)
+            count += int(requests.sum())
             env.step(requests.T.astype(np.int8))
     if spec not in ("always", "never"):
-        assert 0 < asked < 2 * 55 * SENSORS * runs
+        assert 0 < count < 2 * 55 * SENSORS * runs
 
 
 def test_equal_scores_go_to_the_sensor_that_was_silent_longer() -> None:
@@ -263,9 +263,9 @@ def test_variance_reduction_is_what_a_delivery_brings(kind: str, noise: str) -> 
         silent = fused_trace([False] * SENSORS)
         np.testing.assert_allclose(signals["silent_variance"], silent, rtol=1e-9)
         for s in range(SENSORS):
-            alone = fused_trace([sensor == s for sensor in range(SENSORS)])
+            single = fused_trace([sensor == s for sensor in range(SENSORS)])
             np.testing.assert_allclose(
-                signals["variance_reduction"][s], silent - alone, rtol=1e-7, atol=1e-11
+                signals["variance_reduction"][s], silent - single, rtol=1e-7, atol=1e-11
             )
         other = copy.copy(state)
         other.measurement = state.measurement + rng.normal(size=state.measurement.shape)
@@ -291,8 +291,8 @@ def test_random_rate_and_stream() -> None:
     assert (np.abs(first.mean((0, 2)) - rates) < 4.5 * deviation).all()
     np.testing.assert_array_equal(draw(4), first)
     assert not np.array_equal(draw(5), first)
-    for one, other in itertools.combinations(range(SENSORS), 2):
-        correlation = np.corrcoef(first[:, one].ravel(), first[:, other].ravel())[0, 1]
+    for left_value, other in itertools.combinations(range(SENSORS), 2):
+        correlation = np.corrcoef(first[:, left_value].ravel(), first[:, other].ravel())[0, 1]
         assert abs(correlation) < 0.02
     for rate, expected in ((0, False), (1, True)):
         assert (make_rule(f"random:rate={rate}")(signals) == expected).all()
@@ -330,11 +330,11 @@ def test_parameters_come_from_the_text_then_the_scenario_then_the_trigger() -> N
 @pytest.mark.parametrize("name", policy_names("rule"))
 def test_what_the_centre_cannot_know_is_refused(name: str) -> None:
     """And a signal that it may know, but that this system does not have."""
-    centre, told = covers("centre", make_rule(name).knowledge), ""
+    centre, received = covers("centre", make_rule(name).knowledge), ""
     try:
         make_policy(name, make_task(ENV_ID, information="centre"))
     except ConfigurationError as error:
-        told = str(error)
+        received = str(error)
     allowed = "unknown signal" if centre else "signal"
-    assert told.startswith(f"policy '{name}': {allowed} '") or (centre and not told)
-    assert centre == ("information='centre'" not in told)
+    assert received.startswith(f"policy '{name}': {allowed} '") or (centre and not received)
+    assert centre == ("information='centre'" not in received)

@@ -58,11 +58,11 @@ class TestNothingChangesWithoutDeparture:
 
         def course(**options: Any) -> bytes:
             batch = EpisodeBatch.seeded(make_task(env_id, **options), 3, 8)
-            seen = []
+            observed = []
             for _ in range(10):
                 outcome = batch.step(np.ones((batch.task.sensors, 3), dtype=np.bool_))
-                seen += [batch.observe().tobytes(), outcome.error.tobytes()]
-            return b"".join(seen)
+                observed += [batch.observe().tobytes(), outcome.error.tobytes()]
+            return b"".join(observed)
 
         assert course(**AS_ASSUMED) == course()
         assert course(true_process_noise=1.5) != course()
@@ -136,8 +136,8 @@ class TestThresholds:
         _, states = sensed(TOBIT, steps=0, true_threshold_shift=shift)
         measured = states[0].measurement[:, 1]
         share = stats.norm.cdf(shift / np.sqrt(0.6))
-        found = (measured == shift).mean(-1)
-        assert np.abs(found - share).max() < 4.5 * np.sqrt(share * (1.0 - share) / RUNS)
+        result = (measured == shift).mean(-1)
+        assert np.abs(result - share).max() < 4.5 * np.sqrt(share * (1.0 - share) / RUNS)
         assert measured.min() == shift
 
     def test_both_limits_move(self) -> None:
@@ -230,16 +230,16 @@ class TestDraws:
 
     def test_an_episode_has_one_whatever_is_requested(self) -> None:
         task = make_task(TOBIT, **self.OPTIONS)
-        one, other = (EpisodeBatch.seeded(task, 4, 3) for _ in range(2))
-        first = one.state.departure.copy()
+        left_value, other = (EpisodeBatch.seeded(task, 4, 3) for _ in range(2))
+        first = left_value.state.departure.copy()
         for _ in range(5):
-            one.step(np.ones((3, 4), dtype=np.bool_))
+            left_value.step(np.ones((3, 4), dtype=np.bool_))
             other.step(np.zeros((3, 4), dtype=np.bool_))
-        np.testing.assert_array_equal(one.state.departure, first)
+        np.testing.assert_array_equal(left_value.state.departure, first)
         np.testing.assert_array_equal(other.state.departure, first)
-        np.testing.assert_array_equal(one.state.truth, other.state.truth)
-        one.reset(np.array([1]))
-        assert (one.state.departure[0] != first[0]).tolist() == [False, True, False, False]
+        np.testing.assert_array_equal(left_value.state.truth, other.state.truth)
+        left_value.reset(np.array([1]))
+        assert (left_value.state.departure[0] != first[0]).tolist() == [False, True, False, False]
 
 
 class TestWhoKnows:
@@ -249,15 +249,15 @@ class TestWhoKnows:
         departed = make_task(env_id, true_process_noise=2.0, true_transition=0.9)
         batch = EpisodeBatch.seeded(departed, 4, 0)
         assert batch.state.departure is not None
-        seen = batch.signals()["model"]
-        assert seen.departure is None
+        observed = batch.signals()["model"]
+        assert observed.departure is None
         nominal = make_task(env_id).system
         draw = np.random.default_rng(1)
         size = len(nominal.state_names)
         noise = draw.standard_normal((nominal.imagination_channels, 4))
         believed = np.repeat(np.eye(size)[..., None], 4, axis=-1)
         wide = [
-            system.imagine(seen, draw_mean, believed, noise)
+            system.imagine(observed, draw_mean, believed, noise)
             for system in (departed.system, nominal)
             for draw_mean in (np.ones((size, 4)),)
         ]
@@ -269,7 +269,7 @@ class TestWhoKnows:
         ]
         np.testing.assert_array_equal(after[0].truth, after[1].truth)
 
-    def test_a_shadow_lives_in_the_same_world(self) -> None:
+    def test_a_memory_state_lives_in_the_same_world(self) -> None:
         task = make_task(
             JUMP, filter="centralised", memory=True, memory_filter="imm", true_process_noise=2.0,
             true_transition=(0.8, 0.9), true_measurement_noise=3.0,
@@ -290,12 +290,12 @@ class TestWhoKnows:
         for env_id, text in ((REMOTE, "whittle:price=2"), (JUMP, "periodic_optimum:packets=1")):
             tasks = [make_task(env_id, **options) for options in ({}, other)]
             batch = EpisodeBatch.seeded(tasks[1], 5, 0)
-            wanted = []
+            expected = []
             for task in tasks:
                 policy = make_policy(text, task)
                 policy.reset(5, 0)
-                wanted.append(policy(batch.signals()))
-            np.testing.assert_array_equal(*wanted)
+                expected.append(policy(batch.signals()))
+            np.testing.assert_array_equal(*expected)
 
     def test_a_proven_bound_is_refused(self) -> None:
         task = make_task(TOBIT, filter="kalman", censoring_threshold=-np.inf, true_transition=1.1)
@@ -304,7 +304,7 @@ class TestWhoKnows:
 
 
 @pytest.mark.parametrize(
-    ("env_id", "options", "said"),
+    ("env_id", "options", "text"),
     [
         (TOBIT, {"true_process_noise": 0.0}, "from 0.001 to 1000"),
         (TOBIT, {"true_measurement_noise": (2.0, 0.5)}, "low < high"),
@@ -328,20 +328,20 @@ class TestWhoKnows:
         ),
     ],
 )
-def test_what_is_not_allowed(env_id: str, options: dict[str, Any], said: str) -> None:
+def test_what_is_not_allowed(env_id: str, options: dict[str, Any], text: str) -> None:
     """One line that names the option, its value and what is allowed."""
     option = next(name for name in reversed(options) if name.startswith("true_"))
     with pytest.raises(
-        ConfigurationError, match=rf"^{option} = .* is not allowed.*{said}"
-    ) as found:
+        ConfigurationError, match=rf"^{option} = .* is not allowed.*{text}"
+    ) as result:
         make_task(env_id, **options)
-    assert "\n" not in str(found.value)
-    assert re.search(r"must|may", str(found.value))
+    assert "\n" not in str(result.value)
+    assert re.search(r"must|may", str(result.value))
 
 
 def test_a_system_that_knows_no_departure_refuses_it() -> None:
     """A system of one's own takes the common options, and none is ignored."""
-    chosen = CommonOptions(true_process_noise=2.0, token_cost=1.0)
-    scenario = Scenario(chosen, make_task(REMOTE).system, np.ones(1))
+    options = CommonOptions(true_process_noise=2.0, token_cost=1.0)
+    scenario = Scenario(options, make_task(REMOTE).system, np.ones(1))
     with pytest.raises(ConfigurationError, match=r"true_process_noise = 2 is not allowed here: "):
         Task.create(scenario)

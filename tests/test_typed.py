@@ -52,8 +52,8 @@ def test_mypy_strict_accepts_what_a_user_writes(installed: Path, tmp_path: Path)
     """It needs every ``type: ignore`` that stands there, so that no type is Any by chance."""
     file = tmp_path / USER.name
     file.write_text(USER.read_text())
-    said = strictly(installed, file, tmp_path)
-    assert said.startswith("Success"), said
+    output = strictly(installed, file, tmp_path)
+    assert output.startswith("Success"), output
 
 
 def test_what_a_user_writes_runs() -> None:
@@ -88,8 +88,8 @@ def test_the_specification_lists_every_option(env_id: str) -> None:
     assert options["access"].type == "'any' | 'single' | 'round_robin' | 'random'"
     assert options["price_range"].type == "ArrayLike | None"
     for ending in ("Env", "VectorEnv"):  # what an editor shows of the class, and help
-        shown = inspect.signature(getattr(registered, class_name(env_id) + ending)).parameters
+        parameters = inspect.signature(getattr(registered, class_name(env_id) + ending)).parameters
         for name in own:
-            assert shown[name].annotation == options[name].type
-            assert shown[name].default is not inspect.Parameter.empty
-        assert {"system", "render_mode"} <= set(shown)
+            assert parameters[name].annotation == options[name].type
+            assert parameters[name].default is not inspect.Parameter.empty
+        assert {"system", "render_mode"} <= set(parameters)

@@ -43,7 +43,7 @@ class Run(NamedTuple):
 def run(policy: str, episodes: int = 400, horizon: int = 100, **options: Any) -> Run:
     task = build(horizon=horizon, **options)
     n = task.system.plant.size
-    chosen: Policy = {
+    rule: Policy = {
         "event": AdaptiveThreshold(**task.policy_defaults["adaptive_threshold"]),
         "always": Always(),
         "never": Never(),
@@ -52,10 +52,10 @@ def run(policy: str, episodes: int = 400, horizon: int = 100, **options: Any) ->
     batch = EpisodeBatch(task, episodes)
     batch.seed(np.arange(episodes), list(range(9000, 9000 + episodes)))
     batch.reset()
-    chosen.reset(episodes, 1)
+    rule.reset(episodes, 1)
     rates, errors, truths = [], [], []
     for _ in range(horizon):
-        rates.append(batch.step(chosen(batch.signals())).granted)
+        rates.append(batch.step(rule(batch.signals())).granted)
         state = batch.delivered
         fused = task.system.fused(state)[0]
         truth = task.system.truth(state)
@@ -77,24 +77,24 @@ def assert_rmse(name: str, samples: Array, printed: float, digit: float) -> None
 
 
 def test_figures_of_the_papers_trigger() -> None:
-    found = run("event", example="paper")
+    results = run("event", example="paper")
     for sensor, printed in enumerate((0.242, 0.269)):
-        error = found.rate[sensor].std(ddof=1) * math.sqrt(1 / 400 + 1 / 1000)
-        assert abs(found.rate[sensor].mean() - printed) <= 4 * error + 5e-4
+        error = results.rate[sensor].std(ddof=1) * math.sqrt(1 / 400 + 1 / 1000)
+        assert abs(results.rate[sensor].mean() - printed) <= 4 * error + 5e-4
     for place, (x, d) in enumerate(((6.35, 340.0), (0.763, 41.0), (0.638, 40.7))):
-        assert_rmse("x", found.state[place], x, 0.01 if place == 0 else 0.001)
-        assert_rmse("d", found.inputs[place], d, 1.0 if place == 0 else 0.1)
+        assert_rmse("x", results.state[place], x, 0.01 if place == 0 else 0.001)
+        assert_rmse("d", results.inputs[place], d, 1.0 if place == 0 else 0.1)
     with pytest.raises(AssertionError, match="against"):  # the tolerance is one
-        assert_rmse("x", found.state[2], 0.59, 0.001)
+        assert_rmse("x", results.state[2], 0.59, 0.001)
 
 
 def test_figures_of_the_exact_filter() -> None:
-    found = run("always", example="paper", filter="predict", fusion="exact_ci")
+    results = run("always", example="paper", filter="predict", fusion="exact_ci")
     for place, x in enumerate((6.20, 0.748, 0.281)):
-        assert_rmse("x", found.state[place], x, 0.01 if place == 0 else 0.001)
+        assert_rmse("x", results.state[place], x, 0.01 if place == 0 else 0.001)
     # Without a held difference in the bound the paper's filter is the same.
     same = run("always", example="paper", rho_bar=0.0, rho_initial=0.0)
-    np.testing.assert_allclose(same.state[2].mean(), found.state[2].mean(), rtol=1e-4)
+    np.testing.assert_allclose(same.state[2].mean(), results.state[2].mean(), rtol=1e-4)
 
 
 def test_figures_of_the_random_walk_baseline() -> None:
@@ -120,12 +120,12 @@ def test_bound_holds_under_its_trigger_and_not_without() -> None:
     system = build().system
     tables = build(filter="paper").system.nodes.tables.covariance  # type: ignore[attr-defined]
     assert system.sensor_count == 3
-    kept = run("event", filter="paper").errors
+    stored = run("event", filter="paper").errors
     broken = run("never", filter="paper").errors
     for time in (1, 2, 5, 20, 60, 100):
         for node in range(3):
             claimed = tables[node, ..., time]
-            assert largest_ratio(kept[time - 1, node], claimed) < 1.0
+            assert largest_ratio(stored[time - 1, node], claimed) < 1.0
     worst = [largest_ratio(broken[99, node], tables[node, ..., 100]) for node in range(3)]
     assert max(worst) > 2.0
 
@@ -138,7 +138,7 @@ def test_exact_filter_is_unbiased_and_its_covariance_the_actual_one(signal: str)
         options["input_signal"] = tuple((1000.0 * math.sin(0.2 * k),) for k in range(31))
     horizon = 30
     task = build(horizon=horizon, **options)
-    found = run("always", 1500, horizon, **options)
+    results = run("always", 1500, horizon, **options)
     batch = EpisodeBatch(task, 1)
     batch.reset()
     for time in range(horizon):
@@ -146,14 +146,14 @@ def test_exact_filter_is_unbiased_and_its_covariance_the_actual_one(signal: str)
         if time not in (0, 10, 29):
             continue
         for node in range(3):
-            errors = found.errors[time, node]
+            errors = results.errors[time, node]
             claimed = batch.delivered.estimates.covariance[node, ..., 0]
             deviation = np.sqrt(np.diag(claimed))
             bias = np.abs(errors.mean(-1)) / (deviation / math.sqrt(1500))
             assert bias.max() < 4.5
             actual = errors @ errors.T / 1500 / np.outer(deviation, deviation)
-            wanted = claimed / np.outer(deviation, deviation)
-            np.testing.assert_allclose(actual, wanted, atol=0.16)
+            expected = claimed / np.outer(deviation, deviation)
+            np.testing.assert_allclose(actual, expected, atol=0.16)
 
 
 def test_held_measurements_cost_most_where_the_guarantee_is_void() -> None:

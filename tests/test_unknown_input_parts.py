@@ -53,11 +53,11 @@ def textbook_gain(
 ) -> tuple[Array, Array]:
     """N and L with explicit inverses, as in the literature."""
     b = plant.input_matrix[..., 0]
-    omega, seen = c @ phi @ c.T + noise, c @ b
+    omega, observed = c @ phi @ c.T + noise, c @ b
     inverse = np.linalg.inv(omega)
-    left = np.linalg.inv(seen.T @ inverse @ seen) @ seen.T @ inverse
+    left = np.linalg.inv(observed.T @ inverse @ observed) @ observed.T @ inverse
     n = b @ left
-    u = null_space(seen.T)
+    u = null_space(observed.T)
     if u.shape[1]:
         n = n + (phi @ c.T - b @ left @ omega) @ u @ np.linalg.inv(u.T @ omega @ u) @ u.T
     return n, left
@@ -71,8 +71,8 @@ def test_gain_hides_the_input_and_is_the_textbooks(seed: int, q: int, size: int)
     joint = JointGain.create(plant, sensors)
     phi = random_covariances(seed, (3,), 4, 2)
     gain = joint.gain(phi, sensors.covariance)
-    seen = linalg.matmul(sensors.matrix, plant.input_matrix)
-    through = linalg.matmul(gain, seen)
+    observed = linalg.matmul(sensors.matrix, plant.input_matrix)
+    through = linalg.matmul(gain, observed)
     scale = np.abs(gain).max()
     np.testing.assert_allclose(
         through[:, :4], np.broadcast_to(plant.input_matrix, through[:, :4].shape), atol=1e-9 * scale
@@ -89,8 +89,8 @@ def test_gain_hides_the_input_and_is_the_textbooks(seed: int, q: int, size: int)
             phi[sensor, ..., 1],
             sensors.covariance[sensor, ..., 0],
         )
-        wanted = np.concatenate((n, left))
-        np.testing.assert_allclose(gain[sensor, ..., 1], wanted, rtol=1e-5, atol=1e-6 * scale)
+        expected = np.concatenate((n, left))
+        np.testing.assert_allclose(gain[sensor, ..., 1], expected, rtol=1e-5, atol=1e-6 * scale)
 
 
 def test_no_other_gain_that_hides_the_input_has_a_smaller_covariance() -> None:
@@ -149,8 +149,8 @@ def test_paper_gain_is_exact_to_rounding() -> None:
     through = linalg.matmul(gain, linalg.matmul(sensors.matrix, plant.input_matrix))[..., 0]
     residual = through - np.concatenate((plant.input_matrix[..., 0], np.eye(2)))
     assert np.abs(residual).max() < 3e-11
-    kept = linalg.identity(2) - linalg.matmul(gain[:, :2], sensors.matrix)
-    assert np.abs(kept).max() < 1e-9  # N C = I: the estimate has no memory
+    retention = linalg.identity(2) - linalg.matmul(gain[:, :2], sensors.matrix)
+    assert np.abs(retention).max() < 1e-9  # N C = I: the estimate has no memory
 
 
 # --- models and filters --------------------------------------------------------------------------
@@ -224,8 +224,8 @@ def test_bound_tables_are_the_recursion_with_explicit_inverses() -> None:
         for time in range(1, 13):
             phi = (1 + e) * (a @ xi @ a.T + plant.process_covariance[..., 0])
             n, left = textbook_gain(plant, c, phi, noise)
-            kept = np.eye(3) - n @ c
-            xi = kept @ phi @ kept.T + n @ noise @ n.T
+            retention = np.eye(3) - n @ c
+            xi = retention @ phi @ retention.T + n @ noise @ n.T
             omega = c @ phi @ c.T + noise
             table = tables.covariance[sensor, ..., time]
             np.testing.assert_allclose(
@@ -233,7 +233,7 @@ def test_bound_tables_are_the_recursion_with_explicit_inverses() -> None:
             )
             np.testing.assert_allclose(table[:3, :3], xi, rtol=1e-7, atol=1e-9)
             np.testing.assert_allclose(table[3:, 3:], left @ omega @ left.T, rtol=1e-7)
-        radius = np.abs(np.linalg.eigvals(np.sqrt(1 + e) * kept @ a)).max()
+        radius = np.abs(np.linalg.eigvals(np.sqrt(1 + e) * retention @ a)).max()
         assert tables.radius[sensor] == pytest.approx(radius, abs=0.02)
         smaller = tables.covariance[sensor] - tables.delivered[sensor]
         assert np.linalg.eigvalsh(np.moveaxis(smaller, -1, 0)).min() > -1e-9

@@ -15,7 +15,7 @@ from scipy.linalg import block_diag
 from fusion_gym import linalg
 from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
 from fusion_gym.systems.unknown_input.signals import (
-    GivenInput,
+    ArrayInput,
     InputSignal,
     MeanRevertingWalk,
     Sinusoids,
@@ -69,7 +69,7 @@ SIGNALS: dict[str, InputSignal] = {
     "phases given": Sinusoids.create(2, 0.7, ((50.0,), (35.0,)), ((0.0,), (1.0,))),
     "steps": Steps.create(2, (0.7, 0.4), (8.0, 3.0)),
     "walk": MeanRevertingWalk.create(2, (0.7, 0.4), (8.0, 3.0)),
-    "array": GivenInput.create(2, np.random.default_rng(1).normal(size=(31, 2)), 30),
+    "array": ArrayInput.create(2, np.random.default_rng(1).normal(size=(31, 2)), 30),
 }
 
 
@@ -87,11 +87,11 @@ def simulate(signal: InputSignal, horizon: int, runs: int, seed: int) -> Array:
 @pytest.mark.parametrize("name", SIGNALS)
 def test_moments_of_a_signal_are_those_of_its_samples(name: str) -> None:
     signal, horizon, runs = SIGNALS[name], 12, 20_000
-    found = simulate(signal, horizon, runs, 3)
+    results = simulate(signal, horizon, runs, 3)
     mean, lags = signal.mean(horizon), signal.covariance(horizon)
-    room = 5 * found.std(-1).max() / np.sqrt(runs) + 1e-12
-    np.testing.assert_allclose(found.mean(-1), mean, rtol=0, atol=room)
-    centred = found - mean[..., None]
+    room = 5 * results.std(-1).max() / np.sqrt(runs) + 1e-12
+    np.testing.assert_allclose(results.mean(-1), mean, rtol=0, atol=room)
+    centred = results - mean[..., None]
     for first, lag in ((0, 0), (3, 0), (0, 1), (2, 5), (1, 10)):
         product = centred[first][:, None] * centred[first + lag][None]
         spread = 5 * product.std(-1).max() / np.sqrt(runs) + 1e-12
@@ -101,15 +101,15 @@ def test_moments_of_a_signal_are_those_of_its_samples(name: str) -> None:
 def test_signals_follow_their_definitions() -> None:
     k = np.arange(12)
     expected = 0.7 * np.array([np.sin(2 * np.pi * k / 50), np.sin(2 * np.pi * k / 35 + 1)])
-    found = simulate(SIGNALS["phases given"], 12, 3, 0)
-    np.testing.assert_allclose(found, np.repeat(expected.T[..., None], 3, -1), atol=1e-14)
+    results = simulate(SIGNALS["phases given"], 12, 3, 0)
+    np.testing.assert_allclose(results, np.repeat(expected.T[..., None], 3, -1), atol=1e-14)
     steps = simulate(SIGNALS["steps"], 400, 50, 0)
     moved = np.diff(steps, axis=0) != 0.0
     np.testing.assert_allclose(moved.mean((0, 2)), [1 / 8, 1 / 3], atol=0.015)
     array = SIGNALS["array"]
-    given_rows = array.mean(31)
-    found = array.value(np.empty((0, 3)), np.array([0.0, 7.0, 99.0]))
-    np.testing.assert_array_equal(found.T, given_rows[[0, 7, 30]])
+    rows_argument = array.mean(31)
+    results = array.value(np.empty((0, 3)), np.array([0.0, 7.0, 99.0]))
+    np.testing.assert_array_equal(results.T, rows_argument[[0, 7, 30]])
 
 
 @pytest.mark.parametrize("name", SIGNALS)

@@ -32,7 +32,7 @@ CARTS = EXAMPLES["two_carts"]
 
 
 def reference(
-    kind: str, start: Array, noise: Array, asked: NDArray[np.bool_], hold: float | None = None
+    kind: str, start: Array, noise: Array, requests: NDArray[np.bool_], hold: float | None = None
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Truth (T, 5), node means (T, 3, 5), node covariances, fused covariance, held."""
     a1, b1, w1 = two_carts()
@@ -57,40 +57,40 @@ def reference(
         for i in range(3):
             c, v = cs[i], vs[i]
             y = c @ x + np.sqrt(v) @ noise[k, 4 + 2 * i : 6 + 2 * i]
-            if asked[k, i]:
+            if requests[k, i]:
                 held[i] = y
             ahead, prior = f @ mean[i], f @ cov[i] @ f.T + q
             if kind == "random_walk":
-                if not asked[k, i] and hold is None:
+                if not requests[k, i] and hold is None:
                     mean[i], cov[i] = ahead, prior
                     continue
                 h = np.concatenate((c, np.zeros((2, 1))), axis=1)
-                extra = 0.0 if asked[k, i] else hold
+                extra = 0.0 if requests[k, i] else hold
                 gain = prior @ h.T @ np.linalg.inv(h @ prior @ h.T + v + extra * np.eye(2))
                 mean[i] = ahead + gain @ (held[i] - h @ ahead)
                 cov[i] = (np.eye(5) - gain @ h) @ prior
                 continue
             paper = kind == "paper"
-            if not asked[k, i] and not paper:
+            if not requests[k, i] and not paper:
                 mean[i], cov[i] = ahead, prior
                 continue
             grow = 1 + e if paper else 1.0
             phi = grow * (a @ cov[i][:4, :4] @ a.T + w)
             r = grow * v + (1 + 1 / e) * rho * np.eye(2) * paper
-            omega, seen = c @ phi @ c.T + r, c @ b
+            omega, observed = c @ phi @ c.T + r, c @ b
             inverse = np.linalg.inv(omega)
-            left = np.linalg.inv(seen.T @ inverse @ seen) @ seen.T @ inverse
-            u = null_space(seen.T)
+            left = np.linalg.inv(observed.T @ inverse @ observed) @ observed.T @ inverse
+            u = null_space(observed.T)
             n = b @ left
             n = n + (phi @ c.T - n @ omega) @ u @ np.linalg.inv(u.T @ omega @ u) @ u.T
             surprise = held[i] - c @ a @ mean[i][:4]
             mean[i] = np.concatenate((a @ mean[i][:4] + n @ surprise, left @ surprise))
-            kept = np.concatenate((np.eye(4) - n @ c, -left @ c))
+            retention = np.concatenate((np.eye(4) - n @ c, -left @ c))
             both = np.concatenate((n, left))
-            cov[i] = kept @ phi @ kept.T + both @ r @ both.T
+            cov[i] = retention @ phi @ retention.T + both @ r @ both.T
         rows.append((np.append(x, d), mean.copy(), cov.copy(), np.array(held)))
-    truth, means, covariances, kept_values = zip(*rows, strict=True)
-    return (*(np.array(row) for row in (truth, means, covariances, kept_values)),)  # type: ignore[return-value]
+    truth, means, covariances, stored_values = zip(*rows, strict=True)
+    return (*(np.array(row) for row in (truth, means, covariances, stored_values)),)  # type: ignore[return-value]
 
 
 @pytest.mark.parametrize(
@@ -103,20 +103,20 @@ def test_library_and_plain_loop_walk_the_same_trajectories(kind: str, hold: floa
     draw = np.random.default_rng(8)
     start = draw.standard_normal((system.start_channels, runs))
     noise = draw.standard_normal((steps, system.noise_channels, runs))
-    asked = draw.random((steps, 3, runs)) < 0.4
+    requests = draw.random((steps, 3, runs)) < 0.4
     state = system.start(start)
-    found = []
+    result = []
     for step in range(steps):
         state = system.sense(state, noise[step])
-        state = system.deliver(state, asked[step])
+        state = system.deliver(state, requests[step])
         mean, fused = system.fused(state)
-        found.append((system.truth(state), system.local_means(state), state.held, mean, fused))
+        result.append((system.truth(state), system.local_means(state), state.held, mean, fused))
     truths, means, helds, fused_means, fused_covariances = (
-        np.array(row) for row in zip(*found, strict=True)
+        np.array(row) for row in zip(*result, strict=True)
     )
     for run in range(runs):
         truth, mean, covariance, held = reference(
-            kind, start[:, run], noise[..., run], asked[..., run], hold
+            kind, start[:, run], noise[..., run], requests[..., run], hold
         )
         np.testing.assert_allclose(truths[..., run], truth, rtol=1e-8, atol=1e-8)
         np.testing.assert_allclose(means[..., run], mean, rtol=1e-6, atol=1e-6)
@@ -136,9 +136,9 @@ def test_tracked_weights_stay_near_the_best() -> None:
     """The default fusion against the search for the best weights, along the same episodes."""
     claimed, errors = [], []
     for fusion in ("ci", "exact_ci"):
-        found = run_episodes(build(fusion=fusion), Random(0.3), 40, 0)
-        claimed.append(found.bound_trace.mean())
-        errors.append(found.mse.mean())
+        results = run_episodes(build(fusion=fusion), Random(0.3), 40, 0)
+        claimed.append(results.bound_trace.mean())
+        errors.append(results.mse.mean())
     assert 1.0 <= claimed[0] / claimed[1] < 1.03
     assert abs(errors[0] / errors[1] - 1.0) < 0.05
 
@@ -156,8 +156,8 @@ def test_there_is_something_to_learn(kind: str) -> None:
     for sensor in range(3):
         rate = [0.0, 0.0, 0.0]
         rate[sensor] = 1.0
-        alone = run_episodes(task, Random(tuple(rate)), 60, 0).returns.mean()
-        assert never.returns.mean() * 0.6 < alone < always.returns.mean() * 1.1
+        single = run_episodes(task, Random(tuple(rate)), 60, 0).returns.mean()
+        assert never.returns.mean() * 0.6 < single < always.returns.mean() * 1.1
 
 
 @pytest.mark.slow
@@ -168,9 +168,9 @@ def test_larger_thresholds_give_fewer_transmissions_and_larger_errors() -> None:
         defaults = task.policy_defaults["adaptive_threshold"]
         rates, errors = [], []
         for scale in (0.0, 0.25, 1.0, 4.0, 16.0):
-            found = run_episodes(task, AdaptiveThreshold(**defaults, scale=scale), 60, 0)
-            rates.append(found.rate.mean())
-            errors.append(found.squared_error[:, : task.system.plant.size].mean())
+            results = run_episodes(task, AdaptiveThreshold(**defaults, scale=scale), 60, 0)
+            rates.append(results.rate.mean())
+            errors.append(results.squared_error[:, : task.system.plant.size].mean())
         assert rates[0] == 1.0
         assert (np.diff(rates) < 0).all()
         assert (np.diff(errors) > 0).all()
@@ -226,6 +226,6 @@ def test_reward_weighs_state_and_input() -> None:
         assert parts.sum() == pytest.approx(1.0)
         assert parts[4] == pytest.approx(share)
         np.testing.assert_allclose(task.system.state_weights, weights)
-    given_weights = (1.0, 0.0, 2.0, 0.0, 3.0)
-    task = build(state_weights=given_weights)
-    np.testing.assert_array_equal(task.reward.state_weights[:, 0], given_weights)
+    weights_argument = (1.0, 0.0, 2.0, 0.0, 3.0)
+    task = build(state_weights=weights_argument)
+    np.testing.assert_array_equal(task.reward.state_weights[:, 0], weights_argument)

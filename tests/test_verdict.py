@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rliable import library, metrics
 
-from fusion_gym.agents.suite.verdict import Front, interval, judge
+from fusion_gym.agents.suite.verdict import AgentFront, interval, judge
 from fusion_gym.evaluation.episodes import EpisodeResults
 
 
@@ -84,28 +84,28 @@ def test_the_interval_covers_the_difference_between_episodes() -> None:
     generator = np.random.default_rng(1)
     baselines = {"never": made_up(0.0, generator.normal(1.0, 0.2, 2000))}
     agents = [[made_up(0.1, generator.normal(0.9, 0.2, 2000))] for _ in range(1)]
-    found = judge(agents, [1.0], baselines, {}, always=1.0)["middle"]
+    result = judge(agents, [1.0], baselines, {}, always=1.0)["middle"]
     deviation = 0.2 * np.sqrt((1 + 0.9**2) / 2000)
-    width = (found["high"] - found["low"]) / (2 * 1.96)
+    width = (result["high"] - result["low"]) / (2 * 1.96)
     assert width == pytest.approx(deviation, rel=0.1)
 
 
-def front_of(differences: Any, rates: Any) -> Front:
+def front_of(differences: Any, rates: Any) -> AgentFront:
     """A front of given relative differences (seeds, P) without any noise of episodes."""
     shares = np.asarray(differences, dtype=np.float64)
     learned = (1.0 + shares)[..., None] * np.ones(3)
     own = np.broadcast_to(rates, shares.shape)
-    return Front(learned, np.ones_like(learned), own, np.ones((1, *shares.shape)))
+    return AgentFront(learned, np.ones_like(learned), own, np.ones((1, *shares.shape)))
 
 
 def test_no_price_is_trimmed_away() -> None:
     """Seeds are trimmed at each price; a price that stands out counts as every other one."""
     differences = np.array([[-0.9, -0.1, -0.1, -0.1]] * 3 + [[-0.9, -0.1, -0.1, 9.0]])
     rates = np.array([0.1, 0.2, 0.3, 0.4])
-    found = interval(front_of(differences, rates), rates)
-    assert found["mean"] == pytest.approx(np.mean([-0.9, -0.1, -0.1, -0.1]))
-    assert found["low"] < -0.4, "the grid's rates are drawn anew"
-    assert found["high"] > -0.2
+    result = interval(front_of(differences, rates), rates)
+    assert result["mean"] == pytest.approx(np.mean([-0.9, -0.1, -0.1, -0.1]))
+    assert result["low"] < -0.4, "the grid's rates are drawn anew"
+    assert result["high"] > -0.2
 
 
 def test_the_interval_counts_what_tuning_seeds_change() -> None:
@@ -115,7 +115,7 @@ def test_the_interval_counts_what_tuning_seeds_change() -> None:
     still = interval(front, rates)
     assert still["low"] == still["high"] == pytest.approx(-0.2)
     spread = np.array([0.9, 1.0, 1.1])[:, None, None]
-    moved = interval(Front(front.learned, front.envelope, front.rates, spread), rates)
+    moved = interval(AgentFront(front.learned, front.envelope, front.rates, spread), rates)
     assert moved["mean"] == pytest.approx(-0.2)
     assert moved["low"] == pytest.approx(0.8 / 1.1 - 1.0, abs=0.02)
     assert moved["high"] == pytest.approx(0.8 / 0.9 - 1.0, abs=0.02)
@@ -126,10 +126,10 @@ def test_searches_are_compared_at_the_agents_rates() -> None:
     envelope = {"never": made_up(0.0, 2 * noise), "always": made_up(1.0, noise)}
     agents = [[made_up(0.2, 1.8 * noise)]]
     searches = [[(0.0, 1.8), (1.0, 0.9)], [(0.0, 2.2), (1.0, 1.1)]]
-    found = judge(agents, [1.0], envelope, {}, always=1.0, searches=searches)["middle"]
-    assert found["mean"] == pytest.approx(0.0)
-    assert found["low"] == pytest.approx(1 / 1.1 - 1, abs=1e-6)
-    assert found["high"] == pytest.approx(1 / 0.9 - 1, abs=1e-6)
+    result = judge(agents, [1.0], envelope, {}, always=1.0, searches=searches)["middle"]
+    assert result["mean"] == pytest.approx(0.0)
+    assert result["low"] == pytest.approx(1 / 1.1 - 1, abs=1e-6)
+    assert result["high"] == pytest.approx(1 / 0.9 - 1, abs=1e-6)
 
 
 def test_one_table_as_rliable_has_it() -> None:
@@ -140,7 +140,7 @@ def test_one_table_as_rliable_has_it() -> None:
     # agent has all prices here.
     shares = means + 0.2 * np.linalg.qr(noise - noise.mean(0))[0]
     rates = np.array([0.1, 0.2, 0.3, 0.4])
-    found = interval(front_of(shares, rates), rates)
+    result = interval(front_of(shares, rates), rates)
 
     def mean_of_prices(scores: Any) -> Any:
         columns = [metrics.aggregate_iqm(scores[:, [place]]) for place in range(scores.shape[1])]
@@ -154,7 +154,7 @@ def test_one_table_as_rliable_has_it() -> None:
         task_bootstrap=True,
         random_state=np.random.RandomState(0),
     )
-    assert found["mean"] == pytest.approx(point["agent"][0])
+    assert result["mean"] == pytest.approx(point["agent"][0])
     width = ends["agent"][1, 0] - ends["agent"][0, 0]
-    assert found["high"] - found["low"] == pytest.approx(width, rel=0.2)
-    assert (found["low"], found["high"]) == pytest.approx(ends["agent"][:, 0], abs=0.2 * width)
+    assert result["high"] - result["low"] == pytest.approx(width, rel=0.2)
+    assert (result["low"], result["high"]) == pytest.approx(ends["agent"][:, 0], abs=0.2 * width)

@@ -27,9 +27,9 @@ def frames(*names: str, seed: int = 3, steps: int | None = None, **options: Any)
 
 
 def test_pictures_stand_side_by_side_one_a_step_and_one_before() -> None:
-    alone, both = frames("always"), frames("always", "never")
-    assert len(alone) == len(both) == 5
-    height, width, _ = alone[0].shape
+    single, both = frames("always"), frames("always", "never")
+    assert len(single) == len(both) == 5
+    height, width, _ = single[0].shape
     assert all(frame.shape == (height, 2 * width, 3) for frame in both)
     assert [len(frames("always", steps=steps)) for steps in (1, 2)] == [2, 3]
 
@@ -75,14 +75,14 @@ def test_the_command_writes_films(
     command.main()
     with imageio.get_reader(name) as reader:
         film: Any = reader
-        shown = [np.asarray(frame)[..., :3] for frame in film]
-    assert len(shown) == 7
+        visible = [np.asarray(frame)[..., :3] for frame in film]
+    assert len(visible) == 7
     task = fusion_gym.make_task(TOBIT, horizon=6)
     rules = {name: make_policy(name, task) for name in ("always", "never")}
-    for seen, drawn in zip(shown, watch(task, rules), strict=True):
-        assert seen.shape == drawn.shape
+    for observed, drawn in zip(visible, watch(task, rules), strict=True):
+        assert observed.shape == drawn.shape
         # 64 colours of a GIF, chroma of a video.
-        assert np.abs(seen.astype(int) - drawn).mean() < 3.0
+        assert np.abs(observed.astype(int) - drawn).mean() < 3.0
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 

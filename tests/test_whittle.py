@@ -20,8 +20,8 @@ ENV = "fusion_gym/RemoteEstimation-v0"
 
 def cost(policy: str, episodes: int = 400, **options: Any) -> tuple[float, float]:
     task = fusion_gym.make_task(ENV, **options)
-    found = run_episodes(task, make_policy(policy, task), episodes, seed=0)
-    return -float(found.returns.mean()), float(found.rate.mean())
+    results = run_episodes(task, make_policy(policy, task), episodes, seed=0)
+    return -float(results.returns.mean()), float(results.rate.mean())
 
 
 @pytest.mark.parametrize("price", [0.7, 5.0, 60.0])
@@ -54,8 +54,8 @@ def test_it_grows_with_the_error_without_end() -> None:
 def test_one_source_at_a_price_is_solved_by_it(options: dict[str, Any]) -> None:
     """Paired over 400 episodes; the optimum is flat, the interpolation costs little."""
     best, rate = cost("optimal:criterion=average", **options)
-    found, own = cost("whittle", **options)
-    assert found == pytest.approx(best, rel=0.006)
+    result, own = cost("whittle", **options)
+    assert result == pytest.approx(best, rel=0.006)
     assert own == pytest.approx(rate, rel=0.04)
 
 
@@ -89,8 +89,8 @@ def test_what_it_asks_for() -> None:
     task = fusion_gym.make_task(ENV, sensors=3, cost_weight=5.0)
     dear = run_episodes(task, make_policy("whittle:price=1e6", task), 10, seed=0)
     assert dear.requests.max() == 0.0
-    one = run_episodes(task, make_policy("whittle:price=0,at_most=1", task), 10, seed=0)
-    assert one.requests.sum(1).max() <= 1.0
+    results = run_episodes(task, make_policy("whittle:price=0,at_most=1", task), 10, seed=0)
+    assert results.requests.sum(1).max() <= 1.0
     for text, message in (("whittle:price=-1", "price = -1"), ("whittle:at_most=0", "at_most = 0")):
         with pytest.raises(ConfigurationError, match=message):
             make_policy(text, task)

@@ -153,9 +153,9 @@ class DriftOptions(CommonOptions):
     noise: float = 0.5
 
 
-def build(chosen: DriftOptions) -> Scenario:
+def build(options: DriftOptions) -> Scenario:
     """The scenario of these options."""
-    return Scenario(chosen, Drift(chosen.noise))
+    return Scenario(options, Drift(options.noise))
 
 
 def evaluate() -> tuple[Interval, Interval]:
@@ -169,17 +169,17 @@ def evaluate() -> tuple[Interval, Interval]:
         "old": OldNews(steps=3.0),
         "surprised": Surprised(),
     }
-    found = {name: run_episodes(task, policy, 20, seed=0) for name, policy in policies.items()}
-    assert_type(found, dict[str, EpisodeResults])
-    report: dict[str, Any] = summarise(found["old"])
-    assert lower_envelope(found)[-1].mse <= float(found["old"].mse.mean())
+    results = {name: run_episodes(task, policy, 20, seed=0) for name, policy in policies.items()}
+    assert_type(results, dict[str, EpisodeResults])
+    report: dict[str, Any] = summarise(results["old"])
+    assert lower_envelope(results)[-1].mse <= float(results["old"].mse.mean())
     trajectory = record_episode(task, policies["surprised"], seed=0)
     assert_type(trajectory, Trajectory)
     first, *_ = watch(task, policies, seed=0, steps=1)
     assert_type(first, NDArray[np.uint8])
     assert set(report) >= {"mse", "rate"}
-    difference = paired_difference(found["surprised"], found["always"])
-    return mean_interval(found["old"].mse), difference
+    difference = paired_difference(results["surprised"], results["always"])
+    return mean_interval(results["old"].mse), difference
 
 
 def options_objects() -> list[Task]:

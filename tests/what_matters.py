@@ -16,7 +16,7 @@ import numpy as np
 
 from fusion_gym.arrays import merge_runs, take_runs
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.beliefs import Beliefs, Estimate, Shadows
+from fusion_gym.core.beliefs import Beliefs, Estimate, MemoryStates
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.signals import MEMORY_SIGNALS
 from fusion_gym.core.system import Knowledge, Signals, covers
@@ -34,7 +34,7 @@ class Believed:
     they were made of."""
 
     parts = ("difference", "best", "silent", "sent")
-    states = ("remembered", "shadows")
+    states = ("memory_posterior", "memory_states")
 
     def __init__(self, values: Values, made_of: Values) -> None:
         self.values, self.made_of = values, made_of
@@ -43,7 +43,9 @@ class Believed:
     def of(cls, beliefs: Any, steps: int) -> Believed:
         """All that a policy may ask of beliefs, over so many steps."""
         values = {name: getattr(beliefs, name) for name in cls.parts}
-        made_of = {name: getattr(beliefs, name) for name in cls.states if beliefs.task.shadow}
+        made_of = {
+            name: getattr(beliefs, name) for name in cls.states if beliefs.task.memory_system
+        }
         return cls(values | {"value": beliefs.value(steps), "loss": beliefs.loss(steps)}, made_of)
 
     def with_each(self, change: Callable[..., Any], *others: Believed) -> Believed:
@@ -61,7 +63,7 @@ class Believed:
         if name in self.parts:
             return self.values[name]
         if name in self.states:
-            return self.made_of.get(name, Shadows())
+            return self.made_of.get(name, MemoryStates())
         raise AttributeError(name)
 
     def value(self, steps: int = 1) -> Any:
@@ -77,8 +79,8 @@ def read(signals: Signals, policy: Any) -> Values:
     """All signals; what is believed only for a policy that looks at it, for it takes long."""
     beliefs = ("beliefs", "own_beliefs", *(signal.name for signal in MEMORY_SIGNALS))
     believes, steps = owner_of(policy) is not None, getattr(policy, "steps", 1)
-    found: Values = {name: signals[name] for name in signals if believes or name not in beliefs}
-    return {n: Believed.of(v, steps) if isinstance(v, Beliefs) else v for n, v in found.items()}
+    result: Values = {name: signals[name] for name in signals if believes or name not in beliefs}
+    return {n: Believed.of(v, steps) if isinstance(v, Beliefs) else v for n, v in result.items()}
 
 
 def with_states(batch: EpisodeBatch, state: Any, memory: Memory) -> EpisodeBatch:
@@ -89,24 +91,24 @@ def with_states(batch: EpisodeBatch, state: Any, memory: Memory) -> EpisodeBatch
 
 
 def moved_otherwise(
-    batch: EpisodeBatch, remembered: Memory, rng: np.random.Generator
+    batch: EpisodeBatch, memory_posterior: Memory, rng: np.random.Generator
 ) -> EpisodeBatch:
     """The same history, but the last move and all new measurements are made of other noise.
 
-    ``remembered`` is what there was before the last move.
+    ``memory_posterior`` is what there was before the last move.
     """
     if batch.delivered is None:
         return batch
     noise = rng.standard_normal((batch.task.system.noise_channels, batch.num_envs))
-    remembered.sense(noise)
-    return with_states(batch, batch.task.system.sense(batch.delivered, noise), remembered)
+    memory_posterior.sense(noise)
+    return with_states(batch, batch.task.system.sense(batch.delivered, noise), memory_posterior)
 
 
 def forgotten(batch: EpisodeBatch) -> EpisodeBatch:
     """Without what was measured and not sent."""
     states = batch.memory.states
-    memory = Memory(dataclasses.replace(batch.task, shadow=None), batch.memory.owner)
-    states = None if states is None else Shadows(alone=states.alone)
+    memory = Memory(dataclasses.replace(batch.task, memory_system=None), batch.memory.owner)
+    states = None if states is None else MemoryStates(single=states.single)
     return with_states(batch, batch.state, memory.with_states(states))
 
 
@@ -114,11 +116,11 @@ def with_other_truth(batch: EpisodeBatch, rng: np.random.Generator) -> EpisodeBa
     """All that the system's visible state hides is changed: the truth, coming losses."""
     system, states = batch.task.system, batch.memory.states
     if states is not None:
-        shadow = batch.task.shadow
-        states = Shadows(
-            tampered(shadow, states.every, rng),
-            tampered(shadow, states.own, rng),
-            tampered(system, states.alone, rng),
+        memory_system = batch.task.memory_system
+        states = MemoryStates(
+            tampered(memory_system, states.every, rng),
+            tampered(memory_system, states.own, rng),
+            tampered(system, states.single, rng),
         )
     state = tampered(system, batch.state, rng)
     return with_states(batch, state, batch.memory.with_states(states))
@@ -181,7 +183,7 @@ def of_sensor(sensor: int, true: Values, other: Values, batch: EpisodeBatch) -> 
             result[name] = with_own(result[name], value)
         elif name == "own_beliefs":
             result[name] = other[name].with_each(with_own, value)
-    known = [entry.told or entry.sensor == sensor for entry in batch.layout.entries]
+    known = [entry.broadcast or entry.sensor == sensor for entry in batch.layout.entries]
     result["observation"] = np.where(known, true["observation"], other["observation"])
     return result
 
@@ -198,8 +200,8 @@ def in_runs(runs: np.ndarray[Any, Any], true: Values, other: Values) -> Values:
             )
             if name == "beliefs":
                 result[name].made_of = {
-                    what: merge_runs(kept, take_runs(other[name].made_of[what], runs), runs)
-                    for what, kept in value.made_of.items()
+                    what: merge_runs(stored, take_runs(other[name].made_of[what], runs), runs)
+                    for what, stored in value.made_of.items()
                 }
         elif name == "model":
             result[name] = merge_runs(value, take_runs(other[name], runs), runs)
@@ -221,9 +223,9 @@ CHARACTERISTIC: dict[Knowledge, set[str]] = {
     "clock": set(),
     "centre": {ANYTHING},
     "own": {MEASUREMENTS},
-    "coordinator": {MEASUREMENTS, OTHERS},
+    "scheduler": {MEASUREMENTS, OTHERS},
     "own_memory": {MEASUREMENTS, PAST},
-    "coordinator_memory": {MEASUREMENTS, OTHERS, PAST},
+    "scheduler_memory": {MEASUREMENTS, OTHERS, PAST},
 }
 
 
@@ -244,39 +246,39 @@ def what_matters(policy: Policy, task: Task) -> set[str]:
     """Play episodes with the policy and see which changes move its copies' requests."""
     rng, seed = np.random.default_rng(1), 3
     batch = EpisodeBatch.seeded(task, RUNS, seed, owner_of(policy))
-    remembered = batch.memory
-    timed, blind, forgetful, honest, *alone = (
+    memory_posterior = batch.memory
+    timed, blind, without_memory, honest, *single = (
         copy.deepcopy(policy) for _ in range(4 + task.sensors)
     )
-    for each in (policy, timed, blind, forgetful, honest, *alone):
+    for each in (policy, timed, blind, without_memory, honest, *single):
         each.reset(RUNS, seed)
-    found: set[str] = set()
+    result: set[str] = set()
 
     def compare(what: str, answer: Any, expected: Any) -> None:
         if not np.array_equal(answer, expected):
-            found.add(what)
+            result.add(what)
 
     for step in range(STEPS):
         signals = batch.signals()
-        asked = policy(signals)
-        elsewhere = moved_otherwise(batch, remembered, rng)
-        true, other = (read(one.signals(), policy) for one in (batch, elsewhere))
+        requests = policy(signals)
+        elsewhere = moved_otherwise(batch, memory_posterior, rng)
+        true, other = (read(item.signals(), policy) for item in (batch, elsewhere))
         foreign = other_runs(other, rng)
         clock = {name: true[name] if name in CLOCK else foreign[name] for name in true}
-        compare(ANYTHING, timed(Signals(clock)), asked)
-        compare(MEASUREMENTS, blind(elsewhere.signals()), asked)
-        compare(HIDDEN, honest(with_other_truth(batch, rng).signals()), asked)
-        for sensor, each in enumerate(alone):
+        compare(ANYTHING, timed(Signals(clock)), requests)
+        compare(MEASUREMENTS, blind(elsewhere.signals()), requests)
+        compare(HIDDEN, honest(with_other_truth(batch, rng).signals()), requests)
+        for sensor, each in enumerate(single):
             answer = each(Signals(of_sensor(sensor, true, foreign, batch)))
-            compare(OTHERS, answer[sensor], asked[sensor])
-        if task.shadow is not None:
-            compare(PAST, copy.deepcopy(forgetful)(forgotten(batch).signals()), asked)
-        remembered, state = batch.memory.branch(None, batch.num_envs), batch.state
-        granted = batch.step(asked).granted
-        remembered.deliver(state, batch.delivered, granted)
+            compare(OTHERS, answer[sensor], requests[sensor])
+        if task.memory_system is not None:
+            compare(PAST, copy.deepcopy(without_memory)(forgotten(batch).signals()), requests)
+        memory_posterior, state = batch.memory.branch(None, batch.num_envs), batch.state
+        granted = batch.step(requests).granted
+        memory_posterior.deliver(state, batch.delivered, granted)
         if step % 2 == 0:
-            compare(PAST, forgetful(signals), asked)
+            compare(PAST, without_memory(signals), requests)
         else:
             silent = np.flatnonzero(~granted.any(0))
-            forgetful(Signals(in_runs(silent, true, other)))
-    return found
+            without_memory(Signals(in_runs(silent, true, other)))
+    return result

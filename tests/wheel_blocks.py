@@ -102,16 +102,16 @@ class Pages:
         folder.mkdir(parents=True)
         blocks = blocks_of(page, text)
         stray = stray_commands(page, text)
-        self.failed += [f"{one}: a command outside of a shell block" for one in stray]
+        self.failed += [f"{item}: a command outside of a shell block" for item in stray]
         for place, block in enumerate(blocks):
             began = seconds()
-            said = self._run(block, blocks[place + 1 :], folder)
+            output = self._run(block, blocks[place + 1 :], folder)
             taken = seconds() - began
-            if said is None and taken > LIMIT:
-                said = f"takes {taken:.0f} s: it belongs into LISTED of {Path(__file__).name}"
-            if said is not None:
-                self.failed.append(f"{block.place}: {said}")
-            print(f"{taken:5.1f} s  {block.place}{'  failed' if said else ''}", flush=True)
+            if output is None and taken > LIMIT:
+                output = f"takes {taken:.0f} s: it belongs into LISTED of {Path(__file__).name}"
+            if output is not None:
+                self.failed.append(f"{block.place}: {output}")
+            print(f"{taken:5.1f} s  {block.place}{'  failed' if output else ''}", flush=True)
 
     def _run(self, block: Block, later: Sequence[Block], folder: Path) -> str | None:
         """What is wrong with a block; ``None`` if nothing is."""
@@ -137,7 +137,7 @@ class Pages:
     def _wrong_shell(self, block: Block, environment: Environment, folder: Path) -> str | None:
         lines = []
         for line, words in block.commands():
-            listed = next((one for one in LISTED if line.startswith(one.begins)), None)
+            listed = next((item for item in LISTED if line.startswith(item.begins)), None)
             if listed is None:
                 lines.append(line)
             elif listed.instead:
@@ -145,9 +145,9 @@ class Pages:
                 lines.append(f"{shlex.join(words)} {listed.instead}")
             else:
                 self.used.add(listed)
-                said = self._wrong_words(words, environment)
-                if said is not None:
-                    return said
+                text = self._wrong_words(words, environment)
+                if text is not None:
+                    return text
                 if words[0] == "fusion-gym":
                     self.unread.append((block.place, str(folder), words))
         script = "\n".join(["set -euo pipefail", *lines])
@@ -166,8 +166,8 @@ class Pages:
             there = re.search(rf"^{words[1]}:", self.makefile, re.MULTILINE)
             return None if there else f"the Makefile has no target {words[1]}"
         if words[0] == "pip":
-            asked = {part for word in words for part in re.findall(r"\[(.*?)\]", word)}
-            extras = {name for part in asked for name in part.split(",")}
+            text = {part for word in words for part in re.findall(r"\[(.*?)\]", word)}
+            extras = {name for part in text for name in part.split(",")}
             return None if extras <= set(self.wheel.extras) else f"no extras {extras}"
         if words[0] == "python" and words[2] != "pytest":
             file = Path(*words[2].split(".")).with_suffix(".py")
@@ -195,7 +195,7 @@ def _wrong_yaml(block: Block, later: Sequence[Block]) -> str | None:
     yaml.safe_load(block.text)
     if block.file is None:
         return "the first line does not name the file, as # plant.yaml does"
-    if not any(block.file in one.text for one in later):
+    if not any(block.file in item.text for item in later):
         return f"no later block uses {block.file}"
     return None
 
@@ -224,20 +224,20 @@ def run_pages(pages: Sequence[Path], wheel: Path | None) -> None:
     Raises:
         SystemExit: a block does not run, or an entry of the list is of no use.
     """
-    chosen = pages or [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    selection = pages or [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         file = wheel or build(copy(folder / "source"), folder / "built")
         run = Pages(Wheel(file, folder), (ROOT / "Makefile").read_text())
-        for number, page in enumerate(chosen):
+        for number, page in enumerate(selection):
             own = page.resolve().is_relative_to(ROOT)
-            shown = page.resolve().relative_to(ROOT) if own else page
-            run.run(shown, page.read_text(), folder / f"page_{number}" / shown.stem)
+            label = page.resolve().relative_to(ROOT) if own else page
+            run.run(label, page.read_text(), folder / f"page_{number}" / label.stem)
         run.read()
     for text in run.left:
         print(f"left to make integrations: {text}")
     print(f"{seconds():.0f} s of the processor")
-    useless = [one.begins for one in LISTED if one not in run.used] if not pages else []
+    useless = [item.begins for item in LISTED if item not in run.used] if not pages else []
     wrong = [*run.failed, *(f"LISTED: no page shows {begins!r}" for begins in useless)]
     if wrong:
         sys.exit("\n".join(wrong))
@@ -248,8 +248,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Run the blocks of README and docs as printed.")
     parser.add_argument("pages", nargs="*", type=Path, help="all by default")
     parser.add_argument("--wheel", type=Path, help="one that was built")
-    given = parser.parse_args()
-    run_pages(given.pages, given.wheel)
+    arguments = parser.parse_args()
+    run_pages(arguments.pages, arguments.wheel)
 
 
 if __name__ == "__main__":

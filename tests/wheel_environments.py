@@ -70,12 +70,12 @@ class Wheel:
     def metadata(self) -> Mapping[str, list[str]]:
         """Its fields, each with all of its values."""
         with zipfile.ZipFile(self.file) as packed:
-            (name,) = (one for one in packed.namelist() if one.endswith(".dist-info/METADATA"))
-            found = defaultdict(list)
+            (name,) = (item for item in packed.namelist() if item.endswith(".dist-info/METADATA"))
+            result = defaultdict(list)
             for line in packed.read(name).decode().partition("\n\n")[0].splitlines():
                 key, _, value = line.partition(": ")
-                found[key].append(value)
-        return found
+                result[key].append(value)
+        return result
 
     @property
     def extras(self) -> list[str]:
@@ -90,15 +90,15 @@ class Wheel:
             Absent: something that they need is not installed here.
         """
         needed = closure(map(Requirement, self.metadata["Requires-Dist"]), extras)
-        made = Environment(self.folder / "_".join(["wheel", *sorted(extras)]))
-        venv.create(made.folder, with_pip=False)
-        _link(needed, made.packages)
+        environment = Environment(self.folder / "_".join(["wheel", *sorted(extras)]))
+        venv.create(environment.folder, with_pip=False)
+        _link(needed, environment.packages)
         with zipfile.ZipFile(self.file) as packed:
-            packed.extractall(made.packages)
-        own = Distribution.at(next(made.packages.glob("fusion_gym-*.dist-info")))
-        for one in (own, *needed.values()):
-            _scripts(one, made)
-        return made
+            packed.extractall(environment.packages)
+        own = Distribution.at(next(environment.packages.glob("fusion_gym-*.dist-info")))
+        for item in (own, *needed.values()):
+            _scripts(item, environment)
+        return environment
 
     def extra_of(self, module: str) -> str | None:
         """The extra that installs a module: empty for the wheel alone, none if no extra does."""
@@ -106,49 +106,49 @@ class Wheel:
             if extra == "test" or (module.startswith("fusion_gym.agents") and not extra):
                 continue
             try:
-                found = self.environment(frozenset(filter(None, [extra])))
+                result = self.environment(frozenset(filter(None, [extra])))
             except Absent:
                 continue
-            if found.has(module):
+            if result.has(module):
                 return extra
         return None
 
 
-def closure(wanted: Iterable[Requirement], extras: Iterable[str]) -> dict[str, Distribution]:
+def closure(expected: Iterable[Requirement], extras: Iterable[str]) -> dict[str, Distribution]:
     """The installed packages that these need, by name.
 
     Raises:
         Absent: one is not installed.
     """
-    found: dict[str, Distribution] = {}
-    left = [(one, tuple(extras)) for one in wanted]
-    seen = set()
+    result: dict[str, Distribution] = {}
+    left = [(item, tuple(extras)) for item in expected]
+    visited = set()
     while left:
-        requirement, chosen = left.pop()
-        worlds = [{"extra": extra} for extra in ("", *chosen)]
+        requirement, selection = left.pop()
+        worlds = [{"extra": extra} for extra in ("", *selection)]
         if requirement.marker and not any(map(requirement.marker.evaluate, worlds)):
             continue
         name = canonicalize_name(requirement.name)
         key = (name, frozenset(requirement.extras))
-        if key in seen or name == OWN:
+        if key in visited or name == OWN:
             continue
-        seen.add(key)
+        visited.add(key)
         try:
-            found[name] = importlib.metadata.distribution(name)
+            result[name] = importlib.metadata.distribution(name)
         except importlib.metadata.PackageNotFoundError:
             raise Absent(name) from None
-        more = found[name].requires or []
+        more = result[name].requires or []
         left += [(Requirement(text), tuple(requirement.extras)) for text in more]
-    return found
+    return result
 
 
 @functools.cache
 def _owners() -> dict[PurePosixPath, set[str]]:
     """Of every file and folder of the installed packages, the packages that it belongs to."""
     owners: dict[PurePosixPath, set[str]] = defaultdict(set)
-    for one in importlib.metadata.distributions():
-        name = canonicalize_name(one.metadata["Name"])
-        for file, *_ in csv.reader((one.read_text("RECORD") or "").splitlines()):
+    for distribution in importlib.metadata.distributions():
+        name = canonicalize_name(distribution.metadata["Name"])
+        for file, *_ in csv.reader((distribution.read_text("RECORD") or "").splitlines()):
             path = PurePosixPath(file)
             if ".." not in path.parts and not path.is_absolute():
                 for part in (path, *path.parents[:-1]):
@@ -177,14 +177,14 @@ def _link(needed: Mapping[str, Distribution], folder: Path) -> None:
             left += children[path]
 
 
-def _scripts(one: Distribution, made: Environment) -> None:
+def _scripts(entry: Distribution, world: Environment) -> None:
     """The programs of a package."""
-    for point in one.entry_points.select(group="console_scripts"):
-        script = made.programs / point.name
+    for point in entry.entry_points.select(group="console_scripts"):
+        script = world.programs / point.name
         first = point.attr.partition(".")[0]
         script.write_text(
             _SCRIPT.format(
-                python=made.programs / "python", module=point.module, first=first, call=point.attr
+                python=world.programs / "python", module=point.module, first=first, call=point.attr
             )
         )
         script.chmod(0o755)

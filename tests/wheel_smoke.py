@@ -94,10 +94,10 @@ def call(*words: str | Path, cwd: Path, status: int = 0) -> subprocess.Completed
     began = time.perf_counter()
     plain = {key: text for key, text in os.environ.items() if not key.startswith("PYTHON")}
     done = subprocess.run(list(map(str, words)), cwd=cwd, env=plain, capture_output=True, text=True)
-    shown = " ".join(map(str, words[:5])).splitlines()[0]
+    output = " ".join(map(str, words[:5])).splitlines()[0]
     if done.returncode != status:
-        sys.exit(f"{done.stdout}\n{done.stderr}\n{shown} ended with {done.returncode}")
-    print(f"{time.perf_counter() - began:5.1f} s  {shown}", flush=True)
+        sys.exit(f"{done.stdout}\n{done.stderr}\n{output} ended with {done.returncode}")
+    print(f"{time.perf_counter() - began:5.1f} s  {output}", flush=True)
     return done
 
 
@@ -108,8 +108,8 @@ def copy(folder: Path) -> Path:
         cwd=ROOT, capture_output=True, text=True,
     )  # fmt: skip
     if listed.returncode != 0:
-        made = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "runs")
-        return Path(shutil.copytree(ROOT, folder, ignore=made))
+        result = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "runs")
+        return Path(shutil.copytree(ROOT, folder, ignore=result))
     for name in filter(None, listed.stdout.split("\0")):
         if (ROOT / name).is_file() or (ROOT / name).is_symlink():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -153,7 +153,7 @@ def use(programs: Path, folder: Path) -> None:
     assert json.loads((folder / "training" / "summary.json").read_text())["finished"]
     quick = ("--episodes", "2", "--timesteps", "8192")
     call(program, "demo", *quick, "--output", "demo", cwd=folder)
-    assert (folder / "demo" / "coordinator" / "front.png").exists()
+    assert (folder / "demo" / "scheduler" / "front.png").exists()
     table = call(program, "table", "--episodes", "2", "--markdown", cwd=folder).stdout
     assert table.startswith("| setting |"), table
     (folder / "suite.yaml").write_text(json.dumps(SUITE))
@@ -178,19 +178,19 @@ def main() -> None:
         call(sys.executable, "-m", "build", "--outdir", built, source, cwd=folder)
         (wheel,), (archive,) = built.glob("*.whl"), built.glob("*.tar.gz")
         with zipfile.ZipFile(wheel) as packed_wheel:
-            (name,) = (one for one in packed_wheel.namelist() if one.endswith("/METADATA"))
-            said = packed_wheel.read(name).decode()
-        assert "Description-Content-Type: text/markdown" in said
-        assert "](https://github.com/" in said
-        assert "](docs/" not in said
+            (name,) = (item for item in packed_wheel.namelist() if item.endswith("/METADATA"))
+            text = packed_wheel.read(name).decode()
+        assert "Description-Content-Type: text/markdown" in text
+        assert "](https://github.com/" in text
+        assert "](docs/" not in text
         programs = install(wheel, folder / "environment")
         use(programs, folder / "empty")
         with tarfile.open(archive) as packed:
             packed.extractall(folder / "unpacked", filter="data")
         (unpacked,) = (folder / "unpacked").iterdir()
         shipped = {path.relative_to(unpacked) for path in unpacked.rglob("*")}
-        kept = [path.relative_to(source) for path in source.rglob("*") if path.is_file()]
-        missing = [path for path in kept if path not in shipped and path.parts[0] not in HIDDEN]
+        names = [path.relative_to(source) for path in source.rglob("*") if path.is_file()]
+        missing = [path for path in names if path not in shipped and path.parts[0] not in HIDDEN]
         assert not missing, f"the source distribution lacks {missing}"
         tests = (
             "-m",

@@ -29,15 +29,15 @@ class _Page(HTMLParser):
         self._figures = 0
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        found = {name: value or "" for name, value in attrs}
-        self.anchors |= {found[name] for name in ("id", "name") if name in found}
-        if tag in ("a", "link") and "href" in found:
-            self.links.append(found["href"])
-        if tag in ("img", "script") and "src" in found:
-            self.links.append(found["src"])
+        result = {name: value or "" for name, value in attrs}
+        self.anchors |= {result[name] for name in ("id", "name") if name in result}
+        if tag in ("a", "link") and "href" in result:
+            self.links.append(result["href"])
+        if tag in ("img", "script") and "src" in result:
+            self.links.append(result["src"])
         self._figures += tag == "figure"
-        if tag == "img" and not (found.get("alt") and self._figures):
-            self.bare.append(found.get("src", "")[:80])
+        if tag == "img" and not (result.get("alt") and self._figures):
+            self.bare.append(result.get("src", "")[:80])
 
     def handle_endtag(self, tag: str) -> None:
         self._figures -= tag == "figure"
@@ -46,11 +46,11 @@ class _Page(HTMLParser):
 def problems(site: Path) -> list[str]:
     """Links to nothing, anchors that do not exist, and pictures without a caption."""
     pages = {str(path.relative_to(site)): _read(path) for path in sorted(site.rglob("*.html"))}
-    found = []
+    result = []
     for place, page in pages.items():
         if place == "404.html":
             continue
-        found += [f"{place}: picture without a caption: {src}" for src in page.bare]
+        result += [f"{place}: picture without a caption: {src}" for src in page.bare]
         for link in page.links:
             parts = urlsplit(link)
             if parts.scheme in _ELSEWHERE:
@@ -60,12 +60,12 @@ def problems(site: Path) -> list[str]:
             if target.endswith("/") or target in (".", ""):
                 target = posixpath.join(target, "index.html")
             if not (site / target).exists():
-                found.append(f"{place}: link to nothing: {link}")
+                result.append(f"{place}: link to nothing: {link}")
             elif parts.fragment and target in pages:
-                wanted = unquote(parts.fragment)
-                if wanted not in pages[target].anchors and not wanted.startswith("__"):
-                    found.append(f"{place}: no such place on the page: {link}")
-    return found
+                required = unquote(parts.fragment)
+                if required not in pages[target].anchors and not required.startswith("__"):
+                    result.append(f"{place}: no such place on the page: {link}")
+    return result
 
 
 def _read(path: Path) -> _Page:
@@ -89,15 +89,15 @@ def fetched(site: Path) -> list[str]:
 def main() -> None:
     """Print what is wrong and end with 1, or say what was checked."""
     site = Path(sys.argv[1] if sys.argv[1:] else "site")
-    found = problems(site) + [f"fetched from elsewhere: {line}" for line in fetched(site)]
+    result = problems(site) + [f"fetched from elsewhere: {line}" for line in fetched(site)]
     count = len(list(site.rglob("*.html")))
     browser = shutil.which("chromium") or shutil.which("chromium-browser")
     if browser is None:
         print("no Chromium: the width of pages is not checked")
     else:
-        found += [f"wider than {WIDTH} px: {line}" for line in too_wide(site, browser)]
-    if found:
-        print("\n".join(found))
+        result += [f"wider than {WIDTH} px: {line}" for line in too_wide(site, browser)]
+    if result:
+        print("\n".join(result))
         sys.exit(1)
     print(f"{count} pages: links, anchors, pictures" + (", widths" if browser else ""))
 

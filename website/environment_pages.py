@@ -53,9 +53,9 @@ def at_a_glance(env_id: str) -> str:
 def sections(env_id: str) -> str:
     """Actions, reward, end and info: the sections of the page that ``help`` shows."""
     name = env_id.split("/")[1]
-    found = re.findall(r"^## (.+)\n((?:(?!## ).*\n)+)", page(env_id), re.MULTILINE)
+    result = re.findall(r"^## (.+)\n((?:(?!## ).*\n)+)", page(env_id), re.MULTILINE)
     return "\n\n".join(
-        f"### {head} of {name}\n\n{text.strip()}" for head, text in found if head in SECTIONS
+        f"### {head} of {name}\n\n{text.strip()}" for head, text in result if head in SECTIONS
     )
 
 

@@ -19,7 +19,7 @@ from website.parts import Part, example_of
 STEPS = 80
 _KNOWING = {
     "own_memory": palette.RULES_MEMORY,
-    "coordinator_memory": palette.RULES_MEMORY,
+    "scheduler_memory": palette.RULES_MEMORY,
 }
 
 

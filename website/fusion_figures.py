@@ -20,8 +20,8 @@ SHARED = 0.5  # of each estimate's error, as a correlation of the whitened error
 def drawn(part: Part) -> tuple[bytes, str]:
     """The figure of a fusion rule as SVG, and its caption."""
     joint, rule = _joint(), RULES[part.name]
-    given = joint if rule.assumes == "joint covariance" else np.stack((FIRST, SECOND))
-    fused = rule.make().fuse(MEANS[..., None], given[..., None])
+    values = joint if rule.assumes == "joint covariance" else np.stack((FIRST, SECOND))
+    fused = rule.make().fuse(MEANS[..., None], values[..., None])
     gains, claimed = fused.gains[..., 0], fused.covariance[..., 0]
     actual = sum(gains[i] @ joint[i, j] @ gains[j].T for i in range(2) for j in range(2))
     with plt.rc_context({**palette.LARGE, "svg.fonttype": "path"}):
@@ -50,8 +50,8 @@ def drawn(part: Part) -> tuple[bytes, str]:
 
 def _joint() -> np.ndarray:
     """Joint covariance (2, 2, n, n) of two errors that have a part in common."""
-    one, two = np.linalg.cholesky(FIRST), np.linalg.cholesky(SECOND)
-    cross = SHARED * one @ two.T
+    first, two = np.linalg.cholesky(FIRST), np.linalg.cholesky(SECOND)
+    cross = SHARED * first @ two.T
     return np.array([[FIRST, cross], [cross.T, SECOND]])
 
 

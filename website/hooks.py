@@ -70,7 +70,7 @@ def on_page_markdown(markdown: str, page: Page, **kwargs: Any) -> str:
     if environment_pages.of_page(name):
         markdown = environment_pages.with_tables(markdown, name)
     markdown = places.with_links(markdown, places.source_of(place), place)
-    return markup.separated(_README.sub(lambda found: _of_readme(found[1], place), markdown))
+    return markup.separated(_README.sub(lambda value: _of_readme(value[1], place), markdown))
 
 
 def on_page_content(html: str, **kwargs: Any) -> str:
@@ -80,12 +80,12 @@ def on_page_content(html: str, **kwargs: Any) -> str:
 
 def _figures() -> dict[tuple[str, str], tuple[bytes, str]]:
     """The made figures with their captions, drawn by as many processes as there are cores."""
-    asked: list[tuple[str, Any, Any]] = [
+    text: list[tuple[str, Any, Any]] = [
         *(("fusion", fusion_figures.drawn, part) for part in parts.fusions()),
         *(("rules", episode_figures.drawn, part) for part in parts.policies()),
     ]
     with ProcessPoolExecutor(min(2, os.cpu_count() or 1)) as pool:
-        running = {(kind, part.name): pool.submit(draw, part) for kind, draw, part in asked}
+        running = {(kind, part.name): pool.submit(draw, part) for kind, draw, part in text}
         return {key: future.result() for key, future in running.items()}
 
 

@@ -70,8 +70,8 @@ def too_wide(site: Path, browser: str) -> list[str]:
     script = script.replace("WIDTH", str(WIDTH)).replace("SIDE", str(_SIDE_BY_SIDE))
     answers: queue.Queue[list[str]] = queue.Queue()
     # The browser's own helpers may write into its profile a moment longer than it lives itself.
-    kept = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
-    with _served(site, script, answers) as address, kept as profile:
+    folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+    with _served(site, script, answers) as address, folder as profile:
         line = [
             browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={profile}",
             "--remote-debugging-port=0", "--window-size=1280,900", address,

@@ -23,6 +23,7 @@ _USE = (
     ("Speed", "speed.md"),
     ("Many machines", "cluster.md"),
     ("The demo", "demo.md"),
+    ("Glossary", "glossary.md"),
     ("Versions", "versions.md"),
 )
 _TUTORIALS = (
@@ -52,7 +53,7 @@ def navigation() -> list[Any]:
     groups = (start, _USE, _BENCHMARK, _CONTRIBUTING)
     named = {page for group in groups for _, page in group} | set(environments)
     others = sorted(path.name for path in DOCS.glob("*.md") if path.name not in named)
-    made = {
+    jobs = {
         kind: [f"{kind}/index.md", *(f"{kind}/{part.name}.md" for part in parts(kind))]
         for kind in KIND_NAMES
     }
@@ -61,7 +62,7 @@ def navigation() -> list[Any]:
         {"Tutorials": _there(_TUTORIALS) + _unnamed("tutorials", _TUTORIALS)},
         {"Use": _there(_USE) + others},
         {"Environments": environments},
-        {"Parts": [{KIND_NAMES[kind]: pages} for kind, pages in made.items()]},
+        {"Parts": [{KIND_NAMES[kind]: pages} for kind, pages in jobs.items()]},
         {
             "Results": [
                 {"Report": "results/report.md"},

@@ -18,11 +18,11 @@ def paper_of(env_id: str) -> str:
 
 def citations(text: str) -> list[str]:
     """What the papers are of which a text speaks by their words, with links to what is made."""
-    found, seen = [], set()
+    result, visited = [], set()
     for env_id, page in pages_of().items():
         word = paper_of(env_id)
-        if word and page not in seen and re.search(rf"\b{word}\b(?![./])", text):
-            seen.add(page)
+        if word and page not in visited and re.search(rf"\b{word}\b(?![./])", text):
+            visited.add(page)
             source = re.search(r"^Source: (.*?)\n\n", _doc(page), re.MULTILINE | re.DOTALL)
             assert source is not None, page
             cited = " ".join(source[1].split()).replace(
@@ -31,8 +31,8 @@ def citations(text: str) -> list[str]:
             links = f"[our reading of it](../{page}.md)"
             if (DOCS / "reproduction" / f"{word}.md").exists():
                 links += f", [its figures and claims made anew](../reproduction/{word}.md)"
-            found.append(f"*{word}* is {cited} See {links}.")
-    return found
+            result.append(f"*{word}* is {cited} See {links}.")
+    return result
 
 
 def _doc(page: str) -> str:

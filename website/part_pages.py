@@ -41,25 +41,25 @@ def _page(folder: str, part: Part, caption: str | None) -> str:
     text, labelled = part.docstring.text, part.docstring.labelled
     place = f"{part.owner.__module__}.{part.owner.__qualname__}"
     code = ("in code", f"[`{part.owner.__name__}`][{place}]")
-    found = [f"# `{_name(folder, part)}`"]
+    result = [f"# `{_name(folder, part)}`"]
     if folder == "fusion":
-        found.append(part.meaning)
-    found += [markdown(text), table(("", ""), (*part.rows, code))]
-    found += ["## Equation", markdown(labelled["Equation"])]
+        result.append(part.meaning)
+    result += [markdown(text), table(("", ""), (*part.rows, code))]
+    result += ["## Equation", markdown(labelled["Equation"])]
     if caption is not None:
-        found += [f"## {_FIGURES[folder]}", f"![{caption}]({part.name}.svg)"]
-    found += ["## What it assumes", _sentence(markdown(labelled["Assumes"]))]
+        result += [f"## {_FIGURES[folder]}", f"![{caption}]({part.name}.svg)"]
+    result += ["## What it assumes", _sentence(markdown(labelled["Assumes"]))]
     source = markdown(labelled["Source"])
-    found += ["## Source", _sentence(source), *citations(source)]
+    result += ["## Source", _sentence(source), *citations(source)]
     if folder == "rules" and (rows := parameters(part)):
-        found += ["## Parameters", table(("parameter", "default", "allowed", "meaning"), rows)]
+        result += ["## Parameters", table(("parameter", "default", "allowed", "meaning"), rows)]
     if folder == "rules":
         spec, _ = example_of(part)
-        found += [
+        result += [
             f"In a command: `--policies {spec}`; in Python: "
             f'`fusion_gym.make_policy("{spec}", task)`.'
         ]
-    return "\n\n".join(found) + "\n"
+    return "\n\n".join(result) + "\n"
 
 
 def _sentence(text: str) -> str:

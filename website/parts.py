@@ -69,17 +69,17 @@ def policies() -> list[Part]:
 
 def fusions() -> list[Part]:
     """The rows of the table of fusion rules."""
-    found = []
+    result = []
     for name, row in RULES.items():
         structures = {env_id: options_of(env_id).structure for env_id in ENVIRONMENTS}
-        where = [one for one, known in structures.items() if known and name in known.offered]
+        where = [item for item, known in structures.items() if known and name in known.offered]
         none = "no environment of the library: their errors share noise"
         rows = [("offered in", ", ".join(map(environment_link, where)) or none)]
         if row.assumes in REASONS:
             rows.append(("refused elsewhere", f"“{REASONS[row.assumes].format(common='…')}”"))
         owner = row.make().__class__
-        found.append(Part(name, owner, row.meaning, (("assumes", row.assumes), *rows)))
-    return found
+        result.append(Part(name, owner, row.meaning, (("assumes", row.assumes), *rows)))
+    return result
 
 
 def filters() -> list[Part]:

@@ -37,8 +37,8 @@ def source_of(page: str) -> str:
 
 def pictures() -> dict[str, Path]:
     """Figures outside docs/ by their place on the site, which keeps that in the repository."""
-    found = sorted((ROOT / "results").rglob("*.png"))
-    return {str(path.relative_to(ROOT)): path for path in found if "quick" not in path.parts}
+    result = sorted((ROOT / "results").rglob("*.png"))
+    return {str(path.relative_to(ROOT)): path for path in result if "quick" not in path.parts}
 
 
 def with_links(text: str, source: str, page: str) -> str:
@@ -52,8 +52,8 @@ def with_links(text: str, source: str, page: str) -> str:
         before, target, anchor, after = match.groups()
         if not target or re.match(r"\w+:", target):
             return match[0]
-        found = _place(posixpath.normpath(posixpath.join(posixpath.dirname(source), target)), page)
-        return match[0] if found is None else f"{before}{found}{anchor or ''}{after}"
+        result = _place(posixpath.normpath(posixpath.join(posixpath.dirname(source), target)), page)
+        return match[0] if result is None else f"{before}{result}{anchor or ''}{after}"
 
     parts = _CODE.split(text)
     return "".join(

@@ -27,15 +27,15 @@ most people need is imported by `import fusion_gym` alone:
 
 def modules() -> dict[str, str]:
     """Public modules with the first line of their docstrings, by their dotted names."""
-    found = {}
+    result = {}
     for path in sorted(_PACKAGE.rglob("*.py")):
         parts = path.relative_to(ROOT).with_suffix("").parts
         if any(part.startswith("_") and part != "__init__" for part in parts):
             continue
         name = ".".join(part for part in parts if part != "__init__")
         if name != "fusion_gym":
-            found[name] = _first_line(path)
-    return found
+            result[name] = _first_line(path)
+    return result
 
 
 def place(module: str) -> str:
@@ -47,10 +47,10 @@ def pages() -> dict[str, str]:
     """All pages of the reference by their places."""
     every = modules()
     rows = [f"| [`{name}`]({name}.md) | {line} |" for name, line in every.items()]
-    found = {"api/index.md": _INTRO + "\n".join(["| | |", "|---|---|", *rows]) + "\n"}
+    result = {"api/index.md": _INTRO + "\n".join(["| | |", "|---|---|", *rows]) + "\n"}
     for name in every:
-        found[place(name)] = f"# `{name}` {{ #{name} }}\n\n::: {name}\n"
-    return found
+        result[place(name)] = f"# `{name}` {{ #{name} }}\n\n::: {name}\n"
+    return result
 
 
 def _first_line(path: Path) -> str:

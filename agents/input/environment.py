@@ -26,9 +26,9 @@ def environment_of(
             raise ConfigurationError("env = None is not allowed: give --env ID or --config FILE")
         return env, options, None
     # Here, for it needs Stable-Baselines3, which takes seconds to load.
-    from ..training.checked import load
+    from ..training.checked import load_checked
     from ..training.config import Experiment
 
-    experiment = load(Experiment, config)
-    chosen = experiment.environment
-    return env or chosen.id, dict(chosen.options) | options, experiment
+    experiment = load_checked(Experiment, config)
+    environment = experiment.environment
+    return env or environment.id, dict(environment.options) | options, experiment

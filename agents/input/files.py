@@ -5,7 +5,7 @@ from typing import Any, TypeVar
 
 import pydantic
 
-from fusion_gym.errors import shown
+from fusion_gym.errors import display
 from fusion_gym.validation import ConfigurationError
 
 Shape = TypeVar("Shape")
@@ -17,14 +17,14 @@ def read_text(option: str, path: Path, name: str | None = None) -> str:
     Raises:
         ConfigurationError: it cannot be read, or is no text in UTF-8.
     """
-    shown = str(path) if name is None else name
+    label = str(path) if name is None else name
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        raise ConfigurationError(f"{option} = {shown!r} is no text in UTF-8: {error}") from None
+        raise ConfigurationError(f"{option} = {label!r} is no text in UTF-8: {error}") from None
     except (OSError, ValueError) as error:  # a ValueError of a path that no system knows
         reason = getattr(error, "strerror", None) or error
-        raise ConfigurationError(f"{option} = {shown!r} cannot be read: {reason}") from None
+        raise ConfigurationError(f"{option} = {label!r} cannot be read: {reason}") from None
 
 
 def checked(shape: type[Shape], content: Any, source: str) -> Shape:
@@ -39,7 +39,7 @@ def checked(shape: type[Shape], content: Any, source: str) -> Shape:
     except pydantic.ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"]) or "the whole file"
-        given = "" if first["type"] == "missing" else f" = {shown(first['input'])}"
+        text = "" if first["type"] == "missing" else f" = {display(first['input'])}"
         raise ConfigurationError(
-            f"{source}: {place}{given} is not allowed: {first['msg']}"
+            f"{source}: {place}{text} is not allowed: {first['msg']}"
         ) from None

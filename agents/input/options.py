@@ -89,15 +89,15 @@ TrainingSeed = Annotated[int | None, _TRAINING]
 TrainingSeeds = Annotated[tuple[int, ...], _TRAINING]
 
 
-def check_options(given: Any) -> None:
+def check_options(values: Any) -> None:
     """Check every field of a command by its marks.
 
     Raises:
         ConfigurationError: the first that is not allowed.
     """
-    hints = typing.get_type_hints(type(given), include_extras=True)
-    for field in fields(given):
-        value = getattr(given, field.name)
+    hints = typing.get_type_hints(type(values), include_extras=True)
+    for field in fields(values):
+        value = getattr(values, field.name)
         for mark in getattr(hints[field.name], "__metadata__", ()):
             if isinstance(mark, Mark) and value is not None:
                 for entry in value if isinstance(value, tuple) else (value,):

@@ -13,7 +13,7 @@ from fusion_gym.validation import ConfigurationError
 
 
 @contextlib.contextmanager
-def told(interrupted: Callable[[], str] = lambda: "interrupted") -> Iterator[None]:
+def report_errors(interrupted: Callable[[], str] = lambda: "interrupted") -> Iterator[None]:
     """Let what a user or the machine did wrong end the program with one line.
 
     Anything else is an error of the program's own, and keeps its traceback.

@@ -15,7 +15,7 @@ from .files import replacing
 from .palette import AGENT, INK
 
 
-class Line(NamedTuple):
+class FigureLine(NamedTuple):
     """One curve of the Pareto figure: its label and its policies' results, in sweep order."""
 
     label: str
@@ -25,9 +25,9 @@ class Line(NamedTuple):
 def pareto(
     path: Path,
     title: str,
-    lines: Sequence[Line],
+    lines: Sequence[FigureLine],
     points: Mapping[str, EpisodeResults],
-    agent: Line,
+    agent: FigureLine,
     envelope: Sequence[EnvelopePoint],
 ) -> None:
     """MSE against transmission rate, with 95 % intervals over episodes.
@@ -39,8 +39,8 @@ def pareto(
     colours = plt.get_cmap("tab20")
     for place, line in enumerate(lines):
         _draw(axes, line.label, line.results, colours(place % 20), marker="o")
-    for place, (name, found) in enumerate(points.items()):
-        _draw(axes, name, [found], INK, marker="sD^vPX"[place % 6], size=4.5)
+    for place, (name, value) in enumerate(points.items()):
+        _draw(axes, name, [value], INK, marker="sD^vPX"[place % 6], size=4.5)
     hull = [*envelope]
     right = axes.get_xlim()[1]
     known = [point.rate for point in hull]
@@ -60,7 +60,7 @@ def pareto(
     axes.set_xlim(left=-0.005)
     axes.set_title(title, loc="left", fontsize=10)
     axes.legend(fontsize=7.5, loc="upper left", bbox_to_anchor=(1.01, 1.0))
-    save(figure, path)
+    save_figure(figure, path)
 
 
 def _plain_tick(value: float, place: float | None = None) -> str:
@@ -131,10 +131,10 @@ def episode(path: Path, title: str, trajectory: Trajectory, capacity: float) -> 
         panel.set_ylabel(f"x{state + 1}")
     axes[1].legend(ncols=6, fontsize=7, loc="lower right", bbox_to_anchor=(1, 1))
     axes[-1].set_xlabel("step")
-    save(figure, path)
+    save_figure(figure, path)
 
 
-def save(figure: plt.Figure, *paths: Path) -> None:
+def save_figure(figure: plt.Figure, *paths: Path) -> None:
     """Write a figure in one move a path, and close it; the same figure gives the same bytes."""
     try:
         for path in paths:

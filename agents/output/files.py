@@ -82,19 +82,19 @@ def read_json(path: Path, name: str) -> dict[str, Any]:
     """
     text = read_text(name, path)
     try:
-        found = json.loads(text)
+        content = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise ConfigurationError(f"{name} = {str(path)!r} holds no JSON: {error}") from None
-    if not isinstance(found, dict):
+    if not isinstance(content, dict):
         raise ConfigurationError(f"{name} = {str(path)!r} holds no JSON object")
-    return found
+    return content
 
 
 def save_results(path: Path, results: Mapping[str, EpisodeResults], made_from: str = "") -> None:
     """All results in one compressed file, with a hash of what they were made from."""
     arrays = {
-        f"{place}/{field}": getattr(found, field)
-        for place, found in enumerate(results.values())
+        f"{place}/{field}": getattr(result, field)
+        for place, result in enumerate(results.values())
         for field in FIELDS
     }
     with replacing(path) as partial:

@@ -50,22 +50,22 @@ def fingerprint(inputs: Mapping[str, Any]) -> str:
     return hashlib.sha256(plain.encode()).hexdigest()[:16]
 
 
-def check_inputs(given: Mapping[str, Any], earlier: Any, made: str) -> None:
+def check_inputs(arguments: Mapping[str, Any], earlier: Any, label: str) -> None:
     """Whether what is there was made from the inputs that are given now.
 
-    ``earlier`` are the inputs kept with it, and ``made`` says what it is, for the error.
+    ``earlier`` are the inputs kept with it, and ``label`` says what it is, for the error.
 
     Raises:
         ConfigurationError: it was not; names the first input that differs, with both values.
     """
-    now = _flat(json.loads(json.dumps(given, default=list)))
+    now = _flat(json.loads(json.dumps(arguments, default=list)))
     then = _flat(earlier) if isinstance(earlier, Mapping) else {}
     if not then:
-        raise ConfigurationError(f"{made} does not say what it was made from")
+        raise ConfigurationError(f"{label} does not say what it was made from")
     for key in dict.fromkeys([*now, *then]):
         if now.get(key, _ABSENT) != then.get(key, _ABSENT):
             raise ConfigurationError(
-                f"{key} = {now.get(key, _ABSENT)!r} differs from that of {made}: "
+                f"{key} = {now.get(key, _ABSENT)!r} differs from that of {label}: "
                 f"{then.get(key, _ABSENT)!r}"
             )
 
@@ -80,10 +80,10 @@ _ABSENT = _Absent()
 
 def _flat(values: Mapping[str, Any], above: str = "") -> dict[str, Any]:
     """Nested values by their dotted names."""
-    found: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, Mapping) and value:
-            found |= _flat(value, f"{above}{key}.")
+            result |= _flat(value, f"{above}{key}.")
         else:
-            found[f"{above}{key}"] = value
-    return found
+            result[f"{above}{key}"] = value
+    return result

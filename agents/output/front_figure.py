@@ -9,7 +9,7 @@ import numpy as np
 
 from fusion_gym.evaluation.intervals import Interval
 
-from .figures import save
+from .figures import save_figure
 from .palette import AGENTS_MEMORY, BOUND, GREY, ROLLOUT, RULES, RULES_MEMORY
 
 Points = Sequence[tuple[float, float]]  # rate and error
@@ -18,14 +18,14 @@ Points = Sequence[tuple[float, float]]  # rate and error
 class Layers(NamedTuple):
     """What is drawn, from back to front; what is empty is left out.
 
-    ``single`` tuned rules, each by itself · ``plain`` and ``remembering`` rules of the committed
+    ``single`` tuned rules, each by itself · ``plain`` and ``with_memory`` rules of the committed
     envelopes without memory and with it · ``rollout`` · ``bound`` no policy lies below · ``agent``
     rates and errors with their intervals.
     """
 
     single: Points
     plain: Points
-    remembering: Points
+    with_memory: Points
     rollout: Points
     bound: Points
     agent: Sequence[tuple[float, Interval]]
@@ -43,7 +43,7 @@ def front(path: Path, title: str, caption: str, layers: Layers) -> None:
         *_columns(layers.plain), "o--", ms=3.5, color=RULES.colour, label="rules without memory"
     )
     axes.plot(
-        *_columns(layers.remembering),
+        *_columns(layers.with_memory),
         "o-",
         ms=3.5,
         color=RULES_MEMORY.colour,
@@ -79,7 +79,7 @@ def front(path: Path, title: str, caption: str, layers: Layers) -> None:
     axes.set_title(title, loc="left", fontsize=10)
     figure.text(0.01, -0.01, caption, fontsize=7.5, va="top", color="0.35")
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0))
-    save(figure, path)
+    save_figure(figure, path)
 
 
 def _columns(points: Points) -> tuple[list[float], list[float]]:

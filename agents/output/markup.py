@@ -13,7 +13,7 @@ import markdown
 NONE = "–"
 
 
-def plain(text: str) -> str:
+def plain_text(text: str) -> str:
     """Free text in one line, no part of which Markdown or HTML takes for a mark."""
     escaped = html.escape(" ".join(text.split()), quote=False)
     return re.sub(r"[\\`*\[\]|]|(?<!\w)_|_(?!\w)", lambda mark: f"\\{mark[0]}", escaped)
@@ -33,7 +33,7 @@ def share(interval: Mapping[str, float] | None) -> str:
     return f"{interval['mean']:+.1%} [{interval['low']:+.1%}, {interval['high']:+.1%}]"
 
 
-def number(interval: Mapping[str, float] | None) -> str:
+def markup_number(interval: Mapping[str, float] | None) -> str:
     """A quantity with its interval."""
     if interval is None:
         return NONE
@@ -46,7 +46,7 @@ def ranged(values: Sequence[int]) -> str:
     return f"{low:,}" if low == high else f"{low:,} to {high:,}"
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def table_markup(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """A table and the empty line behind it; nothing without rows."""
     if not rows:
         return []

@@ -10,14 +10,14 @@ import matplotlib.ticker
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from .figures import save
+from .figures import save_figure
 from .palette import INK, KINDS, LARGE
 
 # Who is meant, the mark, whether it is filled.
 MARKS: dict[str, tuple[str, Literal["full", "none"]]] = {
     "rules": ("o", "none"),
     "agents": ("^", "full"),
-    "coordinator": ("s", "full"),
+    "scheduler": ("s", "full"),
     "alone": ("D", "none"),
     "centre": ("P", "full"),
 }
@@ -30,15 +30,17 @@ class Dot(NamedTuple):
     interval: Mapping[str, float]
 
 
-class Row(NamedTuple):
+class OverviewRow(NamedTuple):
     """The dots of a setting, or why there are none."""
 
     dots: Sequence[Dot]
     reason: str = ""
 
 
-def draw(
-    paths: Sequence[Path], settings: Sequence[str], columns: Mapping[str, tuple[str, Sequence[Row]]]
+def draw_overview_figure(
+    paths: Sequence[Path],
+    settings: Sequence[str],
+    columns: Mapping[str, tuple[str, Sequence[OverviewRow]]],
 ) -> None:
     """A column of panels for each head, with its kind and one row a setting."""
     with plt.rc_context(LARGE):
@@ -61,10 +63,10 @@ def draw(
             handles.values(), handles.keys(), loc="outside upper left", ncols=len(handles),
             columnspacing=1.2, handletextpad=0.2,
         )  # fmt: skip
-        save(figure, *paths)
+        save_figure(figure, *paths)
 
 
-def _panel(axes: Axes, kind: str, rows: Sequence[Row]) -> None:
+def _panel(axes: Axes, kind: str, rows: Sequence[OverviewRow]) -> None:
     colour = KINDS[kind]
     axes.axvline(0.0, color=INK, lw=1.2, zorder=1)
     axes.grid(axis="y", visible=False)

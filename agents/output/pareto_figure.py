@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.lines import Line2D
 
-from .figures import save
+from .figures import save_figure
 from .palette import BLUE, BOUND, GREY, LARGE, Style
 
 Points = Sequence[tuple[float, float]]  # rate and error, by rate
@@ -60,7 +60,7 @@ class Limits(NamedTuple):
     differences: tuple[float, float] = (-0.1, 0.1)
 
 
-def draw(
+def draw_pareto(
     paths: Sequence[Path], title: str, main: Panel, small: Sequence[Panel], limits: Limits
 ) -> None:
     """The main panel with the legend beside it, and a row of small ones on the same axes."""
@@ -84,7 +84,7 @@ def draw(
             for place, panel in enumerate(small):
                 inner = figure.add_subplot(below[0, place], sharex=axes, sharey=axes)
                 strip = figure.add_subplot(below[1, place], sharex=axes, sharey=under)
-                _panel(inner, panel._replace(series=[bare(one) for one in panel.series]), limits)
+                _panel(inner, panel._replace(series=[bare(item) for item in panel.series]), limits)
                 _strip(strip, panel, limits)
                 for each, label in ((inner, "mean sq. error"), (strip, "agents\nto rules")):
                     each.tick_params(labelleft=place == 0)
@@ -92,7 +92,7 @@ def draw(
         figure.supxlabel("transmissions per sensor and step", fontsize=LARGE["font.size"])
         figure.suptitle(textwrap.fill(title, 72), x=0.01, ha="left", fontsize=LARGE["font.size"])
         figure.align_ylabels()
-        save(figure, *paths)
+        save_figure(figure, *paths)
 
 
 def bare(series: Series) -> Series:
@@ -134,14 +134,14 @@ def _panel(axes: Axes, panel: Panel, limits: Limits) -> None:
 def _strip(axes: Axes, panel: Panel, limits: Limits) -> None:
     """Agents relative to rules; zero is the envelope."""
     axes.axhline(0.0, color=BLUE, lw=1.6, zorder=2)
-    for shown in panel.differences:
-        rates = [rate for rate, _, _, _ in shown.points]
-        means, low, high = ([one[place] for one in shown.points] for place in (1, 2, 3))
+    for visible in panel.differences:
+        rates = [rate for rate, _, _, _ in visible.points]
+        means, low, high = ([point[place] for point in visible.points] for place in (1, 2, 3))
         spread = [
             [mean - end for mean, end in zip(means, low, strict=True)],
             [end - mean for mean, end in zip(means, high, strict=True)],
         ]
-        style = shown.style
+        style = visible.style
         mark = _mark(style._replace(size=0.75 * style.size))
         axes.errorbar(
             rates, means, yerr=spread, ls=style.line, color=style.colour, lw=1.2, elinewidth=1.6,
@@ -185,17 +185,17 @@ def _write(axis: Axis, places: Sequence[float]) -> None:
 
 def ticks(low: float, high: float, least: int) -> list[float]:
     """At least so many round numbers between two positive ones, if there are, and few more."""
-    found: list[float] = []
+    result: list[float] = []
     for steps in _STEPS:
         decades = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)
         every = [step * 10.0**decade for decade in decades for step in steps]
-        found = [float(f"{value:.6g}") for value in every if low <= value <= high]
-        if len(found) >= least:
+        result = [float(f"{value:.6g}") for value in every if low <= value <= high]
+        if len(result) >= least:
             break
-    return found
+    return result
 
 
 def _columns(points: Points) -> tuple[list[float], list[float]]:
     """Rates and errors, without what a logarithm does not know."""
-    kept = [(rate, error) for rate, error in sorted(points) if rate > 0.0 and error > 0.0]
-    return [rate for rate, _ in kept], [error for _, error in kept]
+    mask = [(rate, error) for rate, error in sorted(points) if rate > 0.0 and error > 0.0]
+    return [rate for rate, _ in mask], [error for _, error in mask]

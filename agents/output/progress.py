@@ -83,8 +83,8 @@ class Bar:
 
     def line(self) -> str:
         """All of it in one line."""
-        told = [f"{self.description}: {int(100 * self.share)} %", _count(self), _clock(self)]
-        return ", ".join([*told, self.note] if self.note else told)
+        message = [f"{self.description}: {int(100 * self.share)} %", _count(self), _clock(self)]
+        return ", ".join([*message, self.note] if self.note else message)
 
 
 @contextlib.contextmanager
@@ -154,10 +154,10 @@ class _Screen:
             yield
             return
         watched = sys.stdout is not None and sys.stdout.isatty()  # else it goes on as it is
-        with Progress(*_columns(), console=Console(stderr=True), redirect_stdout=watched) as made:
-            self.progress = made
+        with Progress(*_columns(), console=Console(stderr=True), redirect_stdout=watched) as result:
+            self.progress = result
             try:
-                made.add_task("", bar=bar)
+                result.add_task("", bar=bar)
                 yield
             finally:
                 self.progress = None

@@ -43,9 +43,9 @@ def small_model(path: Path) -> bytes:
 
 def _without_runs(content: bytes) -> bytes:
     """The settings alone: what the training's runs last saw is as large as the network."""
-    found: dict[str, Any] = json.loads(content)
+    data: dict[str, Any] = json.loads(content)
     return json.dumps(
-        {key: None if key in _OF_RUNS else one for key, one in found.items()}
+        {key: None if key in _OF_RUNS else item for key, item in data.items()}
     ).encode()
 
 
@@ -53,7 +53,7 @@ def _unused(content: bytes) -> bytes:
     """The optimiser's settings alone."""
     import torch
 
-    found: dict[str, Any] = torch.load(io.BytesIO(content), "cpu", weights_only=True)
+    data: dict[str, Any] = torch.load(io.BytesIO(content), "cpu", weights_only=True)
     written = io.BytesIO()
-    torch.save({**found, "state": {}}, written)
+    torch.save({**data, "state": {}}, written)
     return written.getvalue()

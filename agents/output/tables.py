@@ -13,11 +13,11 @@ from fusion_gym.evaluation.metrics import METRICS, Metric
 
 def console() -> Console:
     """A console that keeps tables whole where the output is no terminal."""
-    found = Console()
-    return found if found.is_terminal else Console(width=150)
+    result = Console()
+    return result if result.is_terminal else Console(width=150)
 
 
-def table(
+def table_tables(
     title: str,
     columns: Sequence[str],
     rows: Iterable[Sequence[str]] = (),
@@ -35,7 +35,7 @@ def table(
     return result
 
 
-def number(interval: Mapping[str, float]) -> str:
+def table_number(interval: Mapping[str, float]) -> str:
     """Mean with the half width of its interval."""
     half = (interval["high"] - interval["low"]) / 2
     return f"{interval['mean']:.4g} ± {half:.2g}"
@@ -57,27 +57,27 @@ def evaluation_table(
     columns = ["policy", *(metric.column for metric in metrics.values()), "median"]
     columns += ["MSE - reference"] if differences else []
     rows = []
-    for name, found in policies.items():
-        row = [name, *(_cell(metric, found[key]) for key, metric in metrics.items())]
+    for name, policy in policies.items():
+        row = [name, *(_cell(metric, policy[key]) for key, metric in metrics.items())]
         row.append(f"{quantiles[name]['median']:.4g}")
         if differences:
             row.append(difference(differences[name]) if name in differences else "reference")
         rows.append(row)
-    return table(title, columns, rows, _CAPTION)
+    return table_tables(title, columns, rows, _CAPTION)
 
 
-def _cell(metric: Metric, found: Any) -> str:
+def _cell(metric: Metric, value: Any) -> str:
     """A metric's mean, over sensors where it has one for each, with its half width if shown."""
     if metric.interval:
-        return number(found)
-    return format(sum(found) / len(found) if metric.axis else found["mean"], metric.form)
+        return table_number(value)
+    return format(sum(value) / len(value) if metric.axis else value["mean"], metric.form)
 
 
 def state_table(states: Sequence[str], policies: Mapping[str, Mapping[str, Any]]) -> Table:
     """Root mean square error of each state (and input, where there is one), a row a policy."""
     title = "root of the mean squared error over episodes, averaged over time"
-    rows = ([name, *(f"{e:.4g}" for e in found["armse"])] for name, found in policies.items())
-    return table(title, ["policy", *states], rows)
+    rows = ([name, *(f"{e:.4g}" for e in policy["armse"])] for name, policy in policies.items())
+    return table_tables(title, ["policy", *states], rows)
 
 
 _CAPTION = (

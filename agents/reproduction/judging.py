@@ -7,15 +7,15 @@ import numpy as np
 
 from fusion_gym.evaluation.intervals import Interval, mean_interval
 
-from .shown import Verdict
+from .piece_result import Verdict
 
 
 def verdict(parts: Iterable[bool]) -> Verdict:
     """Of a claim with several parts: all of them hold, some, or none."""
-    found = [bool(part) for part in parts]
-    if all(found):
+    result = [bool(part) for part in parts]
+    if all(result):
         return "holds"
-    return "holds partly" if any(found) else "does not hold"
+    return "holds partly" if any(result) else "does not hold"
 
 
 def estimate(sample: Any) -> Interval:
@@ -23,9 +23,9 @@ def estimate(sample: Any) -> Interval:
     return mean_interval(np.asarray(sample, dtype=float))
 
 
-def told(found: Interval, digits: int = 3) -> str:
+def cite(interval: Interval, digits: int = 3) -> str:
     """An interval in words: mean [low, high], with as many significant digits."""
-    mean, low, high = (f"{number:#.{digits}g}".rstrip(".") for number in found)
+    mean, low, high = (f"{number:#.{digits}g}".rstrip(".") for number in interval)
     return f"{mean} [{low}, {high}]"
 
 

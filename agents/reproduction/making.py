@@ -14,12 +14,12 @@ from ..output.files import DAMAGED, replacing
 from ..output.folders import fingerprint
 from .paper import Paper, Piece
 from .papers import paper
-from .shown import Shown
+from .piece_result import PieceResult
 
 _PLAIN = "plain"  # the entry that holds all that is no array, as JSON
 
 
-class Job(NamedTuple):
+class PieceJob(NamedTuple):
     """A piece of a paper with its episodes and seed, and where it is kept."""
 
     paper: str
@@ -64,30 +64,30 @@ class Job(NamedTuple):
             with np.load(self.path, allow_pickle=False) as arrays:
                 if str(arrays["made_from"]) != self.made_from:
                     raise ValueError("it was made from something else")
-                found: dict[str, Any] = json.loads(str(arrays[_PLAIN]))
-                kept = [name for name in arrays.files if name.startswith("/")]
-                return found | {name[1:]: arrays[name] for name in kept}
+                content: dict[str, Any] = json.loads(str(arrays[_PLAIN]))
+                names = [name for name in arrays.files if name.startswith("/")]
+                return content | {name[1:]: arrays[name] for name in names}
         except (*DAMAGED, zipfile.BadZipFile) as error:
             raise ConfigurationError(
                 f"work = {str(self.path)!r} cannot be read: {' '.join(str(error).split())}"
             ) from None
 
 
-def make(job: Job) -> None:
+def compute_jobs(job: PieceJob) -> None:
     """Simulate a piece and keep it."""
-    found = job.find().compute(job.episodes, job.seed)
-    arrays = {f"/{name}": value for name, value in found.items() if isinstance(value, np.ndarray)}
-    plain = {name: value for name, value in found.items() if not isinstance(value, np.ndarray)}
+    result = job.find().compute(job.episodes, job.seed)
+    arrays = {f"/{name}": value for name, value in result.items() if isinstance(value, np.ndarray)}
+    plain = {name: value for name, value in result.items() if not isinstance(value, np.ndarray)}
     with replacing(job.path) as partial:
-        kept: dict[str, Any] = arrays | {_PLAIN: np.array(json.dumps(plain))}
-        np.savez_compressed(partial, made_from=np.array(job.made_from), **kept)
+        data: dict[str, Any] = arrays | {_PLAIN: np.array(json.dumps(plain))}
+        np.savez_compressed(partial, made_from=np.array(job.made_from), **data)
 
 
-def shown(one: Paper, jobs: dict[str, Job]) -> dict[str, Shown]:
+def results_of(item: Paper, jobs: dict[str, PieceJob]) -> dict[str, PieceResult]:
     """What every piece of a paper shows, by its name.
 
     Raises:
         FileNotFoundError: one is not there.
         ConfigurationError: one cannot be read.
     """
-    return {piece.name: piece.show(jobs[piece.name].read()) for piece in one.pieces}
+    return {piece.name: piece.show(jobs[piece.name].read()) for piece in item.pieces}

@@ -12,43 +12,46 @@ from ..output import palette
 from ..output.files import read_json, replacing, write, write_text
 from .paper import Paper
 from .papers import NAMES
-from .shown import Claim, Number, Picture, Shown, Table
+from .piece_result import Claim, Number, NumbersTable, Picture, PieceResult
 
 OVERVIEW = "README.md"
 TEXTS = Path(__file__).parent
 
 
 def write_page(
-    one: Paper, found: Mapping[str, Shown], made: Mapping[str, Mapping[str, int]], output: Path
+    paper: Paper,
+    value: Mapping[str, PieceResult],
+    jobs: Mapping[str, Mapping[str, int]],
+    output: Path,
 ) -> None:
     """A paper's pictures, its page and its numbers as JSON.
 
-    ``made`` has episodes and seed of every piece.
+    ``jobs`` has episodes and seed of every piece.
     """
-    for shown in found.values():
-        for picture in shown.pictures:
-            _draw(picture, output / one.name)
-    introduction = (TEXTS / one.name / "introduction.md").read_text(encoding="utf-8")
-    lines = [f"# {one.title}", "", one.citation, "", introduction.strip(), ""]
-    claims = [claim for shown in found.values() for claim in shown.claims]
+    for entry in value.values():
+        for picture in entry.pictures:
+            _draw(picture, output / paper.name)
+    introduction = (TEXTS / paper.name / "introduction.md").read_text(encoding="utf-8")
+    lines = [f"# {paper.title}", "", paper.citation, "", introduction.strip(), ""]
+    claims = [claim for piece in value.values() for claim in piece.claims]
     lines += ["## Claims", "", *_claims(claims), ""]
-    for piece in one.pieces:
-        shown, runs = found[piece.name], made[piece.name]
+    for piece in paper.pieces:
+        entry, runs = value[piece.name], jobs[piece.name]
         lines += [f"## {piece.title}", ""]
-        for note in shown.notes:
+        for note in entry.notes:
             lines += [note.strip(), ""]
-        for table in shown.tables:
+        for table in entry.tables:
             lines += [*_table(table), ""]
-        for picture in shown.pictures:
-            path = f"{one.name}/{picture.name}.png"
+        for picture in entry.pictures:
+            path = f"{paper.name}/{picture.name}.png"
             lines += [
                 f"### {picture.title}", "", f"![{picture.title}]({path})", "",
                 f"*{picture.caption.strip()}*", "",
             ]  # fmt: skip
         lines += [f"({runs['episodes']:,} episodes, the first with seed {runs['seed']}.)", ""]
-    lines += [f"Made by `fusion-gym reproduce {one.name}`.", ""]
-    write_text(output / f"{one.name}.md", "\n".join(lines))
-    write(output / f"{one.name}.json", _numbers(one, found, made))
+    lines += [f"Made by `fusion-gym reproduce {paper.name}`.", ""]
+    write_text(output / f"{paper.name}.md", "\n".join(lines))
+    write(output / f"{paper.name}.json", _numbers(paper, value, jobs))
 
 
 def write_overview(output: Path) -> None:
@@ -58,16 +61,16 @@ def write_overview(output: Path) -> None:
         path = output / f"{name}.json"
         if not path.exists():
             continue
-        found = read_json(path, "numbers")
-        judged = [n["verdict"] for t in found["tables"] for n in t["numbers"]]
+        content = read_json(path, "numbers")
+        judged = [n["verdict"] for t in content["tables"] for n in t["numbers"]]
         agree, differ = judged.count("agrees"), judged.count("differs")
-        lines += [f"## [{found['title']}]({name}.md)", "", found["citation"], ""]
+        lines += [f"## [{content['title']}]({name}.md)", "", content["citation"], ""]
         if agree + differ:
             lines += [f"{agree} of {agree + differ} printed numbers agree with ours.", ""]
         lines += ["| claim | where | verdict |", "|---|---|---|"]
         lines += [
             f"| {_cell(c['text'])} | {_cell(c['source'])} | {c['verdict']} |"
-            for c in found["claims"]
+            for c in content["claims"]
         ]
         lines += [""]
     write_text(output / OVERVIEW, "\n".join(lines))
@@ -101,7 +104,7 @@ def _fewer_digits(svg: Path) -> None:
     """Paths to a hundredth of a point."""
     text = svg.read_text(encoding="utf-8")
     path = re.compile(r' d="[^"]*"')
-    short = path.sub(lambda found: re.sub(r"(\.\d\d)\d+", r"\1", found.group()), text)
+    short = path.sub(lambda value: re.sub(r"(\.\d\d)\d+", r"\1", value.group()), text)
     svg.write_text(short, encoding="utf-8")
 
 
@@ -118,7 +121,7 @@ def _claims(claims: list[Claim]) -> list[str]:
     return ["| claim | where | verdict | evidence |", "|---|---|---|---|", *rows]
 
 
-def _table(table: Table) -> list[str]:
+def _table(table: NumbersTable) -> list[str]:
     if table.columns:
         return _grid(table)
     rows = [
@@ -133,7 +136,7 @@ def _cell(text: str) -> str:
     return text.replace("|", "\\|")
 
 
-def _grid(table: Table) -> list[str]:
+def _grid(table: NumbersTable) -> list[str]:
     width = len(table.columns)
     lines = [table.numbers[first : first + width] for first in range(0, len(table.numbers), width)]
     rows = [
@@ -156,21 +159,21 @@ def _ours(number: Number) -> str:
 
 
 def _numbers(
-    one: Paper, found: Mapping[str, Shown], made: Mapping[str, Mapping[str, int]]
+    paper: Paper, pieces: Mapping[str, PieceResult], jobs: Mapping[str, Mapping[str, int]]
 ) -> dict[str, Any]:
     return {
-        "paper": one.name,
-        "title": one.title,
-        "citation": one.citation,
-        "made": {name: dict(runs) for name, runs in made.items()},
+        "paper": paper.name,
+        "title": paper.title,
+        "citation": paper.citation,
+        "made": {name: dict(runs) for name, runs in jobs.items()},
         "tables": [
             {
                 "piece": name,
                 "name": table.name,
                 "numbers": [n._asdict() | {"verdict": n.verdict} for n in table.numbers],
             }
-            for name, shown in found.items()
-            for table in shown.tables
+            for name, piece in pieces.items()
+            for table in piece.tables
         ],
-        "claims": [claim._asdict() for shown in found.values() for claim in shown.claims],
+        "claims": [claim._asdict() for piece in pieces.values() for claim in piece.claims],
     }

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from .shown import Shown
+from .piece_result import PieceResult
 
 # Episodes and a seed to whatever JSON and arrays can hold, by name.
 Compute = Callable[[int, int], dict[str, Any]]
@@ -21,7 +21,7 @@ class Piece(NamedTuple):
     name: str
     title: str
     compute: Compute
-    show: Callable[[dict[str, Any]], Shown]
+    show: Callable[[dict[str, Any]], PieceResult]
     weight: float
     usual: int = 1000
 

@@ -35,5 +35,5 @@ def papers(names: tuple[str, ...]) -> list[Paper]:
         raise ConfigurationError(f"papers = () is not allowed: name some of {[*NAMES, 'all']}")
     for name in names:
         choice("paper", name, (*NAMES, "all"))
-    chosen = NAMES if "all" in names else tuple(dict.fromkeys(names))
-    return [paper(name) for name in chosen]
+    selection = NAMES if "all" in names else tuple(dict.fromkeys(names))
+    return [paper(name) for name in selection]

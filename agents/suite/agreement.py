@@ -8,11 +8,11 @@ from rich.table import Table
 
 from ..output.files import read_json
 from ..output.markup import share
-from ..output.tables import table
+from ..output.tables import table_tables
 from .reports import VERDICT
 
 
-def agreement(quick: Path, full: Path, settings: Sequence[str]) -> Table | None:
+def agreement_table(quick: Path, full: Path, settings: Sequence[str]) -> Table | None:
     """Each class of agents over the middle of its front: what both say, and whether they agree.
 
     They agree where their 95 % intervals have a value in common. ``None`` where the folder
@@ -24,13 +24,13 @@ def agreement(quick: Path, full: Path, settings: Sequence[str]) -> Table | None:
     rows = []
     for name in settings:
         ours, theirs = _middles(quick / name / VERDICT), _middles(full / name / VERDICT)
-        for of, found in ours.items():
+        for of, our in ours.items():
             if of in theirs:
-                rows.append((name, of, found, theirs[of], _overlap(found, theirs[of])))
+                rows.append((name, of, our, theirs[of], _overlap(our, theirs[of])))
     if not rows:
         return None
     agreeing = sum(row[-1] for row in rows)
-    return table(
+    return table_tables(
         "agents against the rules of their class: the quick benchmark and the full one",
         ("setting", "class", "quick", "full", "agree"),
         [(*row[:2], share(row[2]), share(row[3]), "yes" if row[4] else "no") for row in rows],
@@ -43,8 +43,8 @@ def _middles(path: Path) -> dict[str, Mapping[str, float]]:
     if not path.exists():
         return {}
     classes: Mapping[str, Any] = read_json(path, "results")["classes"]
-    return {of: found["middle"] for of, found in classes.items() if "middle" in found}
+    return {of: value["middle"] for of, value in classes.items() if "middle" in value}
 
 
-def _overlap(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
-    return one["low"] <= other["high"] and other["low"] <= one["high"]
+def _overlap(item: Mapping[str, float], other: Mapping[str, float]) -> bool:
+    return item["low"] <= other["high"] and other["low"] <= item["high"]

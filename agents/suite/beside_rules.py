@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.envelope import EnvelopePoint, chosen_mse
+from fusion_gym.evaluation.envelope import EnvelopePoint, best_mse
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.base import Policy
@@ -22,8 +22,8 @@ from ..output.folders import check_inputs
 from .committed import FOLDER, read_envelopes
 from .config import Setting, load_suite
 from .envelope_table import bound_of, measured
-from .envelopes import Test, inputs_of, run_test
-from .fronts import prices_of
+from .envelopes import Test, envelope_inputs, run_test
+from .fronts import front_prices
 from .workers import Work
 
 # Beside the folder of the commands, in a clone as in an installed package.
@@ -72,10 +72,10 @@ class Ground:
             ConfigurationError: a file that is absent, damaged or made from other settings.
         """
         suite = load_suite("benchmark")
-        setting = next(one for one in suite.settings if one.name == name)
+        setting = next(setting for setting in suite.settings if setting.name == name)
         path = SHIPPED / FOLDER / f"{name}.json"
         envelopes = read_envelopes(path)
-        check_inputs(inputs_of(suite, setting), envelopes["inputs"], repr(str(path)))
+        check_inputs(envelope_inputs(suite, setting), envelopes["inputs"], repr(str(path)))
         rollout, simulated = measured(SHIPPED / "rollout" / f"{name}.json", name)
         bound = bound_of(SHIPPED / "bounds" / f"{name}.json")
         return cls(setting, envelopes, bound, rollout, simulated, episodes, suite.seed)
@@ -102,7 +102,7 @@ class Ground:
                 self.setting, options, f"agent at price {price:.4g}", self.episodes, self.seed,
                 model, digest, price,
             )
-            for price in prices_of(self.setting.price_range, PRICES)
+            for price in front_prices(self.setting.price_range, PRICES)
         ]  # fmt: skip
 
     def single(self, name: str) -> list[tuple[float, float]]:
@@ -125,14 +125,14 @@ class Ground:
 
         Its few episodes are easier or harder than all of them by more than what it brings.
         """
-        found = []
+        result = []
         for point in self.rollout if self.simulated <= self.episodes else ():
-            below = chosen_mse(rules, point.rate)
+            below = best_mse(rules, point.rate)
             if below is not None:
-                found.append(
+                result.append(
                     (point.rate, point.mse / below[: self.simulated].mean() * below.mean())
                 )
-        return found
+        return result
 
 
 def measure(test: Test, work: Path) -> None:
@@ -185,19 +185,19 @@ class Trials(NamedTuple):
         points: list[dict[str, Any]] = [
             {
                 "price": test.price,
-                "rate": float(found.rate.mean()),
-                "mse": mean_interval(found.mse)._asdict(),
+                "rate": float(value.rate.mean()),
+                "mse": mean_interval(value.mse)._asdict(),
                 "rules": {},
             }
-            for test, found in zip(self.agent, learned, strict=True)
+            for test, value in zip(self.agent, learned, strict=True)
         ]
         means = {}
         for name in self.rules:
             results, shares = self.results(name), []
-            for point, found in zip(points, learned, strict=True):
-                below = chosen_mse(results, point["rate"])
+            for point, value in zip(points, learned, strict=True):
+                below = best_mse(results, point["rate"])
                 if below is not None:
-                    shares.append((found.mse - below) / below.mean())
+                    shares.append((value.mse - below) / below.mean())
                     point["rules"][name] = {
                         "mse": float(below.mean()),
                         "difference": mean_interval(shares[-1])._asdict(),

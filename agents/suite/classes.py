@@ -13,8 +13,8 @@ from .config import Broadcast, Mode, Packet, Setting, Suite
 
 KNOWS: dict[tuple[Mode, bool], Knowledge] = {
     ("centre", False): "centre",
-    ("sensors", False): "coordinator",
-    ("sensors", True): "coordinator_memory",
+    ("sensors", False): "scheduler",
+    ("sensors", True): "scheduler_memory",
     ("local", False): "own",
     ("local", True): "own_memory",
 }
@@ -46,7 +46,7 @@ class Class(NamedTuple):
     def world(self) -> Options:
         """The options in which rules are tuned that look neither at memory nor at what is heard.
 
-        Packets that hold the estimate take a coordinator that remembers.
+        Packets that hold the estimate take a scheduler that remembers.
         """
         return () if self.packet == "measurement" else self.options
 
@@ -58,8 +58,8 @@ class Class(NamedTuple):
         """
         if self.mode == "centre":
             return dict(self.options) | {"information": "centre"}
-        shown = {} if self.memory else {"belief_features": list(FEATURES)}
-        return dict(self.options) | shown
+        visible = {} if self.memory else {"belief_features": list(FEATURES)}
+        return dict(self.options) | visible
 
     @property
     def knows(self) -> Knowledge:
@@ -79,18 +79,18 @@ def classes_of(setting: Setting) -> Iterator[Class]:
     """All classes of a setting, each after those that it contains."""
     yield Class("centre")
     for broadcast in sorted(setting.broadcasts, key=HEARD.index):
-        heard = () if broadcast == setting.broadcasts[0] else (("broadcast", broadcast),)
+        received = () if broadcast == setting.broadcasts[0] else (("broadcast", broadcast),)
         for memory in (False, True):
             remembers = (("memory", True),) if memory else ()
-            yield Class("local", memory, broadcast, heard + remembers)
+            yield Class("local", memory, broadcast, received + remembers)
     for memory in (False, True):
         yield Class("sensors", memory, None, (("memory", True),) if memory else ())
     if setting.estimates:
-        remembered = (("packet", "estimate"), ("memory", True))
-        yield Class("sensors", True, None, remembered, "estimate")
+        memory_posterior = (("packet", "estimate"), ("memory", True))
+        yield Class("sensors", True, None, memory_posterior, "estimate")
 
 
-def trained(suite: Suite, setting: Setting) -> list[Class]:
+def trained_classes(suite: Suite, setting: Setting) -> list[Class]:
     """The classes of a setting in which the suite trains agents.
 
     Raises:
@@ -104,8 +104,8 @@ def trained(suite: Suite, setting: Setting) -> list[Class]:
     own = list(every) if setting.agents is None else setting.agents
     for name in own:
         choice(f"agents of {setting.name}", name, every)
-    wanted = own if suite.classes is None else suite.classes
-    return [c for name, c in every.items() if name in own and name in wanted]
+    classes = own if suite.classes is None else suite.classes
+    return [c for name, c in every.items() if name in own and name in classes]
 
 
 def names_of(suite: Suite) -> list[str]:

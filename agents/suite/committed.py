@@ -15,18 +15,18 @@ from ..output.folders import check_inputs
 from . import envelopes
 from .classes import Class, classes_of
 from .config import Setting, Suite
-from .reports import Interval, Shape, read
+from .reports import IntervalRecord, Shape, read_shape
 from .team import Team
 from .workers import Work, side_by_side
 
 FOLDER = "envelopes"  # in that of the results
 
 
-class Place(Shape):
+class PlaceRecord(Shape):
     """A policy's mean rate and its error."""
 
     rate: FiniteFloat
-    mse: Interval
+    mse: IntervalRecord
 
 
 class Vertex(Shape):
@@ -37,12 +37,12 @@ class Vertex(Shape):
     options: dict[str, Any]
     family: str
     knows: Knowledge
-    tuning: Place
-    test: Place
+    tuning: PlaceRecord
+    test: PlaceRecord
     convex: bool
 
 
-class Envelope(Shape):
+class EnvelopeRecord(Shape):
     """One class."""
 
     mode: str
@@ -58,7 +58,7 @@ class Envelope(Shape):
     sha256: str = pydantic.Field(pattern=r"^[0-9a-f]{64}$")
 
 
-class Envelopes(Shape):
+class EnvelopesRecord(Shape):
     """A setting's ``envelopes/SETTING.json``."""
 
     setting: str
@@ -66,7 +66,7 @@ class Envelopes(Shape):
     env: str
     always: FiniteFloat
     inputs: dict[str, Any]
-    classes: dict[str, Envelope]
+    classes: dict[str, EnvelopeRecord]
     curves: list[dict[str, Any]]
 
 
@@ -82,14 +82,14 @@ def read_envelopes(path: Path) -> dict[str, Any]:
         ConfigurationError: the file cannot be read, is of another shape, or a class is not what
             its hash says.
     """
-    found = read(Envelopes, path, "envelopes")
-    for name, content in found["classes"].items():
-        if envelopes.digest(found["inputs"], name, content) != content["sha256"]:
+    result = read_shape(EnvelopesRecord, path, "envelopes")
+    for name, content in result["classes"].items():
+        if envelopes.digest(result["inputs"], name, content) != content["sha256"]:
             raise ConfigurationError(
                 f"envelopes = {str(path)!r}: classes.{name}.sha256 = {content['sha256'][:12]!r}… "
                 "is not that of what it holds: it was changed after it was written"
             )
-    return found
+    return result
 
 
 def present(suite: Suite, setting: Setting, results: Path) -> dict[str, Any]:
@@ -101,9 +101,9 @@ def present(suite: Suite, setting: Setting, results: Path) -> dict[str, Any]:
     path = path_of(results, setting.name)
     if not path.exists():
         return {}
-    found = read_envelopes(path)
-    check_inputs(envelopes.inputs_of(suite, setting), found["inputs"], repr(str(path)))
-    return found["classes"]
+    content = read_envelopes(path)
+    check_inputs(envelopes.envelope_inputs(suite, setting), content["inputs"], repr(str(path)))
+    return content["classes"]
 
 
 class Shelf(NamedTuple):
@@ -116,7 +116,7 @@ class Shelf(NamedTuple):
         """What is there of a setting, as :func:`present`."""
         return present(self.suite, setting, self.results)
 
-    def found(self, setting: Setting) -> dict[str, Any]:
+    def envelopes(self, setting: Setting) -> dict[str, Any]:
         """What is there of a setting; nothing, if that was made from another suite."""
         try:
             return self.classes(setting)
@@ -126,8 +126,8 @@ class Shelf(NamedTuple):
     def vertices(self, setting: Setting, names: Sequence[str]) -> list[dict[str, Any]]:
         """The rules of some classes, each once."""
         classes = self.classes(setting)
-        found = {v["name"]: v for name in names for v in classes[name]["vertices"]}
-        return list(found.values())
+        result = {v["name"]: v for name in names for v in classes[name]["vertices"]}
+        return list(result.values())
 
 
 def complete(
@@ -154,40 +154,42 @@ def complete(
 
 
 def _complete(
-    suite: Suite, setting: Setting, wanted: Sequence[Class], results: Path, work: Path, team: Team
+    suite: Suite, setting: Setting, required: Sequence[Class], results: Path, work: Path, team: Team
 ) -> None:
-    searches = envelopes.searches_of(suite, setting, wanted)
+    searches = envelopes.searches_of(suite, setting, required)
     left = [search for search in searches if not search.path(work).exists()]
     left.sort(key=lambda search: -len(search.family.parameters))  # the long ones first
     side_by_side(
-        [Work(10.0, envelopes.run_search, (one, work)) for one in left],
+        [Work(10.0, envelopes.run_search, (item, work)) for item in left],
         team,
         f"{setting.name}: tuning",
     )
     vertices = [
         vertex
-        for of in wanted
-        for vertex in envelopes.chosen(envelopes.candidates_of(setting, of, searches, work)[0])
+        for of in required
+        for vertex in envelopes.select_candidates(
+            envelopes.candidates_of(setting, of, searches, work)[0]
+        )
     ]
-    tests = {one.path(work): one for one in envelopes.tests_of(suite, setting, vertices)}
+    tests = {item.path(work): item for item in envelopes.tests_of(suite, setting, vertices)}
     side_by_side(
         [
-            Work(2.0, envelopes.run_test, (one, work))
-            for path, one in tests.items()
+            Work(2.0, envelopes.run_test, (test, work))
+            for path, test in tests.items()
             if not path.exists()
         ],
         team,
         f"{setting.name}: testing",
     )
     classes = present(suite, setting, results)
-    inputs = envelopes.inputs_of(suite, setting)
-    for of in wanted:
+    inputs = envelopes.envelope_inputs(suite, setting)
+    for of in required:
         content = envelopes.content_of(suite, setting, of, searches, work)
         classes[of.name] = content | {"sha256": envelopes.digest(inputs, of.name, content)}
-    task, path = envelopes.task_of(setting), path_of(results, setting.name)
+    task, path = envelopes.envelope_task(setting), path_of(results, setting.name)
     earlier = read_envelopes(path)["curves"] if path.exists() else []
     curves = merged_curves(earlier, list(envelopes.curves_of(searches, work)))
-    always = next(one for one in curves if one["family"] == "always")
+    always = next(curve for curve in curves if curve["family"] == "always")
     order = [c.name for c in classes_of(setting)]
     report = {
         "setting": setting.name,
@@ -207,5 +209,5 @@ def merged_curves(
     earlier: Sequence[dict[str, Any]], new: Sequence[dict[str, Any]]
 ) -> list[dict[str, Any]]:
     """Each family's curve in each world, once: classes that are added take none away."""
-    every = {(one["family"], str(one["options"])): one for one in (*earlier, *new)}
+    every = {(item["family"], str(item["options"])): item for item in (*earlier, *new)}
     return list(every.values())

@@ -8,7 +8,7 @@ import numpy as np
 from rich.table import Table
 
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.envelope import Comparison, compare_with_envelope, lower_envelope
+from fusion_gym.evaluation.envelope import BaselineComparison, compare_with_envelope, lower_envelope
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.metrics import robust_summary, summarise
 from fusion_gym.policies.registry import make_policy
@@ -29,14 +29,14 @@ def run_all(
     trust: bool = False,
 ) -> dict[str, EpisodeResults]:
     """Every policy on the same seeds, with a bar of progress; ``trust`` as in ``make_policy``."""
-    made = {name: make_policy(name, task, trust=trust) for name in policies}
+    built = {name: make_policy(name, task, trust=trust) for name in policies}
     total = len(policies) * episodes * task.horizon
     with progress_bar(total, description) as bar:
-        found = {}
-        for name, policy in made.items():
+        result = {}
+        for name, policy in built.items():
             bar.say(name)
-            found[name] = run_episodes(task, policy, episodes, seed, bar.update)
-        return found
+            result[name] = run_episodes(task, policy, episodes, seed, bar.update)
+        return result
 
 
 def compare(
@@ -52,7 +52,7 @@ def compare(
     """
     episodes = next(iter(baselines.values())).episodes
     learned = run_all(task, list(agents), episodes, seed, "agent", trust=trust)
-    found = {name: compare_with_envelope(one, baselines) for name, one in learned.items()}
+    result = {name: compare_with_envelope(item, baselines) for name, item in learned.items()}
     envelope = lower_envelope(baselines)
     results = baselines | learned
     report: dict[str, Any] = {
@@ -61,34 +61,34 @@ def compare(
         "seed": seed,
         "horizon": task.horizon,
         "settings": task.settings,
-        "policies": {name: summarise(one) for name, one in results.items()},
-        "quantiles": {name: robust_summary(one) for name, one in results.items()},
+        "policies": {name: summarise(result) for name, result in results.items()},
+        "quantiles": {name: robust_summary(result) for name, result in results.items()},
     }
     write(folder / "evaluation.json", report)
-    points = [_point(name, learned[name], comparison) for name, comparison in found.items()]
+    points = [_point(name, learned[name], comparison) for name, comparison in result.items()]
     write(folder / "comparison.json", {"points": points})
-    shown = dict.fromkeys([*sweep.points, *(point.name for point in envelope), *learned])
+    visible = dict.fromkeys([*sweep.points, *(point.name for point in envelope), *learned])
     console = tables.console()
     console.print(
         tables.evaluation_table(
             f"{env_id}: single policies, the lower envelope of all {len(baselines)} baselines, "
             "and the agent",
-            {name: report["policies"][name] for name in shown},
+            {name: report["policies"][name] for name in visible},
             report["quantiles"],
             {},
         )
     )
-    console.print(comparison_table(found, learned))
+    console.print(comparison_table(result, learned))
     lines = [
-        figures.Line(curve.label, [baselines[name] for name in curve.policies])
+        figures.FigureLine(curve.label, [baselines[name] for name in curve.policies])
         for curve in sweep.curves
     ]
     single = {name: baselines[name] for name in sweep.points}
-    agent = figures.Line(_label(agents), list(learned.values()))
+    agent = figures.FigureLine(_label(agents), list(learned.values()))
     figures.pareto(folder / "pareto.png", env_id, lines, single, agent, envelope)
 
 
-def _point(name: str, learned: EpisodeResults, comparison: Comparison) -> dict[str, Any]:
+def _point(name: str, learned: EpisodeResults, comparison: BaselineComparison) -> dict[str, Any]:
     return {
         "agent": name,
         "rate": float(learned.rate.mean()),
@@ -106,11 +106,11 @@ def _label(agents: Sequence[str]) -> str:
 
 
 def comparison_table(
-    found: Mapping[str, Comparison], learned: Mapping[str, EpisodeResults]
+    comparisons: Mapping[str, BaselineComparison], learned: Mapping[str, EpisodeResults]
 ) -> Table:
     """The agent against the envelope, at its own rate at each of its prices."""
     rows = []
-    for name, comparison in found.items():
+    for name, comparison in comparisons.items():
         share = comparison.difference.mean / (comparison.envelope or np.nan)
         row = (
             "\n".join(comparison.between),
@@ -124,4 +124,4 @@ def comparison_table(
         rows.append(row)
     heads = "rate", "agent's MSE", "envelope's MSE", "difference [95 %]", "relative"
     title = "the agent against the lower envelope at its own rate"
-    return tables.table(title, ("envelope between", *heads), rows)
+    return tables.table_tables(title, ("envelope between", *heads), rows)

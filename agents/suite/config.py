@@ -44,7 +44,7 @@ class Family(Strict):
 
     ``tuned_in`` says where: ``"setting"`` once in each setting, for what the rule looks at depends
     neither on memory nor on what is broadcast; ``"sensors"`` or ``"local"`` anew in each class of
-    the coordinator or of sensors that decide by themselves, for it does.
+    the scheduler or of sensors that decide by themselves, for it does.
     """
 
     label: str
@@ -94,7 +94,7 @@ class Setting(Strict):
     ``informed`` are policies that know the model and all new signals, ``references`` computed
     ones that know no more than the centre. ``broadcasts`` are what a sensor by itself may hear, by
     rising knowledge, the environment's default first; with ``estimates`` there is a class of
-    coordinators whose packets hold the estimate. ``known`` are policies that earlier searches
+    schedulers whose packets hold the estimate. ``known`` are policies that earlier searches
     found: they compete with what the search finds, as if every tuning seed had found them.
 
     ``agents`` are the classes in which agents are trained, by name (all by default), and

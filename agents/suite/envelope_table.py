@@ -8,7 +8,7 @@ from fusion_gym.evaluation.envelope import EnvelopePoint, height
 from fusion_gym.validation import ConfigurationError
 
 from .committed import FOLDER, read_envelopes
-from .reports import Shape, read
+from .reports import Shape, read_shape
 
 SHARES = (0.05, 0.1, 0.2, 0.4)  # of the rate that transmitting always gets
 HEADLINE = 0.2
@@ -29,43 +29,43 @@ class Measurements(Shape):
     points: list[Measured]
 
 
-class Price(Shape):
+class PriceErrorRecord(Shape):
     """No policy costs less than ``lower`` at this price of a packet, error and packets a step."""
 
     price: float
     lower: float
 
 
-class Bound(Shape):
+class BoundRecord(Shape):
     """``bounds/SETTING.json``, as ``fusion-gym bound`` writes it."""
 
     sensors: int
     floor: float
-    costs: list[Price]
+    costs: list[PriceErrorRecord]
 
 
-def text_of(results: Path, command: str) -> str:
+def envelope_text(results: Path, command: str) -> str:
     """The table in Markdown.
 
     Raises:
         ConfigurationError: a file that is damaged or of another shape.
     """
     files = sorted((results / FOLDER).glob("*.json"))
-    found = [read_envelopes(path) for path in files]
+    content = [read_envelopes(path) for path in files]
     text = Path(__file__).with_suffix(".md").read_text(encoding="utf-8")
     lines = text.format(command=command).splitlines()
-    for envelopes in found:
+    for envelopes in content:
         lines += rows_of(envelopes, results)
     lines += ["", "## The strongest rules", ""]
-    for envelopes in found:
+    for envelopes in content:
         lines += vertices_of(envelopes)
     return "\n".join(lines) + "\n"
 
 
-def headline_table(results: Path) -> list[str]:
+def envelope_headline(results: Path) -> list[str]:
     """One row a setting, at a fifth of the rate of always transmitting: the front page's table."""
     lines = [
-        "| setting | rate | coordinator | with memory | bound | alone | alone, with memory |",
+        "| setting | rate | scheduler | with memory | bound | alone | alone, with memory |",
         "|---|---|---|---|---|---|---|",
     ]
     for path in sorted((results / FOLDER).glob("*.json")):
@@ -73,10 +73,15 @@ def headline_table(results: Path) -> list[str]:
         name, rate = envelopes["setting"], round(HEADLINE * envelopes["always"], 4)
         classes = envelopes["classes"]
         bound = bound_of(results / "bounds" / f"{name}.json")
-        heard = envelopes["inputs"]["broadcasts"][0]
+        received = envelopes["inputs"]["broadcasts"][0]
         cells = [
             cell(hull_of(classes[key]) if key in classes else [], rate)
-            for key in ("sensors", "sensors_memory", f"local_{heard}", f"local_{heard}_memory")
+            for key in (
+                "sensors",
+                "sensors_memory",
+                f"local_{received}",
+                f"local_{received}_memory",
+            )
         ]
         cells.insert(2, "–" if bound is None else f"{at_least(bound, rate):.4g}")
         title = envelopes["title"].split(",")[0]
@@ -127,14 +132,14 @@ def measured(path: Path, setting: str) -> tuple[list[EnvelopePoint], int]:
     """
     if not path.exists():
         return [], 0
-    found = read(Measurements, path, "results")
-    if found["setting"] != setting:
+    result = read_shape(Measurements, path, "results")
+    if result["setting"] != setting:
         raise ConfigurationError(
-            f"results = {str(path)!r}: setting = {found['setting']!r} is not allowed: it must be "
+            f"results = {str(path)!r}: setting = {result['setting']!r} is not allowed: it must be "
             f"{setting!r}"
         )
-    points = [EnvelopePoint(f"{p['rate']}", p["rate"], p["mse"]) for p in found["points"]]
-    return sorted(points, key=lambda point: point.rate), found["episodes"]
+    points = [EnvelopePoint(f"{p['rate']}", p["rate"], p["mse"]) for p in result["points"]]
+    return sorted(points, key=lambda point: point.rate), result["episodes"]
 
 
 def bound_of(path: Path) -> dict[str, Any] | None:
@@ -143,7 +148,7 @@ def bound_of(path: Path) -> dict[str, Any] | None:
     Raises:
         ConfigurationError: it is of another shape.
     """
-    return read(Bound, path, "results") if path.exists() else None
+    return read_shape(BoundRecord, path, "results") if path.exists() else None
 
 
 def at_least(bound: dict[str, Any], rate: float) -> float:
@@ -158,12 +163,12 @@ def cell(points: list[EnvelopePoint], rate: float) -> str:
     computed = bool(points) and points[0].rate > 0.0  # point by point: it ends with the last one
     if not points or (computed and rate > points[-1].rate):
         return "–"
-    found = height(points, rate)
-    return "–" if found is None else f"{found:.4g}"
+    result = height(points, rate)
+    return "–" if result is None else f"{result:.4g}"
 
 
 def vertices_of(envelopes: dict[str, Any]) -> Iterator[str]:
-    """A setting's coordinators and what their envelopes are made of."""
+    """A setting's schedulers and what their envelopes are made of."""
     yield f"### {envelopes['title']}"
     yield ""
     yield "| class | rule | rate | MSE on test seeds | on tuning seeds |"

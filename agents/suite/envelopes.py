@@ -15,6 +15,7 @@ import numpy as np
 
 from fusion_gym.core.system import Knowledge, covers
 from fusion_gym.core.task import Task
+from fusion_gym.deprecation import replace_value
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import EnvelopePoint, lower_hull, points_of
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
@@ -27,7 +28,7 @@ from ..output.files import load_results, read_json, save_results, write
 from ..output.folders import fingerprint
 from .classes import Class, classes_of
 from .config import Family, Setting, Suite, Tuning
-from .tuning import as_they_are, first_values, policy_text, tune
+from .tuning import as_they_are, first_values, policy_text, tune_families
 
 Options = tuple[tuple[str, Any], ...]
 
@@ -47,14 +48,14 @@ class Search(NamedTuple):
     @property
     def inputs(self) -> dict[str, Any]:
         """All that its result depends on."""
-        found = {
+        result = {
             "environment": self.setting.environment.model_dump(mode="json"),
             "options": dict(self.options),
             "family": self.family.model_dump(mode="json"),
             "price_range": list(self.setting.price_range),
             "tuning": self.tuning.model_dump(mode="json"),
         }
-        return found | ({"policies": list(self.policies)} if self.policies else {})
+        return result | ({"policies": list(self.policies)} if self.policies else {})
 
     def path(self, work: Path) -> Path:
         """Its JSON."""
@@ -67,7 +68,7 @@ class Search(NamedTuple):
             ConfigurationError: the family does not fit; names it, the setting and the options.
         """
         try:
-            task = task_of(self.setting, self.options)
+            task = envelope_task(self.setting, self.options)
             texts = self.policies
             if not texts:
                 values = first_values(self.family, 1, task.sensors, 0)[0]
@@ -94,7 +95,7 @@ class Test:
     @property
     def name(self) -> str:
         """The policy, with what the class adds to the setting's options."""
-        return named(self.policy, self.options)
+        return policy_with_options(self.policy, self.options)
 
     @property
     def inputs(self) -> dict[str, Any]:
@@ -124,25 +125,27 @@ class Test:
         return load_results(self.path(work), fingerprint(self.inputs))[self.policy]
 
 
-def named(policy: str, options: Iterable[tuple[str, Any]]) -> str:
+def policy_with_options(policy: str, options: Iterable[tuple[str, Any]]) -> str:
     """A policy's text, with the options of its class where there are some."""
     added = " ".join(f"{key}={json.dumps(value).strip(chr(34))}" for key, value in options)
     return f"{policy} [{added}]" if added else policy
 
 
-def task_of(setting: Setting, options: Iterable[tuple[str, Any]] = ()) -> Task:
+def envelope_task(setting: Setting, options: Iterable[tuple[str, Any]] = ()) -> Task:
     """The setting's task with the options of a class."""
     return make_task(setting.environment.id, **(setting.environment.options | dict(options)))
 
 
 def run_search(search: Search, work: Path) -> None:
     """Tune a family and keep its finalists, on the episodes of all searches."""
-    task = task_of(search.setting, search.options)
+    task = envelope_task(search.setting, search.options)
     if search.policies:
         tried, finalists = 0, as_they_are(task, search.policies, search.tuning)
     else:
-        tried, finalists = tune(task, search.family, search.tuning, search.setting.price_range)
-    found = [
+        tried, finalists = tune_families(
+            task, search.family, search.tuning, search.setting.price_range
+        )
+    requests = [
         {
             "policy": finalist.policy,
             "knows": make_policy(finalist.policy, task).knowledge,
@@ -152,7 +155,7 @@ def run_search(search: Search, work: Path) -> None:
         }
         for finalist in finalists
     ]
-    write(search.path(work), {"inputs": search.inputs, "trials": tried, "policies": found})
+    write(search.path(work), {"inputs": search.inputs, "trials": tried, "policies": requests})
 
 
 def _finite(mse: Any) -> Any:
@@ -161,31 +164,31 @@ def _finite(mse: Any) -> Any:
 
 def run_test(test: Test, work: Path) -> None:
     """Measure a policy on the test seeds."""
-    task = task_of(test.setting, test.options)
+    task = envelope_task(test.setting, test.options)
     results = run_episodes(task, test.make(task), test.episodes, test.seed)
     save_results(test.path(work), {test.policy: results}, fingerprint(test.inputs))
 
 
-def searches_of(suite: Suite, setting: Setting, wanted: Sequence[Class]) -> list[Search]:
+def searches_of(suite: Suite, setting: Setting, classes: Sequence[Class]) -> list[Search]:
     """What is to be tuned for these classes: their own families, and those of all within them."""
     tuning = suite.tuning_of(setting)
     points = [Family(label=name, policy=name, parameters={}) for name in setting.points]
-    within = [c for c in classes_of(setting) if any(one.contains(c) for one in wanted)]
-    found = []
+    within = [c for c in classes_of(setting) if any(item.contains(c) for item in classes)]
+    result = []
     for family in [*suite.families_of(setting), *points]:
         if family.tuned_in == "setting":
             worlds = dict.fromkeys(c.world for c in within)
-            found += [Search(setting, world, family, tuning) for world in worlds]
+            result += [Search(setting, world, family, tuning) for world in worlds]
         else:
-            found += [
+            result += [
                 Search(setting, c.options, family, tuning)
                 for c in within
                 if c.mode == family.tuned_in
             ]
     if setting.known and any(c.world == () for c in within):
         earlier = Family(label="found before", policy="", parameters={})
-        found.append(Search(setting, (), earlier, tuning, setting.known))
-    return found
+        result.append(Search(setting, (), earlier, tuning, setting.known))
+    return result
 
 
 class Candidate(NamedTuple):
@@ -202,7 +205,9 @@ class Candidate(NamedTuple):
     @property
     def point(self) -> EnvelopePoint:
         """Where it lies."""
-        return EnvelopePoint(named(self.policy, self.options), self.rate, self.mse["mean"])
+        return EnvelopePoint(
+            policy_with_options(self.policy, self.options), self.rate, self.mse["mean"]
+        )
 
 
 def candidates_of(
@@ -210,32 +215,32 @@ def candidates_of(
 ) -> tuple[dict[str, Candidate], int]:
     """The tuned policies that know no more than a class, by name, and the number of trials."""
     inside = [c for c in classes_of(setting) if of.contains(c)]
-    found: dict[str, Candidate] = {}
+    result: dict[str, Candidate] = {}
     trials = 0
     for search in searches:
         able = [c for c in inside if search.family.tuned_in in ("setting", c.mode)]
         if not any(search.options in (c.world, c.options) for c in able):
             continue
         tuned = read_json(search.path(work), "work")
-        kept = [
+        stored = [
             Candidate(
                 policy=entry["policy"],
                 options=search.options,
                 family=search.family.label,
-                knows=entry["knows"],
+                knows=replace_value(entry["knows"]),
                 found_by=tuple(entry["found_by"]),
                 rate=entry["rate"],
                 mse=entry["mse"],
             )
             for entry in tuned["policies"]
-            if covers(of.knows, entry["knows"])
+            if covers(of.knows, replace_value(entry["knows"]))
         ]
-        found |= {candidate.point.name: candidate for candidate in kept}
-        trials += tuned["trials"] if kept else 0
-    return found, trials
+        result |= {candidate.point.name: candidate for candidate in stored}
+        trials += tuned["trials"] if stored else 0
+    return result, trials
 
 
-def chosen(candidates: Mapping[str, Candidate]) -> list[Candidate]:
+def select_candidates(candidates: Mapping[str, Candidate]) -> list[Candidate]:
     """Those on the lower envelope on all tuning episodes, by rising rate."""
     hull = lower_hull(candidate.point for candidate in candidates.values())
     return [candidates[point.name] for point in hull]
@@ -254,7 +259,7 @@ def content_of(
 ) -> dict[str, Any]:
     """A class as its JSON holds it, without the hash."""
     candidates, trials = candidates_of(setting, of, searches, work)
-    vertices = chosen(candidates)
+    vertices = select_candidates(candidates)
     measured = {test.name: test.read(work) for test in tests_of(suite, setting, vertices)}
     places = {point.name: point for point in points_of(measured)}
     convex = {point.name for point in lower_hull(places.values())}
@@ -286,18 +291,18 @@ def content_of(
         "trials": trials,
         "vertices": listed,
         "searches": [
-            [[p.rate, p.mse] for p in lower_hull(c.point for c in found_by(candidates, seed))]
+            [[p.rate, p.mse] for p in lower_hull(c.point for c in best_of_seed(candidates, seed))]
             for seed in range(seeds)
         ],
     }
 
 
-def found_by(candidates: Mapping[str, Candidate], seed: int) -> list[Candidate]:
+def best_of_seed(candidates: Mapping[str, Candidate], seed: int) -> list[Candidate]:
     """What one search alone has found."""
     return [candidate for candidate in candidates.values() if seed in candidate.found_by]
 
 
-def inputs_of(suite: Suite, setting: Setting) -> dict[str, Any]:
+def envelope_inputs(suite: Suite, setting: Setting) -> dict[str, Any]:
     """All that a setting's envelopes depend on."""
     return {
         "environment": setting.environment.model_dump(mode="json"),

@@ -18,7 +18,7 @@ Points = Sequence[Sequence[float]]  # (rate, MSE) at each price
 WIDTH = 3.0  # the least factor between the rates of a front: less is hardly more than a point
 
 
-def prices_of(price_range: tuple[float, float], count: int) -> list[float]:
+def front_prices(price_range: tuple[float, float], count: int) -> list[float]:
     """Prices over the whole range, evenly in the logarithm, both ends exactly."""
     low, high = price_range
     return [min(max(float(price), low), high) for price in np.geomspace(low, high, count)]
@@ -30,9 +30,9 @@ def meter(experiment: Experiment, prices: Sequence[float], episodes: int) -> Mea
     local, seed = experiment.environment.local, experiment.validation.seed
 
     def measure(model: BaseAlgorithm, seconds: float) -> dict[str, Any]:
-        asked = [ModelPolicy(model, task, price=price, local=local) for price in prices]
-        found = run_beside(task, asked, episodes, seed)
-        points = [[float(brief.rate.mean()), float(brief.mse.mean())] for brief in found]
+        policies = [ModelPolicy(model, task, price=price, local=local) for price in prices]
+        result = run_beside(task, policies, episodes, seed)
+        points = [[float(brief.rate.mean()), float(brief.mse.mean())] for brief in result]
         return {"cpu_seconds": seconds, "front": points}
 
     return measure
@@ -53,8 +53,8 @@ def excess_over(front: Points, envelope: Sequence[EnvelopePoint]) -> float:
     pairs = [(mse, height(hull, rate)) for rate, mse in front]
     pairs += [(height(own, v.rate), v.mse) for v in hull if low < v.rate < high]
     shares = [mse / above - 1.0 if mse is not None and above else np.inf for mse, above in pairs]
-    found = float(np.max(shares))
-    return found if np.isfinite(found) else np.inf
+    result = float(np.max(shares))
+    return result if np.isfinite(result) else np.inf
 
 
 def is_below(front: Points, envelope: Sequence[EnvelopePoint], least: float) -> bool:

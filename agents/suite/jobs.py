@@ -14,10 +14,10 @@ from fusion_gym.validation import ConfigurationError
 from ..output.files import load_results, read_json
 from ..output.folders import alone_in, check_inputs
 from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, ValidationConfig
-from .classes import Class, classes_of, trained
+from .classes import Class, classes_of, trained_classes
 from .committed import Shelf, path_of
 from .config import Setting, Suite
-from .envelopes import Test, task_of
+from .envelopes import Test, envelope_task
 
 VALIDATIONS = 2  # of a training
 
@@ -53,7 +53,7 @@ class Folders(NamedTuple):
     work: Path
 
     @classmethod
-    def chosen(cls, results: Path | None, work: Path | None, quick: bool) -> Folders:
+    def create(cls, results: Path | None, work: Path | None, quick: bool) -> Folders:
         """The folders that a command line names, or those of the full or the quick benchmark."""
         return cls(
             results or Path("results/quick" if quick else "results"),
@@ -73,7 +73,7 @@ class Folders(NamedTuple):
         return self.report(job).exists() and self.episodes(job).exists()
 
     @contextmanager
-    def alone(self) -> Iterator[None]:
+    def lock(self) -> Iterator[None]:
         """Both folders, made if they are not there, for this process alone.
 
         Raises:
@@ -94,8 +94,8 @@ def jobs(
     Raises:
         ConfigurationError: a class that an agent would be compared with is not there.
     """
-    wanted = {setting.name: trained(suite, setting) for setting in settings}
-    hashes = {one.name: _hashes(shelf, one, wanted[one.name]) for one in settings}
+    required = {setting.name: trained_classes(suite, setting) for setting in settings}
+    hashes = {setting.name: _hashes(shelf, setting, required[setting.name]) for setting in settings}
     for setting in settings:
         yield Job(setting, "baselines", weight=5.0, envelopes=tuple(hashes[setting.name].items()))
     for setting in settings:
@@ -106,29 +106,29 @@ def jobs(
             yield Job(setting, "hindsight", weight=0.6 * suite.hindsight_episodes)
     for seed in range(suite.training_seeds):
         for setting in settings:
-            for of in wanted[setting.name]:
+            for of in required[setting.name]:
                 if of.name in classes:
                     weight = 10.0 + suite.timesteps_of(setting, of.name, of.mode) / setting.pace
-                    kept = ((of.name, hashes[setting.name][of.name]),)
-                    yield Job(setting, "agent", of, seed, weight, kept)
+                    stored = ((of.name, hashes[setting.name][of.name]),)
+                    yield Job(setting, "agent", of, seed, weight, stored)
 
 
-def _hashes(shelf: Shelf, setting: Setting, wanted: Sequence[Class]) -> dict[str, str]:
+def _hashes(shelf: Shelf, setting: Setting, classes: Sequence[Class]) -> dict[str, str]:
     """The hash of each class of agents, and of those without agents that are there as well."""
     there = shelf.classes(setting)
-    for of in wanted:
+    for of in classes:
         if of.name not in there:
             path = str(path_of(shelf.results, setting.name))
             raise ConfigurationError(
                 f"envelopes = {path!r} is not allowed: it has no class {of.name!r}"
             )
-    names = {of.name for of in wanted}
+    names = {of.name for of in classes}
     return {c.name: there[c.name]["sha256"] for c in classes_of(setting) if c.name in names}
 
 
 def rules_of(suite: Suite, setting: Setting, shelf: Shelf) -> list[Test]:
     """The rules of the envelopes that agents are compared with, to be run on the test episodes."""
-    names = [of.name for of in trained(suite, setting)]
+    names = [of.name for of in trained_classes(suite, setting)]
     return [
         Test(setting, tuple(v["options"].items()), v["policy"], suite.episodes, suite.seed)
         for v in shelf.vertices(setting, names)
@@ -147,42 +147,42 @@ def agent_options(setting: Setting, of: Class) -> dict[str, Any]:
 
 def agent_task(setting: Setting, of: Class) -> Task:
     """The task in which an agent of a class is tested: no price is drawn."""
-    return task_of(setting, agent_options(setting, of).items())
+    return envelope_task(setting, agent_options(setting, of).items())
 
 
 def training_of(experiment: Experiment) -> dict[str, Any]:
     return experiment.model_dump(mode="json", exclude={"output"})
 
 
-def inputs_of(job: Job, suite: Suite) -> dict[str, Any]:
+def job_inputs(job: Job, suite: Suite) -> dict[str, Any]:
     """All that the results of a job depend on."""
     setting = job.setting
-    found: dict[str, Any] = {
+    result: dict[str, Any] = {
         "environment": setting.environment.model_dump(mode="json"),
         "episodes": suite.episodes,
         "seed": suite.seed,
     }
     if job.kind == "baselines":
         genie = setting.genie and setting.genie.model_dump(mode="json")
-        return found | {
+        return result | {
             "envelopes": dict(job.envelopes),
             "points": list(setting.points),
             "genie": genie,
         }
     if job.kind in ("informed", "references"):
-        return found | {job.kind: list(computed(setting, job.kind))}
+        return result | {job.kind: list(computed(setting, job.kind))}
     if job.kind == "hindsight":
         assert setting.hindsight is not None
-        chosen = setting.hindsight.model_dump(mode="json")
-        return found | {"hindsight": chosen | {"episodes": suite.hindsight_episodes}}
+        hindsight = setting.hindsight.model_dump(mode="json")
+        return result | {"hindsight": hindsight | {"episodes": suite.hindsight_episodes}}
     assert job.of is not None
     experiment = experiment_of(suite, setting, job.of, job.seed, Path())
     tested = {"prices": suite.prices, "price_range": list(setting.price_range)}
     envelope = {"class": job.envelopes[0][0], "sha256": job.envelopes[0][1]}
-    return found | {"training": training_of(experiment), "envelope": envelope} | tested
+    return result | {"training": training_of(experiment), "envelope": envelope} | tested
 
 
-def finished(job: Job, suite: Suite, folders: Folders) -> bool:
+def job_finished(job: Job, suite: Suite, folders: Folders) -> bool:
     """Whether a job's results are there.
 
     Raises:
@@ -192,7 +192,7 @@ def finished(job: Job, suite: Suite, folders: Folders) -> bool:
     if not folders.hold(job):
         return False
     report = read_json(path, "results")
-    check_inputs(inputs_of(job, suite), report.get("inputs"), repr(str(path)))
+    check_inputs(job_inputs(job, suite), report.get("inputs"), repr(str(path)))
     load_results(folders.episodes(job), report.get("made_from", ""))
     return True
 

@@ -10,24 +10,24 @@ from .fronts import range_of
 from .study import Kind, Lesson, Study
 
 
-def finished(study: Study, kind: Kind, seeds: int) -> list[dict[str, Any]]:
+def finished_lessons(study: Study, kind: Kind, seeds: int) -> list[dict[str, Any]]:
     """What the first so many seeds taught, as far as they are finished.
 
     Raises:
         ConfigurationError: a file is damaged, or was made from other inputs.
     """
-    found = [Lesson(study, kind, seed).result() for seed in range(seeds)]
-    return [result for result in found if result is not None]
+    results = [Lesson(study, kind, seed).result() for seed in range(seeds)]
+    return [result for result in results if result is not None]
 
 
 def report(study: Study, seeds: int) -> dict[str, Any]:
     """Write the study's JSON anew and return what it holds; lessons may end side by side."""
     study.output.mkdir(parents=True, exist_ok=True)
     with FileLock(study.work / f".{study.setting.name}.lock"):
-        fronts = finished(study, "front", seeds)
-        plain = finished(study, "plain", min(seeds, study.learning.plain.seeds))
+        fronts = finished_lessons(study, "front", seeds)
+        plain = finished_lessons(study, "plain", min(seeds, study.learning.plain.seeds))
         speed = study.throughput
-        found: dict[str, Any] = {
+        content: dict[str, Any] = {
             "setting": study.setting.name,
             "title": study.setting.title,
             "env": study.setting.environment.id,
@@ -37,15 +37,15 @@ def report(study: Study, seeds: int) -> dict[str, Any]:
             "seeds": seeds,
             "throughput": read_json(speed, "work") if speed.exists() else None,
             "reached": {
-                "front": [reached(one) for one in fronts],
-                "plain": [reached(one) for one in plain],
+                "front": [reached(front) for front in fronts],
+                "plain": [reached(item) for item in plain],
             },
-            "finished": judged(study, fronts),
+            "finished": judge_fronts(study, fronts),
             "fronts": fronts,
             "plain": plain,
         }
-        write(study.report, found)
-    return found
+        write(study.report, content)
+    return content
 
 
 def reached(lesson: Mapping[str, Any]) -> dict[str, Any]:
@@ -55,7 +55,7 @@ def reached(lesson: Mapping[str, Any]) -> dict[str, Any]:
     measurements after it that were not below.
     """
     curve = lesson["curve"]
-    found: dict[str, Any] = {
+    result: dict[str, Any] = {
         "seed": lesson["seed"],
         "timesteps": curve[-1]["timesteps"],
         "cpu_seconds": curve[-1]["cpu_seconds"],
@@ -63,17 +63,17 @@ def reached(lesson: Mapping[str, Any]) -> dict[str, Any]:
     below = [place for place, point in enumerate(curve) if point.get("below")]
     if below:
         first, later = curve[below[0]], curve[below[0] :]
-        found["first"] = {
+        result["first"] = {
             "timesteps": first["timesteps"],
             "cpu_seconds": first["cpu_seconds"],
             "excess": first["excess"],
             "rates": range_of(first["front"]),
             "above_later": sum(not point["below"] for point in later),
         }
-    return found
+    return result
 
 
-def judged(study: Study, fronts: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+def judge_fronts(study: Study, fronts: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """All seeds' finished fronts at the prices that count, beside what they are compared with.
 
     With an optimum all prices count, otherwise the inner ones. ``above`` are seeds and prices

@@ -38,18 +38,18 @@ def row(report: Report) -> list[str]:
     steps = [f"{speed[name]:,.0f}" if name in speed else "–" for name in ("without", "values")]
     remembering = course["memoryless"] is not None
     moments = [_moments(report["reached"][kind]) for kind in ("front", "plain")]
-    found = report["finished"]
+    result = report["finished"]
     cells = ["–", "–", "–"]
-    if found:
-        worst = found["worst"]
-        low, high = found["rates"]
+    if result:
+        worst = result["worst"]
+        low, high = result["rates"]
         cells = [
-            f"{len(found['above'])} of {found['compared']} above {course['allowed']:+.1%} "
+            f"{len(result['above'])} of {result['compared']} above {course['allowed']:+.1%} "
             f"(rates {low:.3f} to {high:.3f})",
             f"{share(worst['difference'])} (seed {worst['seed']}, price {worst['price']:.3g})",
             ", ".join(
                 f"{part:.0%} to {name}"
-                for name, part in found["closed"].items()
+                for name, part in result["closed"].items()
                 if part is not None
             )
             or "–",
@@ -62,7 +62,7 @@ def _moments(reached: Sequence[Mapping[str, Any]]) -> str:
     """When the seeds' fronts first were below the envelope."""
     if not reached:
         return "–"
-    firsts = [one["first"] for one in reached if "first" in one]
+    firsts = [item["first"] for item in reached if "first" in item]
     parts = [f"{len(firsts)} of {len(reached)} seeds"]
     if firsts:
         parts += [
@@ -70,13 +70,13 @@ def _moments(reached: Sequence[Mapping[str, Any]]) -> str:
             _span("{:,} steps", firsts, "timesteps"),
         ]
     if len(firsts) < len(reached):
-        late = [one for one in reached if "first" not in one]
-        parts.append(f"not within {min(one['cpu_seconds'] for one in late):.0f} s")
+        late = [item for item in reached if "first" not in item]
+        parts.append(f"not within {min(item['cpu_seconds'] for item in late):.0f} s")
     return ", ".join(parts)
 
 
-def _span(form: str, found: Sequence[Mapping[str, Any]], name: str) -> str:
-    low, high = (choose(one[name] for one in found) for choose in (min, max))
+def _span(form: str, rows: Sequence[Mapping[str, Any]], name: str) -> str:
+    low, high = (choose(item[name] for item in rows) for choose in (min, max))
     texts = dict.fromkeys((form.format(low), form.format(high)))
     return " to ".join(texts)
 
@@ -89,15 +89,15 @@ def headline(reports: Sequence[Report]) -> list[str]:
     )  # fmt: skip
     lines = [_joined(cells), _joined(["---"] * len(cells))]
     for report in reports:
-        found, whole = report["finished"], row(report)
-        mean = f"{found['mean']:+.1%}" if found else "–"
+        result, whole = report["finished"], row(report)
+        mean = f"{result['mean']:+.1%}" if result else "–"
         title = report["title"].split(",")[0]
         above = whole[6].split(" (")[0]
         lines.append(_joined([title, *whole[3:6], mean, whole[7], above]))
     return lines
 
 
-def text_of(reports: Sequence[Report], command: str) -> str:
+def learning_text(reports: Sequence[Report], command: str) -> str:
     """All tables in Markdown, with how they are made."""
     text = Path(__file__).with_suffix(".md").read_text(encoding="utf-8")
     lines = [
@@ -148,15 +148,15 @@ def _firsts(report: Report) -> Iterator[str]:
     yield _joined(_FIRSTS)
     yield _joined(["---"] * len(_FIRSTS))
     for kind, seeds in report["reached"].items():
-        for one in seeds:
-            cells, first = ["–"] * 5, one.get("first")
+        for seed in seeds:
+            cells, first = ["–"] * 5, seed.get("first")
             if first:
                 low, high = first["rates"]
                 cells = [f"{first['timesteps']:,}", f"{first['cpu_seconds']:.1f}"]
                 cells += [f"{first['excess']:+.0%}", f"{low:.3f} to {high:.3f}"]
                 cells.append(str(first["above_later"]))
-            ended = [f"{one['timesteps']:,}", f"{one['cpu_seconds']:.1f}"]
-            yield _joined([_LABELS[kind], str(one["seed"]), *cells, *ended])
+            ended = [f"{seed['timesteps']:,}", f"{seed['cpu_seconds']:.1f}"]
+            yield _joined([_LABELS[kind], str(seed["seed"]), *cells, *ended])
     yield ""
 
 
@@ -165,7 +165,7 @@ def _curves(report: Report) -> Iterator[str]:
     yield _joined(["training", "steps", "seconds", "above the rules without memory by at most"])
     yield _joined(["---"] * 4)
     for kind, label in _LABELS.items():
-        curves = [one["curve"] for one in report["fronts" if kind == "front" else "plain"]]
+        curves = [item["curve"] for item in report["fronts" if kind == "front" else "plain"]]
         for steps in sorted({point["timesteps"] for curve in curves for point in curve}):
             points = [p for curve in curves for p in curve if p["timesteps"] == steps]
             known = [p["excess"] for p in points if p["excess"] is not None]

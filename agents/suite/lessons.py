@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from fusion_gym.arrays import Array
-from fusion_gym.evaluation.envelope import chosen_mse, height
+from fusion_gym.deprecation import replace_value
+from fusion_gym.evaluation.envelope import best_mse, height
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
 
@@ -21,7 +22,7 @@ from .envelopes import Test, run_test
 from .fronts import excess_over, meter
 from .learned import report
 from .study import Lesson, Study
-from .verdict import Front, excess, interval
+from .verdict import AgentFront, excess, interval
 from .work import check_vertex
 
 
@@ -75,15 +76,15 @@ def curve(study: Study, folder: Path) -> list[dict[str, Any]]:
     ``cpu_seconds`` are of environment, policy and updates, on all threads.
     """
     lines = (folder / "validation.jsonl").read_text(encoding="utf-8").splitlines()
-    found = []
+    result = []
     for record in map(json.loads, lines):
         point = {key: record[key] for key in ("timesteps", "cpu_seconds", "return", "front")}
         if study.memoryless is not None:
             above = excess_over(point["front"], study.memoryless)
             point["excess"] = above if above < float("inf") else None
             point["below"] = study.below(point["front"])
-        found.append(point)
-    return found
+        result.append(point)
+    return result
 
 
 def tested(study: Study, model: Path) -> list[dict[str, Any]]:
@@ -95,7 +96,7 @@ def tested(study: Study, model: Path) -> list[dict[str, Any]]:
     references = {test.name: test.read(study.work) for test in study.tests}
     for vertex in study.vertices if study.episodes == study.suite.episodes else []:
         check_vertex(vertex, references[vertex["name"]])
-    task, found = study.task(), []
+    task, result = study.task(), []
     for place, price in enumerate(study.prices):
         policy = make_policy(f"model:{model},price={price!r}", task)
         agent = run_episodes(task, policy, study.episodes, study.suite.seed)
@@ -110,8 +111,8 @@ def tested(study: Study, model: Path) -> list[dict[str, Any]]:
             point |= above_optimum(price, task.horizon, agent, references.values())
         else:
             point |= beside_envelope(study, agent, references)
-        found.append(point)
-    return found
+        result.append(point)
+    return result
 
 
 def above_optimum(
@@ -122,8 +123,8 @@ def above_optimum(
     All of them with tokens that cost nothing.
     """
 
-    def returns(found: EpisodeResults) -> Array:
-        return found.returns - price * horizon * found.tokens
+    def returns(results: EpisodeResults) -> Array:
+        return results.returns - price * horizon * results.tokens
 
     own = returns(agent)
     best = max(map(returns, candidates), key=lambda each: float(each.mean()))
@@ -139,10 +140,12 @@ def beside_envelope(
 ) -> dict[str, Any]:
     """The line through the references at the front's own rate; left of it there is nothing."""
     rate = float(agent.rate.mean())
-    below = chosen_mse(references, rate)
+    below = best_mse(references, rate)
     if below is None:
         return {}
-    front = Front(agent.mse[None, None], below[None, None], np.array([[rate]]), np.ones((1, 1, 1)))
+    front = AgentFront(
+        agent.mse[None, None], below[None, None], np.array([[rate]]), np.ones((1, 1, 1))
+    )
     difference = interval(front, np.array([rate]))
     known = beyond(study, rate, references)
     return {"envelope": float(below.mean()), "difference": difference} | known
@@ -154,14 +157,14 @@ def beyond(study: Study, rate: float, envelope: Mapping[str, EpisodeResults]) ->
     The rollout was run on the first of the test episodes: it is taken as a share of the envelope
     on these, times the envelope on all.
     """
-    found, name = {}, f"{study.setting.name}.json"
+    result, name = {}, f"{study.setting.name}.json"
     rollout, episodes = measured(study.results / "rollout" / name, study.setting.name)
-    same = study.envelope(study.course.against)["knows"] == "coordinator_memory"
+    same = replace_value(study.envelope(study.course.against)["knows"]) == "scheduler_memory"
     inside = same and bool(rollout) and rollout[0].rate <= rate <= rollout[-1].rate
-    below, own = chosen_mse(envelope, rate), height(rollout, rate) if inside else None
+    below, own = best_mse(envelope, rate), height(rollout, rate) if inside else None
     if own is not None and below is not None:
-        found["rollout"] = own / float(below[:episodes].mean()) * float(below.mean())
+        result["rollout"] = own / float(below[:episodes].mean()) * float(below.mean())
     bound = bound_of(study.results / "bounds" / name)
     if bound is not None:
-        found["bound"] = at_least(bound, rate)
-    return found
+        result["bound"] = at_least(bound, rate)
+    return result

@@ -11,7 +11,7 @@ from fusion_gym.evaluation.envelope import EnvelopePoint, height, lower_hull
 from ..output import palette, pareto_figure
 from ..output.pareto_figure import Differences, Limits, Panel, Series
 from .envelope_table import at_least
-from .found import Found
+from .setting_results import SettingResults
 
 FINE = 80  # rates of a curved line
 LEFT = 0.04  # of the rate that always transmitting gets: where the figure begins
@@ -22,53 +22,55 @@ MIXED = "found before"  # no family of one rule
 HEARS = {"none": "hear nothing", "estimate": "hear estimate", "packets": "hear packets"}
 
 
-def draw(folder: Path, found: Found) -> None:
+def draw_layers(folder: Path, value: SettingResults) -> None:
     """The setting's figure, into its folder, as PNG and as SVG."""
-    main, small = panels_of(found)
+    main, small = panels_of(value)
     paths = [folder / f"pareto.{suffix}" for suffix in ("png", "svg")]
-    pareto_figure.draw(paths, found.verdict["title"], main, small, limits_of(found, [main, *small]))
+    pareto_figure.draw_pareto(
+        paths, value.verdict["title"], main, small, limits_of(value, [main, *small])
+    )
 
 
-def panels_of(found: Found) -> tuple[Panel, list[Panel]]:
-    """The coordinators' panel, and one for the centre, for sensors alone, and for estimates."""
+def panels_of(results: SettingResults) -> tuple[Panel, list[Panel]]:
+    """The schedulers' panel, and one for the centre, for sensors alone, and for estimates."""
     grouped: dict[tuple[str, str, str], list[str]] = {}
-    for name, content in shown(found).items():
+    for name, content in figure_of(results).items():
         grouped.setdefault(_kind(content), []).append(name)
-    coordinator = grouped.pop(("sensors", "", "measurement"), [])
-    rates = _fine(found)
-    bound = [(r, at_least(found.bound, r)) for r in rates] if found.bound else []
-    series = list(_series(found, coordinator, found.ahead))
-    if found.rollout:
-        points = [(point.rate, point.mse) for point in found.rollout]
-        label = f"improved by simulation\n({found.rollout_episodes} episodes)"
+    scheduler = grouped.pop(("sensors", "", "measurement"), [])
+    rates = _fine(results)
+    bound = [(r, at_least(results.bound, r)) for r in rates] if results.bound else []
+    series = list(_series(results, scheduler, results.ahead))
+    if results.rollout:
+        points = [(point.rate, point.mse) for point in results.rollout]
+        label = f"improved by simulation\n({results.rollout_episodes} episodes)"
         style = palette.ROLLOUT._replace(label=label)
         series.append(Series(style, [], points))
-    genie = found.baselines.get("genie")
+    genie = results.baselines.get("genie")
     level = ("everything arrives", float(genie["mse"]["mean"])) if genie and not bound else None
     main = Panel(
-        "coordinator",
+        "scheduler",
         series,
-        _single(found, coordinator),
+        _single(results, scheduler),
         bound,
         level,
-        list(_differences(found, coordinator)),
+        list(_differences(results, scheduler)),
     )
     small = [
         Panel(
             _title(*key),
-            list(_series(found, names, found.known if key[0] == "centre" else [])),
-            _single(found, names),
+            list(_series(results, names, results.known if key[0] == "centre" else [])),
+            _single(results, names),
             bound,
-            differences=list(_differences(found, names)),
+            differences=list(_differences(results, names)),
         )
         for key, names in grouped.items()
     ]
     return main, small
 
 
-def limits_of(found: Found, panels: Sequence[Panel]) -> Limits:
+def limits_of(results: SettingResults, panels: Sequence[Panel]) -> Limits:
     """From 4 % of what always transmitting gets, and from the least error that is drawn there."""
-    always = found.verdict["always"]
+    always = results.verdict["always"]
     left, right = LEFT * always, 1.12 * always
     every = [
         error
@@ -85,8 +87,8 @@ def limits_of(found: Found, panels: Sequence[Panel]) -> Limits:
     ends = [
         end
         for panel in panels
-        for one in panel.differences
-        for rate, _, low, high in one.points
+        for difference in panel.differences
+        for rate, _, low, high in difference.points
         if left <= rate <= right
         for end in (low, high)
     ]
@@ -94,13 +96,13 @@ def limits_of(found: Found, panels: Sequence[Panel]) -> Limits:
     return Limits((left, right), (0.88 * min([least, *lows]), 1.15 * most), apart)
 
 
-def shown(found: Found) -> dict[str, Any]:
+def figure_of(results: SettingResults) -> dict[str, Any]:
     """The classes that have agents, and committed ones where no class of the same kind has any."""
-    committed = found.envelopes.get("classes", {})
-    there = {_kind(content) for content in found.classes.values()}
-    others = {name: one for name, one in committed.items() if _kind(one) not in there}
-    every = others | found.classes
-    order = [*committed, *(name for name in found.classes if name not in committed)]
+    committed = results.envelopes.get("classes", {})
+    there = {_kind(content) for content in results.classes.values()}
+    others = {name: item for name, item in committed.items() if _kind(item) not in there}
+    every = others | results.classes
+    order = [*committed, *(name for name in results.classes if name not in committed)]
     return {name: every[name] for name in order if name in every}
 
 
@@ -115,39 +117,39 @@ def _packet(content: dict[str, Any]) -> str:
 
 def _title(mode: str, broadcast: str, packet: str) -> str:
     if packet == "estimate":
-        return "coordinator,\nsends estimate"
+        return "scheduler,\nsends estimate"
     return "centre,\nsees no signal" if mode == "centre" else f"sensors alone,\n{HEARS[broadcast]}"
 
 
 def _series(
-    found: Found, names: Sequence[str], reference: Sequence[EnvelopePoint]
+    results: SettingResults, names: Sequence[str], reference: Sequence[EnvelopePoint]
 ) -> Iterator[Series]:
     """Rules and agents of classes that differ in memory, and what computes with the model."""
-    contents = shown(found)
+    contents = figure_of(results)
     for name in sorted(names, key=lambda name: contents[name]["memory"]):
-        hull, memory = found.hull(name), contents[name]["memory"]
+        hull, memory = results.hull(name), contents[name]["memory"]
         style = palette.RULES_MEMORY if memory else palette.RULES
-        yield Series(style, list(_along(hull, _fine(found))), [(p.rate, p.mse) for p in hull])
+        yield Series(style, list(_along(hull, _fine(results))), [(p.rate, p.mse) for p in hull])
     if reference:
         hull = lower_hull(reference)
         yield Series(
-            _reference_style(found, reference),
-            list(_along(hull, [r for r in _fine(found) if r <= hull[-1].rate])),
+            _reference_style(results, reference),
+            list(_along(hull, [r for r in _fine(results) if r <= hull[-1].rate])),
             [(point.rate, point.mse) for point in hull],
         )
     for name in sorted(names, key=lambda name: contents[name]["memory"]):
-        if name in found.classes:
+        if name in results.classes:
             style = palette.AGENTS_MEMORY if contents[name]["memory"] else palette.AGENTS
-            points = found.classes[name]["points"]
+            points = results.classes[name]["points"]
             marks = [(point["rate"], point["mse"]) for point in points]
-            yield Series(style, marks, marks, list(_band(found, name, marks)))
+            yield Series(style, marks, marks, list(_band(results, name, marks)))
 
 
-def _differences(found: Found, names: Sequence[str]) -> Iterator[Differences]:
+def _differences(results: SettingResults, names: Sequence[str]) -> Iterator[Differences]:
     """What agents do relative to the rules of their class, by rate."""
     for name in names:
-        if name in found.classes:
-            content = found.classes[name]
+        if name in results.classes:
+            content = results.classes[name]
             points = [
                 (point["rate"], *(point["difference"][end] for end in ("mean", "low", "high")))
                 for point in content["points"]
@@ -158,25 +160,25 @@ def _differences(found: Found, names: Sequence[str]) -> Iterator[Differences]:
             )
 
 
-def _reference_style(found: Found, reference: Sequence[EnvelopePoint]) -> palette.Style:
-    style = palette.SCHEDULES if reference is found.known else palette.REFERENCE
-    return style._replace(label=reference_label(found, reference))
+def _reference_style(results: SettingResults, reference: Sequence[EnvelopePoint]) -> palette.Style:
+    style = palette.SCHEDULES if reference is results.known else palette.REFERENCE
+    return style._replace(label=reference_label(results, reference))
 
 
-def reference_label(found: Found, reference: Sequence[EnvelopePoint]) -> str:
+def reference_label(results: SettingResults, reference: Sequence[EnvelopePoint]) -> str:
     """What computes with the model, in a word."""
-    if reference is found.known:
+    if reference is results.known:
         return "best periodic schedules"
-    return "optimum" if found.optimal else "lookahead with the model"
+    return "optimum" if results.optimal else "lookahead with the model"
 
 
 def _band(
-    found: Found, name: str, marks: Sequence[tuple[float, float]]
+    results: SettingResults, name: str, marks: Sequence[tuple[float, float]]
 ) -> Iterator[tuple[float, float, float]]:
     """The least and the greatest error of training seeds at each price."""
-    columns = found.seeds.get(name, ())
+    columns = results.seeds.get(name, ())
     if len(columns) > 1:
-        for place, (rate, _) in sorted(enumerate(marks), key=lambda one: one[1]):
+        for place, (rate, _) in sorted(enumerate(marks), key=lambda item: item[1]):
             errors = [column[place][1] for column in columns]
             yield rate, min(errors), max(errors)
 
@@ -189,14 +191,14 @@ def _along(hull: Sequence[EnvelopePoint], rates: Sequence[float]) -> Iterator[tu
             yield rate, error
 
 
-def _single(found: Found, names: Sequence[str]) -> list[list[tuple[float, float]]]:
+def _single(results: SettingResults, names: Sequence[str]) -> list[list[tuple[float, float]]]:
     """Each family's tuned rules, on the tuning seeds, in the classes of a panel.
 
     They are drawn down to the envelope on the test seeds: what was best on the seeds that it was
     tuned on lies lower there, by luck.
     """
-    hulls = [found.hull(name) for name in names]
-    classes = found.envelopes.get("classes", {})
+    hulls = [results.hull(name) for name in names]
+    classes = results.envelopes.get("classes", {})
     own = [classes[name] for name in names if name in classes]
     families = {family for content in own for family in content["families"]}
     options = [{}, *(content["options"] for content in own)]
@@ -205,7 +207,7 @@ def _single(found: Found, names: Sequence[str]) -> list[list[tuple[float, float]
             (point["rate"], max(point["mse"], _least(hulls, point["rate"])))
             for point in curve["points"]
         ]
-        for curve in found.envelopes.get("curves", ())
+        for curve in results.envelopes.get("curves", ())
         if curve["family"] in families - {MIXED}
         and curve["options"] in options
         and len(curve["points"]) > 1
@@ -215,9 +217,9 @@ def _single(found: Found, names: Sequence[str]) -> list[list[tuple[float, float]
 def _least(hulls: Sequence[Sequence[EnvelopePoint]], rate: float) -> float:
     """The least error of these envelopes at a rate; zero left of them."""
     heights = [height(hull, rate) for hull in hulls if hull]
-    return min([one for one in heights if one is not None], default=0.0)
+    return min([item for item in heights if item is not None], default=0.0)
 
 
-def _fine(found: Found) -> list[float]:
-    always = found.verdict["always"]
+def _fine(results: SettingResults) -> list[float]:
+    always = results.verdict["always"]
     return np.geomspace(LEFT * always, always, FINE).tolist()

@@ -33,50 +33,50 @@ class Mean(Shape):
     mean: float
 
 
-class Interval(Mean):
+class IntervalRecord(Mean):
     """A mean with its interval."""
 
     low: float
     high: float
 
 
-NOTHING = Interval(mean=0.0, low=0.0, high=0.0)  # of a field that may be left out
+NOTHING = IntervalRecord(mean=0.0, low=0.0, high=0.0)  # of a field that may be left out
 
 
-class Policy(Shape):
+class PolicyRecord(Shape):
     """A tested policy."""
 
-    mse: Interval
+    mse: IntervalRecord
     rate: list[FiniteFloat] = pydantic.Field(min_length=1)
 
 
-class Tested(Shape):
+class TestRecord(Shape):
     """Policies by name."""
 
-    policies: dict[str, Policy]
+    policies: dict[str, PolicyRecord]
 
 
-class Curve(Shape):
+class CurveRecord(Shape):
     """A baseline's policies."""
 
     policies: list[str] = pydantic.Field(min_length=1)
 
 
-class Genie(Shape):
+class HindsightRecord(Shape):
     """A lower bound, and what it assumes."""
 
     mse: Mean
     assumes: str
 
 
-class Baselines(Tested):
+class Baselines(TestRecord):
     """A setting's ``baselines.json``."""
 
     env: str
     episodes: int
     seed: int
-    curves: dict[str, Curve] = pydantic.Field(min_length=1)
-    genie: Genie = Genie(mse=Mean(mean=0.0), assumes="")
+    curves: dict[str, CurveRecord] = pydantic.Field(min_length=1)
+    genie: HindsightRecord = HindsightRecord(mse=Mean(mean=0.0), assumes="")
 
 
 class Point(Shape):
@@ -88,10 +88,10 @@ class Point(Shape):
     envelope: float = 0.0
     reference: float = 0.0
     hindsight: float = 0.0
-    difference: Interval = NOTHING
+    difference: IntervalRecord = NOTHING
 
 
-class Place(Shape):
+class PriceRecord(Shape):
     """A policy on the envelope."""
 
     name: str
@@ -103,23 +103,23 @@ class Beside(Shape):
     """Rules and agents of a class at one rate, as far as they reach it."""
 
     rate: FiniteFloat
-    rules: Interval = NOTHING
-    agents: Interval = NOTHING
-    difference: Interval = NOTHING
+    rules: IntervalRecord = NOTHING
+    agents: IntervalRecord = NOTHING
+    difference: IntervalRecord = NOTHING
 
 
-class Front(Shape):
+class FrontRecord(Shape):
     """A class of knowledge: its agents' points beside the envelope of its rules."""
 
     seeds: NonNegativeInt
     prices: NonNegativeInt = 0
     rates: list[FiniteFloat] = pydantic.Field(default_factory=list)
     points: list[Point] = pydantic.Field(min_length=1)
-    envelope: list[Place]
+    envelope: list[PriceRecord]
     room: FiniteFloat = 0.0
     closed: FiniteFloat = 0.0
     hindsight_room: FiniteFloat = 0.0
-    middle: Interval = NOTHING
+    middle: IntervalRecord = NOTHING
     at: list[Beside]
     mode: Literal["centre", "local", "sensors"]
     memory: bool
@@ -128,7 +128,7 @@ class Front(Shape):
     knows: Knowledge
 
     @pydantic.model_validator(mode="after")
-    def _closed(self) -> Front:
+    def _closed(self) -> FrontRecord:
         if "room" in self.model_fields_set and "closed" not in self.model_fields_set:
             raise ValueError("room stands without closed")
         return self
@@ -140,8 +140,8 @@ class Worth(Shape):
     kind: str
     knows: str
     less: str
-    rules: Interval = NOTHING
-    agents: Interval = NOTHING
+    rules: IntervalRecord = NOTHING
+    agents: IntervalRecord = NOTHING
 
 
 class Verdict(Shape):
@@ -149,7 +149,7 @@ class Verdict(Shape):
 
     title: str
     always: FiniteFloat = pydantic.Field(gt=0.0)
-    classes: dict[str, Front]
+    classes: dict[str, FrontRecord]
     worth: list[Worth]
 
 
@@ -187,7 +187,7 @@ class Agent(Shape):
     episodes: int
     seed: int
     prices: list[float]
-    points: list[Policy]
+    points: list[PolicyRecord]
 
 
 class Quantiles(Shape):
@@ -199,7 +199,7 @@ class Quantiles(Shape):
 # A policy in the JSON of an evaluation: an interval for a metric, or a list.
 _Row = Annotated[list[float], pydantic.Field(min_length=1)]
 _FIELDS: dict[str, Any] = {
-    name: (_Row if metric.axis else Interval, ...) for name, metric in METRICS.items()
+    name: (_Row if metric.axis else IntervalRecord, ...) for name, metric in METRICS.items()
 }
 EVALUATED = pydantic.create_model("EVALUATED", __base__=Shape, **_FIELDS)
 
@@ -217,7 +217,7 @@ class Evaluation(Shape):
         return self
 
 
-def read(shape: type[Shape], path: Path, option: str) -> dict[str, Any]:
+def read_shape(shape: type[Shape], path: Path, option: str) -> dict[str, Any]:
     """The JSON of a file, in which everything of the shape is there.
 
     Raises:

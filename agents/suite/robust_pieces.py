@@ -25,8 +25,8 @@ from ..training.run import holds_training, train
 from .classes import Class, classes_of
 from .committed import Shelf, path_of
 from .config import Setting, Suite
-from .envelopes import task_of
-from .fronts import prices_of
+from .envelopes import envelope_task
+from .fronts import front_prices
 from .jobs import agent_options, experiment_of
 from .robust_summary import FOLDER
 
@@ -34,21 +34,21 @@ RULES = "rules"
 Options = tuple[tuple[str, Any], ...]
 
 
-class Entry(NamedTuple):
+class RobustEntry(NamedTuple):
     """A policy with the options that it adds to those of the case.
 
-    ``told`` stands for its text among the inputs where that is a file's path; one that is ``added``
-    is no rule of the envelope.
+    ``label`` stands for its text among the inputs where that is a file's path; one that is
+    ``added`` is no rule of the envelope.
     """
 
     name: str
     policy: str
     options: Options
-    told: str | None = None
+    label: str | None = None
     added: bool = False
 
 
-class Piece(NamedTuple):
+class RobustPiece(NamedTuple):
     """Some policies in a case: the rules of a class, or an agent at all its prices.
 
     ``setting`` is the setting as it is in the case.
@@ -58,7 +58,7 @@ class Piece(NamedTuple):
     of: Class
     case: str
     label: str
-    entries: tuple[Entry, ...]
+    entries: tuple[RobustEntry, ...]
     episodes: int
     seed: int
 
@@ -78,33 +78,33 @@ class Piece(NamedTuple):
         return {
             "environment": self.setting.environment.model_dump(mode="json"),
             "policies": {
-                one.name: {"policy": one.told or one.policy, "options": dict(one.options)}
-                for one in self.entries
+                entry.name: {"policy": entry.label or entry.policy, "options": dict(entry.options)}
+                for entry in self.entries
             },
             "episodes": self.episodes,
             "seed": self.seed,
         }
 
-    def task(self, entry: Entry) -> Task:
+    def task(self, entry: RobustEntry) -> Task:
         """The task in which a policy runs."""
-        return task_of(self.setting, entry.options)
+        return envelope_task(self.setting, entry.options)
 
 
-class Folders(NamedTuple):
+class RobustFolders(NamedTuple):
     """``results`` holds JSON for readers, ``work`` models and episodes."""
 
     results: Path
     work: Path
 
-    def report(self, piece: Piece) -> Path:
+    def report(self, piece: RobustPiece) -> Path:
         """The JSON of a piece."""
         return self.results / FOLDER / f"{piece.place}.json"
 
-    def episodes(self, piece: Piece) -> Path:
+    def episodes(self, piece: RobustPiece) -> Path:
         """The episodes of a piece."""
         return self.work / f"{piece.place}.npz"
 
-    def finished(self, piece: Piece) -> bool:
+    def finished(self, piece: RobustPiece) -> bool:
         """Whether a piece's results are there.
 
         Raises:
@@ -117,7 +117,7 @@ class Folders(NamedTuple):
         self.read(piece)
         return True
 
-    def read(self, piece: Piece) -> dict[str, EpisodeResults]:
+    def read(self, piece: RobustPiece) -> dict[str, EpisodeResults]:
         """The episodes of a finished piece, by the names of its policies.
 
         Raises:
@@ -126,28 +126,28 @@ class Folders(NamedTuple):
         return load_results(self.episodes(piece), fingerprint(piece.inputs))
 
 
-def run_piece(piece: Piece, folders: Folders) -> None:
+def run_piece(piece: RobustPiece, folders: RobustFolders) -> None:
     """Run the policies of a piece and keep what they did."""
     torch.set_num_threads(1)
-    found = {}
+    result = {}
     tasks: dict[str, Task] = {}
     for entry in piece.entries:
         same = repr(entry.options)
         task = tasks[same] = tasks[same] if same in tasks else piece.task(entry)
         policy = make_policy(entry.policy, task)
-        found[entry.name] = run_episodes(task, policy, piece.episodes, piece.seed)
-    save_results(folders.episodes(piece), found, fingerprint(piece.inputs))
+        result[entry.name] = run_episodes(task, policy, piece.episodes, piece.seed)
+    save_results(folders.episodes(piece), result, fingerprint(piece.inputs))
     report = {
         "setting": piece.setting.name,
         "case": piece.case,
         "inputs": piece.inputs,
         "policies": {
             name: {
-                "rate": float(one.rate.mean()),
-                "mse": mean_interval(one.mse)._asdict(),
-                "diverged": float(one.diverged.mean()),
+                "rate": float(item.rate.mean()),
+                "mse": mean_interval(item.mse)._asdict(),
+                "diverged": float(item.diverged.mean()),
             }
-            for name, one in found.items()
+            for name, item in result.items()
         },
     }
     write(folders.report(piece), report)
@@ -159,7 +159,7 @@ def class_named(setting: Setting, name: str) -> Class:
     Raises:
         ConfigurationError: it has none of that name.
     """
-    every = {one.name: one for one in classes_of(setting)}
+    every = {item.name: item for item in classes_of(setting)}
     if name not in every:
         raise refusal("class", name, f"one of those of {setting.name}: {', '.join(every)}")
     return every[name]
@@ -171,36 +171,41 @@ def envelope_of(shelf: Shelf, setting: Setting, of: Class) -> dict[str, Any]:
     Raises:
         ConfigurationError: there is none.
     """
-    found = shelf.classes(setting)
-    if of.name not in found:
+    result = shelf.classes(setting)
+    if of.name not in result:
         path = str(path_of(shelf.results, setting.name))
         raise ConfigurationError(f"results: {path!r} has no class {of.name!r}: tune it first")
-    return found[of.name]
+    return result[of.name]
 
 
 def rules_piece(
     setting: Setting, of: Class, case: str, vertices: Sequence[Mapping[str, Any]], episodes: int,
     seed: int,
-) -> Piece:  # fmt: skip
+) -> RobustPiece:  # fmt: skip
     """The rules of an envelope in a case, and what transmits always."""
-    entries = [Entry(one["name"], one["policy"], tuple(one["options"].items())) for one in vertices]
+    entries = [
+        RobustEntry(vertex["name"], vertex["policy"], tuple(vertex["options"].items()))
+        for vertex in vertices
+    ]
     if "always" not in [entry.name for entry in entries]:
-        entries.append(Entry("always", "always", (), added=True))
-    return Piece(setting, of, case, RULES, tuple(entries), episodes, seed)
+        entries.append(RobustEntry("always", "always", (), added=True))
+    return RobustPiece(setting, of, case, RULES, tuple(entries), episodes, seed)
 
 
 def agent_piece(
     suite: Suite, setting: Setting, of: Class, case: str, label: str, agent: str, episodes: int,
     seed: int,
-) -> Piece:  # fmt: skip
+) -> RobustPiece:  # fmt: skip
     """An agent in a case, at prices over the whole range."""
-    told = f"{label} {_digest(agent)}"
+    text = f"{label} {_digest(agent)}"
     options = tuple(agent_options(setting, of).items())
     entries = tuple(
-        Entry(f"price={price!r}", f"{agent},price={price!r}", options, f"{told},price={price!r}")
-        for price in prices_of(setting.price_range, suite.prices)
+        RobustEntry(
+            f"price={price!r}", f"{agent},price={price!r}", options, f"{text},price={price!r}"
+        )
+        for price in front_prices(setting.price_range, suite.prices)
     )
-    return Piece(setting, of, case, label, entries, episodes, seed)
+    return RobustPiece(setting, of, case, label, entries, episodes, seed)
 
 
 def _digest(agent: str) -> str:
@@ -222,25 +227,25 @@ def agents_of(
         ConfigurationError: there are none.
     """
     if patterns:
-        found: list[str] = []
+        result: list[str] = []
         for pattern in patterns:
             filled = pattern.replace("{setting}", setting.name).replace("{class}", of.name)
             files = sorted(glob.glob(filled))
             if not files and "{setting}" not in pattern:
                 raise refusal("agents", pattern, "a file, or a pattern that some file fits")
-            found += files
-        if not found:
+            result += files
+        if not result:
             raise refusal(
                 "agents", list(patterns), f"patterns that some file of {setting.name} fits"
             )
-        return [f"model:{path}" for path in found]
+        return [f"model:{path}" for path in result]
     folder = usual if models is None else models
-    found = [
+    result = [
         f"model:{path}"
         for path in sorted(folder.glob(f"{setting.name}/{of.name}_[0-9]*/best_model.zip"))
     ]
-    if found:
-        return found
+    if result:
+        return result
     if models is not None:
         raise refusal("models", str(models), f"a folder with agents {setting.name}/{of.name}_SEED")
     name = f"{setting.name}_{of.name}"

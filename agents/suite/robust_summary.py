@@ -7,7 +7,7 @@ from typing import Any
 from fusion_gym.validation import choice
 
 from ..output.files import read_json
-from ..output.markup import NONE, plain, share, table
+from ..output.markup import NONE, plain_text, share, table_markup
 from .reports import VERDICT
 from .robustness import NOMINAL
 
@@ -29,7 +29,7 @@ def read_reports(results: Path, settings: Sequence[str]) -> list[dict[str, Any]]
     return [read_json(path, "results") for path in paths]
 
 
-def summary(reports: Sequence[Report], titles: Mapping[str, str]) -> list[str]:
+def robustness_summary(reports: Sequence[Report], titles: Mapping[str, str]) -> list[str]:
     """A table: each setting's agents as they are, and those trained over draws.
 
     ``titles`` of the settings by name; what stands before their first comma is shown.
@@ -43,23 +43,23 @@ def summary(reports: Sequence[Report], titles: Mapping[str, str]) -> list[str]:
         title = titles[report["setting"]].partition(",")[0]
         for kind, name in _NAMES.items():
             if kind in report["cases"][NOMINAL]:
-                rows.append([plain(title), name, *_cells(report["cases"], kind)])
-    return table(_HEAD, rows)
+                rows.append([plain_text(title), name, *_cells(report["cases"], kind)])
+    return table_markup(_HEAD, rows)
 
 
 def _cells(cases: Mapping[str, Report], kind: str) -> Iterator[str]:
     nominal = cases[NOMINAL][kind].get("middle")
-    found = {
+    result = {
         row["title"]: row[kind]["middle"]
         for name, row in cases.items()
         if name != NOMINAL and "middle" in row.get(kind, {})
     }
-    better = sum(is_gain(middle) for middle in found.values())
-    worse = sum(middle["low"] > 0.0 for middle in found.values())
+    better = sum(is_gain(middle) for middle in result.values())
+    worse = sum(middle["low"] > 0.0 for middle in result.values())
     yield share(nominal)
-    yield from map(str, (better, len(found) - better - worse, worse))
-    worst = max(found, key=lambda title: float(found[title]["mean"]), default=None)
-    yield NONE if worst is None else f"{share(found[worst])}, {plain(worst)}"
+    yield from map(str, (better, len(result) - better - worse, worse))
+    worst = max(result, key=lambda title: float(result[title]["mean"]), default=None)
+    yield NONE if worst is None else f"{share(result[worst])}, {plain_text(worst)}"
 
 
 def is_gain(middle: Mapping[str, float]) -> bool:

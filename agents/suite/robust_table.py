@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from fusion_gym.evaluation.envelope import chosen_mse
+from fusion_gym.evaluation.envelope import best_mse
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import mean_interval
 
 from ..output.files import write_text
 from ..output.markup import NONE, share
-from .robust_pieces import RULES, Folders, Piece
-from .robust_summary import FOLDER, KINDS, is_gain, read_reports, summary
+from .robust_pieces import RULES, RobustFolders, RobustPiece
+from .robust_summary import FOLDER, KINDS, is_gain, read_reports, robustness_summary
 from .robustness import NOMINAL
 from .verdict import MIDDLE, Searches, judge
 
@@ -30,12 +30,12 @@ _HEAD = """
 """
 
 
-def judged(
-    pieces: Mapping[str, Piece],
-    nominal: Piece,
+def judge_case(
+    pieces: Mapping[str, RobustPiece],
+    nominal: RobustPiece,
     prices: Sequence[float],
     searches: Searches,
-    folders: Folders,
+    folders: RobustFolders,
 ) -> dict[str, Any]:
     """A case: what it does to the rules, and every kind of agent beside them.
 
@@ -49,7 +49,7 @@ def judged(
     envelope = _without_added(every, pieces[RULES])
     row: dict[str, Any] = {
         "always": always,
-        "rules": change(_without_added(before, nominal), envelope, middle),
+        "rules": error_change(_without_added(before, nominal), envelope, middle),
     }
     for kind, prefix in KINDS.items():
         tested = [
@@ -72,17 +72,17 @@ def with_shares(cases: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     return cases
 
 
-def _without_added(found: Rules, piece: Piece) -> Rules:
-    added = {one.name for one in piece.entries if one.added}
-    return {name: one for name, one in found.items() if name not in added}
+def _without_added(rules: Rules, piece: RobustPiece) -> Rules:
+    added = {entry.name for entry in piece.entries if entry.added}
+    return {name: rule for name, rule in rules.items() if name not in added}
 
 
-def change(nominal: Rules, case: Rules, rate: float) -> dict[str, float] | None:
+def error_change(nominal: Rules, case: Rules, rate: float) -> dict[str, float] | None:
     """The relative change of the rules' error at a rate, with its interval over paired episodes.
 
     That of a ratio of means, by its linear part; ``None`` left of either's first rule.
     """
-    before, after = chosen_mse(nominal, rate), chosen_mse(case, rate)
+    before, after = best_mse(nominal, rate), best_mse(case, rate)
     if before is None or after is None:
         return None
     ratio = float(after.mean() / before.mean())
@@ -108,15 +108,15 @@ def write_table(results: Path, titles: Mapping[str, str], command: str) -> Path:
     """
     folder = results / FOLDER
     reports = read_reports(results, list(titles))
-    found: dict[str, list[dict[str, Any]]] = {}
+    result: dict[str, list[dict[str, Any]]] = {}
     for report in reports:
-        found.setdefault(report["class"], []).append(report)
+        result.setdefault(report["class"], []).append(report)
     text = Path(__file__).with_suffix(".md").read_text(encoding="utf-8")
-    parts = [text.format(command=command), "\n".join(summary(reports, titles))]
-    for of, reports in sorted(found.items()):
+    parts = [text.format(command=command), "\n".join(robustness_summary(reports, titles))]
+    for of, reports in sorted(result.items()):
         counts = {report["episodes"] for report in reports}
-        asked = " or ".join(str(count) for count in sorted(counts))
-        parts.append(_HEAD.format(of=of, episodes=asked))
+        option_text = " or ".join(str(count) for count in sorted(counts))
+        parts.append(_HEAD.format(of=of, episodes=option_text))
         parts.append("\n".join(line for report in reports for line in _lines(report)) + "\n")
     path = folder / "README.md"
     write_text(path, "".join(parts))
@@ -132,5 +132,5 @@ def _lines(report: Mapping[str, Any]) -> Iterator[str]:
             share(row["rules"]),
             *(share(row.get(kind, {}).get("middle")) for kind in KINDS),
         )
-        kept = NONE if left is None else f"{left:.0%}"
-        yield f"| {' | '.join((*cells[:4], kept, cells[4]))} |"
+        stored = NONE if left is None else f"{left:.0%}"
+        yield f"| {' | '.join((*cells[:4], stored, cells[4]))} |"

@@ -13,16 +13,16 @@ from ..output.files import read_json, write
 from ..training.config import Experiment
 from .classes import Class
 from .config import Setting, Suite
-from .fronts import prices_of
+from .fronts import front_prices
 from .jobs import agent_task
 from .reports import VERDICT
-from .robust_pieces import RULES, Folders, Piece, agent_piece, rules_piece, training
+from .robust_pieces import RULES, RobustFolders, RobustPiece, agent_piece, rules_piece, training
 from .robust_summary import FOLDER, KINDS
-from .robust_table import judged, with_shares
+from .robust_table import judge_case, with_shares
 from .robustness import NOMINAL, Case, Perturbed, drawn_world, world
 
 
-class Trial(NamedTuple):
+class RobustTrial(NamedTuple):
     """What is to be tried in a setting.
 
     ``worlds`` are the setting as it is in each case, by name and the nominal one first, with
@@ -39,14 +39,14 @@ class Trial(NamedTuple):
     agents: tuple[str, ...]
     seeds: tuple[int, ...]
     episodes: int
-    folders: Folders
+    folders: RobustFolders
 
     @classmethod
     def create(
         cls, suite: Suite, setting: Setting, perturbed: Perturbed, cases: Sequence[Case], of: Class,
         envelope: dict[str, Any], agents: Sequence[str], trained: bool, episodes: int,
-        folders: Folders,
-    ) -> Trial:  # fmt: skip
+        folders: RobustFolders,
+    ) -> RobustTrial:  # fmt: skip
         """Every case is made once before anything runs.
 
         Raises:
@@ -55,9 +55,9 @@ class Trial(NamedTuple):
         """
         worlds = {case.name: world(setting, case) for case in cases}
         drawn = drawn_world(setting, perturbed)
-        for name, one in [*worlds.items(), ("drawn", drawn)]:
+        for name, item in [*worlds.items(), ("drawn", drawn)]:
             try:
-                agent_task(one, of)
+                agent_task(item, of)
             except ConfigurationError as error:
                 raise ConfigurationError(f"{name} of {setting.name}: {error}") from None
         for agent in agents:
@@ -101,28 +101,28 @@ class Trial(NamedTuple):
             },
         }
 
-    def pieces(self, kinds: Sequence[str], cases: Sequence[str] = ()) -> Iterator[Piece]:
+    def pieces(self, kinds: Sequence[str], cases: Sequence[str] = ()) -> Iterator[RobustPiece]:
         """The work of some kinds of agents, and with ``"rules"`` theirs, in some cases (none: all).
 
         Raises:
             OSError: an agent's file cannot be read.
         """
-        asked = (self.episodes, self.suite.seed)
+        requested = (self.episodes, self.suite.seed)
         for case in cases or self.worlds:
-            one = self.worlds[case]
+            single = self.worlds[case]
             if RULES in kinds:
-                yield rules_piece(one, self.of, case, self.envelope["vertices"], *asked)
+                yield rules_piece(single, self.of, case, self.envelope["vertices"], *requested)
             for kind in kinds:
                 for label, agent in self.labels.get(kind, {}).items():
-                    yield agent_piece(self.suite, one, self.of, case, label, agent, *asked)
+                    yield agent_piece(self.suite, single, self.of, case, label, agent, *requested)
 
     def judge(self, case: str) -> None:
         """Judge a case, all of whose pieces are finished, and keep that."""
         (nominal,) = self.pieces((RULES,), (NOMINAL,))
-        row = judged(
+        row = judge_case(
             {piece.label: piece for piece in self.pieces((RULES, *KINDS), (case,))},
             nominal,
-            prices_of(self.setting.price_range, self.suite.prices),
+            front_prices(self.setting.price_range, self.suite.prices),
             self.envelope["searches"],
             self.folders,
         )

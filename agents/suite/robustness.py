@@ -10,7 +10,7 @@ import pydantic
 from fusion_gym.envs.registration import make_task
 from fusion_gym.validation import ConfigurationError, choice
 
-from ..training.checked import Rate, Strict, load
+from ..training.checked import Rate, Strict, load_checked
 from .config import Setting, load_suite
 
 NOMINAL = "as_assumed"
@@ -37,7 +37,7 @@ class Perturbed(Strict):
     drawn: dict[str, Any] = pydantic.Field(default_factory=dict)
 
 
-class Robustness(Strict):
+class RobustnessSettings(Strict):
     """Which settings of a suite are tried, and under which cases; the nominal one goes before."""
 
     suite: str = "benchmark"
@@ -45,7 +45,7 @@ class Robustness(Strict):
     settings: tuple[Perturbed, ...] = pydantic.Field(min_length=1)
 
     @pydantic.model_validator(mode="after")
-    def _named(self) -> Robustness:
+    def _named(self) -> RobustnessSettings:
         known = [case.name for case in self.cases]
         for setting in self.settings:
             unknown = [name for name in setting.shared if name not in known]
@@ -63,16 +63,16 @@ class Robustness(Strict):
         return [nominal, *(shared[name] for name in setting.shared), *setting.own]
 
 
-def load_robustness(path: str | Path) -> Robustness:
+def load_robustness(path: str | Path) -> RobustnessSettings:
     """The config.
 
     Raises:
         ConfigurationError: unreadable, an unknown key, or a value that is not allowed.
     """
-    return load(Robustness, path)
+    return load_checked(RobustnessSettings, path)
 
 
-def chosen(config: Robustness, names: tuple[str, ...]) -> list[Perturbed]:
+def select_settings(config: RobustnessSettings, names: tuple[str, ...]) -> list[Perturbed]:
     """The settings of these names (none: all), each of which the suite has.
 
     Raises:

@@ -16,13 +16,13 @@ from fusion_gym.validation import ConfigurationError, choice
 
 from ..output.files import read_json
 from ..output.folders import check_inputs
-from ..training.checked import load, parse
+from ..training.checked import load_checked, parse
 from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, ValidationConfig
 from .committed import path_of, present, read_envelopes
 from .config import Setting, Suite
 from .envelope_table import hull_of
-from .envelopes import Test, task_of
-from .fronts import Points, is_below, prices_of
+from .envelopes import Test, envelope_task
+from .fronts import Points, front_prices, is_below
 from .jobs import training_of
 from .learning import Course, Learning
 from .verdict import MIDDLE
@@ -56,7 +56,7 @@ class Study:
     @property
     def prices(self) -> list[float]:
         """The prices that every front is asked for."""
-        return prices_of(self.setting.price_range, self.learning.prices)
+        return front_prices(self.setting.price_range, self.learning.prices)
 
     @property
     def inner(self) -> list[bool]:
@@ -149,14 +149,14 @@ class Study:
             ConfigurationError: a config that is not allowed.
         """
         if kind == "front":
-            found, every = load(Experiment, self.course.front, "front"), self.learning.every
+            value, every = load_checked(Experiment, self.course.front, "front"), self.learning.every
         else:
-            found = self._plain()
+            value = self._plain()
             every = self.learning.plain.every
-        plain = found.model_dump()
+        plain = value.model_dump()
         plain["validation"]["every"] = every
         plain["training"] |= {"seed": seed, "threads": 1}
-        plain["training"]["timesteps"] = self.learning.timesteps or found.training.timesteps
+        plain["training"]["timesteps"] = self.learning.timesteps or value.training.timesteps
         plain["output"] = str(self.work / self.setting.name / f"{kind}_{seed}")
         return parse(Experiment, plain, self.course.front, "front")
 
@@ -184,7 +184,7 @@ class Study:
 
         Where costs are compared tokens are free of charge, and counted at each price.
         """
-        where = load(Experiment, self.course.front, "front").environment
+        where = load_checked(Experiment, self.course.front, "front").environment
         priced = ("cost_weight", "price_range")
         own = {key: value for key, value in where.options.items() if key not in priced}
         return make_task(where.id, **(own | ({"cost_weight": 0.0} if self.solved else {})))
@@ -195,7 +195,7 @@ class Study:
         Raises:
             ConfigurationError: another environment, setting or class; names the first difference.
         """
-        where = load(Experiment, self.course.front, "front").environment
+        where = load_checked(Experiment, self.course.front, "front").environment
         options: dict[str, Any] = {}
         local, free = False, set(_FREE)
         if self.course.against == "schedules":
@@ -206,14 +206,14 @@ class Study:
             compared = self.envelope(self.course.against)
             options, local = compared["options"], compared["mode"] == "local"
         expected = {"id": self.setting.environment.id, "local": local}
-        expected |= task_of(self.setting, options.items()).settings
-        given = {"id": where.id, "local": where.local} | self.task().settings
+        expected |= envelope_task(self.setting, options.items()).settings
+        value = {"id": where.id, "local": where.local} | self.task().settings
         expected |= {"cost_weight": "random", "price_range": list(self.setting.price_range)}
-        given |= {key: where.options.get(key) for key in ("cost_weight", "price_range")}
-        for key in dict.fromkeys([*expected, *given]):
-            if key not in free and given.get(key) != expected.get(key):
+        value |= {key: where.options.get(key) for key in ("cost_weight", "price_range")}
+        for key in dict.fromkeys([*expected, *value]):
+            if key not in free and value.get(key) != expected.get(key):
                 raise ConfigurationError(
-                    f"front = {self.course.front!r}: {key} = {given.get(key)!r} is not allowed in "
+                    f"front = {self.course.front!r}: {key} = {value.get(key)!r} is not allowed in "
                     f"{self.setting.name}: what it is compared with has {expected.get(key)!r}"
                 )
 
@@ -257,6 +257,6 @@ class Lesson(NamedTuple):
         """
         if not self.path.exists():
             return None
-        found = read_json(self.path, "work")
-        check_inputs(self.inputs, found.get("inputs"), repr(str(self.path)))
-        return found
+        content = read_json(self.path, "work")
+        check_inputs(self.inputs, content.get("inputs"), repr(str(self.path)))
+        return content

@@ -7,7 +7,7 @@ import pydantic
 from ..training.checked import Strict
 
 
-class Curve(Strict):
+class SweepCurve(Strict):
     """A baseline swept over one parameter: ``policy`` holds ``{value}`` in its place."""
 
     label: str
@@ -30,7 +30,7 @@ class Curve(Strict):
 class Sweep(Strict):
     """Baselines over their thresholds, and the single policies that stand beside them."""
 
-    curves: tuple[Curve, ...]
+    curves: tuple[SweepCurve, ...]
     points: tuple[str, ...] = ()
 
     @property
@@ -49,7 +49,7 @@ class ComparisonRow(Strict):
     options: dict[str, Any] = pydantic.Field(default_factory=dict)
 
 
-class Comparison(Strict):
+class SweepSettings(Strict):
     """Settings and policies of one environment, row by row."""
 
     environment: str

@@ -16,7 +16,7 @@ from fusion_gym.validation import ConfigurationError
 from ..output.ending import on_signal
 from ..output.progress import progress_bar
 from ..training.config import Experiment
-from ..training.monitor import shown
+from ..training.monitor import log_line
 from ..training.run import holds_training, train
 from .workers import end_with
 
@@ -38,7 +38,7 @@ def train_beside(experiments: Mapping[str, Experiment]) -> dict[str, dict[str, A
     with ProcessPoolExecutor(len(experiments), spawn, end_with, (os.getpid(),)) as pool:
         try:
             with on_signal(signal.SIGINT, signal.SIG_IGN):  # the new processes ignore it
-                running = {name: _begin(pool, one) for name, one in experiments.items()}
+                running = {name: _begin(pool, item) for name, item in experiments.items()}
             _watch(experiments, set(running.values()))
             return {name: future.result() for name, future in running.items()}
         except BaseException as error:
@@ -65,15 +65,15 @@ def _watch(experiments: Mapping[str, Experiment], left: set[Future[dict[str, Any
     """
     with contextlib.ExitStack() as stack:
         bars = {
-            name: stack.enter_context(progress_bar(one.training.timesteps, f"training {name}"))
-            for name, one in experiments.items()
+            name: stack.enter_context(progress_bar(item.training.timesteps, f"training {name}"))
+            for name, item in experiments.items()
         }
         while left:
             done, left = wait(left, _EVERY)
-            for name, one in experiments.items():
-                last = _last_validation(Path(one.output))
+            for name, experiment in experiments.items():
+                last = _last_validation(Path(experiment.output))
                 if last is not None:
-                    bars[name].say(shown(last))
+                    bars[name].say(log_line(last))
                     bars[name].reach(last["timesteps"])
             for future in done:
                 if not future.result()["finished"]:

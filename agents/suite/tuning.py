@@ -26,7 +26,7 @@ _MOST = 3  # parameters of a rule that multiply its trials
 _WORST = 1e300  # the error of a policy whose error is no number
 
 
-class Trial(NamedTuple):
+class TuningTrial(NamedTuple):
     """A tried policy: its text, its parameters for the sampler, mean rate and error."""
 
     policy: str
@@ -45,17 +45,17 @@ class Finalist(NamedTuple):
 
 def space_of(family: Family, sensors: int) -> dict[str, BaseDistribution]:
     """The numbers that a family's search sets, by name."""
-    found: dict[str, BaseDistribution] = {}
+    result: dict[str, BaseDistribution] = {}
     for name, space in family.parameters.items():
         if isinstance(space, Choices):
-            found[name] = CategoricalDistribution(space.values)
+            result[name] = CategoricalDistribution(space.values)
             continue
         for key in _keys(name, space, sensors):
             if space.whole:
-                found[key] = IntDistribution(int(space.low), int(space.high), log=True)
+                result[key] = IntDistribution(int(space.low), int(space.high), log=True)
             else:
-                found[key] = FloatDistribution(space.low, space.high, log=True)
-    return found
+                result[key] = FloatDistribution(space.low, space.high, log=True)
+    return result
 
 
 def _keys(name: str, space: Range | Choices, sensors: int) -> list[str]:
@@ -96,7 +96,7 @@ def first_values(family: Family, trials: int, sensors: int, seed: int) -> list[d
     swept = swept if len(ranges) == 1 else 0
     count = max(-(-swept // len(turns)), 1)
     offset = generator.random()
-    found = []
+    result = []
     for place in range(trials):
         values: dict[str, Any] = dict(zip(choices, turns[place % len(turns)], strict=True))
         for name, space in ranges.items():
@@ -105,8 +105,8 @@ def first_values(family: Family, trials: int, sensors: int, seed: int) -> list[d
             if place < swept:
                 shares[:] = (place // len(turns) + offset) / count
             values |= zip(keys, (_between(space, share) for share in shares), strict=True)
-        found.append(values)
-    return found
+        result.append(values)
+    return result
 
 
 def _between(space: Range, share: float) -> float | int:
@@ -115,9 +115,9 @@ def _between(space: Range, share: float) -> float | int:
     return round(value) if space.whole else float(value)
 
 
-def search(
+def search_family(
     task: Task, family: Family, tuning: Tuning, price_range: tuple[float, float], seed: int
-) -> list[Trial]:
+) -> list[TuningTrial]:
     """All policies that the search of one tuning seed tried, each once.
 
     First those of :func:`first_values`. Then, price by price in turns, one that Optuna's sampler
@@ -128,14 +128,14 @@ def search(
         ConfigurationError: a policy that does not fit the task.
     """
     space = space_of(family, task.sensors)
-    tried: dict[str, Trial] = {}
+    tried: dict[str, TuningTrial] = {}
 
-    def run(asked: Iterable[dict[str, Any]]) -> None:
-        texts = {policy_text(family, values, task.sensors): values for values in asked}
+    def run(requested: Iterable[dict[str, Any]]) -> None:
+        texts = {policy_text(family, values, task.sensors): values for values in requested}
         new = [text for text in texts if text not in tried]
         briefs = briefs_of(task, new, tuning.episodes, episodes_seed(tuning, seed))
         for text, brief in zip(new, briefs, strict=True):
-            tried[text] = Trial(text, texts[text], *_means(brief))
+            tried[text] = TuningTrial(text, texts[text], *_means(brief))
 
     effort = min(len(space), _MOST)
     run(first_values(family, max(effort * tuning.trials, 1), task.sensors, seed))
@@ -166,7 +166,10 @@ def error_per_rate(task: Task, price: float) -> float:
 
 
 def ask(
-    space: dict[str, BaseDistribution], tried: Sequence[Trial], slope: float, seed: Sequence[int]
+    space: dict[str, BaseDistribution],
+    tried: Sequence[TuningTrial],
+    slope: float,
+    seed: Sequence[int],
 ) -> dict[str, Any]:
     """The next values for the least error plus ``slope`` times rate, after all that was tried."""
     state = int(np.random.SeedSequence(seed).generate_state(1)[0])
@@ -184,11 +187,11 @@ def ask(
 def briefs_of(task: Task, policies: Sequence[str], episodes: int, seed: int) -> list[Brief]:
     """The policies on the same episodes, many at a time."""
     size = max(_RUNS // episodes, 1)
-    found: list[Brief] = []
+    result: list[Brief] = []
     for first in range(0, len(policies), size):
-        made = [make_policy(text, task) for text in policies[first : first + size]]
-        found += run_beside(task, made, episodes, seed)
-    return found
+        built = [make_policy(text, task) for text in policies[first : first + size]]
+        result += run_beside(task, built, episodes, seed)
+    return result
 
 
 def _means(brief: Brief) -> tuple[float, float]:
@@ -196,7 +199,7 @@ def _means(brief: Brief) -> tuple[float, float]:
     return float(brief.rate.mean()), mse if np.isfinite(mse) else _WORST
 
 
-def near_hull(trials: Sequence[Trial], near: float, finalists: int) -> list[str]:
+def near_hull(trials: Sequence[TuningTrial], near: float, finalists: int) -> list[str]:
     """The policies on the lower envelope of a search and those hardly above it, best first.
 
     All of the envelope, and more only up to ``finalists``, within a share ``near`` of its error.
@@ -214,7 +217,7 @@ def near_hull(trials: Sequence[Trial], near: float, finalists: int) -> list[str]
     return on_it + close[: max(finalists - len(on_it), 0)]
 
 
-def tune(
+def tune_families(
     task: Task, family: Family, tuning: Tuning, price_range: tuple[float, float]
 ) -> tuple[int, list[Finalist]]:
     """The number of trials of all searches, and their finalists, each on all searches' episodes.
@@ -225,7 +228,7 @@ def tune(
     found_by: dict[str, list[int]] = {}
     tried = 0
     for seed in range(tuning.seeds):
-        trials = search(task, family, tuning, price_range, seed)
+        trials = search_family(task, family, tuning, price_range, seed)
         tried += len(trials)
         for text in near_hull(trials, tuning.near, tuning.finalists):
             found_by.setdefault(text, []).append(seed)

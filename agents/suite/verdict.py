@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fusion_gym.arrays import Array
-from fusion_gym.evaluation.envelope import EnvelopePoint, chosen_mse, envelope_mse, height
+from fusion_gym.evaluation.envelope import EnvelopePoint, best_mse, envelope_mse, height
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import mean_interval
 
@@ -19,7 +19,7 @@ _PRICE = (1, 1, 1, 2)  # the axis of the prices in the arrays of a front
 Searches = Sequence[Sequence[tuple[float, float]]]
 
 
-class Front(NamedTuple):
+class AgentFront(NamedTuple):
     """An agent beside the envelope, at P prices.
 
     ``learned`` and ``envelope`` (seeds, P, E) are the agents' MSE and the envelope's at their own
@@ -32,11 +32,14 @@ class Front(NamedTuple):
     rates: Array
     tuned: Array
 
-    def at(self, price: int) -> Front:
+    def at(self, price: int) -> AgentFront:
         """The front at one price alone."""
-        one = slice(price, price + 1)
-        return Front(
-            self.learned[:, one], self.envelope[:, one], self.rates[:, one], self.tuned[..., one]
+        lane = slice(price, price + 1)
+        return AgentFront(
+            self.learned[:, lane],
+            self.envelope[:, lane],
+            self.rates[:, lane],
+            self.tuned[..., lane],
         )
 
 
@@ -68,21 +71,21 @@ def judge(
     the first of the episodes: points have their MSE at the same rate, as a share of the envelope on
     the same episodes times that on all.
     """
-    points, columns, kept = [], [], []
+    points, columns, stored = [], [], []
     for place, price in enumerate(prices):
         column = [seed[place] for seed in agents]
-        rates = [float(found.rate.mean()) for found in column]
-        learned: Array = np.array([found.mse for found in column])
+        rates = [float(value.rate.mean()) for value in column]
+        learned: Array = np.array([value.mse for value in column])
         rate = float(np.mean(rates))
         point: dict[str, Any] = {"price": price, "rate": rate, "mse": float(learned.mean())}
-        floors = [chosen_mse(envelope, own) for own in rates]
+        floors = [best_mse(envelope, own) for own in rates]
         if all(floor is not None for floor in floors):
             below = np.array(floors)
             point["envelope"] = float(below.mean())
             columns.append((learned, below, rates, shares_of(searches, rates)))
-            kept.append(point)
+            stored.append(point)
             known = [envelope_mse(references, own) for own in rates] if references else []
-            sound = [found.mean() for found in known if found is not None]
+            sound = [value.mean() for value in known if value is not None]
             if sound and len(sound) == len(rates):
                 point["reference"] = float(np.mean(sound))
             ahead = envelope_mse(clairvoyant, rate) if clairvoyant else None
@@ -91,15 +94,15 @@ def judge(
                 point["hindsight"] = float(share * below.mean())
         points.append(point)
     verdict: dict[str, Any] = {"points": points, "seeds": len(agents)}
-    if kept:
+    if stored:
         parts = [np.array(part) for part in zip(*columns, strict=True)]  # prices first
-        front = Front(
+        front = AgentFront(
             *(np.moveaxis(part, 0, axis) for part, axis in zip(parts, _PRICE, strict=True))
         )
-        for place, point in enumerate(kept):
+        for place, point in enumerate(stored):
             point["difference"] = interval(front.at(place), np.array([point["rate"]]))
         grid = grid_of(front, always)
-        inside = sum(_in_middle(point, always) for point in kept)
+        inside = sum(_in_middle(point, always) for point in stored)
         verdict |= {"prices": inside, "rates": grid.tolist()}
         if inside:
             verdict["middle"] = interval(front, grid)
@@ -124,14 +127,14 @@ def shares_of(searches: Searches, rates: Sequence[float]) -> Array:
 
     One search, or a rate at which some search has nothing, says nothing of the spread: shares of 1.
     """
-    found = np.ones((max(len(searches), 1), len(rates)))
-    hulls = [[EnvelopePoint(f"{rate}", rate, mse) for rate, mse in one] for one in searches]
+    values = np.ones((max(len(searches), 1), len(rates)))
+    hulls = [[EnvelopePoint(f"{rate}", rate, mse) for rate, mse in search] for search in searches]
     for column, rate in enumerate(rates):
         heights = [height(hull, rate) for hull in hulls]
         if heights and None not in heights:
             known = np.array(heights, dtype=np.float64)
-            found[:, column] = known / known.mean()
-    return found
+            values[:, column] = known / known.mean()
+    return values
 
 
 def middles(always: float) -> Array:
@@ -140,7 +143,7 @@ def middles(always: float) -> Array:
     return np.asarray(np.sqrt(edges[:-1] * edges[1:]))
 
 
-def grid_of(front: Front, always: float) -> Array:
+def grid_of(front: AgentFront, always: float) -> Array:
     """The grid's rates, of those of its parts that the front reaches; moved to its nearest end."""
     edges = np.geomspace(MIDDLE[0] * always, MIDDLE[1] * always, RATES + 1)
     rates = front.rates.mean(0)
@@ -157,8 +160,8 @@ def score(shares: Array, rates: Array, grid: Array) -> Array:
 def trimmed(shares: Array) -> Array:
     """Mean over the first axis without its lowest and highest quarter, each rounded down."""
     cut = len(shares) // 4
-    kept = np.sort(shares, axis=0)[cut : len(shares) - cut]
-    return np.asarray(kept.mean(0))
+    stored = np.sort(shares, axis=0)[cut : len(shares) - cut]
+    return np.asarray(stored.mean(0))
 
 
 def _between(values: Array, rates: Array, grid: Array) -> Array:
@@ -169,9 +172,9 @@ def _between(values: Array, rates: Array, grid: Array) -> Array:
     return np.interp(np.log(np.maximum(grid, tiny)), np.log(np.maximum(places, tiny)), means)
 
 
-def interval(front: Front, grid: Array) -> dict[str, float]:
+def interval(front: AgentFront, grid: Array) -> dict[str, float]:
     """Mean over the grid's rates of the relative difference to the envelope, and its interval."""
-    found = front.learned.mean(-1) / front.envelope.mean(-1) - 1.0
+    result = front.learned.mean(-1) / front.envelope.mean(-1) - 1.0
     generator = np.random.default_rng(0)
     seeds, _, episodes = front.learned.shape
     searches = len(front.tuned)
@@ -181,15 +184,16 @@ def interval(front: Front, grid: Array) -> dict[str, float]:
     tuned = front.tuned[generator.integers(0, searches, (RESAMPLES, searches))].mean(1)
     below = np.moveaxis(tuned, 0, -1) * (front.envelope @ weights)
     shares = (front.learned @ weights) / below - 1.0  # (seeds, P, resamples)
-    chosen = generator.integers(0, seeds, (seeds, RESAMPLES))
-    middle = trimmed(np.take_along_axis(shares, chosen[:, None], axis=0))
-    rates = front.rates[chosen].mean(0)  # (resamples, P)
+    choice = generator.integers(0, seeds, (seeds, RESAMPLES))
+    middle = trimmed(np.take_along_axis(shares, choice[:, None], axis=0))
+    rates = front.rates[choice].mean(0)  # (resamples, P)
     places = generator.integers(0, len(grid), (RESAMPLES, len(grid)))
     drawn = [
-        _between(middle[:, one], rates[one], grid)[places[one]].mean() for one in range(RESAMPLES)
+        _between(middle[:, item], rates[item], grid)[places[item]].mean()
+        for item in range(RESAMPLES)
     ]
     low, high = np.quantile(drawn, (0.025, 0.975))
-    mean = float(score(found, front.rates, grid).mean())
+    mean = float(score(result, front.rates, grid).mean())
     return {"mean": mean, "low": float(low), "high": float(high)}
 
 

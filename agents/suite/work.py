@@ -19,29 +19,29 @@ from fusion_gym.validation import ConfigurationError
 from ..output.files import load_results, read_json, save_results, write
 from ..output.folders import fingerprint
 from ..training.run import holds_training, train
-from .classes import names_of, trained
+from .classes import names_of, trained_classes
 from .committed import Shelf
 from .config import Setting, Suite
-from .envelopes import run_test, task_of
-from .fronts import prices_of
+from .envelopes import envelope_task, run_test
+from .fronts import front_prices
 from .jobs import (
     Folders,
     Job,
     agent_task,
     computed,
     experiment_of,
-    finished,
-    inputs_of,
+    job_finished,
+    job_inputs,
     jobs,
     rules_of,
     training_of,
 )
 from .reports import VERDICT
 from .verdict import judge
-from .worth import Tested, at_rates, worths
+from .worth import ClassTests, at_rates, worths
 
 
-def run(job: Job, suite: Suite, folders: Folders, shelf: Shelf) -> None:
+def run_job(job: Job, suite: Suite, folders: Folders, shelf: Shelf) -> None:
     """Do a job and write its results."""
     torch.set_num_threads(1)
     if job.kind == "baselines":
@@ -63,27 +63,27 @@ def conclude(
         ConfigurationError: results that are damaged or were made from other settings.
     """
     every = jobs(suite, [setting], names_of(suite), shelf)
-    pieces = [job for job in every if finished(job, suite, folders)]
+    pieces = [job for job in every if job_finished(job, suite, folders)]
     reports = {job.name: read_json(folders.report(job), "results") for job in pieces}
-    found = {
+    result = {
         job.name: load_results(folders.episodes(job), reports[job.name]["made_from"])
         for job in pieces
     }
-    if "baselines" not in found:
+    if "baselines" not in result:
         return None
-    rules, known = found["baselines"], found.get("references", {})
-    references = {"sensors": found.get("informed", {}) | known, "centre": known, "local": {}}
+    rules, known = result["baselines"], result.get("references", {})
+    references = {"sensors": result.get("informed", {}) | known, "centre": known, "local": {}}
     always = float(rules["always"].rate.mean())
     committed, tested, classes = shelf.classes(setting), {}, {}
-    for of in trained(suite, setting):
+    for of in trained_classes(suite, setting):
         own = committed[of.name]
         envelope = {vertex["name"]: rules[vertex["name"]] for vertex in own["vertices"]}
         done = [job.name for job in pieces if job.of == of]
-        agents = [list(found[job].values()) for job in done]
-        tested[of.name] = Tested(of, envelope, agents, own["searches"])
+        agents = [list(result[job].values()) for job in done]
+        tested[of.name] = ClassTests(of, envelope, agents, own["searches"])
         if done:
             prices = reports[done[0]]["prices"]
-            clairvoyant = found.get("hindsight", {}) if of.packet == "measurement" else {}
+            clairvoyant = result.get("hindsight", {}) if of.packet == "measurement" else {}
             ahead = references[of.mode] if of.packet == "measurement" else {}
             classes[of.name] = {
                 **judge(agents, prices, envelope, ahead, always, clairvoyant, own["searches"]),
@@ -122,7 +122,7 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders, shelf: Shelf) -> No
     """
     setting = job.setting
     curves: dict[str, dict[str, Any]] = {}
-    found: dict[str, EpisodeResults] = {}
+    result: dict[str, EpisodeResults] = {}
     vertices = shelf.vertices(setting, [name for name, _ in job.envelopes])
     for vertex, test in zip(vertices, rules_of(suite, setting, shelf), strict=True):
         if not test.path(folders.work).exists():
@@ -130,58 +130,58 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders, shelf: Shelf) -> No
         results = test.read(folders.work)
         if suite.episodes == shelf.suite.episodes and suite.seed == shelf.suite.seed:
             check_vertex(vertex, results)
-        policy = make_policy(vertex["policy"], task_of(setting, vertex["options"].items()))
-        found[vertex["name"]] = results
+        policy = make_policy(vertex["policy"], envelope_task(setting, vertex["options"].items()))
+        result[vertex["name"]] = results
         curve = curves.setdefault(vertex["family"], {"knows": [], "policies": []})
         curve["knows"].append(policy.knowledge)
         curve["policies"].append(vertex["name"])
-    task = task_of(setting)
+    task = envelope_task(setting)
     for name in setting.points:
-        found |= _test(task, [name], suite)
+        result |= _test(task, [name], suite)
         knows = [make_policy(name, task).knowledge]
         curves[name] = {"knows": knows, "policies": [name]}
     for curve in curves.values():
         curve["knows"] = least_covering(curve["knows"])
-        curve["policies"].sort(key=lambda name: float(found[name].rate.mean()))
+        curve["policies"].sort(key=lambda name: float(result[name].rate.mean()))
     report: dict[str, Any] = {**_header(job, suite, task), "curves": curves}
     if setting.genie is not None:
         options = setting.environment.options | setting.genie.options
         free = make_task(setting.environment.id, **options)
         results = run_episodes(free, make_policy("always", free), suite.episodes, suite.seed)
         report["genie"] = _summary(results) | {"assumes": setting.genie.assumes}
-    _keep(job, folders, found, report)
+    _keep(job, folders, result, report)
 
 
 def check_vertex(vertex: dict[str, Any], results: EpisodeResults) -> None:
     """Whether a rule does on the test seeds what its envelope says."""
-    said, does = vertex["test"]["mse"]["mean"], float(results.mse.mean())
-    if not np.isclose(said, does, rtol=1e-6):
+    claim, does = vertex["test"]["mse"]["mean"], float(results.mse.mean())
+    if not np.isclose(claim, does, rtol=1e-6):
         raise ConfigurationError(
             f"envelopes: {vertex['name']!r} has an error of {does:.6g} on the test seeds, and not "
-            f"{said:.6g} as its envelope says: tune it again"
+            f"{claim:.6g} as its envelope says: tune it again"
         )
 
 
 def _run_references(job: Job, suite: Suite, folders: Folders) -> None:
     """Test policies that were computed."""
-    task = task_of(job.setting)
-    found = _test(task, list(computed(job.setting, job.kind)), suite)
-    _keep(job, folders, found, _header(job, suite, task))
+    task = envelope_task(job.setting)
+    result = _test(task, list(computed(job.setting, job.kind)), suite)
+    _keep(job, folders, result, _header(job, suite, task))
 
 
 def _run_hindsight(job: Job, suite: Suite, folders: Folders) -> None:
     """Search a clairvoyant's schedules for the first test episodes."""
-    task, chosen = task_of(job.setting), job.setting.hindsight
-    assert chosen is not None
+    task, hindsight = envelope_task(job.setting), job.setting.hindsight
+    assert hindsight is not None
     episodes = min(suite.hindsight_episodes, suite.episodes)
-    found = {
+    result = {
         f"hindsight at price {price:g}": run_hindsight(
-            task, price, chosen.width, episodes, suite.seed
+            task, price, hindsight.width, episodes, suite.seed
         )
-        for price in chosen.prices
+        for price in hindsight.prices
     }
-    header = _header(job, suite, task) | {"episodes": episodes, "width": chosen.width}
-    _keep(job, folders, found, header)
+    header = _header(job, suite, task) | {"episodes": episodes, "width": hindsight.width}
+    _keep(job, folders, result, header)
 
 
 def _run_agent(job: Job, suite: Suite, folders: Folders) -> None:
@@ -194,9 +194,9 @@ def _run_agent(job: Job, suite: Suite, folders: Folders) -> None:
     if not summary["finished"]:
         raise KeyboardInterrupt
     task, model = agent_task(setting, of), folder / "best_model.zip"
-    prices = prices_of(setting.price_range, suite.prices)
+    prices = front_prices(setting.price_range, suite.prices)
     names = [f"model:{model},price={price!r}" for price in prices]
-    found = _test(task, names, suite)
+    result = _test(task, names, suite)
     report = {
         **_header(job, suite, task),
         "mode": of.mode,
@@ -207,23 +207,23 @@ def _run_agent(job: Job, suite: Suite, folders: Folders) -> None:
         "seconds": summary["seconds"],
         "best_validation": summary["best_validation"],
         "prices": prices,
-        "points": [_summary(found[name]) for name in names],
+        "points": [_summary(result[name]) for name in names],
     }
-    save_results(folders.episodes(job), found, report["made_from"])
+    save_results(folders.episodes(job), result, report["made_from"])
     write(folders.report(job), report)
 
 
 def _keep(
-    job: Job, folders: Folders, found: dict[str, EpisodeResults], report: dict[str, Any]
+    job: Job, folders: Folders, content: dict[str, EpisodeResults], report: dict[str, Any]
 ) -> None:
     """Write the episodes, then the report with a summary of every policy."""
-    save_results(folders.episodes(job), found, report["made_from"])
-    policies = {name: _summary(results) for name, results in found.items()}
+    save_results(folders.episodes(job), content, report["made_from"])
+    policies = {name: _summary(results) for name, results in content.items()}
     write(folders.report(job), report | {"policies": policies})
 
 
 def _header(job: Job, suite: Suite, task: Task) -> dict[str, Any]:
-    inputs = inputs_of(job, suite)
+    inputs = job_inputs(job, suite)
     return {
         "setting": job.setting.name,
         "title": job.setting.title,
@@ -238,6 +238,6 @@ def _header(job: Job, suite: Suite, task: Task) -> dict[str, Any]:
 
 
 def _summary(results: EpisodeResults) -> dict[str, Any]:
-    found = summarise(results)
-    kept = {key: found[key] for key in ("mse", "return", "rate", "denied", "tokens", "nees")}
-    return kept | {"median": robust_summary(results)["median"]}
+    summary = summarise(results)
+    stored = {key: summary[key] for key in ("mse", "return", "rate", "denied", "tokens", "nees")}
+    return stored | {"median": robust_summary(results)["median"]}

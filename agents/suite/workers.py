@@ -33,7 +33,7 @@ def side_by_side(work: Sequence[Work], team: Team, description: str) -> None:
     """
     if not work:
         return
-    total, done = sum(one.weight for one in work), 0.0
+    total, done = sum(item.weight for item in work), 0.0
     parent = os.getpid() if team.here else None
     with progress_bar(len(work), description, unit="pieces") as bar, team.gathered():
         weights = team.done(functools.partial(_do, parent), work)

@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 
 from fusion_gym.arrays import Array
-from fusion_gym.evaluation.envelope import chosen_mse
+from fusion_gym.evaluation.envelope import best_mse
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import mean_interval
 
 from .classes import HEARD, Class
-from .verdict import RATES, Front, Searches, interval, middles, shares_of
+from .verdict import RATES, AgentFront, Searches, interval, middles, shares_of
 
 SHARES = (0.05, 0.1, 0.2, 0.4)  # of the rate that transmitting always gets
 
 
 @dataclass(frozen=True)
-class Tested:
+class ClassTests:
     """A class with its rules and agents on the test episodes.
 
     ``agents[seed][price]``, of which there may be none; ``searches`` as :func:`judge` has them.
@@ -31,26 +31,26 @@ class Tested:
 
     def rule_mse(self, rate: float) -> Array | None:
         """The rules' MSE (1, E) at a rate."""
-        found = chosen_mse(self.rules, rate)
-        return None if found is None else found[None]
+        result = best_mse(self.rules, rate)
+        return None if result is None else result[None]
 
     def agent_mse(self, rate: float) -> Array | None:
         """The agents' MSE (seeds, E) at a rate, mixed of the two prices beside it.
 
         None without agents, or where some agent has no price on one side of the rate.
         """
-        found = []
+        result = []
         for column in self.agents:
             by_place = {f"{place:03d}": results for place, results in enumerate(column)}
             highest = max(float(results.rate.mean()) for results in column)
-            mse = chosen_mse(by_place, rate) if rate <= highest else None
+            mse = best_mse(by_place, rate) if rate <= highest else None
             if mse is None:
                 return None
-            found.append(mse)
-        return np.array(found) if found else None
+            result.append(mse)
+        return np.array(result) if result else None
 
 
-def at_rates(tested: Tested, always: float) -> list[dict[str, Any]]:
+def at_rates(tested: ClassTests, always: float) -> list[dict[str, Any]]:
     """Rules, agents and their relative difference at each of :data:`SHARES`, with intervals."""
     rows = []
     for share in SHARES:
@@ -60,48 +60,48 @@ def at_rates(tested: Tested, always: float) -> list[dict[str, Any]]:
         if rules is not None:
             row["rules"] = mean_interval(rules[0])._asdict()
         if agents is not None:
-            alone = compared(agents[:, None], np.ones_like(agents)[:, None], [rate])
-            row["agents"] = {name: 1.0 + value for name, value in alone.items()}
+            single = compare_classes(agents[:, None], np.ones_like(agents)[:, None], [rate])
+            row["agents"] = {name: 1.0 + value for name, value in single.items()}
         if rules is not None and agents is not None:
             heights = shares_of(tested.searches, [rate] * len(agents))[..., None]
             below = np.repeat(rules, len(agents), axis=0)
-            row["difference"] = compared(agents[:, None], below[:, None], [rate], heights)
+            row["difference"] = compare_classes(agents[:, None], below[:, None], [rate], heights)
         rows.append(row)
     return rows
 
 
-def compared(
+def compare_classes(
     learned: Array, below: Array, rates: Sequence[float], tuned: Array | None = None
 ) -> dict[str, float]:
     """Relative difference of errors (seeds, P, E) at P rates, as :func:`interval` has it."""
     seeds, count, _ = learned.shape
     own = np.broadcast_to(np.array(rates), (seeds, count))
     spread = np.ones((1, seeds, count)) if tuned is None else tuned
-    return interval(Front(learned, below, own, spread), np.array(rates))
+    return interval(AgentFront(learned, below, own, spread), np.array(rates))
 
 
-def worths(tested: Mapping[str, Tested], always: float) -> list[dict[str, Any]]:
+def worths(tested: Mapping[str, ClassTests], always: float) -> list[dict[str, Any]]:
     """What more knowledge is worth, by rules and by agents, over the grid of the verdict's rates.
 
     Each row has the relative difference of the MSE of ``knows`` to that of ``less`` at equal rate,
     where both reach at least half of the grid; over paired episodes, training seeds and rates.
     """
     rows = []
-    for kind, more, less in pairs([one.of for one in tested.values()]):
+    for kind, more, less in pairs([item.of for item in tested.values()]):
         row: dict[str, Any] = {"kind": kind, "knows": more, "less": less}
         for who in ("rules", "agents"):
-            found = _worth(tested[more], tested[less], who, always)
-            if found is not None:
-                row[who] = found
+            result = _worth(tested[more], tested[less], who, always)
+            if result is not None:
+                row[who] = result
         rows.append(row)
     return rows
 
 
-def _worth(more: Tested, less: Tested, who: str, always: float) -> dict[str, float] | None:
+def _worth(more: ClassTests, less: ClassTests, who: str, always: float) -> dict[str, float] | None:
     rates: list[float] = []
     columns: list[tuple[Array, Array]] = []
     for rate in middles(always).tolist():
-        ask = Tested.rule_mse if who == "rules" else Tested.agent_mse
+        ask = ClassTests.rule_mse if who == "rules" else ClassTests.agent_mse
         own, other = ask(more, rate), ask(less, rate)
         if own is not None and other is not None:
             seeds = min(len(own), len(other))
@@ -110,7 +110,7 @@ def _worth(more: Tested, less: Tested, who: str, always: float) -> dict[str, flo
     if 2 * len(columns) < RATES:
         return None
     known, beside = (np.stack(part, axis=1) for part in zip(*columns, strict=True))
-    return compared(known, beside, rates)
+    return compare_classes(known, beside, rates)
 
 
 def pairs(classes: Sequence[Class]) -> Iterator[tuple[str, str, str]]:

@@ -47,12 +47,12 @@ class AlgorithmConfig(Strict):
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of the algorithm's class."""
-        found = self.model_dump(exclude={"name", "learning_rate_end", "network"})
+        value = self.model_dump(exclude={"name", "learning_rate_end", "network"})
         if self.learning_rate_end is not None:
-            found["learning_rate"] = LinearSchedule(self.learning_rate, self.learning_rate_end, 1.0)
+            value["learning_rate"] = LinearSchedule(self.learning_rate, self.learning_rate_end, 1.0)
         activation = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[self.network.activation]
         shape = {"net_arch": list(self.network.hidden), "activation_fn": activation}
-        return found | {"policy_kwargs": shape}
+        return value | {"policy_kwargs": shape}
 
 
 class A2CConfig(AlgorithmConfig):
@@ -67,9 +67,9 @@ class A2CConfig(AlgorithmConfig):
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of the algorithm's class; the initial rate is set on the finished model."""
-        found = super().arguments()
-        del found["initial_rate"]
-        return found
+        result = super().arguments()
+        del result["initial_rate"]
+        return result
 
 
 class PPOConfig(A2CConfig):
@@ -85,7 +85,7 @@ class CounterfactualConfig(PPOConfig):
     """PPO with counterfactual credit (:mod:`.counterfactual`).
 
     ``alternatives`` of a decision are ``all`` actions, or the requests with one sensor's flipped at
-    a time; by default all where a coordinator has at most 16. Without ``path_credit`` what the view
+    a time; by default all where a scheduler has at most 16. Without ``path_credit`` what the view
     of one step has missed teaches the critic alone.
     """
 
@@ -107,9 +107,9 @@ class RecurrentPPOConfig(PPOConfig):
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of the algorithm's class; the memory is the size of its policy's LSTM."""
-        found = super().arguments()
-        found["policy_kwargs"]["lstm_hidden_size"] = found.pop("memory")
-        return found
+        result = super().arguments()
+        result["policy_kwargs"]["lstm_hidden_size"] = result.pop("memory")
+        return result
 
 
 class DQNConfig(AlgorithmConfig):

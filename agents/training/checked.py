@@ -55,7 +55,7 @@ def config_path(name: str | Path, option: str = "config") -> Path:
     return SHIPPED / f"{validation.choice(option, str(name), shipped)}.yaml"
 
 
-def load(kind: type[Model], name: str | Path, option: str = "config") -> Model:
+def load_checked(kind: type[Model], name: str | Path, option: str = "config") -> Model:
     """The config of a path or shipped name, checked; ``option`` is where the user named it.
 
     Raises:
@@ -69,7 +69,7 @@ def load_changed(kind: type[Model], name: str | Path, changes: Mapping[str, Any]
     """The config of a path or shipped name with these entries instead, checked.
 
     Raises:
-        ConfigurationError: as :func:`load`.
+        ConfigurationError: as :func:`load_checked`.
     """
     plain = read_yaml(name)
     changed = isinstance(plain, dict)  # all else is refused

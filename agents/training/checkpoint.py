@@ -51,14 +51,16 @@ class Journal:
     best: bytes | None = None
 
 
-def save(path: Path, model: BaseAlgorithm, env: FusionSB3VecEnv, journal: Journal) -> None:
+def save_checkpoint(
+    path: Path, model: BaseAlgorithm, env: FusionSB3VecEnv, journal: Journal
+) -> None:
     """Write the checkpoint; between rollouts, for a rollout under way is no part of it."""
-    told = asdict(journal)
-    best = told.pop("best")
+    content = asdict(journal)
+    best = content.pop("best")
     with replacing(path) as partial:
         model.save(partial)
         with zipfile.ZipFile(partial, "a") as archive:
-            archive.writestr(_JOURNAL, json.dumps(told))
+            archive.writestr(_JOURNAL, json.dumps(content))
             if best is not None:
                 archive.writestr(_BEST, best)
             with archive.open(_STATE, "w", force_zip64=True) as file:
@@ -78,9 +80,9 @@ def read_journal(path: Path) -> Journal:
             broken = archive.testzip()
             if broken is not None:
                 raise zipfile.BadZipFile(f"{broken} is damaged")
-            told = json.loads(archive.read(_JOURNAL))
+            content = json.loads(archive.read(_JOURNAL))
             best = archive.read(_BEST) if _BEST in archive.namelist() else None
-        return Journal(**told, best=best)
+        return Journal(**content, best=best)
     except DAMAGED as error:
         reason = " ".join(str(error).split()).strip("'\"")
         raise ConfigurationError(

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import pydantic
 
-from fusion_gym.envs.registration import opened
+from fusion_gym.envs.registration import open_options
 
 from .algorithms import AnyAlgorithm
 from .checked import Positive, Share, Strict, parse
@@ -28,7 +28,7 @@ class EnvironmentConfig(Strict):
     @pydantic.field_validator("options")
     @classmethod
     def _opened(cls, options: dict[str, Any], info: pydantic.ValidationInfo) -> dict[str, Any]:
-        return opened(info.data["id"], options) if "id" in info.data else options
+        return open_options(info.data["id"], options) if "id" in info.data else options
 
 
 class TrainingConfig(Strict):
@@ -88,6 +88,6 @@ class Experiment(Strict):
         """
         plain = self.model_dump() | ({} if output is None else {"output": str(output)})
         environment = plain["environment"]
-        environment["options"] |= opened(environment["id"], options or {})
+        environment["options"] |= open_options(environment["id"], options or {})
         plain["training"] |= {key: value for key, value in training.items() if value is not None}
         return parse(Experiment, plain, "command line")

@@ -54,7 +54,7 @@ class TargetRate(Callback):
         self.logger.record("constraint/rate", rate)
 
 
-def score(record: dict[str, Any], target: float | None) -> tuple[float, float]:
+def rate_score(record: dict[str, Any], target: float | None) -> tuple[float, float]:
     """What the best model has most of: return, or with a target its rate kept, then its return."""
     if target is None:
         return 0.0, record["return"]

@@ -29,17 +29,17 @@ from .decisions import Chosen, Decisions, Kind
 _CLOSED = -1e8  # the logit of a choice that is masked
 
 
-class Rollout(NamedTuple):
+class RolloutBatch(NamedTuple):
     """What one stretch of T steps taught, B = T · runs.
 
     ``observations`` (B, entries), ``masks`` (B, choices) or ``None``, and where sensors decide by
-    themselves (B, sensors, …), ``chosen`` (B, D), ``old`` log-probabilities and ``advantages``
+    themselves (B, sensors, …), ``choices`` (B, D), ``old`` log-probabilities and ``advantages``
     (B, D, C), ``surplus`` δ, ``returns`` G and ``values`` (B,).
     """
 
     observations: torch.Tensor
     masks: torch.Tensor | None
-    chosen: torch.Tensor
+    choices: torch.Tensor
     old: torch.Tensor
     advantages: torch.Tensor
     surplus: torch.Tensor
@@ -80,7 +80,7 @@ class Counterfactual(OnPolicyAlgorithm):
         super()._setup_model()
         if self.env is not None:
             self._decisions = Decisions(_privileged(self.env), self.alternatives)
-        self._rollout: Rollout | None = None
+        self._rollout: RolloutBatch | None = None
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_decisions", "_rollout"]
@@ -106,9 +106,9 @@ class Counterfactual(OnPolicyAlgorithm):
             with torch.no_grad():
                 old = decisions.log_probabilities(self._logits(observation, masks))
                 noise = -torch.log(-torch.log(torch.rand(old.shape)))
-            chosen = (old + noise).argmax(-1).numpy()
+            choice = (old + noise).argmax(-1).numpy()
             (after, rewards, dones, infos), branched = privileged.step_alternatives(
-                decisions.actions(chosen), decisions.alternatives(chosen)
+                decisions.actions(choice), decisions.alternatives(choice)
             )
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
@@ -122,8 +122,8 @@ class Counterfactual(OnPolicyAlgorithm):
             beyond = goes_on * self._beyond(branched.observation)
             value = goes_on * self._value(decisions.by_run(follows))
             taken = rewards[first] + self.gamma * value
-            found = decisions.arranged(chosen, taken, branched.reward + self.gamma * beyond)
-            steps.append(_Step(observation, masks, chosen, old, found, value, dones[first]))
+            values = decisions.arranged(choice, taken, branched.reward + self.gamma * beyond)
+            steps.append(_Step(observation, masks, choice, old, values, value, dones[first]))
             self._last_obs = after  # type: ignore[assignment]
             self._last_episode_starts = dones
         self._rollout = self._credited(steps)
@@ -131,20 +131,20 @@ class Counterfactual(OnPolicyAlgorithm):
         callback.on_rollout_end()
         return True
 
-    def _credited(self, steps: list[_Step]) -> Rollout:
+    def _credited(self, steps: list[_Step]) -> RolloutBatch:
         """Advantages and returns of a rollout, undivided."""
         values = [self._value(step.observation.numpy()) for step in steps]
         advantages, surplus, returns = [], [], []
         ahead = np.zeros(len(steps[0].dones))
         for place in range(len(steps) - 1, -1, -1):
             step = steps[place]
-            mean = (np.exp(step.old.numpy()) * step.found).sum(-1)
+            mean = (np.exp(step.old.numpy()) * step.values).sum(-1)
             left = np.zeros_like(ahead)
             if place + 1 < len(steps):
                 left = self.gamma * self.gae_lambda * (ahead - step.follows)
                 left[step.dones] = 0.0
             ahead = mean.mean(-1) + left
-            advantages.append(step.found - mean[..., None])
+            advantages.append(step.values - mean[..., None])
             surplus.append(left)
             returns.append(ahead)
 
@@ -152,10 +152,10 @@ class Counterfactual(OnPolicyAlgorithm):
             return torch.as_tensor(np.concatenate(parts[::-1]), dtype=torch.float32)
 
         masks = [step.masks for step in steps if step.masks is not None]
-        return Rollout(
+        return RolloutBatch(
             torch.cat([step.observation for step in steps]),
             torch.cat(masks) if masks else None,
-            torch.as_tensor(np.concatenate([step.chosen for step in steps])),
+            torch.as_tensor(np.concatenate([step.choices for step in steps])),
             torch.cat([step.old for step in steps]),
             joined(advantages),
             joined(surplus),
@@ -172,7 +172,7 @@ class Counterfactual(OnPolicyAlgorithm):
         clip = float(self.clip_range(self._current_progress_remaining))
         weight = rollout.old.exp()
         spread = float((weight * rollout.advantages**2).sum(-1).mean().sqrt()) + 1e-8
-        told: dict[str, list[float]] = {}
+        entries: dict[str, list[float]] = {}
         size = max(self.batch_size // _privileged(self.env).view.rows_per_run, 1)
         for _ in range(self.n_epochs):
             order = np.random.permutation(len(rollout.returns))  # noqa: NPY002
@@ -184,22 +184,22 @@ class Counterfactual(OnPolicyAlgorithm):
                 torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
                 self.policy.optimizer.step()
                 for name, part in parts.items():
-                    told.setdefault(name, []).append(part.item())
+                    entries.setdefault(name, []).append(part.item())
             self._n_updates += 1
         surplus = float(rollout.surplus.square().mean())
-        told |= {
+        entries |= {
             "advantage_spread": [spread],
             "surplus_share": [surplus / (surplus + spread**2)],
             "explained_variance": [
                 float(explained_variance(rollout.values.numpy(), rollout.returns.numpy()))
             ],
         }
-        for name, found in told.items():
-            self.logger.record(f"train/{name}", float(np.mean(found)))
+        for name, entry in entries.items():
+            self.logger.record(f"train/{name}", float(np.mean(entry)))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _loss(
-        self, rollout: Rollout, batch: torch.Tensor, spread: float, clip: float
+        self, rollout: RolloutBatch, batch: torch.Tensor, spread: float, clip: float
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         observation = rollout.observations[batch]
         masks = None if rollout.masks is None else rollout.masks[batch]
@@ -209,8 +209,8 @@ class Counterfactual(OnPolicyAlgorithm):
         ratio = change.exp()
         credit = rollout.advantages[batch] / spread
         gain = torch.minimum(ratio * credit, ratio.clamp(1.0 - clip, 1.0 + clip) * credit)
-        chosen = rollout.chosen[batch][..., None]
-        taken = change.gather(-1, chosen)
+        selection = rollout.choices[batch][..., None]
+        taken = change.gather(-1, selection)
         whole = (taken if self._decisions.local else taken.sum((-1, -2), keepdim=True)).exp()
         surplus = rollout.surplus[batch][:, None, None] / spread
         late = torch.minimum(whole * surplus, whole.clamp(1.0 - clip, 1.0 + clip) * surplus)
@@ -244,9 +244,9 @@ class Counterfactual(OnPolicyAlgorithm):
     def _critic(self, observation: torch.Tensor) -> torch.Tensor:
         policy: Any = self.policy
         rows = policy.vf_features_extractor(observation.reshape(-1, observation.shape[-1]))
-        found: torch.Tensor = policy.value_net(policy.mlp_extractor.forward_critic(rows))
-        found = found.reshape(observation.shape[:-1])
-        return found.sum(-1) if self._decisions.local else found
+        values: torch.Tensor = policy.value_net(policy.mlp_extractor.forward_critic(rows))
+        values = values.reshape(observation.shape[:-1])
+        return values.sum(-1) if self._decisions.local else values
 
     def _value(self, observation: NDArray[np.float32]) -> Array:
         """V of runs whose decisions are made on observations (…, entries) or, where sensors decide
@@ -259,7 +259,7 @@ class Counterfactual(OnPolicyAlgorithm):
         if not self._decisions.local:
             return self._value(observation)
         # One by one: that many rows of that many sensors would not fit into the cache.
-        return np.stack([self._value(self._decisions.seen(one)) for one in observation])
+        return np.stack([self._value(self._decisions.visible_rows(item)) for item in observation])
 
     def _masks(self, env: PrivilegedVecEnv) -> torch.Tensor | None:
         """Open choices of the runs' decisions, for an algorithm that knows them."""
@@ -278,27 +278,27 @@ class CounterfactualMaskablePPO(Counterfactual, MaskablePPO):
 
 
 class _Step(NamedTuple):
-    """One step of all runs, on the way to a :class:`Rollout`.
+    """One step of all runs, on the way to a :class:`RolloutBatch`.
 
-    ``found`` (runs, D, C) are the values Q of all choices, ``follows`` (runs,) that of the state
+    ``values`` (runs, D, C) are the values Q of all choices, ``follows`` (runs,) that of the state
     reached; ``dones`` (runs,) bool.
     """
 
     observation: torch.Tensor
     masks: torch.Tensor | None
-    chosen: Chosen
+    choices: Chosen
     old: torch.Tensor
-    found: Array
+    values: Array
     follows: Array
     dones: NDArray[np.bool_]
 
 
 def _terminated(dones: NDArray[np.bool_], infos: list[dict[str, Any]]) -> NDArray[np.bool_]:
     """The rows whose episode has ended for good, after which nothing has a value."""
-    found = dones.copy()
+    result = dones.copy()
     for row in np.flatnonzero(dones):
-        found[row] = not infos[row]["TimeLimit.truncated"]
-    return found
+        result[row] = not infos[row]["TimeLimit.truncated"]
+    return result
 
 
 def _privileged(env: Any) -> PrivilegedVecEnv:
@@ -307,10 +307,10 @@ def _privileged(env: Any) -> PrivilegedVecEnv:
     Raises:
         ConfigurationError: another one, which cannot step alternatives.
     """
-    found = env.unwrapped
-    if not isinstance(found, PrivilegedVecEnv):
+    result = env.unwrapped
+    if not isinstance(result, PrivilegedVecEnv):
         raise ConfigurationError(
-            f"env = {type(found).__name__} is not allowed with counterfactual credit: it must be "
+            f"env = {type(result).__name__} is not allowed with counterfactual credit: it must be "
             "a PrivilegedVecEnv, which steps alternatives"
         )
-    return found
+    return result

@@ -21,7 +21,7 @@ Chosen = NDArray[np.int64]  # choices (runs, D)
 class Decisions:
     """The alternatives of every run's decision, as D factors of C choices each.
 
-    - ``"all"``: one factor, whose choices are all actions of a coordinator.
+    - ``"all"``: one factor, whose choices are all actions of a scheduler.
     - ``"flips"``: a factor a sensor, silence or a request, the other sensors as they were; so too
       where the sensors decide by themselves.
 
@@ -65,11 +65,11 @@ class Decisions:
         """
         if self.choices <= 2**MOST_SENSORS:
             return
-        asked, instead = ("action = 'discrete'", "action must be 'binary'")
+        text, instead = ("action = 'discrete'", "action must be 'binary'")
         if self.binary:
-            asked, instead = ("alternatives = 'all'", "it must be 'flips'")
+            text, instead = ("alternatives = 'all'", "it must be 'flips'")
         raise ConfigurationError(
-            f"{asked} is not allowed here with {self.sensors} sensors: all 2^{self.sensors} sets "
+            f"{text} is not allowed here with {self.sensors} sensors: all 2^{self.sensors} sets "
             f"of requests would be stepped, of at most {MOST_SENSORS} sensors; {instead}"
         )
 
@@ -80,8 +80,8 @@ class Decisions:
         (runs, sensors, 2), or of the requests of ``MultiBinary`` (runs, sensors).
         """
         if not self.binary:
-            found = torch.log_softmax(logits, -1)
-            return found if self.local else found[:, None]
+            values = torch.log_softmax(logits, -1)
+            return values if self.local else values[:, None]
         silent = -torch.nn.functional.softplus(logits)
         if self.kind == "flips":
             return torch.stack((silent, logits + silent), -1)
@@ -90,35 +90,35 @@ class Decisions:
     def by_run(self, rows: Any) -> Any:
         """Rows (rows, entries) that belong to a run together, (runs, sensors, entries).
 
-        A coordinator's rows are runs already.
+        A scheduler's rows are runs already.
         """
         return rows.reshape(-1, self.sensors, rows.shape[-1]) if self.local else rows
 
-    def seen(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+    def visible_rows(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """What the sensors of runs see by themselves, (runs, sensors, entries of a row), from
         observations (runs, entries)."""
         return self.by_run(self.view.rows(observation))
 
-    def actions(self, chosen: Chosen) -> NDArray[Any]:
+    def actions(self, choice: Chosen) -> NDArray[Any]:
         """The rows' actions of the space from the choices (runs, D)."""
         if not self.binary:
-            return chosen.reshape(-1)
+            return choice.reshape(-1)
         if self.kind == "flips":
-            return chosen
-        return chosen >> np.arange(self.sensors) & 1
+            return choice
+        return choice >> np.arange(self.sensors) & 1
 
-    def alternatives(self, chosen: Chosen) -> NDArray[Any]:
+    def alternatives(self, choice: Chosen) -> NDArray[Any]:
         """The requests (A, sensors, N) that are stepped beside those chosen (runs, D)."""
         if self.kind == "all":
             return np.broadcast_to(self.requests, (self.choices, self.sensors, self.runs))
-        taken = chosen.T == 1
+        taken = choice.T == 1
         return taken ^ np.eye(self.sensors, dtype=np.bool_)[:, :, None]
 
-    def arranged(self, chosen: Chosen, taken: Array, stepped: Array) -> Array:
+    def arranged(self, choice: Chosen, taken: Array, stepped: Array) -> Array:
         """Values (runs, D, C) of all choices, from those taken (runs,) and stepped (A, runs)."""
         if self.kind == "all":
             return stepped.T[:, None]
         flipped = stepped.T
-        kept = np.broadcast_to(taken[:, None], flipped.shape)
-        request = chosen == 1
-        return np.stack((np.where(request, flipped, kept), np.where(request, kept, flipped)), -1)
+        rest = np.broadcast_to(taken[:, None], flipped.shape)
+        request = choice == 1
+        return np.stack((np.where(request, flipped, rest), np.where(request, rest, flipped)), -1)

@@ -65,10 +65,10 @@ def by_price(task: Task, prices: Array, results: EpisodeResults) -> list[dict[st
         {
             "low": float(ends[place]),
             "high": float(ends[place + 1]),
-            "episodes": int(chosen.sum()),
-            "rate": float(results.rate[chosen].mean()),
-            "mse": float(results.mse[chosen].mean()),
+            "episodes": int(selection.sum()),
+            "rate": float(results.rate[selection].mean()),
+            "mse": float(results.mse[selection].mean()),
         }
         for place in range(PARTS)
-        if (chosen := part == place).any()
+        if (selection := part == place).any()
     ]

@@ -64,8 +64,11 @@ def _reference(task: Task, where: EnvironmentConfig, error_filter: str | None) -
     Raises:
         ConfigurationError: the environment has no such filter.
     """
-    if task.shadow is not None and error_filter in (None, where.options.get("memory_filter")):
-        return task.shadow
+    if task.memory_system is not None and error_filter in (
+        None,
+        where.options.get("memory_filter"),
+    ):
+        return task.memory_system
     try:
         return reference_system(where.id, where.options, error_filter)
     except ConfigurationError as error:
@@ -149,10 +152,10 @@ def warn_of_cross_term(experiment: Experiment, env: FusionSB3VecEnv) -> None:
     rate = experiment.training.target_rate or begins or 0.5
     usual = usual_policies(task, (rate,))
     policies = {name: make_policy(name, task) for name in (usual[0], usual[-1])}
-    name, found = worst(cross_terms(task, reference, policies, _EPISODES, _SEED, _LEVEL))
-    if not found.compatible:
+    name, terms = worst(cross_terms(task, reference, policies, _EPISODES, _SEED, _LEVEL))
+    if not terms.compatible:
         remark(
-            f"warning: training.error = 'mismatch' leaves out a cross term of {found.shown} of the "
+            f"warning: training.error = 'mismatch' leaves out a cross term of {terms.text} of the "
             f"error under {name} ({_EPISODES} episodes); error: excess has none, and the command "
             "mismatch measures it under other policies and filters"
         )

@@ -27,7 +27,7 @@ from . import checkpoint
 from .callback import Callback
 from .checkpoint import Journal
 from .config import Experiment
-from .constraint import score
+from .constraint import rate_score
 from .diagnosis import by_price, prices_of
 
 # Handed the model and the processor's seconds of its training; more for a validation's record.
@@ -83,7 +83,7 @@ class Progress(Callback):
         self.experiment, self.folder, self.task = experiment, folder, task
         self.interrupt, self.bar, self.journal = interrupt, bar, journal
         self.target = experiment.training.target_rate
-        scores = (score(record, self.target) for record in journal.records)
+        scores = (rate_score(record, self.target) for record in journal.records)
         self.best = max(scores, default=(-np.inf, -np.inf))
         self._mark = _now()
         self._env_mark = 0.0
@@ -150,20 +150,20 @@ class Progress(Callback):
         """Run the validation episodes, log them, and keep the model if it is the best so far."""
         settings = self.experiment.validation
         policy = ModelPolicy(self.model, self.task, local=self.experiment.environment.local)
-        found = run_episodes(self.task, policy, settings.episodes, settings.seed)
+        results = run_episodes(self.task, policy, settings.episodes, settings.seed)
         record: dict[str, Any] = {
             "timesteps": self.num_timesteps,
-            "return": float((found.returns * self._weights()).mean()),
-            "mse": float(found.mse.mean()),
-            "rate": float(found.rate.mean()),
+            "return": float((results.returns * self._weights()).mean()),
+            "mse": float(results.mse.mean()),
+            "rate": float(results.rate.mean()),
         }
         if self.measure is not None:
             record |= self.measure(self.model, self.journal.cpu_seconds)
-        parts = by_price(self.task, self.prices, found)
+        parts = by_price(self.task, self.prices, results)
         if parts:
             record["prices"] = parts
-        if score(record, self.target) > self.best:
-            self.best = score(record, self.target)
+        if rate_score(record, self.target) > self.best:
+            self.best = rate_score(record, self.target)
             file = io.BytesIO()
             self.model.save(file)
             self.journal.best = file.getvalue()
@@ -181,7 +181,7 @@ class Progress(Callback):
 
     def _show(self, record: dict[str, Any]) -> None:
         """A validation to the bar, and to whoever watches and may end the training."""
-        self.bar.say(shown(record))
+        self.bar.say(log_line(record))
         if self.watch is not None:
             self.stopped = self.watch(record)
 
@@ -208,10 +208,12 @@ class Progress(Callback):
 
     def save(self) -> None:
         """Write the checkpoint."""
-        checkpoint.save(self.folder / "latest.zip", self.model, self.environment, self.journal)
+        checkpoint.save_checkpoint(
+            self.folder / "latest.zip", self.model, self.environment, self.journal
+        )
 
 
-def shown(record: dict[str, Any]) -> str:
+def log_line(record: dict[str, Any]) -> str:
     """A validation in a few words."""
     return f"MSE {record['mse']:.4f}, rate {record['rate']:.3f}"
 

@@ -21,10 +21,10 @@ from fusion_gym.validation import ConfigurationError
 from ..output.files import replacing, write, write_text
 from ..output.folders import alone_in, check_inputs, fingerprint
 from ..output.progress import progress_bar, writing
-from .checked import load
+from .checked import load_checked
 from .checkpoint import Journal, read_journal, restore
 from .config import Experiment
-from .constraint import TargetRate, score
+from .constraint import TargetRate, rate_score
 from .diagnosis import Traffic
 from .models import make_env, make_model, warn_of_cross_term
 from .monitor import Interrupt, Measure, Progress, Stop
@@ -66,7 +66,9 @@ def earlier(experiment: Experiment, folder: Path, resume: bool) -> Journal | Non
             f"output = {str(folder)!r} holds a finished training without its checkpoint, "
             "latest.zip: nothing to resume"
         )
-    check_inputs(experiment.inputs(), load(Experiment, folder / "config.yaml").inputs(), where)
+    check_inputs(
+        experiment.inputs(), load_checked(Experiment, folder / "config.yaml").inputs(), where
+    )
     return None
 
 
@@ -90,7 +92,7 @@ def validation_task(experiment: Experiment, task: Task) -> Task:
     )
 
 
-def check(experiment: Experiment) -> tuple[BaseAlgorithm, FusionSB3VecEnv, Task]:
+def check_run(experiment: Experiment) -> tuple[BaseAlgorithm, FusionSB3VecEnv, Task]:
     """A new model, what it trains in, and the task that it is validated on; nothing is written.
 
     Raises:
@@ -127,7 +129,7 @@ def train(
     folder = Path(experiment.output)
     if resume and not holds_training(folder):
         raise ConfigurationError(f"output = {str(folder)!r} holds no training: nothing to resume")
-    model, env, scored = check(experiment)
+    model, env, scored = check_run(experiment)
     torch.set_num_threads(experiment.training.threads)
     with alone_in(folder, "output"):
         journal = earlier(experiment, folder, resume)
@@ -184,7 +186,9 @@ def _learn(
         if finished:
             with replacing(folder / "final_model.zip") as partial:
                 model.save(partial)
-    best = max(journal.records, key=lambda record: score(record, progress.target), default=None)
+    best = max(
+        journal.records, key=lambda record: rate_score(record, progress.target), default=None
+    )
     summary = {
         "timesteps": model.num_timesteps,
         "finished": finished,

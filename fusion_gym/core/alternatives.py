@@ -44,7 +44,7 @@ def alternatives(
     """
     many, sensors, runs = requests.shape
     granted = before.answer(requests.transpose(1, 0, 2).reshape(sensors, -1)).granted
-    found = np.tile(np.arange(runs), many)  # where each one's results are; first the taken ones
+    values = np.tile(np.arange(runs), many)  # where each one's results are; first the taken ones
     other = np.flatnonzero((granted != np.tile(taken.granted, many)).any(0))
     error, communication = taken.error, taken.reward_communication
     if other.size:
@@ -52,13 +52,13 @@ def alternatives(
         if sensors + runs.bit_length() <= _MOST_BITS:
             codes = (1 << np.arange(sensors)) @ granted[:, other] * runs + other % runs
             _, first, place = np.unique(codes, return_index=True, return_inverse=True)
-            found[other] = runs + place
+            values[other] = runs + place
         else:
-            found[other] = runs + first
+            values[other] = runs + first
         places = other[first]
         run, sent = places % runs, granted[:, places]
         if before.memory.keeps_every:
-            branch = before.remembering(run)
+            branch = before.branch_memory(run)
             outcome = branch.step(sent, noise[:, run], take_runs(beliefs.best, run))
         else:
             branch = before.branch(run)
@@ -67,7 +67,7 @@ def alternatives(
         communication = np.concatenate((communication, outcome.reward_communication))
         observation = np.concatenate((observation, branch.observe()))
     return Alternatives(
-        error[:, found].reshape(-1, many, runs),
-        communication[found].reshape(many, runs),
-        observation[found].reshape(many, runs, -1),
+        error[:, values].reshape(-1, many, runs),
+        communication[values].reshape(many, runs),
+        observation[values].reshape(many, runs, -1),
     )

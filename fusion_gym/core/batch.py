@@ -28,8 +28,8 @@ class EpisodeBatch(Runs):
     seed fixes an episode's noise (common random numbers), and a run does not depend on what
     stands beside it (batch invariance).
 
-    ``remember`` says whose memory is kept, the coordinator's or every sensor's own; ``None`` is
-    the coordinator's in a task with memory, and nothing in one without.
+    ``remember`` says whose memory is kept, the scheduler's or every sensor's own; ``None`` is
+    the scheduler's in a task with memory, and nothing in one without.
 
     ``reference`` is a system on the same noise whose filter takes in every measurement beside the
     run, whoever decides: after each step ``reference_error`` (n, N) is the truth minus its fused
@@ -45,15 +45,17 @@ class EpisodeBatch(Runs):
         remember: Owner | None = None,
         reference: System[Any] | None = None,
     ) -> None:
-        memory = Memory(task, "coordinator" if remember is None else remember)
+        memory = Memory(task, "scheduler" if remember is None else remember)
         super().__init__(task, memory, ObservationLayout(task, memory.owner))
         self.num_envs = num_envs
         self.generators: list[np.random.Generator | None] = [None] * num_envs
         self._episode_starts: list[Any] = [None] * num_envs
         self.state = None
         self.reference = reference
-        # Where the coordinator's own memory is that of the reference, it is not kept twice.
-        self._shared = reference is not None and memory.keeps_every and reference is task.shadow
+        # Where the scheduler's own memory is that of the reference, it is not kept twice.
+        self._shared = (
+            reference is not None and memory.keeps_every and reference is task.memory_system
+        )
         self._beside: Any = None  # the reference's state, after sensing
         self.tokens = task.bucket.start(num_envs)
         self.price = task.reward.price.draw(np.zeros(num_envs))

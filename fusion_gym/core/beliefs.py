@@ -30,38 +30,38 @@ from fusion_gym.core.system import System
 from fusion_gym.core.task import Task
 from fusion_gym.fusion.intersection import covariance_intersection
 
-Owner = Literal["coordinator", "own"]
+Owner = Literal["scheduler", "own"]
 Packets = NDArray[np.bool_]
 
 
 @dataclass(slots=True)
-class Shadows:
+class MemoryStates:
     """What is kept of N runs, states after sensing; ``None`` where it is not needed.
 
     ``every`` (N runs) has taken in all measurements · ``own`` (sensors · N runs, those of a sensor
-    together) one sensor's, and what it heard · ``alone`` (the same) is the centre to which that
+    together) one sensor's, and what it heard · ``single`` (the same) is the centre to which that
     sensor alone has sent.
     """
 
     every: Any = None
     own: Any = None
-    alone: Any = None
+    single: Any = None
 
 
 @dataclass(frozen=True)
 class Estimate:
     """``mean`` (k, n, N) and ``covariance`` (k, n, n, N): k = 1 for all, or one a sensor.
 
-    Covariances may be ``given`` as a function, for they are large where there are many states.
+    Covariances may be ``source`` as a function, for they are large where there are many states.
     """
 
     mean: Array
-    given: Array | Callable[[], Array]
+    source: Array | Callable[[], Array]
 
     @cached_property
     def covariance(self) -> Array:
         """The covariance, computed when first looked at."""
-        return self.given() if callable(self.given) else self.given
+        return self.source() if callable(self.source) else self.source
 
     def __iter__(self) -> Iterator[Array]:
         return iter((self.mean, self.covariance))
@@ -78,11 +78,11 @@ class Beliefs(ABC):
     """
 
     def __init__(
-        self, task: Task, state: Any, shadows: Shadows, best: Estimate | None = None
+        self, task: Task, state: Any, memory_states: MemoryStates, best: Estimate | None = None
     ) -> None:
         if best is not None:
             vars(self)["best"] = best
-        self.task, self.shadows, self._state = task, shadows, state
+        self.task, self.memory_states, self._state = task, memory_states, state
         system = task.system
         self.arrival: Array | None = None
         if system.offers("arrival_probability"):
@@ -106,7 +106,7 @@ class Beliefs(ABC):
 
     @property
     @abstractmethod
-    def remembered(self) -> Any:
+    def memory_posterior(self) -> Any:
         """The shadow with its owner's new measurements."""
 
     @cached_property
@@ -143,7 +143,7 @@ class Beliefs(ABC):
         return np.zeros((self.task.sensors, runs), dtype=np.bool_)
 
 
-class CoordinatorBeliefs(Beliefs):
+class SchedulerBeliefs(Beliefs):
     """Of whoever sees all sensors' new measurements and knows all that the centre knows."""
 
     @cached_property
@@ -160,23 +160,23 @@ class CoordinatorBeliefs(Beliefs):
             return Estimate(*self.task.system.fused_alone(self._state))
         each = [_of(self.task.system, delivered) for delivered in self._sent]
         return Estimate(
-            np.concatenate([one.mean for one in each]),
-            lambda: np.concatenate([one.covariance for one in each]),
+            np.concatenate([item.mean for item in each]),
+            lambda: np.concatenate([item.covariance for item in each]),
         )
 
     @cached_property
     def best(self) -> Estimate:
         """See :class:`Beliefs`."""
-        return _of(self.task.shadow or self.task.system, self.remembered)
+        return _of(self.task.memory_system or self.task.system, self.memory_posterior)
 
     @cached_property
-    def remembered(self) -> Any:
+    def memory_posterior(self) -> Any:
         """See :class:`Beliefs`; without memory the centre's, had all packets arrived."""
         everyone = ~self._nobody(self._runs)
-        if self.shadows.every is None:
+        if self.memory_states.every is None:
             return arrived(self.task.system, self._state, everyone)
-        assert self.task.shadow is not None
-        return arrived(self.task.shadow, self.shadows.every, everyone)
+        assert self.task.memory_system is not None
+        return arrived(self.task.memory_system, self.memory_states.every, everyone)
 
     def loss(self, steps: int = 1) -> Array:
         """See :class:`Beliefs`; summed over ``steps`` times without noise and transmissions."""
@@ -204,15 +204,17 @@ class CoordinatorBeliefs(Beliefs):
     @cached_property
     def _sent(self) -> list[Any]:
         """The centre's states after each sensor's packet alone."""
-        found = []
+        result = []
         for sensor in range(self.task.sensors):
-            alone = self._nobody(self._runs)
-            alone[sensor] = True
-            found.append(arrived(self.task.system, self._state, alone))
-        return found
+            single = self._nobody(self._runs)
+            single[sensor] = True
+            result.append(arrived(self.task.system, self._state, single))
+        return result
 
     def _best_path(self, steps: int) -> Array:
-        return silent_path(self.task.shadow or self.task.system, self.remembered, steps)
+        return silent_path(
+            self.task.memory_system or self.task.system, self.memory_posterior, steps
+        )
 
     def _path(self, delivered: Any, steps: int) -> Array:
         return silent_path(self.task.system, delivered, steps)
@@ -227,40 +229,40 @@ class OwnBeliefs(Beliefs):
         system, sensors = self.task.system, self.task.sensors
         if self.task.broadcast == "none":
             nobody = self._nobody(sensors * self._runs)
-            return self._each(system, system.deliver(self.shadows.alone, nobody))
-        told = _of(system, system.deliver(self._state, self._nobody(self._runs)))
+            return self._each(system, system.deliver(self.memory_states.single, nobody))
+        received = _of(system, system.deliver(self._state, self._nobody(self._runs)))
         return Estimate(
-            np.repeat(told.mean, sensors, axis=0),
-            lambda: np.repeat(told.covariance, sensors, axis=0),
+            np.repeat(received.mean, sensors, axis=0),
+            lambda: np.repeat(received.covariance, sensors, axis=0),
         )
 
     @cached_property
     def sent(self) -> Estimate:
         """See :class:`Beliefs`."""
         system, itself = self.task.system, self._itself
-        if self.shadows.alone is None:
+        if self.memory_states.single is None:
             if system.offers("fused_alone"):
                 return Estimate(*system.fused_alone(self._state))
             every = np.tile(np.arange(self._runs), self.task.sensors)
             return self._each(system, arrived(system, take_runs(self._state, every), itself))
-        own = self._each(system, arrived(system, self.shadows.alone, itself))
+        own = self._each(system, arrived(system, self.memory_states.single, itself))
         return own if self.task.broadcast == "none" else _joined(self.silent, own)
 
     @cached_property
     def best(self) -> Estimate:
         """See :class:`Beliefs`."""
-        if self.task.shadow is None:
+        if self.task.memory_system is None:
             return self.sent
-        own = self._each(self.task.shadow, self.remembered)
+        own = self._each(self.task.memory_system, self.memory_posterior)
         if self.task.broadcast != "estimate":
             return own
         return _joined(self.sent if self.task.feedback else self.silent, own)
 
     @cached_property
-    def remembered(self) -> Any:
+    def memory_posterior(self) -> Any:
         """See :class:`Beliefs`."""
-        assert self.task.shadow is not None
-        return arrived(self.task.shadow, self.shadows.own, self._itself)
+        assert self.task.memory_system is not None
+        return arrived(self.task.memory_system, self.memory_states.own, self._itself)
 
     @property
     def _itself(self) -> Packets:

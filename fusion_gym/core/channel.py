@@ -70,7 +70,7 @@ class Channel:
         matrix = validation.array("channel_transition", transition, (2, 2))
         if np.any(matrix < 0.0) or not np.allclose(matrix.sum(1), 1.0, rtol=0.0, atol=1e-9):
             raise ConfigurationError(
-                f"channel_transition = {validation.shown(matrix)} is not allowed: it must have "
+                f"channel_transition = {validation.display(matrix)} is not allowed: it must have "
                 "rows of probabilities that sum to 1"
             )
         drop = _probabilities("drop_probability", drop_probability, (2,))
@@ -128,6 +128,6 @@ def _probabilities(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Arra
     result = validation.not_negative(field, value, shape)
     if np.any(result > 1.0):
         raise ConfigurationError(
-            f"{field} = {validation.shown(value)} is not allowed: it must be between 0 and 1"
+            f"{field} = {validation.display(value)} is not allowed: it must be between 0 and 1"
         )
     return result

@@ -16,13 +16,13 @@ FEATURES: tuple[str, ...] = get_args(Feature)
 
 class Communication(NamedTuple):
     """A scenario's model: ``packet`` and ``broadcast`` of the options, the latter never ``None``;
-    whether there is ``memory``, and its ``features`` in the observation; ``shadow``, the system
-    that remembers beside the run, ``None`` where it is not needed."""
+    whether there is ``memory``, and its ``features`` in the observation; ``memory_system``, the
+    system that remembers beside the run, ``None`` where it is not needed."""
 
     packet: str
     broadcast: str
     memory: bool
-    shadow: System[Any] | None
+    memory_system: System[Any] | None
     features: tuple[str, ...]
 
 
@@ -32,26 +32,26 @@ def communication(scenario: Scenario) -> Communication:
     Raises:
         ConfigurationError: a value that is not allowed, alone or with the others.
     """
-    chosen = scenario.options
-    remembers, packet = chosen.memory, chosen.packet
-    shadow = scenario.memory_system
-    if shadow is None and not scenario.nodes_remember:
-        shadow = scenario.system
-    if remembers and chosen.information == "centre":
+    options = scenario.options
+    remembers, packet = options.memory, options.packet
+    memory_system = scenario.memory_system
+    if memory_system is None and not scenario.nodes_remember:
+        memory_system = scenario.system
+    if remembers and options.information == "centre":
         raise ConfigurationError(
             "memory = True is not allowed with information='centre': it must be False, for the "
             "centre has nothing to remember but what was sent"
         )
-    if chosen.memory_filter is not None and not remembers:
-        raise validation.refusal("memory_filter", chosen.memory_filter, "None unless memory=True")
-    features = _features(chosen.belief_features, remembers)
-    if features and chosen.information == "centre":
+    if options.memory_filter is not None and not remembers:
+        raise validation.refusal("memory_filter", options.memory_filter, "None unless memory=True")
+    features = _features(options.belief_features, remembers)
+    if features and options.information == "centre":
         raise validation.refusal(
-            "belief_features", chosen.belief_features, "None or empty with information='centre'"
+            "belief_features", options.belief_features, "None or empty with information='centre'"
         )
-    if chosen.memory_filter is not None and scenario.memory_system is None:
+    if options.memory_filter is not None and scenario.memory_system is None:
         raise validation.refusal(
-            "memory_filter", chosen.memory_filter, "None here, for this system has one filter"
+            "memory_filter", options.memory_filter, "None here, for this system has one filter"
         )
     if packet == "estimate":
         _check_estimates(scenario, remembers)
@@ -59,7 +59,7 @@ def communication(scenario: Scenario) -> Communication:
         packet,
         _broadcast(scenario),
         remembers,
-        shadow if remembers else None,
+        memory_system if remembers else None,
         features,
     )
 
@@ -67,7 +67,7 @@ def communication(scenario: Scenario) -> Communication:
 def _check_estimates(scenario: Scenario, remembers: bool) -> None:
     reason = scenario.no_estimates
     if not remembers:
-        reason = "it holds what the coordinator remembers, which takes memory=True"
+        reason = "it holds what the scheduler remembers, which takes memory=True"
     elif scenario.system.offers("arriving") or not scenario.system.offers("adopt"):
         reason = reason or "this system's centre cannot go on from an estimate that is sent to it"
     if reason is not None:
@@ -77,15 +77,15 @@ def _check_estimates(scenario: Scenario, remembers: bool) -> None:
 
 
 def _broadcast(scenario: Scenario) -> str:
-    given = scenario.options.broadcast
-    if given is None:
+    value = scenario.options.broadcast
+    if value is None:
         return "estimate" if scenario.feedback else "none"
-    if given == "none" and scenario.feedback:
+    if value == "none" and scenario.feedback:
         raise ConfigurationError(
             "broadcast = 'none' is not allowed here: it must be 'estimate' or 'packets', for the "
             "nodes get the centre's estimate back"
         )
-    return given
+    return value
 
 
 def _features(value: Any, remembers: bool) -> tuple[str, ...]:
@@ -94,9 +94,9 @@ def _features(value: Any, remembers: bool) -> tuple[str, ...]:
         return FEATURES if remembers else ()
     if value is True:
         return FEATURES
-    given = (value,) if isinstance(value, str) else value
-    if not isinstance(given, Sequence):
+    values = (value,) if isinstance(value, str) else value
+    if not isinstance(values, Sequence):
         raise validation.refusal("belief_features", value, f"a list of some of {FEATURES}, or true")
-    for name in given:
+    for name in values:
         validation.choice("belief_features", name, FEATURES)
-    return tuple(name for name in FEATURES if name in given)
+    return tuple(name for name in FEATURES if name in values)

@@ -22,14 +22,15 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_gym import deprecation
 from fusion_gym.arrays import Array, merge_runs, take_runs
 from fusion_gym.core.beliefs import (
     Beliefs,
-    CoordinatorBeliefs,
     Estimate,
+    MemoryStates,
     OwnBeliefs,
     Owner,
-    Shadows,
+    SchedulerBeliefs,
     arriving,
 )
 from fusion_gym.core.signals import memory_signals, missing_signals
@@ -40,14 +41,15 @@ from fusion_gym.errors import refusal
 class Memory:
     """What the owner of a task's runs remembers, moved along with them, and what it believes.
 
-    ``owner`` is the coordinator, or every sensor by itself. ``states`` are the memory states after
+    ``owner`` is the scheduler, or every sensor by itself. ``states`` are the memory states after
     sensing, ``None`` where nothing is remembered from step to step.
 
     Raises:
-        ConfigurationError: sensors by themselves, where packets hold the coordinator's estimate.
+        ConfigurationError: sensors by themselves, where packets hold the scheduler's estimate.
     """
 
     def __init__(self, task: Task, owner: Owner) -> None:
+        owner = deprecation.current("owner", owner)
         self.task, self.owner = task, owner
         own = owner == "own"
         if own and task.packet == "estimate":
@@ -55,14 +57,14 @@ class Memory:
                 "packet",
                 task.packet,
                 "'measurement' where sensors decide by themselves, for the estimate is the "
-                "coordinator's, of all sensors",
+                "scheduler's, of all sensors",
             )
         distant = task.broadcast == "none" or (task.broadcast == "estimate" and not task.feedback)
-        self._needs_alone = own and distant
-        self._needs_own = own and task.shadow is not None
-        self.keeps_every = not own and task.shadow is not None
-        keeps = self.keeps_every or self._needs_own or self._needs_alone
-        self.states = Shadows() if keeps else None
+        self._needs_single = own and distant
+        self._needs_own = own and task.memory_system is not None
+        self.keeps_every = not own and task.memory_system is not None
+        keeps = self.keeps_every or self._needs_own or self._needs_single
+        self.states = MemoryStates() if keeps else None
         self._beliefs: Beliefs | None = None
 
     def begin(
@@ -76,24 +78,24 @@ class Memory:
         self._beliefs = None
         if self.states is None:
             return
-        first, system = fresh, self.task.shadow
+        first, system = fresh, self.task.memory_system
         if system is not None and system is not self.task.system:
             first = system.start(noise)
         every = np.tile(np.arange(noise.shape[-1]), self.task.sensors)
         new = self._sensed(
-            Shadows(
+            MemoryStates(
                 every=first if self.keeps_every else None,
                 own=take_runs(first, every) if self._needs_own else None,
-                alone=take_runs(fresh, every) if self._needs_alone else None,
+                single=take_runs(fresh, every) if self._needs_single else None,
             ),
             row,
         )
         if len(runs) < num_envs:
             old, many = self.states, self._places(runs, num_envs)
-            new = Shadows(
+            new = MemoryStates(
                 every=merge_runs(old.every, new.every, runs),
                 own=merge_runs(old.own, new.own, many),
-                alone=merge_runs(old.alone, new.alone, many),
+                single=merge_runs(old.single, new.single, many),
             )
         self.states = new
 
@@ -131,14 +133,14 @@ class Memory:
             result._beliefs = None
             if self.states is not None:
                 many = self._places(runs, num_envs)
-                result.states = Shadows(
+                result.states = MemoryStates(
                     every=take_runs(self.states.every, runs),
                     own=take_runs(self.states.own, many),
-                    alone=take_runs(self.states.alone, many),
+                    single=take_runs(self.states.single, many),
                 )
         return result
 
-    def with_states(self, states: Shadows | None) -> Self:
+    def with_states(self, states: MemoryStates | None) -> Self:
         """Return the memory of other runs, in these states."""
         result = copy.copy(self)
         result.states, result._beliefs = states, None
@@ -160,38 +162,40 @@ class Memory:
         return missing_signals(self.owner)
 
     def _make_beliefs(self, state: Any, best: Estimate | None = None) -> Beliefs:
-        kind = OwnBeliefs if self.owner == "own" else CoordinatorBeliefs
-        return kind(self.task, state, self.states or Shadows(), best)
+        kind = OwnBeliefs if self.owner == "own" else SchedulerBeliefs
+        return kind(self.task, state, self.states or MemoryStates(), best)
 
-    def _sensed(self, states: Shadows, noise: Array) -> Shadows:
-        system, remembering = self.task.system, self.task.shadow or self.task.system
-        result = Shadows()
+    def _sensed(self, states: MemoryStates, noise: Array) -> MemoryStates:
+        system, remembering = self.task.system, self.task.memory_system or self.task.system
+        result = MemoryStates()
         if states.every is not None:
             result.every = remembering.sense(states.every, noise)
-        if states.own is not None or states.alone is not None:
+        if states.own is not None or states.single is not None:
             noise = np.tile(noise, self.task.sensors)
         if states.own is not None:
             result.own = remembering.sense(states.own, noise)
-        if states.alone is not None:
-            result.alone = system.sense(states.alone, noise)
+        if states.single is not None:
+            result.single = system.sense(states.single, noise)
         return result
 
-    def _delivered(self, states: Shadows, beliefs: Beliefs, granted: NDArray[np.bool_]) -> Shadows:
-        result, itself = Shadows(), np.eye(self.task.sensors, dtype=np.bool_)
+    def _delivered(
+        self, states: MemoryStates, beliefs: Beliefs, granted: NDArray[np.bool_]
+    ) -> MemoryStates:
+        result, itself = MemoryStates(), np.eye(self.task.sensors, dtype=np.bool_)
         # Each sensor's own packet in its own runs (sensors, sensors · N).
         itself = np.repeat(itself, granted.shape[-1], axis=-1)
         if states.every is not None:
-            result.every = beliefs.remembered
+            result.every = beliefs.memory_posterior
         if states.own is not None:
-            result.own = beliefs.remembered
+            result.own = beliefs.memory_posterior
             if self.task.broadcast == "packets":
-                system = self.task.shadow
+                system = self.task.memory_system
                 assert system is not None
                 received = np.tile(granted, self.task.sensors) | itself
                 result.own = system.deliver(arriving(system, states.own, itself), received)
-        if states.alone is not None:
+        if states.single is not None:
             sent = np.tile(granted, self.task.sensors) & itself
-            result.alone = self.task.system.deliver(states.alone, sent)
+            result.single = self.task.system.deliver(states.single, sent)
         return result
 
     def _places(self, runs: NDArray[np.int64], num_envs: int) -> NDArray[np.int64]:

@@ -41,20 +41,20 @@ class Nature:
     high: tuple[float, ...] = _MODEL
 
     @classmethod
-    def create(cls, chosen: object, absent: Collection[str] = ()) -> Nature:
+    def create(cls, selection: object, absent: Collection[str] = ()) -> Nature:
         """Of the options; ``absent`` are those of them that can change nothing here.
 
         Raises:
             ConfigurationError: neither a number nor a pair (low, high) that rises, a factor outside
                 0.001 to 1000, or an option that can change nothing and is asked to.
         """
-        pairs = [_span(name, getattr(chosen, name)) for name in DEPARTURES]
+        pairs = [_span(name, getattr(selection, name)) for name in DEPARTURES]
         nature = cls(*(tuple(ends) for ends in zip(*pairs, strict=True)))
         for name in nature.departing:
             if name in absent:
                 model = _MODEL[list(DEPARTURES).index(name)]
                 raise refusal(
-                    name, getattr(chosen, name), f"{model:g} here, for {DEPARTURES[name]}"
+                    name, getattr(selection, name), f"{model:g} here, for {DEPARTURES[name]}"
                 )
         return nature
 

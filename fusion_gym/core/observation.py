@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fusion_gym import deprecation
 from fusion_gym.arrays import Array
 from fusion_gym.core.beliefs import Beliefs
 from fusion_gym.core.memory import Owner
@@ -22,7 +23,7 @@ _DIFFERENCE, _DIFFERENCE_LIMIT = 4.0, 10.0
 _VALUE, _VALUE_LIMIT = 2.0, 20.0
 
 
-class Network(NamedTuple):
+class NetworkState(NamedTuple):
     """The network's side of an observation: ``tokens`` and ``price`` (N,), ``admitted()``
     (sensors, N) bool, and the ``left`` steps of the episode (N,)."""
 
@@ -32,17 +33,17 @@ class Network(NamedTuple):
     left: Array
 
 
-class Entry(NamedTuple):
+class ObservationEntry(NamedTuple):
     """One number of an observation.
 
-    ``sensor`` is the sensor that sees it by itself, under the name ``own_name``; ``told`` says
+    ``sensor`` is the sensor that sees it by itself, under the name ``own_name``; ``broadcast`` says
     that every sensor does, ``centre`` that the centre knows it.
     """
 
     name: str
     own_name: str
     sensor: int | None
-    told: bool
+    broadcast: bool
     centre: bool
 
 
@@ -53,7 +54,7 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
         "tokens",
         "tokens over the capacity",
         lambda net: net.tokens / capacity,
-        node="told",
+        node="broadcast",
         constants={"capacity": capacity},
     )
     admitted = Block(
@@ -67,15 +68,15 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
         "time_left",
         "steps left of the episode over the horizon",
         lambda net: net.left / task.horizon,
-        node="told",
+        node="broadcast",
         constants={"horizon": task.horizon},
     )
     place = "place of a token's price in its range, in the logarithm"
-    shown = Block(
+    block = Block(
         "price",
         place,
         lambda net: price.encode(net.price),
-        node="told",
+        node="broadcast",
         constants={} if price.span is None else {"range": price.span},
     )
     decides = task.access in ("round_robin", "random")
@@ -83,7 +84,7 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
         tokens,
         *((admitted,) if decides else ()),
         *((left,) if task.clock else ()),
-        *((shown,) if price.span is not None else ()),
+        *((block,) if price.span is not None else ()),
     )
 
 
@@ -122,7 +123,7 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
     if owner == "own":
         known: Knowledge = "own_memory" if task.memory else "own"
         own = partial(Block, knowledge=known, node="own")
-        found = {
+        result = {
             "difference": own(
                 "own_difference",
                 apart,
@@ -141,9 +142,9 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
             ),
         }
     else:
-        known = "coordinator_memory" if task.memory else "coordinator"
+        known = "scheduler_memory" if task.memory else "scheduler"
         every = partial(Block, knowledge=known)
-        found = {
+        result = {
             "difference": every(
                 "belief_difference",
                 apart,
@@ -161,13 +162,13 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
                 constants=of_value,
             ),
         }
-    return tuple(found[name] for name in task.belief_features)
+    return tuple(result[name] for name in task.belief_features)
 
 
 class ObservationLayout:
     """Which entries an agent's observation has, by name, and how it is filled.
 
-    ``owner`` says whose memory is shown, where there is one: the coordinator's, or every sensor's
+    ``owner`` says whose memory is shown, where there is one: the scheduler's, or every sensor's
     own, for a view of its own.
 
     ``blocks`` are those that the task's information mode shows, the network's last; ``entries``
@@ -177,13 +178,14 @@ class ObservationLayout:
         ConfigurationError: two blocks of one name.
     """
 
-    def __init__(self, task: Task, owner: Owner = "coordinator") -> None:
-        def shown(blocks: tuple[Block, ...]) -> tuple[Block, ...]:
+    def __init__(self, task: Task, owner: Owner = "scheduler") -> None:
+        def visible(blocks: tuple[Block, ...]) -> tuple[Block, ...]:
             return tuple(block for block in blocks if covers(task.knowledge, block.knowledge))
 
+        owner = deprecation.current("owner", owner)
         self._task, self._owner = task, owner
-        self._own, self._network = shown(task.system.observation), shown(network_blocks(task))
-        self._memory = shown(belief_blocks(task, owner))
+        self._own, self._network = visible(task.system.observation), visible(network_blocks(task))
+        self._memory = visible(belief_blocks(task, owner))
         self.blocks = self._own + self._memory + self._network
         names = [block.name for block in self.blocks]
         for name in names:
@@ -199,7 +201,7 @@ class ObservationLayout:
         return ObservationLayout, (self._task, self._owner)
 
     def encode(
-        self, state: Any, network: Network, beliefs: Callable[[], Beliefs]
+        self, state: Any, network: NetworkState, beliefs: Callable[[], Beliefs]
     ) -> NDArray[np.float32]:
         """Observations (N, entries) float32, clipped to their bounds.
 
@@ -218,21 +220,21 @@ class ObservationLayout:
         return np.minimum(result, self.high, out=result)
 
 
-def block_entries(block: Block) -> list[Entry]:
+def block_entries(block: Block) -> list[ObservationEntry]:
     """The entries of a block, one a number."""
-    found = []
+    result = []
     for place in block.places:
         own, rest = block.node == "own", place[1:] if block.node == "own" else place
-        found.append(
-            Entry(
+        result.append(
+            ObservationEntry(
                 name=_named(block.name, place),
                 own_name=_named(block.name, rest),
                 sensor=block.labels[0].index(place[0]) if own else None,
-                told=block.node == "told",
+                broadcast=block.node == "broadcast",
                 centre=covers("centre", block.knowledge),
             )
         )
-    return found
+    return result
 
 
 def _named(kind: str, place: tuple[str, ...]) -> str:

@@ -148,12 +148,12 @@ class Scenario:
     no_estimates: str | None = None
 
 
-def plain(value: Any) -> Any:
+def plain_options(value: Any) -> Any:
     """Settings as plain lists, numbers and strings, ready for JSON."""
     if isinstance(value, dict):
-        return {key: plain(entry) for key, entry in value.items()}
+        return {key: plain_options(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(entry) for entry in value]
+        return [plain_options(entry) for entry in value]
     if callable(value):
         return name_of(value)
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value

@@ -24,8 +24,8 @@ def rehearse(task: Task) -> None:
     while finite and step < min(_STEPS, task.horizon):
         requests = np.stack([sensors < 0, sensors >= 0, (sensors + step) % 2 == 0], axis=-1)
         outcome = batch.step(requests)
-        shown = (outcome.reward, outcome.squared_error, batch.observe())
-        finite = all(bool(np.isfinite(entry).all()) for entry in shown)
+        observation = (outcome.reward, outcome.squared_error, batch.observe())
+        finite = all(bool(np.isfinite(entry).all()) for entry in observation)
         step += 1
     if not finite:
         raise ConfigurationError(

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.options import ErrorKind
-from fusion_gym.importing import name_of, named
+from fusion_gym.importing import import_named, name_of
 from fusion_gym.validation import ConfigurationError
 
 Cost = Callable[[Array, Array], Any]  # of errors (n, N) and covariances (n, n, N)
@@ -51,7 +51,7 @@ def equal_weights(open_loop: Array) -> Array:
 def _at_rest(open_loop: Array) -> ConfigurationError:
     """The error of a plant some of whose states are known without any transmission."""
     return ConfigurationError(
-        f"a squared error of {validation.shown(open_loop)} without transmissions is not allowed: "
+        f"a squared error of {validation.display(open_loop)} without transmissions is not allowed: "
         "every state must be moved by noise before the horizon, or be uncertain at the start"
     )
 
@@ -62,7 +62,7 @@ def _cost(error: str | Cost) -> str | Cost:
     Raises:
         ConfigurationError: neither, or a function that cannot be imported.
     """
-    own = named("error", error) if isinstance(error, str) and ":" in error else error
+    own = import_named("error", error) if isinstance(error, str) and ":" in error else error
     if own not in ERROR_KINDS and (isinstance(own, str) or not callable(own)):
         listed = ", ".join(repr(kind) for kind in ERROR_KINDS)
         near = validation.nearest(own, ERROR_KINDS) if isinstance(own, str) else None
@@ -117,7 +117,7 @@ class Reward:
         if not weight * (weights @ open_loop) <= _LARGEST:
             raise ConfigurationError(
                 f"error_weight = {weight:g} is not allowed with state_weights = "
-                f"{validation.shown(weights)}: without transmissions the error may cost up to "
+                f"{validation.display(weights)}: without transmissions the error may cost up to "
                 f"{_LARGEST:g} a step, not {weight * (weights @ open_loop):g}"
             )
         return cls(
@@ -153,14 +153,14 @@ class Reward:
         if self.error == "maximum":
             return np.asarray((self.state_weights * (error * error)).max(0))
         assert not isinstance(self.error, str)
-        found = np.asarray(self.error(error, covariance), dtype=np.float64)
-        if found.shape != error.shape[1:] or not np.all(found >= 0.0):
+        values = np.asarray(self.error(error, covariance), dtype=np.float64)
+        if values.shape != error.shape[1:] or not np.all(values >= 0.0):
             raise ConfigurationError(
                 f"error = {name_of(self.error)!r} is not allowed: of errors {error.shape} it must "
                 f"return numbers >= 0 of shape {error.shape[1:]}, and returned "
-                f"{validation.shown(found)} of shape {found.shape}"
+                f"{validation.display(values)} of shape {values.shape}"
             )
-        return found
+        return values
 
     def training_error(self, kind: str, error: Array, reference_error: Array) -> Array:
         """The error's term of the reward (…,) to train with, of errors (n, …): truth - estimate.
@@ -177,8 +177,8 @@ class Reward:
             squared = error * error - reference_error * reference_error
         else:
             squared = error * error
-        found = -self.error_weight * np.tensordot(self.state_weights[:, 0], squared, axes=1)
-        return np.asarray(found)
+        result = -self.error_weight * np.tensordot(self.state_weights[:, 0], squared, axes=1)
+        return np.asarray(result)
 
 
 @dataclass(frozen=True)

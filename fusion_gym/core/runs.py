@@ -15,7 +15,7 @@ from fusion_gym.arrays import Array, take_runs
 from fusion_gym.core.access import access_mask, first_request
 from fusion_gym.core.beliefs import Beliefs, Estimate
 from fusion_gym.core.memory import Memory
-from fusion_gym.core.observation import Network, ObservationLayout
+from fusion_gym.core.observation import NetworkState, ObservationLayout
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import Grants
@@ -130,10 +130,10 @@ class Runs:
         memory = self.memory.branch(runs, len(self.steps))
         return Branch(self.task, memory, self.layout, self._position(runs))
 
-    def remembering(self, runs: NDArray[np.int64]) -> Branch:
-        """As :meth:`branch`, of a coordinator's runs whose x* is known and no longer computed.
+    def branch_memory(self, runs: NDArray[np.int64]) -> Branch:
+        """As :meth:`branch`, of a scheduler's runs whose x* is known and no longer computed.
 
-        What a coordinator remembers does not depend on what is sent: x* after a step is that of
+        What a scheduler remembers does not depend on what is sent: x* after a step is that of
         the runs that these were taken from, and has to be given to :meth:`Branch.step`.
         """
         position = self._position(runs)
@@ -162,7 +162,7 @@ class Runs:
     def observe(self) -> NDArray[np.float32]:
         """Observations (N, entries) of all runs, a fresh array."""
         left = (self._limit - self.steps).astype(np.float64)
-        network = Network(self.tokens, self.admitted, self.price, left)
+        network = NetworkState(self.tokens, self.admitted, self.price, left)
         return self.layout.encode(self.state, network, self.beliefs)
 
     def beliefs(self) -> Beliefs:
@@ -178,9 +178,9 @@ class Runs:
         admitted = self.admitted()
         result = np.zeros_like(admitted)
         for sensor in range(self.task.sensors):
-            alone = np.zeros_like(admitted)
-            alone[sensor] = admitted[sensor]
-            result[sensor] = self.task.bucket.grant(self.tokens, alone, self.steps).granted[sensor]
+            single = np.zeros_like(admitted)
+            single[sensor] = admitted[sensor]
+            result[sensor] = self.task.bucket.grant(self.tokens, single, self.steps).granted[sensor]
         return result
 
     def signals(self) -> Signals:

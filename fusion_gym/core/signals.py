@@ -8,17 +8,17 @@ from typing import Any
 from fusion_gym.core.beliefs import Beliefs, Owner
 from fusion_gym.core.system import Signal
 
-# Knowledge as in a task with memory; without it these need no more than "coordinator" and "own".
+# Knowledge as in a task with memory; without it these need no more than "scheduler" and "own".
 MEMORY_SIGNALS = (
     Signal(
         "belief_difference",
-        "coordinator_memory",
+        "scheduler_memory",
         "(n, N)",
         "what is believed beyond the centre's estimate if nobody transmits",
     ),
     Signal(
         "transmission_value",
-        "coordinator_memory",
+        "scheduler_memory",
         "(sensors, N)",
         "what each packet alone is expected to take off its squared norm, in weights of mean 1",
     ),
@@ -47,6 +47,6 @@ def missing_signals(owner: Owner) -> Mapping[str, str]:
     """What is believed by others than the owner of a batch's memory, and why it is not there."""
     why = (
         "is not there, for this batch does not keep what it needs: a policy that looks at what is "
-        "believed declares whose beliefs as an attribute, remember = 'coordinator' or 'own'"
+        "believed declares whose beliefs as an attribute, remember = 'scheduler' or 'own'"
     )
     return {name: f"signal {name!r} {why}" for name in (_EVERY if owner == "own" else _OWN)}

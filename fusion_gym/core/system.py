@@ -16,42 +16,43 @@ from typing import Any, ClassVar, Generic, Literal, TypeVar, cast, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fusion_gym import validation
+from fusion_gym import deprecation, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature
 
 Knowledge = Literal[
-    "clock", "centre", "own", "coordinator", "own_memory", "coordinator_memory"
+    "clock", "centre", "own", "scheduler", "own_memory", "scheduler_memory"
 ]  # fmt: skip
 KNOWLEDGE: tuple[Knowledge, ...] = get_args(Knowledge)
 MEANING: dict[Knowledge, str] = {
     "clock": "nothing but the time in the episode",
     "centre": "what the fusion centre knows before anything is sent",
     "own": "a sensor's new measurement and what the centre tells all sensors",
-    "coordinator": "all sensors' new measurements and what the centre knows",
+    "scheduler": "all sensors' new measurements and what the centre knows",
     "own_memory": "the same as own, and what that sensor measured and did not send",
-    "coordinator_memory": "the same as coordinator, and what all sensors measured and did not send",
+    "scheduler_memory": "the same as scheduler, and what all sensors measured and did not send",
 }
 # What each class knows besides itself.
 _BELOW: dict[Knowledge, tuple[Knowledge, ...]] = {
     "clock": (),
     "centre": ("clock",),
     "own": ("clock",),
-    "coordinator": ("clock", "centre", "own"),
+    "scheduler": ("clock", "centre", "own"),
     "own_memory": ("clock", "own"),
-    "coordinator_memory": ("clock", "centre", "own", "coordinator", "own_memory"),
+    "scheduler_memory": ("clock", "centre", "own", "scheduler", "own_memory"),
 }
 
 
 def covers(knower: Knowledge, known: Knowledge) -> bool:
     """Whether whoever has the class ``knower`` knows all that belongs to the class ``known``.
 
-    clock < centre and own < coordinator, and own and coordinator also with memory; centre and own
+    clock < centre and own < scheduler, and own and scheduler also with memory; centre and own
     do not cover each other.
 
     Raises:
         ConfigurationError: an unknown class.
     """
+    knower, known = deprecation.current("knower", knower), deprecation.current("known", known)
     for name, value in (("knower", knower), ("known", known)):
         validation.choice(name, value, KNOWLEDGE)
     return known == knower or known in _BELOW[knower]
@@ -59,8 +60,8 @@ def covers(knower: Knowledge, known: Knowledge) -> bool:
 
 def least_covering(classes: Iterable[Knowledge]) -> Knowledge:
     """The least class that covers all the given ones; ``"clock"`` for none."""
-    wanted = tuple(classes)
-    able = [k for k in KNOWLEDGE if all(covers(k, one) for one in wanted)]
+    required = tuple(classes)
+    able = [k for k in KNOWLEDGE if all(covers(k, item) for item in required)]
     return min(able, key=lambda k: len(_BELOW[k]))
 
 
@@ -83,6 +84,9 @@ class Signal:
     knowledge: Knowledge
     axes: str
     meaning: str
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "knowledge", deprecation.current("knowledge", self.knowledge))
 
 
 # The signals of every system, and what they are where the system does not say otherwise.
@@ -139,9 +143,13 @@ class Block:
     value: Callable[[Any], NDArray[Any]]
     labels: tuple[tuple[str, ...], ...] = ()
     knowledge: Knowledge = "centre"
-    node: Literal["own", "told", "hidden"] = "hidden"
+    node: Literal["own", "broadcast", "hidden"] = "hidden"
     limit: float | None = None
     constants: Mapping[str, ArrayLike] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("knowledge", "node"):
+            object.__setattr__(self, name, deprecation.current(name, getattr(self, name)))
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -13,13 +13,13 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.access import ACCESS_RULES
 from fusion_gym.core.communication import communication
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import Action, CommonOptions, Scenario, plain
+from fusion_gym.core.options import Action, CommonOptions, Scenario, plain_options
 from fusion_gym.core.reward import Price, Reward, bounded_open_loop
 from fusion_gym.core.system import Knowledge, System, covers, least_covering
 from fusion_gym.core.token_bucket import TokenBucket
 
 # What a policy of each information mode may know.
-INFORMATION_MODES: dict[str, Knowledge] = {"sensors": "coordinator", "centre": "centre"}
+INFORMATION_MODES: dict[str, Knowledge] = {"sensors": "scheduler", "centre": "centre"}
 ACTION_KINDS: tuple[str, ...] = get_args(Action)
 # Signals beside the system's own that only who sees the sensors may have.
 SENSORS_ONLY = (
@@ -33,12 +33,12 @@ _MOST_DISCRETE = 16  # sensors whose requests are one number: that has 2^sensors
 class Task:
     """Everything that an environment needs to know, independent of the number of runs.
 
-    ``information`` is ``"sensors"`` (a coordinator that sees every sensor's new measurement) or
+    ``information`` is ``"sensors"`` (a scheduler that sees every sensor's new measurement) or
     ``"centre"`` (only what the fusion centre knows before anything is sent). ``action`` is
     ``"binary"`` (one bit a sensor) or ``"discrete"`` (the bits as one number, sensor 0 the lowest).
     ``access`` is a rule of :mod:`fusion_gym.core.access`; with ``"single"`` the action is
     0 for nobody or the number of the sensor, counted from 1.
-    ``packet``, ``broadcast``, ``memory``, ``shadow`` and ``belief_features`` are those of
+    ``packet``, ``broadcast``, ``memory``, ``memory_system`` and ``belief_features`` are those of
     :mod:`fusion_gym.core.communication`; ``feedback`` says that the nodes get the centre's
     estimate back. With ``clock`` the observation shows what is left of the episode, whose end then
     belongs to the problem: a termination, no truncation. Without ``own_number`` a sensor that
@@ -61,7 +61,7 @@ class Task:
     packet: str = "measurement"
     broadcast: str = "none"
     memory: bool = False
-    shadow: System[Any] | None = None
+    memory_system: System[Any] | None = None
     belief_features: tuple[str, ...] = ()
     feedback: bool = False
     clock: bool = False
@@ -101,40 +101,40 @@ class Task:
         Raises:
             ConfigurationError: a value that is not allowed.
         """
-        chosen, system = scenario.options, scenario.system
+        options, system = scenario.options, scenario.system
         if not isinstance(system, System):
             raise validation.refusal(
                 "system", system, "an instance of fusion_gym.core.system.System"
             )
-        if system.nature != (nature := Nature.create(chosen)):
+        if system.nature != (nature := Nature.create(options)):
             nature.refuse("here", f"the truth of {type(system).__name__} is its model")
-        horizon = validation.horizon(chosen.horizon)
+        horizon = validation.horizon(options.horizon)
         reward = Reward.create(
-            chosen.error,
-            chosen.error_weight,
-            Price.create(chosen.cost_weight, chosen.price_range),
-            scenario.state_weights if chosen.state_weights is None else chosen.state_weights,
+            options.error,
+            options.error_weight,
+            Price.create(options.cost_weight, options.price_range),
+            scenario.state_weights if options.state_weights is None else options.state_weights,
             bounded_open_loop(system.open_loop(horizon), horizon),
         )
         how = communication(scenario)
         return cls(
             system=system,
-            bucket=make_bucket(chosen, system.sensor_count),
+            bucket=make_bucket(options, system.sensor_count),
             reward=reward,
             horizon=horizon if limit is None else min(horizon, limit),
-            information=chosen.information,
-            action=chosen.action,
-            access=chosen.access,
+            information=options.information,
+            action=options.action,
+            access=options.access,
             packet=how.packet,
             broadcast=how.broadcast,
             memory=how.memory,
-            shadow=how.shadow,
+            memory_system=how.memory_system,
             belief_features=how.features,
             feedback=scenario.feedback,
-            clock=chosen.clock,
-            own_number=chosen.own_number,
-            vector_reward=chosen.reward == "vector",
-            settings=plain(asdict(chosen)),
+            clock=options.clock,
+            own_number=options.own_number,
+            vector_reward=options.reward == "vector",
+            settings=plain_options(asdict(options)),
             policy_defaults=scenario.policy_defaults,
         )
 
@@ -142,7 +142,7 @@ class Task:
     def knowledge(self) -> Knowledge:
         """What a policy may know, in the one vocabulary."""
         known = INFORMATION_MODES[self.information]
-        return least_covering((known, "coordinator_memory")) if self.memory else known
+        return least_covering((known, "scheduler_memory")) if self.memory else known
 
     @property
     def sensors(self) -> int:
@@ -176,21 +176,21 @@ class Task:
         """Names of the signals that the information mode withholds."""
         signals = self.system.signals
         hidden = (s.name for s in signals if not covers(self.knowledge, s.knowledge))
-        return (*hidden, *(() if covers(self.knowledge, "coordinator") else SENSORS_ONLY))
+        return (*hidden, *(() if covers(self.knowledge, "scheduler") else SENSORS_ONLY))
 
 
-def make_bucket(chosen: CommonOptions, sensors: int) -> TokenBucket:
+def make_bucket(options: CommonOptions, sensors: int) -> TokenBucket:
     """The token bucket of the options.
 
     Raises:
         ConfigurationError: a value that is not allowed.
     """
     return TokenBucket.create(
-        rate=chosen.token_rate,
-        capacity=chosen.token_capacity,
-        initial=chosen.initial_tokens,
-        cost=chosen.token_cost,
+        rate=options.token_rate,
+        capacity=options.token_capacity,
+        initial=options.initial_tokens,
+        cost=options.token_cost,
         sensors=sensors,
-        sharing=chosen.sharing,
-        unlimited=chosen.tokens == "unlimited",
+        sharing=options.sharing,
+        unlimited=options.tokens == "unlimited",
     )

@@ -80,7 +80,7 @@ class TokenBucket:
             )
             raise ConfigurationError(
                 f"token_capacity = {limit:g} is not allowed: with token_cost = "
-                f"{validation.shown(cost)} it must be {reason}"
+                f"{validation.display(cost)} it must be {reason}"
             )
         start = validation.number("initial_tokens", initial, at_least=0.0)
         if start > limit:

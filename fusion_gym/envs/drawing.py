@@ -50,7 +50,7 @@ class Film:
         self.task = task
         self._steps: deque[_Step] = deque(maxlen=WINDOW)
         self._ages = np.zeros(runs, dtype=np.int64)  # steps of each run's episode
-        self._shown = task.system.state_names[:_MOST_STATES]
+        self._state_names = task.system.state_names[:_MOST_STATES]
         self._figure: Any = None  # made when it is first looked at
 
     def begin(self, runs: NDArray[np.int64] | None = None) -> None:
@@ -66,7 +66,7 @@ class Film:
         """How far the axis of each state that is shown has to reach, for films side by side."""
         truth, mean, deviation = self._shown_of(self._steps_of(run), run)
         if not len(truth):
-            return [(-1.0, 1.0)] * len(self._shown)
+            return [(-1.0, 1.0)] * len(self._state_names)
         low, high = np.minimum(truth, mean).min(0), np.maximum(truth, mean).max(0)
         room = 0.15 * (high - low) + 1e-6 + 0.5 * np.median(deviation, 0)
         return list(zip((low - room).tolist(), (high + room).tolist(), strict=True))
@@ -108,12 +108,12 @@ class Film:
 
     def _shown_of(self, steps: list[_Step], run: int) -> tuple[Array, Array, Array]:
         """Truth, fused estimate and two deviations that it claims, each (steps, shown)."""
-        system, shown = self.task.system, len(self._shown)
+        system, visible = self.task.system, len(self._state_names)
         fused = [system.fused(step.state) for step in steps]
-        truth = np.array([system.truth(step.state)[:shown, run] for step in steps])
-        mean = np.array([found[0][:shown, run] for found in fused])
-        variance = np.array([linalg.diagonal(found[1])[:shown, run] for found in fused])
-        truth, mean, variance = (part.reshape(-1, shown) for part in (truth, mean, variance))
+        truth = np.array([system.truth(step.state)[:visible, run] for step in steps])
+        mean = np.array([value[0][:visible, run] for value in fused])
+        variance = np.array([linalg.diagonal(value[1])[:visible, run] for value in fused])
+        truth, mean, variance = (part.reshape(-1, visible) for part in (truth, mean, variance))
         return truth, mean, 2.0 * np.sqrt(np.maximum(variance, 0.0))
 
     def _draw_states(
@@ -139,10 +139,10 @@ class Film:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        height = _TOP + _BOTTOM + _STATE * len(self._shown) + 2 * _STRIP
+        height = _TOP + _BOTTOM + _STATE * len(self._state_names) + 2 * _STRIP
         self._figure = Figure(figsize=(_WIDTH / 100, height / 100), dpi=100)
         self._canvas = FigureCanvasAgg(self._figure)
-        ratios = [_STATE] * len(self._shown) + [_STRIP, _STRIP]
+        ratios = [_STATE] * len(self._state_names) + [_STRIP, _STRIP]
         self._axes: list[Any] = list(
             self._figure.subplots(
                 len(ratios), 1, sharex=True,
@@ -152,7 +152,7 @@ class Film:
         )  # fmt: skip
         self._curves: list[list[Any]] = []
         limits = self.task.system.censored_beyond
-        for place, (name, axis) in enumerate(zip(self._shown, self._axes, strict=False)):
+        for place, (name, axis) in enumerate(zip(self._state_names, self._axes, strict=False)):
             (truth,) = axis.plot([], [], color=_TRUTH, lw=1.4, label="state")
             (mean,) = axis.plot([], [], color=_ESTIMATE, lw=1.4, label="fused estimate")
             band = axis.fill_between(

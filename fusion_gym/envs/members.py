@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.envs.views import CoordinatorView
-from fusion_gym.validation import shown
+from fusion_gym.envs.views import SchedulerView
+from fusion_gym.validation import display
 
 # Attributes that all runs share, as single environments have them.
 _SHARED = ("task", "view", "observation_names", "reward_space", "spec", "metadata", "render_mode")
@@ -24,7 +24,7 @@ class Members:
 
     num_envs: int
     batch: EpisodeBatch
-    view: CoordinatorView
+    view: SchedulerView
     single_observation_space: Any
     single_action_space: Any
 
@@ -42,8 +42,8 @@ class Members:
             AttributeError: runs have no such method or attribute, for they share one batch.
         """
         if name in _METHODS:
-            found = getattr(self, name)(*args, **kwargs)
-            return (None,) * self.num_envs if found is None else tuple(found)
+            result = getattr(self, name)(*args, **kwargs)
+            return (None,) * self.num_envs if result is None else tuple(result)
         return (self._attribute(name),) * self.num_envs
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -74,5 +74,5 @@ class Members:
         known = [*_METHODS, "observation_space", "action_space"]
         known += [shared for shared in _SHARED if hasattr(self, shared)]
         raise AttributeError(
-            f"the runs share one batch and have no {shown(name)}: known are {', '.join(known)}"
+            f"the runs share one batch and have no {display(name)}: known are {', '.join(known)}"
         )

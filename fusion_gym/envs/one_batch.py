@@ -12,10 +12,10 @@ from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
-from fusion_gym.core.options import plain
+from fusion_gym.core.options import plain_options
 from fusion_gym.envs.registration import base_of
 from fusion_gym.envs.sb3 import FusionSB3VecEnv, make_sb3_vec_env
-from fusion_gym.validation import ConfigurationError, shown
+from fusion_gym.validation import ConfigurationError, display
 
 
 def one_batch(envs: VecEnv, **options: Any) -> FusionSB3VecEnv:
@@ -37,23 +37,23 @@ def one_batch(envs: VecEnv, **options: Any) -> FusionSB3VecEnv:
     base, _ = base_of(spec.id)  # the options are in the specification too
     if any(_made_with(other) != _made_with(spec) for other in specs):
         raise ConfigurationError(
-            f"different environments {shown([_made_with(other) for other in specs])} are not "
+            f"different environments {display([_made_with(other) for other in specs])} are not "
             "allowed in one batch: all must be made alike"
         )
     wrappers = [w.name for w in spec.additional_wrappers if w.name != Monitor.__name__]
     if wrappers:
         raise ConfigurationError(
-            f"wrappers {shown(wrappers)} are not allowed in one batch, which would be without them"
+            f"wrappers {display(wrappers)} are not allowed in one batch, which would lack them"
         )
-    made = dict(spec.kwargs)
-    if made.pop("render_mode", None) == "human":
+    arguments = dict(spec.kwargs)
+    if arguments.pop("render_mode", None) == "human":
         raise ConfigurationError(
             "render_mode = 'human' is not allowed in one batch: it must be None or 'rgb_array'"
         )
     (task,) = envs.get_attr("task", indices=0)
     if spec.max_episode_steps is not None and spec.max_episode_steps < task.horizon:
-        made["max_episode_steps"] = spec.max_episode_steps  # a limit of gym.make
-    batch = make_sb3_vec_env(base, envs.num_envs, **(options | made))
+        arguments["max_episode_steps"] = spec.max_episode_steps  # a limit of gym.make
+    batch = make_sb3_vec_env(base, envs.num_envs, **(options | arguments))
     batch.seed(envs._seeds[0])
     envs.close()
     return batch
@@ -61,4 +61,4 @@ def one_batch(envs: VecEnv, **options: Any) -> FusionSB3VecEnv:
 
 def _made_with(spec: EnvSpec) -> Any:
     """What two specifications have in common if their environments are alike."""
-    return spec.id, spec.max_episode_steps, plain(spec.kwargs)
+    return spec.id, spec.max_episode_steps, plain_options(spec.kwargs)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fusion_gym.core.options import CommonOptions, plain
+from fusion_gym.core.options import CommonOptions, plain_options
 from fusion_gym.declaration import choices, hints, meanings, type_text
 
 
@@ -30,22 +30,24 @@ FOR_ALL = {
 
 def options_in(kind: type[CommonOptions]) -> dict[str, Option]:
     """Return every option by its name: the environment's own, then those that all have."""
-    given, common = kind(), {field.name for field in fields(CommonOptions)}
+    value, common = kind(), {field.name for field in fields(CommonOptions)}
     types, texts = hints(kind), meanings(kind)
     result = {}
     for field in sorted(fields(kind), key=lambda field: field.name in common):
         name, hint = field.name, types.get(field.name, field.type)
         text = hint if isinstance(hint, str) else type_text(hint)
-        result[name] = Option(text, getattr(given, name), texts.get(name, ""), choices(hint))
+        result[name] = Option(text, getattr(value, name), texts.get(name, ""), choices(hint))
     return result | {name: option for name, option in FOR_ALL.items() if name not in result}
 
 
-def listed(options: Mapping[str, Option], given: Mapping[str, Any] | None = None) -> Iterator[str]:
-    """Yield the lines of each option; of one that is ``given`` its value, then its default."""
+def list_options(
+    options: Mapping[str, Option], value: Mapping[str, Any] | None = None
+) -> Iterator[str]:
+    """Yield the lines of each option; of one that is ``value`` its value, then its default."""
     for name, option in options.items():
         default = short(option.default)
-        if given is not None and name in given:
-            yield f"{name}: {option.type} = {short(given[name])}  (default: {default})"
+        if value is not None and name in value:
+            yield f"{name}: {option.type} = {short(value[name])}  (default: {default})"
         else:
             yield f"{name}: {option.type} = {default}"
         yield f"    {option.meaning}"
@@ -53,7 +55,7 @@ def listed(options: Mapping[str, Option], given: Mapping[str, Any] | None = None
 
 def short(value: Any) -> str:
     """Return a value as it would be written, its numbers with four digits."""
-    value = plain(value)
+    value = plain_options(value)
     if isinstance(value, list):
         return f"({', '.join(map(short, value))}{',' if len(value) == 1 else ''})"
     return f"{value:.4g}" if isinstance(value, float) and np.isfinite(value) else repr(value)

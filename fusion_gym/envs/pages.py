@@ -30,11 +30,11 @@ from fusion_gym.core.reward import Price
 from fusion_gym.core.system import Block, covers, numbered
 from fusion_gym.core.task import Task
 from fusion_gym.docstrings import plain_marks, read, table
-from fusion_gym.envs.option_text import listed, options_in, short
+from fusion_gym.envs.option_text import list_options, options_in, short
 from fusion_gym.envs.registration import make_task, options_of
-from fusion_gym.envs.views import heard, make_view
+from fusion_gym.envs.views import is_received, make_view
 from fusion_gym.fusion.table import RULES
-from fusion_gym.importing import named
+from fusion_gym.importing import import_named
 
 LEGEND = """\
 A star marks what only the sensors know: `information="centre"` leaves it out. The third column
@@ -86,12 +86,12 @@ _NETWORK = {
     "time_left": "only with `clock=True`",
     "price": "only with a `price_range`",
 }
-# What is believed, in the observation of the coordinator and in a sensor's own.
+# What is believed, in the observation of the scheduler and in a sensor's own.
 _BELIEFS: dict[Owner, str] = {
-    "coordinator": "only with `memory=True` or `belief_features`",
+    "scheduler": "only with `memory=True` or `belief_features`",
     "own": "only with `memory=True` or `belief_features`, for a sensor by itself",
 }
-_SEES = {"own": "its own", "told": "all", "hidden": "none"}
+_SEES = {"own": "its own", "broadcast": "all", "hidden": "none"}
 _WORDS = {"ArrayLike": "number or array", "float": "number", "int": "whole number", "str": "word"}
 _LONGEST = 60  # characters of a default in a table
 # What writes the tables of a kind from the text of their marker: "module:function".
@@ -134,7 +134,7 @@ def page(env_id: str, task: Task | None = None) -> str:
         open_loop=f"{float(weights @ system.open_loop(task.horizon)):.3g}",
         horizon=task.horizon,
         options=kind.__name__,
-        arguments="\n".join(f"    {plain_marks(line)}" for line in listed(options_in(kind))),
+        arguments="\n".join(f"    {plain_marks(line)}" for line in list_options(options_in(kind))),
         history="\n".join(f"- {text}" for text in ["v0: first version.", *versions]),
     )
 
@@ -152,8 +152,8 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
     remembering = replace(task, memory=True, belief_features=task.belief_features or FEATURES)
     for owner, condition in _BELIEFS.items():
         for block in belief_blocks(remembering, owner):
-            shown = bool(task.belief_features) and owner == "coordinator"
-            rows[block.name] = _row(task, block, "" if shown else condition)
+            visible = bool(task.belief_features) and owner == "scheduler"
+            rows[block.name] = _row(task, block, "" if visible else condition)
     always = [block.name for block in network_blocks(task)]
     price = replace(task.reward, price=Price(None, (0.01, 1.0)))
     for block in network_blocks(replace(task, access="round_robin", clock=True, reward=price)):
@@ -181,17 +181,17 @@ def option_table(text: str) -> str:
     return table(("option", "type", "default", "meaning"), rows)
 
 
-def documented(text: str) -> str:
+def update_tables(text: str) -> str:
     """The text with all its marked tables made anew.
 
     Raises:
         ConfigurationError: an id or an option in a marker that does not exist.
     """
 
-    def anew(match: re.Match[str]) -> str:
-        return f"{match[1]}{named('table', TABLES[match[2]])(match[3])}\n{match[4]}"
+    def rewrite(match: re.Match[str]) -> str:
+        return f"{match[1]}{import_named('table', TABLES[match[2]])(match[3])}\n{match[4]}"
 
-    return _MARKED.sub(anew, text)
+    return _MARKED.sub(rewrite, text)
 
 
 def observation_text(marker: str) -> str:
@@ -202,11 +202,11 @@ def observation_text(marker: str) -> str:
     """
     first, *others = marker.split(";")
     env_id, *options = shlex.split(first)
-    given, task = _listed(options), task_of(first)
+    value, task = _listed(options), task_of(first)
     rest = [(_listed(shlex.split(text)), task_of(f"{env_id} {text}")) for text in others]
     count = len(ObservationLayout(task).names)
     states = ", ".join(f"`{name}`" for name in task.system.state_names)
-    last = f"With {given or 'the defaults'} these are {count} numbers; states: {states}."
+    last = f"With {value or 'the defaults'} these are {count} numbers; states: {states}."
     return f"{LEGEND}\n\n{observation_table(task, *rest)}\n\n{last}"
 
 
@@ -252,7 +252,9 @@ def _row(task: Task, block: Block, condition: str = "") -> tuple[str, ...]:
 def _seen(task: Task, block: Block) -> str:
     """What a sensor that decides by itself sees of a block."""
     entries = block_entries(block)
-    return "all" if all(heard(entry, task.broadcast) for entry in entries) else _SEES[block.node]
+    return (
+        "all" if all(is_received(entry, task.broadcast) for entry in entries) else _SEES[block.node]
+    )
 
 
 def _axis(task: Task, block: Block, place: int) -> str:
@@ -277,8 +279,8 @@ def _options(words: list[str]) -> dict[str, Any]:
 
 
 def _listed(words: list[str]) -> str:
-    shown = (f"{name}={value!r}" for name, value in _options(words).items())
-    return _double(", ".join(f"`{text}`" for text in shown))
+    output = (f"{name}={value!r}" for name, value in _options(words).items())
+    return _double(", ".join(f"`{text}`" for text in output))
 
 
 def _double(text: str) -> str:
@@ -289,7 +291,7 @@ def _double(text: str) -> str:
 def main(paths: list[str]) -> None:
     """Write the tables of these files anew."""
     for path in map(Path, paths):
-        path.write_text(documented(path.read_text(encoding="utf-8")), encoding="utf-8")
+        path.write_text(update_tables(path.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.vector import refuse_vector_reward
 from fusion_gym.envs.views import SensorView
-from fusion_gym.errors import shown
+from fusion_gym.errors import display
 
 Dict = dict[str, Any]
 
@@ -83,11 +83,11 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
             raise gymnasium.error.ResetNeeded("the episode is over or never began: call reset")
         if not isinstance(actions, Mapping) or set(actions) != set(self.agents):
             raise ValueError(
-                f"actions {shown(actions)} are not allowed: they must be a dictionary with one of "
-                f"each of {self.agents}"
+                f"actions {display(actions)} are not allowed: they must be a dictionary with one "
+                f"of each of {self.agents}"
             )
-        chosen = [actions[agent] for agent in self.agents]
-        outcome = self.batch.step(self.view.requests(chosen, None))
+        selection = [actions[agent] for agent in self.agents]
+        outcome = self.batch.step(self.view.requests(selection, None))
         reward, ended = float(outcome.reward[0]), bool(outcome.ended[0])
         agents = self.agents
         costs = outcome.granted[:, 0] * self.task.bucket.cost[:, 0]
@@ -109,7 +109,7 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
     def state(self) -> NDArray[np.float32]:
         """What all sensors and the centre know together (entries,), for a central critic.
 
-        It is a coordinator's observation, with what each sensor remembers by itself in a task with
+        It is a scheduler's observation, with what each sensor remembers by itself in a task with
         memory: everything that an agent observes but its own number, and nothing of the truth.
 
         Raises:

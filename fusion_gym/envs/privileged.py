@@ -71,8 +71,8 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         super().__init__(task, num_envs, **options)
         if error != "squared":
             self.batch = EpisodeBatch(task, num_envs, self.view.owner, reference)
-        self._wanted: NDArray[np.bool_] | None = None
-        self._seen: NDArray[np.float32] | None = None  # the rows, until an episode begins
+        self._requests: NDArray[np.bool_] | None = None
+        self._observed: NDArray[np.float32] | None = None  # the rows, until an episode begins
         self._branched: Branched | None = None
 
     def step_alternatives(
@@ -83,44 +83,44 @@ class PrivilegedVecEnv(FusionSB3VecEnv):
         Raises:
             ValueError: an action that is not in the action space.
         """
-        self._wanted = requests
+        self._requests = requests
         try:
             result = self.step(actions)
         finally:
-            self._wanted = None
+            self._requests = None
         branched = self._branched
         assert branched is not None
         return result, branched
 
     def _begin(self) -> None:
-        self._seen = None
+        self._observed = None
         self.batch.reset(stagger=self.stagger, groups=_GROUPS)
 
     def _finish(
         self, runs: NDArray[np.int64], lengths: NDArray[np.int64], infos: list[dict[str, Any]]
     ) -> None:
         super()._finish(runs, lengths, infos)
-        self._seen = None
+        self._observed = None
 
     def _observe(self) -> NDArray[np.float32]:
-        return super()._observe() if self._seen is None else self._seen
+        return super()._observe() if self._observed is None else self._observed
 
     def _advance(self, requests: NDArray[np.bool_]) -> Outcome:
-        self._seen = None
-        if self._wanted is None:
+        self._observed = None
+        if self._requests is None:
             return super()._advance(requests)
         before, scale = self.batch.branch(), self._scale()
         outcome = self.batch.step(requests)
         observation = self.batch.observe()
-        self._seen = self.view.rows(observation)
-        found = alternatives(
-            before, self._wanted, self.batch.normals(), outcome, observation, self.batch.beliefs()
+        self._observed = self.view.rows(observation)
+        result = alternatives(
+            before, self._requests, self.batch.normals(), outcome, observation, self.batch.beliefs()
         )
         reference = self._reference_error()
         if reference is not None:
             reference = reference[:, None]
-        reward = self._error_term(found.error, reference) + found.communication
-        self._branched = Branched(reward * scale, found.observation)
+        reward = self._error_term(result.error, reference) + result.communication
+        self._branched = Branched(reward * scale, result.observation)
         return outcome
 
     def _reward(self, outcome: Outcome) -> Array:
@@ -147,8 +147,8 @@ def reference_system(
     Raises:
         ConfigurationError: an unknown id, option or filter.
     """
-    chosen = {**options, "information": "sensors", "memory": True}
+    settings = {**options, "information": "sensors", "memory": True}
     if memory_filter is not None:
-        chosen["memory_filter"] = memory_filter
-    task = make_task(env_id, **chosen)
-    return task.shadow or task.system
+        settings["memory_filter"] = memory_filter
+    task = make_task(env_id, **settings)
+    return task.memory_system or task.system

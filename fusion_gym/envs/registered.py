@@ -33,10 +33,10 @@ def __getattr__(name: str) -> type:
     env_id = id_of(name)
     if env_id is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    made = _vector(env_id) if name.endswith("VectorEnv") else _single(env_id)
-    made.__name__ = made.__qualname__ = name
-    globals()[name] = made
-    return made
+    result = _vector(env_id) if name.endswith("VectorEnv") else _single(env_id)
+    result.__name__ = result.__qualname__ = name
+    globals()[name] = result
+    return result
 
 
 def _single(env_id: str) -> type:

@@ -20,7 +20,7 @@ from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.rehearsal import rehearse
 from fusion_gym.core.task import Task
 from fusion_gym.envs.option_file import read_options
-from fusion_gym.envs.option_text import Option, listed, options_in
+from fusion_gym.envs.option_text import Option, list_options, options_in
 from fusion_gym.importing import imported, name_of
 from fusion_gym.validation import ConfigurationError
 
@@ -36,13 +36,13 @@ class FusionSpec(EnvSpec):
     """
 
     @classmethod
-    def of(cls, given: EnvSpec) -> EnvSpec:
+    def of(cls, spec: EnvSpec) -> EnvSpec:
         """A copy of what Gymnasium knows, of this kind where the environment is registered."""
         try:
-            base_of(given.id)
+            base_of(spec.id)
         except ConfigurationError:
-            return copy.copy(given)
-        known = {field.name: getattr(given, field.name) for field in fields(given) if field.init}
+            return copy.copy(spec)
+        known = {field.name: getattr(spec, field.name) for field in fields(spec) if field.init}
         return cls(**known)
 
     @property
@@ -57,7 +57,7 @@ class FusionSpec(EnvSpec):
         print_all: bool = False,
     ) -> str | None:
         """See Gymnasium's; the options follow."""
-        lines = [f"    {option}" for option in listed(self.options, self.kwargs)]
+        lines = [f"    {option}" for option in list_options(self.options, self.kwargs)]
         text = super().pprint(True, include_entry_points, print_all)
         text = "\n".join([f"{text}", "options:", *lines])
         if disable_print:
@@ -67,14 +67,14 @@ class FusionSpec(EnvSpec):
 
 
 ENVIRONMENTS: dict[str, str | Build] = {
-    "fusion_gym/TobitOscillator-v0": "fusion_gym.systems.tobit.oscillator:build",
-    "fusion_gym/CorrelatedTracking-v0": "fusion_gym.systems.correlated.environment:build",
-    "fusion_gym/MarkovJumpTracking-v0": "fusion_gym.systems.markov_jump.environment:build",
-    "fusion_gym/UnknownInput-v0": "fusion_gym.systems.unknown_input.environment:build",
-    "fusion_gym/BiasedOscillator-v0": "fusion_gym.systems.tobit.biased:build_oscillator",
-    "fusion_gym/BiasedTracking-v0": "fusion_gym.systems.tobit.biased:build_tracking",
-    "fusion_gym/LinearFusion-v0": "fusion_gym.systems.tobit.linear:build",
-    "fusion_gym/RemoteEstimation-v0": "fusion_gym.systems.remote.environment:build",
+    "fusion_gym/TobitOscillator-v0": "fusion_gym.systems.tobit.oscillator:build_tobit",
+    "fusion_gym/CorrelatedTracking-v0": "fusion_gym.systems.correlated.environment:build_adaptive",
+    "fusion_gym/MarkovJumpTracking-v0": "fusion_gym.systems.markov_jump.environment:build_markov",
+    "fusion_gym/UnknownInput-v0": "fusion_gym.systems.unknown_input.environment:build_unknown",
+    "fusion_gym/BiasedOscillator-v0": "fusion_gym.systems.tobit.biased:build_biased_oscillator",
+    "fusion_gym/BiasedTracking-v0": "fusion_gym.systems.tobit.biased:build_biased_tracking",
+    "fusion_gym/LinearFusion-v0": "fusion_gym.systems.tobit.linear:build_linear",
+    "fusion_gym/RemoteEstimation-v0": "fusion_gym.systems.remote.environment:build_remote",
 }
 
 
@@ -165,8 +165,8 @@ def build_of(env_id: str) -> Build:
     if not isinstance(entry, str):
         return entry
     module, _, name = entry.partition(":")
-    found: Build = getattr(importlib.import_module(module), name)
-    return found
+    member: Build = getattr(importlib.import_module(module), name)
+    return member
 
 
 def options_of(env_id: str) -> type[CommonOptions]:
@@ -216,12 +216,12 @@ def make_task(env: str | CommonOptions, **options: Any) -> Task:
                 "registered environments"
             )
         return _checked(build_of(env_id), env, limit)
-    kind, options = options_of(env), opened(env, options)
+    kind, options = options_of(env), open_options(env, options)
     validation.arguments(env, options, [field.name for field in fields(kind)])
     return _checked(build_of(env), kind(**options), limit)
 
 
-def opened(env_id: str, options: Mapping[str, Any]) -> dict[str, Any]:
+def open_options(env_id: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """The options of an environment with those of the file that ``system`` names, if it does.
 
     What the id's own registration says goes before the file.
@@ -237,25 +237,25 @@ def opened(env_id: str, options: Mapping[str, Any]) -> dict[str, Any]:
     return {name: content[name] for name in content if name not in registered} | beside
 
 
-def _checked(build: Build, chosen: CommonOptions, limit: int | None) -> Task:
+def _checked(build: Build, options: CommonOptions, limit: int | None) -> Task:
     """The task, rehearsed if options were given, which an error names in any case.
 
     A default may be what does not fit beside them, as the 2 entries of ``initial_mean`` beside a
     ``transition`` of 3 states.
     """
-    given = {
+    args = {
         field.name: value
-        for field in fields(chosen)
-        if (value := getattr(chosen, field.name)) is not field.default
+        for field in fields(options)
+        if (value := getattr(options, field.name)) is not field.default
     }
     try:
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # results are checked
-            task = Task.create(build(chosen), limit)
-            if given:
+            task = Task.create(build(options), limit)
+            if args:
                 rehearse(task)
     except ConfigurationError as error:
-        if not given or any(re.search(rf"\b{name}(\[\d+\])? ?=", str(error)) for name in given):
+        if not args or any(re.search(rf"\b{name}(\[\d+\])? ?=", str(error)) for name in args):
             raise
-        listed = ", ".join(f"{name} = {validation.shown(value)}" for name, value in given.items())
+        listed = ", ".join(f"{name} = {validation.display(value)}" for name, value in args.items())
         raise ConfigurationError(f"{error} (given: {listed})") from None
     return task

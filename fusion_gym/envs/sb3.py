@@ -41,7 +41,7 @@ class FusionSB3VecEnv(VecEnv):
 
     Attributes:
         task: the task.
-        view: who looks and decides, the coordinator or every sensor.
+        view: who looks and decides, the scheduler or every sensor.
         observation_names: a name for each entry of an observation.
         seconds: wall time spent in :meth:`step_wait` and :meth:`reset` so far.
         totals: tokens spent and steps made so far, over all runs.
@@ -124,8 +124,8 @@ class FusionSB3VecEnv(VecEnv):
         self._returns += outcome.reward
         self._spent += outcome.cost
         self.totals = (self.totals[0] + float(outcome.cost.sum()), self.totals[1] + self.runs)
-        made, granted = np.count_nonzero(requests), np.count_nonzero(outcome.granted)
-        self.requests = (self.requests[0] + int(made), self.requests[1] + int(granted))
+        request_count, granted = np.count_nonzero(requests), np.count_nonzero(outcome.granted)
+        self.requests = (self.requests[0] + int(request_count), self.requests[1] + int(granted))
         done = outcome.ended
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done.any():

@@ -23,7 +23,7 @@ from fusion_gym.envs.vector import (
     rewards_of,
     step_infos,
 )
-from fusion_gym.envs.views import CoordinatorView
+from fusion_gym.envs.views import SchedulerView
 
 
 class FusionEnv(Specified, gymnasium.Env[Any, Any]):
@@ -45,10 +45,10 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
         self.render_mode = checked_mode(type(self).__name__, render_mode)
         self.task = task
         self._film = None if self.render_mode is None else Film(task, 1)
-        shown = self.render_mode == "human"
-        self._window = Window(type(self).__name__, FRAMES_PER_SECOND) if shown else None
+        visible = self.render_mode == "human"
+        self._window = Window(type(self).__name__, FRAMES_PER_SECOND) if visible else None
         self.batch = EpisodeBatch(task, 1)
-        self.view = CoordinatorView(task)
+        self.view = SchedulerView(task)
         self.observation_names = self.view.names
         self.observation_space = self.view.space
         self.action_space = self.view.actions

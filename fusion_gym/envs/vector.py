@@ -20,7 +20,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.envs.drawing import Film, Frame
 from fusion_gym.envs.members import Members
 from fusion_gym.envs.registration import FusionSpec
-from fusion_gym.envs.views import CoordinatorView
+from fusion_gym.envs.views import SchedulerView
 
 Infos = dict[str, Any]
 RENDER_MODES = ("rgb_array", "human")
@@ -43,8 +43,8 @@ class Specified:
         return self._spec
 
     @spec.setter
-    def spec(self, given: EnvSpec | None) -> None:
-        self._spec = None if given is None else FusionSpec.of(given)
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = None if spec is None else FusionSpec.of(spec)
         if self._spec is not None:
             self._spec.max_episode_steps = self.task.horizon
 
@@ -74,8 +74,8 @@ class FusionVectorEnv(Specified, Members, VectorEnv[Any, Any, Any]):
         self.render_mode = checked_mode(type(self).__name__, render_mode, ("rgb_array",))
         self.num_envs = validation.runs(num_envs)
         modes = [mode.value for mode in AutoresetMode]
-        given = getattr(autoreset_mode, "value", autoreset_mode)
-        self.autoreset_mode = AutoresetMode(validation.choice("autoreset_mode", given, modes))
+        value = getattr(autoreset_mode, "value", autoreset_mode)
+        self.autoreset_mode = AutoresetMode(validation.choice("autoreset_mode", value, modes))
         self.metadata = {
             "render_modes": ["rgb_array"],
             "render_fps": FRAMES_PER_SECOND,
@@ -83,7 +83,7 @@ class FusionVectorEnv(Specified, Members, VectorEnv[Any, Any, Any]):
         }
         self.task = task
         self.batch = EpisodeBatch(task, self.num_envs)
-        self.view = CoordinatorView(task)
+        self.view = SchedulerView(task)
         self.observation_names = self.view.names
         self.single_observation_space = self.view.space
         self.single_action_space = self.view.actions

@@ -1,4 +1,4 @@
-"""Who looks and decides: a coordinator of all sensors, or every sensor by itself.
+"""Who looks and decides: a scheduler of all sensors, or every sensor by itself.
 
 A view turns a batch's observations into rows, one for each decision of a policy, and the
 decisions into requests. It has ``names`` of a row's entries, the ``space`` of a row, float32, and
@@ -15,16 +15,16 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from fusion_gym.core.memory import Owner
-from fusion_gym.core.observation import Entry, ObservationLayout
+from fusion_gym.core.observation import ObservationEntry, ObservationLayout
 from fusion_gym.core.system import Knowledge
 from fusion_gym.core.task import Task
-from fusion_gym.errors import ConfigurationError, shown
+from fusion_gym.errors import ConfigurationError, display
 
 Rows = NDArray[np.float32]
 Requests = NDArray[np.bool_]
 
 
-class CoordinatorView:
+class SchedulerView:
     """One row a run: the task's whole observation, and a decision for all sensors.
 
     The action space is ``MultiBinary(sensors)``; with ``action="discrete"`` it is
@@ -60,13 +60,13 @@ class CoordinatorView:
             ValueError: actions of another shape, not finite, or outside the action space.
         """
         shape = self.actions.shape or ()
-        given = _numbers(actions, shape if runs is None else (runs, *shape))
+        array = _numbers(actions, shape if runs is None else (runs, *shape))
         if isinstance(self.actions, spaces.MultiBinary):
-            requests = _ones(given)
+            requests = _ones(array)
             return np.ascontiguousarray((requests[None] if runs is None else requests).T)
         high = int(self.actions.n) - 1
-        _check(given, (given >= 0) & (given <= high) & (given == np.floor(given)), f"0..{high}")
-        return self._decoded(given.astype(np.int64).reshape(-1))
+        _check(array, (array >= 0) & (array <= high) & (array == np.floor(array)), f"0..{high}")
+        return self._decoded(array.astype(np.int64).reshape(-1))
 
     def masks(self, allowed: Requests) -> NDArray[np.bool_]:
         """Return the open choices (N, choices) where sensors (sensors, N) may request.
@@ -101,7 +101,7 @@ class SensorView:
 
     Raises:
         ConfigurationError: a task whose information is not "sensors", whose packets only a
-            coordinator can fill, or whose sensors do not see the same kinds of entries.
+            scheduler can fill, or whose sensors do not see the same kinds of entries.
     """
 
     def __init__(self, task: Task) -> None:
@@ -110,7 +110,7 @@ class SensorView:
         if task.packet == "estimate":
             raise ConfigurationError(
                 "packet = 'estimate' is not allowed with a local view: it must be 'measurement', "
-                "for the estimate is the coordinator's, of all sensors"
+                "for the estimate is the scheduler's, of all sensors"
             )
         if task.information != "sensors":
             raise ConfigurationError(
@@ -118,11 +118,13 @@ class SensorView:
                 "'sensors', for a sensor sees its own measurement"
             )
         layout, count = ObservationLayout(task, "own"), task.sensors
-        told = [p for p, entry in enumerate(layout.entries) if heard(entry, task.broadcast)]
+        received = [
+            p for p, entry in enumerate(layout.entries) if is_received(entry, task.broadcast)
+        ]
         columns, names = [], []
         for sensor in range(count):
             own = [place for place, entry in enumerate(layout.entries) if entry.sensor == sensor]
-            columns.append(own + told)
+            columns.append(own + received)
             names.append([layout.entries[place].own_name for place in own])
         if any(kinds != names[0] for kinds in names):
             raise ConfigurationError(
@@ -134,44 +136,44 @@ class SensorView:
         # Which sensor it is, one-hot: a row a sensor, (sensors, sensors) or without entries.
         self._identity = np.eye(count, dtype=np.float32)[:, : count if task.own_number else 0]
         identity = [f"sensor[{sensor}]" for sensor in range(self._identity.shape[1])]
-        self.names = (*names[0], *(layout.names[place] for place in told), *identity)
+        self.names = (*names[0], *(layout.names[place] for place in received), *identity)
         low = np.concatenate((layout.low[columns[0]], np.zeros_like(self._identity[0])))
         high = np.concatenate((layout.high[columns[0]], np.ones_like(self._identity[0])))
         self.space = spaces.Box(low, high, dtype=np.float32)
         self.actions: spaces.Discrete[Any] = spaces.Discrete(2)
 
     def rows(self, observation: Rows) -> Rows:
-        """Turn observations (N, coordinator's entries) into rows (N·sensors, entries)."""
-        seen = observation[:, self._columns]
+        """Turn observations (N, scheduler's entries) into rows (N·sensors, entries)."""
+        observed = observation[:, self._columns]
         shared = np.broadcast_to(self._identity, (len(observation), *self._identity.shape))
-        return np.concatenate((seen, shared), axis=-1).reshape(-1, len(self.names))
+        return np.concatenate((observed, shared), axis=-1).reshape(-1, len(self.names))
 
     def requests(self, actions: Any, runs: int | None) -> Requests:
         """Return the requests (sensors, N) of actions (N·sensors,), 1 for a request, run by run."""
-        given = _numbers(actions, ((1 if runs is None else runs) * self.rows_per_run,))
-        return np.ascontiguousarray(_ones(given).reshape(-1, self.rows_per_run).T)
+        values = _numbers(actions, ((1 if runs is None else runs) * self.rows_per_run,))
+        return np.ascontiguousarray(_ones(values).reshape(-1, self.rows_per_run).T)
 
     def masks(self, allowed: Requests) -> NDArray[np.bool_]:
         """Return the open choices (N·sensors, 2), silence and a request."""
         return np.stack((np.ones(allowed.size, dtype=np.bool_), allowed.T.ravel()), axis=1)
 
 
-View = CoordinatorView | SensorView
+View = SchedulerView | SensorView
 
 
 def make_view(task: Task, local: bool = False) -> View:
-    """The coordinator's view of a task, or with ``local`` the one that every sensor has.
+    """The scheduler's view of a task, or with ``local`` the one that every sensor has.
 
     Raises:
         ConfigurationError: a local view of a task that has none (:class:`SensorView`).
     """
-    return SensorView(task) if local else CoordinatorView(task)
+    return SensorView(task) if local else SchedulerView(task)
 
 
-def heard(entry: Entry, broadcast: str) -> bool:
+def is_received(entry: ObservationEntry, broadcast: str) -> bool:
     """Whether every sensor sees an entry."""
-    told = {"none": False, "estimate": entry.centre and entry.sensor is None}
-    return entry.told or told.get(broadcast, entry.centre)
+    received = {"none": False, "estimate": entry.centre and entry.sensor is None}
+    return entry.broadcast or received.get(broadcast, entry.centre)
 
 
 def _numbers(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
@@ -181,31 +183,31 @@ def _numbers(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
         ValueError: anything else.
     """
     try:
-        given = np.asarray(actions)
+        values = np.asarray(actions)
     except ValueError:
-        given = np.array(None)
-    if given.dtype.kind not in "biuf":
+        values = np.array(None)
+    if values.dtype.kind not in "biuf":
         raise ValueError(
-            f"action {shown(actions)} is not allowed: it must be numbers of shape {shape}, not "
-            f"{type(actions).__name__} of {given.dtype}"
+            f"action {display(actions)} is not allowed: it must be numbers of shape {shape}, not "
+            f"{type(actions).__name__} of {values.dtype}"
         )
-    if given.shape != shape:
+    if values.shape != shape:
         raise ValueError(
-            f"action {shown(given)} of shape {given.shape} is not allowed: its shape must be "
+            f"action {display(values)} of shape {values.shape} is not allowed: its shape must be "
             f"{shape}"
         )
-    return given
+    return values
 
 
-def _ones(given: NDArray[Any]) -> Requests:
+def _ones(values: NDArray[Any]) -> Requests:
     """Where the actions are 1; all others must be 0."""
-    requests: Requests = given == 1
-    _check(given, requests | (given == 0), "0 or 1")
+    requests: Requests = values == 1
+    _check(values, requests | (values == 0), "0 or 1")
     return requests
 
 
-def _check(given: NDArray[Any], valid: NDArray[np.bool_], allowed: str) -> None:
+def _check(values: NDArray[Any], valid: NDArray[np.bool_], allowed: str) -> None:
     if not valid.all():
         place = tuple(int(i) for i in np.argwhere(~valid)[0])
         where = f"action {list(place)}" if place else "action"
-        raise ValueError(f"{where} = {given[place]} is not allowed: it must be {allowed}")
+        raise ValueError(f"{where} = {values[place]} is not allowed: it must be {allowed}")

@@ -62,8 +62,8 @@ def run_beside(task: Task, policies: Sequence[Policy], episodes: int, seed: int)
     mse, rate = np.zeros(runs), np.zeros(runs)
     for _ in range(task.horizon):
         signals = _Whole(batch.signals())
-        asked = [policy(signals.part(part)) for policy, part in zip(policies, parts, strict=True)]
-        outcome = batch.step(np.concatenate(asked, axis=-1))
+        request = [policy(signals.part(part)) for policy, part in zip(policies, parts, strict=True)]
+        outcome = batch.step(np.concatenate(request, axis=-1))
         mse += outcome.squared_error.sum(0)
         rate += outcome.granted.mean(0)
     return [Brief(rate[part] / task.horizon, mse[part] / task.horizon) for part in parts]
@@ -110,28 +110,28 @@ class _Part(Beliefs):
     """The beliefs of some runs alone."""
 
     def __init__(self, whole: _Once, runs: Runs) -> None:
-        self.task, self.shadows = whole.beliefs.task, whole.beliefs.shadows
-        self._whole, self._chosen = whole, runs
+        self.task, self.memory_states = whole.beliefs.task, whole.beliefs.memory_states
+        self._whole, self._choices = whole, runs
         self.arrival = take_runs(whole.beliefs.arrival, runs)
 
     @property
     def silent(self) -> Estimate:
-        return take_runs(self._whole.beliefs.silent, self._chosen)
+        return take_runs(self._whole.beliefs.silent, self._choices)
 
     @property
     def sent(self) -> Estimate:
-        return take_runs(self._whole.beliefs.sent, self._chosen)
+        return take_runs(self._whole.beliefs.sent, self._choices)
 
     @property
     def best(self) -> Estimate:
-        return take_runs(self._whole.beliefs.best, self._chosen)
+        return take_runs(self._whole.beliefs.best, self._choices)
 
     @property
-    def remembered(self) -> Any:
-        return take_runs(self._whole.beliefs.remembered, self._chosen)
+    def memory_posterior(self) -> Any:
+        return take_runs(self._whole.beliefs.memory_posterior, self._choices)
 
     def loss(self, steps: int = 1) -> Array:
-        return np.asarray(take_runs(self._whole.loss(steps), self._chosen))
+        return np.asarray(take_runs(self._whole.loss(steps), self._choices))
 
     def value(self, steps: int = 1) -> Array:
-        return np.asarray(take_runs(self._whole.value(steps), self._chosen))
+        return np.asarray(take_runs(self._whole.value(steps), self._choices))

@@ -48,7 +48,7 @@ class CrossTerm(NamedTuple):
         return self.share.low <= 0.0 <= self.share.high
 
     @property
-    def shown(self) -> str:
+    def text(self) -> str:
         """The share with its interval, as text."""
         return f"{self.share.mean:+.2%} [{self.share.low:+.2%}, {self.share.high:+.2%}]"
 
@@ -76,19 +76,19 @@ def cross_terms(
     validation.integer("episodes", episodes, at_least=2)
     validation.integer("seed", seed, at_least=0)
     each = 1.0 - (1.0 - level) / max(len(policies), 1)
-    found = {}
+    result = {}
     for name, policy in policies.items():
         sizes = [(first, min(BATCH, episodes - first)) for first in range(0, episodes, BATCH)]
         parts = [
             _run(task, reference, policy, many, seed + first, progress) for first, many in sizes
         ]
-        found[name] = _summary(np.concatenate(parts, axis=-1), each)
-    return found
+        result[name] = _summary(np.concatenate(parts, axis=-1), each)
+    return result
 
 
-def worst(found: Mapping[str, CrossTerm]) -> tuple[str, CrossTerm]:
+def worst(terms: Mapping[str, CrossTerm]) -> tuple[str, CrossTerm]:
     """The policy with the largest cross term, of those whose may not be zero if there are some."""
-    return max(found.items(), key=lambda item: (not item[1].compatible, abs(item[1].share.mean)))
+    return max(terms.items(), key=lambda item: (not item[1].compatible, abs(item[1].share.mean)))
 
 
 def usual_policies(task: Task, rates: Sequence[float] = RATES) -> list[str]:

@@ -97,7 +97,7 @@ def envelope_mse(results: Mapping[str, EpisodeResults], rate: float) -> Array | 
     return mixed_mse(results, lower_envelope(results), rate)
 
 
-def chosen_mse(results: Mapping[str, EpisodeResults], rate: float) -> Array | None:
+def best_mse(results: Mapping[str, EpisodeResults], rate: float) -> Array | None:
     """Each episode's MSE (E,) at a rate on the line through all these policies, by their rate.
 
     For policies that were chosen as an envelope on other episodes: all of them count, also those
@@ -119,7 +119,7 @@ def _mixed(results: Mapping[str, EpisodeResults], shares: Mapping[str, float]) -
     return np.asarray(sum(share * results[name].mse for name, share in shares.items()))
 
 
-class Comparison(NamedTuple):
+class BaselineComparison(NamedTuple):
     """A policy against the envelope at its own rate, over paired episodes.
 
     ``difference`` is the policy's MSE minus the envelope's, ``envelope`` the envelope's MSE,
@@ -133,7 +133,7 @@ class Comparison(NamedTuple):
 
 def compare_with_envelope(
     results: EpisodeResults, baselines: Mapping[str, EpisodeResults]
-) -> Comparison:
+) -> BaselineComparison:
     """Paired difference of the MSE to the baselines' lower envelope at the policy's own rate.
 
     Raises:
@@ -153,7 +153,7 @@ def compare_with_envelope(
             "episodes differ between policy and baselines: they must be paired"
         )
     envelope = _mixed(baselines, shares)
-    return Comparison(
+    return BaselineComparison(
         difference=mean_interval(results.mse - envelope),
         envelope=float(envelope.mean()),
         between=tuple(name for name, share in shares.items() if share > 0.0),

@@ -36,11 +36,13 @@ def everything_delivered(
         name: mean_interval(
             run_episodes(task, make_policy("always", task), episodes, seed, progress).mse
         )
-        for name, task in opened(env_id, options, filters).items()
+        for name, task in everything_delivered_tasks(env_id, options, filters).items()
     }
 
 
-def opened(env_id: str, options: Mapping[str, Any], filters: Sequence[str] = ()) -> dict[str, Task]:
+def everything_delivered_tasks(
+    env_id: str, options: Mapping[str, Any], filters: Sequence[str] = ()
+) -> dict[str, Task]:
     """The environment with tokens and access opened, by filter.
 
     Raises:

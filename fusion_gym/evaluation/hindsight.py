@@ -25,17 +25,17 @@ def run_hindsight(task: Task, price: float, width: int, episodes: int, seed: int
     Raises:
         ConfigurationError: as :func:`find_schedules`.
     """
-    found = find_schedules(task, price, width, episodes, seed)
+    result = find_schedules(task, price, width, episodes, seed)
     priced = dataclasses.replace(task.reward, price=Price.create(price))
     played = dataclasses.replace(task, reward=priced)
-    return run_episodes(played, _Replay(found.granted, seed), episodes, seed)
+    return run_episodes(played, _Replay(result.granted, seed), episodes, seed)
 
 
 class _Replay:
     """Requests what schedules (H, sensors, E) say, for episodes from the seed ``first`` on."""
 
     # It knows all noise, so it is in no registry; the class is the largest that there is.
-    knowledge: ClassVar[Knowledge] = "coordinator_memory"
+    knowledge: ClassVar[Knowledge] = "scheduler_memory"
 
     def __init__(self, schedules: NDArray[np.bool_], first: int) -> None:
         self._schedules, self._first = schedules, first

@@ -33,8 +33,8 @@ class Metric(NamedTuple):
 
     def summary(self, name: str, results: EpisodeResults) -> Any:
         """Return what a summary has of it: an interval, or a list along its axis."""
-        found = self.samples(results) if self.samples else getattr(results, name)
-        return found.mean(0).tolist() if self.axis else mean_interval(found)._asdict()
+        result = self.samples(results) if self.samples else getattr(results, name)
+        return result.mean(0).tolist() if self.axis else mean_interval(result)._asdict()
 
 
 METRICS = {

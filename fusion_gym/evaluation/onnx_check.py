@@ -59,7 +59,7 @@ def session(path: Path) -> Any:
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
-def agreement(
+def onnx_agreement(
     agent: ModelPolicy,
     graph: DecisionGraph,
     path: Path,
@@ -84,13 +84,13 @@ def agreement(
 def latency(graph: DecisionGraph, path: Path) -> Latency:
     """How long the file at ``path`` takes for one row, by many calls one after another."""
     run = session(path)
-    given = {
+    arguments = {
         name: value.numpy() for name, value in zip(graph.inputs, graph.example(1), strict=True)
     }
     seconds = np.empty(_CALLS)
     for call in range(-_WARM, _CALLS):
         began = time.perf_counter()
-        run.run(None, given)
+        run.run(None, arguments)
         if call >= 0:
             seconds[call] = time.perf_counter() - began
     return Latency(float(np.median(seconds)), float(np.quantile(seconds, 0.99)))
@@ -103,50 +103,52 @@ class _Beside:
         self.knowledge: Knowledge = agent.knowledge
         self.remember = agent.remember
         self._agent, self._graph, self._session = agent, graph, run
-        self._kept = [agent.view.names.index(name) for name in graph.entries]
+        self._columns = [agent.view.names.index(name) for name in graph.entries]
         self.different, self.difference, self.relative = 0, 0.0, 0.0
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Forget what was remembered."""
         self._agent.reset(runs, seed)
         start = self._graph.example(runs * self._agent.view.rows_per_run)
-        values = dict(zip(self._graph.inputs, (one.numpy() for one in start), strict=True))
+        values = dict(zip(self._graph.inputs, (item.numpy() for item in start), strict=True))
         memory: Values = {name: values[name] for name in ("hidden", "cell") if name in values}
         self._memories = [memory, memory]
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N) of the agent."""
-        asked: Values = {"observation": self._agent.rows(signals)[:, self._kept]}
+        request: Values = {"observation": self._agent.rows(signals)[:, self._columns]}
         if "grantable" in self._graph.inputs:
-            asked["grantable"] = signals["grantable"].T.reshape(len(asked["observation"]), -1)
+            request["grantable"] = signals["grantable"].T.reshape(len(request["observation"]), -1)
         ours, theirs = self._memories
-        found = self._of_session(asked | ours)
-        wanted = self._of_torch(asked | theirs)
-        self._memories = [_following(found), _following(wanted)]
+        result = self._of_session(request | ours)
+        required = self._of_torch(request | theirs)
+        self._memories = [_following(result), _following(required)]
         requests = self._agent(signals)
-        decided = requests != found["request"].reshape(requests.shape[1], -1).T
-        self.different += int(decided.T.reshape(len(asked["observation"]), -1).any(1).sum())
+        decided = requests != result["request"].reshape(requests.shape[1], -1).T
+        self.different += int(decided.T.reshape(len(request["observation"]), -1).any(1).sum())
         for name in self._graph.outputs:
             if name != "request":
-                apart = np.abs(found[name].astype(np.float64) - wanted[name])
+                apart = np.abs(result[name].astype(np.float64) - required[name])
                 apart[np.isnan(apart)] = np.inf
                 self.difference = max(self.difference, float(apart.max()))
-                relative = apart / (1.0 + np.abs(wanted[name]))
+                relative = apart / (1.0 + np.abs(required[name]))
                 self.relative = max(self.relative, float(relative.max()))
         return requests
 
-    def _of_session(self, given: Values) -> Values:
-        return dict(zip(self._graph.outputs, self._session.run(None, given), strict=True))
+    def _of_session(self, value: Values) -> Values:
+        return dict(zip(self._graph.outputs, self._session.run(None, value), strict=True))
 
-    def _of_torch(self, given: Values) -> Values:
-        inputs = [torch.as_tensor(np.ascontiguousarray(given[name])) for name in self._graph.inputs]
+    def _of_torch(self, value: Values) -> Values:
+        inputs = [torch.as_tensor(np.ascontiguousarray(value[name])) for name in self._graph.inputs]
         with torch.no_grad():
-            found = self._graph(*inputs)
-        return {name: one.numpy() for name, one in zip(self._graph.outputs, found, strict=True)}
+            result = self._graph(*inputs)
+        return {name: item.numpy() for name, item in zip(self._graph.outputs, result, strict=True)}
 
 
-def _following(found: Values) -> Values:
+def _following(outputs: Values) -> Values:
     """The memory for the next step."""
     return {
-        name.removesuffix("_next"): value for name, value in found.items() if name.endswith("_next")
+        name.removesuffix("_next"): value
+        for name, value in outputs.items()
+        if name.endswith("_next")
     }

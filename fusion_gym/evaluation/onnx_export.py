@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.onnx_check import Agreement, Latency, agreement, latency
+from fusion_gym.evaluation.onnx_check import Agreement, Latency, latency, onnx_agreement
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.policies.onnx_card import onnx_card
@@ -47,12 +47,12 @@ def export_onnx(
         )
     path, graph = Path(path), DecisionGraph(agent)
     save_graph(graph, path, onnx_card(agent, graph, environment, model))
-    found = agreement(agent, graph, path, task)
-    if not found.holds:
+    result = onnx_agreement(agent, graph, path, task)
+    if not result.holds:
         path.unlink()
         raise ConfigurationError(
-            f"{found.different:,} of {found.observations:,} observations are decided otherwise "
-            f"than by the agent, and numbers differ by up to {found.difference:.3g}"
+            f"{result.different:,} of {result.observations:,} observations are decided otherwise "
+            f"than by the agent, and numbers differ by up to {result.difference:.3g}"
         )
     taken = latency(graph, path)
-    return Exported(path.stat().st_size, graph.inputs, graph.outputs, found, taken)
+    return Exported(path.stat().st_size, graph.inputs, graph.outputs, result, taken)

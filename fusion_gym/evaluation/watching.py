@@ -75,13 +75,13 @@ def watch(
 def _frames(watched: list[_Watched], steps: int) -> Iterator[Frame]:
     yield _beside(watched)
     for _ in range(steps):
-        for one in watched:
-            one.step()
+        for item in watched:
+            item.step()
         yield _beside(watched)
 
 
 def _beside(watched: list[_Watched]) -> Frame:
     """The pictures of all, with axes that reach as far as any of them needs."""
-    needed = zip(*(one.film.limits() for one in watched), strict=True)
+    needed = zip(*(item.film.limits() for item in watched), strict=True)
     limits = [(min(low for low, _ in ends), max(high for _, high in ends)) for ends in needed]
-    return np.hstack([one.film.frame(title=one.title(), limits=limits) for one in watched])
+    return np.hstack([item.film.frame(title=item.title(), limits=limits) for item in watched])

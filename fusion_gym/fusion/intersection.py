@@ -168,14 +168,14 @@ def covariance_intersection(
     return _join(mean_a, mean_b, pair, d / total, (1.0 - weight) / total, weight)
 
 
-def best_of_pair(covariances: Array, chosen: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Covariance intersection where two of l estimates are ``chosen`` (l, N).
+def best_of_pair(covariances: Array, selected: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Covariance intersection where two of l estimates are ``selected`` (l, N).
 
     Weights (l, N) and covariance (n, n, N) of the smallest trace, from ``covariances``
     (l, n, n, N).
     """
-    first = chosen.argmax(0)
-    second = len(chosen) - 1 - chosen[::-1].argmax(0)
+    first = selected.argmax(0)
+    second = len(selected) - 1 - selected[::-1].argmax(0)
     a, b = (
         np.take_along_axis(covariances, which[None, None, None], 0)[0] for which in (first, second)
     )
@@ -183,8 +183,8 @@ def best_of_pair(covariances: Array, chosen: NDArray[np.bool_]) -> tuple[Array, 
     d = pair.ratio
     share = best_weight(pair.power * d, np.ones_like(d), d)
     scaled = pair.basis * np.sqrt(d / (share * d + (1.0 - share)))[:, None]
-    weights = np.zeros(chosen.shape)
-    inside = np.arange(chosen.shape[-1])
+    weights = np.zeros(selected.shape)
+    inside = np.arange(selected.shape[-1])
     weights[first, inside], weights[second, inside] = share, 1.0 - share
     return weights, linalg.matmul(linalg.transpose(scaled), scaled)
 
@@ -290,14 +290,14 @@ class SequentialIntersection(FusionRule):
         own = own_covariances(covariance)
         count, _, runs = means.shape
         self._check_order(count)
-        chosen = np.ones((count, runs), dtype=np.bool_) if active is None else active
+        selected = np.ones((count, runs), dtype=np.bool_) if active is None else active
         mean, fused = np.full(means.shape[1:], np.nan), np.full(own.shape[1:], np.nan)
         begun = np.zeros(runs, dtype=np.bool_)
         steps: list[_Step] = []
         for estimate in range(count) if self.order is None else self.order:
-            if not chosen[estimate].any():
+            if not selected[estimate].any():
                 continue
-            first, later = chosen[estimate] & ~begun, chosen[estimate] & begun
+            first, later = selected[estimate] & ~begun, selected[estimate] & begun
             np.copyto(mean, means[estimate], where=first)
             np.copyto(fused, own[estimate], where=first)
             begun |= first
@@ -315,16 +315,16 @@ class SequentialIntersection(FusionRule):
         return Fused(mean, fused, lambda: _chained(steps, own.shape))
 
     def _check_order(self, count: int | None = None) -> None:
-        given = self.order
-        if given is None:
+        value = self.order
+        if value is None:
             return
-        whole = isinstance(given, tuple) and all(
-            isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in given
+        whole = isinstance(value, tuple) and all(
+            isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in value
         )
-        if not whole or not given or sorted(given) != list(range(count or len(given))):
+        if not whole or not value or sorted(value) != list(range(count or len(value))):
             last = "l - 1" if count is None else f"{count - 1}"
             raise ConfigurationError(
-                f"order = {given!r} is not allowed: it must be a tuple that holds each of the "
+                f"order = {value!r} is not allowed: it must be a tuple that holds each of the "
                 f"estimates 0 to {last} exactly once"
             )
 
@@ -345,10 +345,10 @@ def _chained(steps: list[_Step], shape: tuple[int, ...]) -> Array:
     for estimate, first, lanes, pair in steps:
         gains[estimate] = linalg.identity(shape[1]) * first
         if pair is not None:
-            kept, taken = pair.gains
+            stored, taken = pair.gains
             for earlier in joined:
                 gain = gains[earlier]
-                gain[..., lanes] = linalg.matmul(kept, _lanes(gain, lanes))
+                gain[..., lanes] = linalg.matmul(stored, _lanes(gain, lanes))
             gains[estimate][..., lanes] = taken
         joined.append(estimate)
     return gains

@@ -63,18 +63,18 @@ class FusionRule(ABC):
             active: (l, N), the estimates that take part; all by default. Others are not read.
         """
 
-    def fuse_alone(self, silent: Array, delivered: Array) -> tuple[Array, Array]:
+    def fuse_single(self, silent: Array, delivered: Array) -> tuple[Array, Array]:
         """Fused covariances if nobody delivers (n, n, N), and (l, n, n, N) if each alone does.
 
         From the nodes' own covariances without and with a delivery, both (l, n, n, N).
         """
         nowhere = np.zeros(silent.shape[:2] + silent.shape[-1:])
-        alone = np.empty(silent.shape)
+        single = np.empty(silent.shape)
         for node in range(len(silent)):
             covariances = silent.copy()
             covariances[node] = delivered[node]
-            alone[node] = self.fuse(nowhere, covariances).covariance
-        return self.fuse(nowhere, silent).covariance, alone
+            single[node] = self.fuse(nowhere, covariances).covariance
+        return self.fuse(nowhere, silent).covariance, single
 
 
 def own_covariances(covariance: Array) -> Array:
@@ -151,7 +151,7 @@ class InformationFusion(FusionRule):
         vector = _replaced_in_turn(linalg.matvec(information, means), linalg.matvec(gained, others))
         return linalg.matvec(fused, vector), fused
 
-    def fuse_alone(self, silent: Array, delivered: Array) -> tuple[Array, Array]:
+    def fuse_single(self, silent: Array, delivered: Array) -> tuple[Array, Array]:
         """See :class:`FusionRule`: informations are sums."""
         information = inverses(silent)
         total = information.sum(0)
@@ -247,8 +247,8 @@ class MatrixWeightedFusion(FusionRule):
         """Lanes with the same active estimates together, as if there were no others."""
         mean, fused = np.full(means.shape[1:], np.nan), np.full(joint.shape[2:], np.nan)
         gains = np.zeros(joint.shape[1:])
-        for chosen in np.unique(active, axis=1).T:
-            nodes, lanes = np.flatnonzero(chosen), np.flatnonzero((chosen == active.T).all(1))
+        for selected in np.unique(active, axis=1).T:
+            nodes, lanes = np.flatnonzero(selected), np.flatnonzero((selected == active.T).all(1))
             if nodes.size:
                 part = self.fuse(means[nodes][..., lanes], joint[np.ix_(nodes, nodes)][..., lanes])
                 mean[:, lanes], fused[..., lanes] = part.mean, part.covariance

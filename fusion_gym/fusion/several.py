@@ -103,26 +103,26 @@ def covariance_intersection_many(
     Source: the optimum is an A-optimal design, and the gap is J. Kiefer's, "General equivalence
     theory for optimum designs", Annals of Statistics 2, 1974.
     """
-    chosen = np.ones(means.shape[::2], dtype=np.bool_) if active is None else active
+    selected = np.ones(means.shape[::2], dtype=np.bool_) if active is None else active
     means, covariances = np.ascontiguousarray(means), np.ascontiguousarray(covariances)
-    information = _informations(covariances, chosen)
-    weights, fused, open_lanes = _best_alone(covariances, information, chosen)
-    pairs = open_lanes & (chosen.sum(0) == 2)
+    information = _informations(covariances, selected)
+    weights, fused, open_lanes = _best_alone(covariances, information, selected)
+    pairs = open_lanes & (selected.sum(0) == 2)
     lanes = np.flatnonzero(pairs)
     if lanes.size:
         weights[:, lanes], fused[..., lanes] = best_of_pair(
-            _of(covariances, lanes), _of(chosen, lanes)
+            _of(covariances, lanes), _of(selected, lanes)
         )
     lanes = np.flatnonzero(open_lanes & ~pairs)
     if lanes.size:
-        taking_part = _of(chosen, lanes)
+        taking_part = _of(selected, lanes)
         start = taking_part / np.abs(_of(linalg.trace(covariances), lanes))
         np.copyto(start, 0.0, where=~taking_part)
         start /= _sum(start)
         weights[:, lanes], fused[..., lanes] = _search(_of(information, lanes), start)
     vector = np.zeros_like(means[0])
-    for weight, one, mean, takes_part in zip(weights, information, means, chosen, strict=True):
-        vector += weight * linalg.matvec(one, np.where(takes_part, mean, 0.0))
+    for weight, item, mean, takes_part in zip(weights, information, means, selected, strict=True):
+        vector += weight * linalg.matvec(item, np.where(takes_part, mean, 0.0))
     return Fused(
         linalg.matvec(fused, vector),
         fused,
@@ -131,12 +131,12 @@ def covariance_intersection_many(
     )
 
 
-def _informations(covariances: Array, chosen: NDArray[np.bool_]) -> Array:
+def _informations(covariances: Array, selected: NDArray[np.bool_]) -> Array:
     """Inverses (l, n, n, N) of the chosen covariances, zero elsewhere."""
-    if chosen.all():
+    if selected.all():
         return linalg.inverse(covariances)
     information = np.zeros_like(covariances)
-    for estimate, takes_part in enumerate(chosen):
+    for estimate, takes_part in enumerate(selected):
         lanes = np.flatnonzero(takes_part)
         information[estimate][..., lanes] = linalg.inverse(_of(covariances[estimate], lanes))
     return information
@@ -164,7 +164,7 @@ def _total(terms: Array) -> Array:
 
 
 def _best_alone(
-    covariances: Array, information: Array, chosen: NDArray[np.bool_]
+    covariances: Array, information: Array, selected: NDArray[np.bool_]
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """All weight on the active estimate of the smallest trace; where it is not the optimum.
 
@@ -172,11 +172,11 @@ def _best_alone(
         Weights (l, N), covariance (n, n, N), and the lanes (N,) that have a gap or a NaN. Where
         nobody is active the weights are zero, the covariance is NaN, and there is no search.
     """
-    traces = np.where(chosen, linalg.trace(covariances), np.inf)
+    traces = np.where(selected, linalg.trace(covariances), np.inf)
     first = traces.argmin(0)
-    weights = ((np.arange(len(traces))[:, None] == first) & chosen) * 1.0
+    weights = ((np.arange(len(traces))[:, None] == first) & selected) * 1.0
     fused = np.take_along_axis(covariances, first[None, None, None], 0)[0]
-    nobody = ~chosen.any(0)
+    nobody = ~selected.any(0)
     fused[..., nobody] = np.nan
     gain, total = _gain(information, fused), linalg.trace(fused)
     closed = gain.max(0) - total <= _GAP * total
@@ -227,8 +227,8 @@ def _search(information: Array, start: Array) -> tuple[Array, Array]:
 def _weighted(weights: Array, information: Array) -> Array:
     """Σ w_i Y_i, (n, n, N)."""
     total: Array = weights[0] * information[0]
-    for weight, one in zip(weights[1:], information[1:], strict=True):
-        total += weight * one
+    for weight, item in zip(weights[1:], information[1:], strict=True):
+        total += weight * item
     return total
 
 
@@ -274,9 +274,9 @@ def _newton(information: Array, weights: Array, root: Array, fused: Array, gain:
         if not lanes.size:
             break
         reached[:, lanes], blocking = _as_far(_of(reached, lanes), _of(target, lanes))
-        kept = _of(free, lanes) & ~blocking
-        trial = _model_minimum(_of(curvature, lanes), _of(gain, lanes), kept)
-        free[:, lanes], target[:, lanes] = kept, trial
+        mask = _of(free, lanes) & ~blocking
+        trial = _model_minimum(_of(curvature, lanes), _of(gain, lanes), mask)
+        free[:, lanes], target[:, lanes] = mask, trial
         lanes = lanes[(trial < 0.0).any(0)]
     target /= _sum(target)
     sound = (linalg.dot(target - weights, gain) > 0.0) & (target >= 0.0).all(0)

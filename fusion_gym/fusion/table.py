@@ -46,7 +46,7 @@ REASONS: dict[Assumption, str] = {
 
 
 @dataclass(frozen=True)
-class Rule:
+class FusionRow:
     """A row of the table.
 
     ``make`` gives the rule, for an ``order`` of arrival where it has one; the docstring of its
@@ -66,24 +66,26 @@ class Rule:
 _IN_TURN = partial(SequentialIntersection, covariance_intersection)
 _INVERSE = partial(SequentialIntersection, inverse_covariance_intersection)
 RULES = {
-    "federated": Rule(
+    "federated": FusionRow(
         InformationFusion, "information shares", "Sum of informations, fed back in shares."
     ),
-    "information": Rule(InformationFusion, "independence", "Sum of informations."),
-    "matrix": Rule(
+    "information": FusionRow(InformationFusion, "independence", "Sum of informations."),
+    "matrix": FusionRow(
         MatrixWeightedFusion, "joint covariance", "Sum with the best matrix weights.", cubic=True
     ),
-    "sici": Rule(
+    "sici": FusionRow(
         _INVERSE, "common information", "Inverse covariance intersection, two by two.", ordered=True
     ),
-    "sci": Rule(_IN_TURN, "nothing", "Covariance intersection, two by two: a bound.", ordered=True),
-    "ci": Rule(
+    "sci": FusionRow(
+        _IN_TURN, "nothing", "Covariance intersection, two by two: a bound.", ordered=True
+    ),
+    "ci": FusionRow(
         CovarianceIntersection, "nothing", "Covariance intersection of all: a bound.", cubic=True
     ),
-    "exact_ci": Rule(
+    "exact_ci": FusionRow(
         CovarianceIntersection, "tracked weights", "The same with exact weights.", cubic=True
     ),
-    "ici": Rule(
+    "ici": FusionRow(
         _INVERSE, "common information", "Inverse covariance intersection of a pair.", pair=True
     ),
 }
@@ -106,7 +108,7 @@ class Structure:
         """Names of the rules that are sound for these estimates."""
         return tuple(name for name, rule in RULES.items() if self.refusal(rule) is None)
 
-    def refusal(self, rule: Rule) -> str | None:
+    def refusal(self, rule: FusionRow) -> str | None:
         """Why the rule is not for these estimates, or ``None``."""
         if rule.assumes in self.holds or rule.assumes not in REASONS:
             return None
@@ -150,7 +152,7 @@ def choose_rule(
         return rule.make()
     if not rule.ordered:
         raise ConfigurationError(
-            f"order = {validation.shown(order)} is not allowed with fusion={name!r}: it belongs "
+            f"order = {validation.display(order)} is not allowed with fusion={name!r}: it belongs "
             "to the sequential rules 'sici' and 'sci'"
         )
     arrival = _arrival(order, sensors)
@@ -158,10 +160,10 @@ def choose_rule(
 
 
 def _arrival(order: ArrayLike, sensors: int) -> tuple[int, ...]:
-    given = validation.array("order", order, (sensors,))
-    if sorted(given.tolist()) != list(range(sensors)):
+    values = validation.array("order", order, (sensors,))
+    if sorted(values.tolist()) != list(range(sensors)):
         raise ConfigurationError(
-            f"order = {validation.shown(order)} is not allowed: it must hold each of the "
+            f"order = {validation.display(order)} is not allowed: it must hold each of the "
             f"sensors 0 to {sensors - 1} once"
         )
-    return tuple(int(sensor) for sensor in given)
+    return tuple(int(sensor) for sensor in values)

@@ -46,12 +46,12 @@ def read_plain(file: Path) -> dict[str, Any]:
     """
     content = _part(file, "data")
     try:
-        found = json.loads(content)
+        data = json.loads(content)
     except (ValueError, RecursionError):
         raise _none("its data is no JSON") from None
-    if not isinstance(found, dict):
+    if not isinstance(data, dict):
         raise _none("its data is no JSON object")
-    return found
+    return data
 
 
 def read_weights(file: Path) -> dict[str, torch.Tensor]:
@@ -71,17 +71,17 @@ def read_weights(file: Path) -> dict[str, torch.Tensor]:
         raise NeedsTrust("its weights are compressed")
     content.seek(0)
     try:
-        found = torch.load(content, map_location="cpu", weights_only=True)
+        data = torch.load(content, map_location="cpu", weights_only=True)
     except Exception:  # a crafted file raises whatever it likes; torch's advice is not ours
         raise NeedsTrust("its policy.pth holds more than plain weights") from None
-    if not isinstance(found, dict) or len(found) > _MOST or not all(map(_is_plain, found.values())):
+    if not isinstance(data, dict) or len(data) > _MOST or not all(map(_is_plain, data.values())):
         raise NeedsTrust("its policy.pth is no table of float32 weights")
-    size = 4 * sum(weight.numel() for weight in found.values())
+    size = 4 * sum(weight.numel() for weight in data.values())
     if size > LARGEST:
         raise NeedsTrust(f"its weights have {size} bytes, more than {LARGEST}")
-    if not all(bool(torch.isfinite(weight).all()) for weight in found.values()):
+    if not all(bool(torch.isfinite(weight).all()) for weight in data.values()):
         raise _none("its weights are not finite")
-    return {str(name): weight for name, weight in found.items()}
+    return {str(name): weight for name, weight in data.items()}
 
 
 def _part(file: Path, name: str) -> bytes:

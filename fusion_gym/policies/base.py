@@ -10,7 +10,7 @@ from typing import Any, Protocol, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_gym import linalg, validation
+from fusion_gym import deprecation, linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.system import Knowledge, Signals
@@ -27,7 +27,7 @@ class Policy(Protocol):
     episode wherever ``signals["start"]`` is true.
 
     A policy that looks at what is believed (:mod:`fusion_gym.core.signals`) has an attribute
-    ``remember`` as well, ``"coordinator"`` or ``"own"``: whose beliefs. One that answers to the
+    ``remember`` as well, ``"scheduler"`` or ``"own"``: whose beliefs. One that answers to the
     signals of the present step alone may say so by an attribute ``stateless``, true: it can then be
     asked in the middle of a simulated episode.
     """
@@ -52,11 +52,11 @@ def owner_of(policy: Policy) -> Owner | None:
     Raises:
         ConfigurationError: an attribute ``remember`` that is neither.
     """
-    found = getattr(policy, "remember", None)
-    if found is None:
+    result = deprecation.current("remember", getattr(policy, "remember", None))
+    if result is None:
         return None
-    validation.choice("remember", found, get_args(Owner))
-    owner: Owner = found
+    validation.choice("remember", result, get_args(Owner))
+    owner: Owner = result
     return owner
 
 
@@ -106,7 +106,7 @@ def parameter(default: Any, check: Callable[..., Any], **limits: float) -> Any:
     return dataclasses.field(default=default, metadata={"check": check})
 
 
-def not_negative(name: str, value: Any) -> None:
+def not_negative_parameter(name: str, value: Any) -> None:
     """One number >= 0 or a sequence of them.
 
     Raises:
@@ -148,16 +148,16 @@ def surprise(signals: Signals, whitened: bool = False) -> Array:
     return linalg.dot(innovation, innovation)
 
 
-def strongest(score: Array, wanted: Requests, at_most: int | None, age: Array) -> Requests:
-    """Of the ``wanted`` (sensors, N) those ``at_most`` with the highest score in each run.
+def strongest(score: Array, requests: Requests, at_most: int | None, age: Array) -> Requests:
+    """Of the ``requests`` (sensors, N) those ``at_most`` with the highest score in each run.
 
     Equal scores go to the sensor that was silent for longer, then to the first.
     """
     sensors = len(score)
     if at_most is None or at_most >= sensors:
-        return wanted
-    ranked = np.where(wanted, score, -np.inf)
+        return requests
+    ranked = np.where(requests, score, -np.inf)
     order = np.lexsort((-age, -ranked), axis=0)
-    chosen = np.zeros_like(wanted)
-    np.put_along_axis(chosen, order[:at_most], True, axis=0)
-    return chosen & wanted
+    selected = np.zeros_like(requests)
+    np.put_along_axis(selected, order[:at_most], True, axis=0)
+    return selected & requests

@@ -26,7 +26,7 @@ from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
 from fusion_gym.envs.views import make_view
 from fusion_gym.policies.archive import NeedsTrust
-from fusion_gym.policies.network import Network
+from fusion_gym.policies.network import NetworkShape
 from fusion_gym.validation import ConfigurationError
 
 ENTRY = "fusion_gym_model"
@@ -65,7 +65,7 @@ _HARMLESS = {
 
 
 @dataclass(frozen=True)
-class Seen:
+class ModelView:
     """What a model was trained to see: the entries by name (if the file says), whose, the price."""
 
     observation_names: tuple[str, ...] | None = None
@@ -73,19 +73,19 @@ class Seen:
     price_range: tuple[float, float] | None = None
 
     @classmethod
-    def read(cls, data: Mapping[str, Any]) -> Seen:
-        """As the card in an archive's data has it; without a card, a coordinator's whole view.
+    def read(cls, data: Mapping[str, Any]) -> ModelView:
+        """As the card in an archive's data has it; without a card, a scheduler's whole view.
 
         Raises:
             ConfigurationError: an entry that is not allowed.
         """
-        told = _entry(data)
-        names, span = told.get("observation_names"), told.get("price_range")
+        card_entry = _entry(data)
+        names, span = card_entry.get("observation_names"), card_entry.get("price_range")
         if names is not None and not _are_words(names):
             raise ConfigurationError("observation_names is not allowed: it must be a list of words")
         return cls(
             None if names is None else tuple(names),
-            validation.boolean("local", told.get("local", False)),
+            validation.boolean("local", card_entry.get("local", False)),
             None if span is None else Price.create("random", span).span,
         )
 
@@ -97,7 +97,7 @@ class Blueprint:
     algorithm: str
     activation: str
     actions: str  # the action space, as Gymnasium writes it
-    network: Mapping[str, Any] | None = None  # as :meth:`Network.plain` says it
+    network: Mapping[str, Any] | None = None  # as :meth:`NetworkShape.plain` says it
 
     @classmethod
     def read(cls, data: Mapping[str, Any]) -> Blueprint:
@@ -107,26 +107,26 @@ class Blueprint:
             ConfigurationError: a card of a later format, or with entries that are not allowed.
             NeedsTrust: a policy that is none of :data:`POLICIES`, or made with code of its own.
         """
-        told = _entry(data)
-        if "format" not in told:
+        card_entry = _entry(data)
+        if "format" not in card_entry:
             return _inferred(data)
-        validation.integer("format", told["format"], at_least=FORMAT, at_most=FORMAT)
-        known = {"format", *Seen.__dataclass_fields__, *cls.__dataclass_fields__}
-        validation.keys("entry of the card", told, known)
-        if not isinstance(told.get("network"), dict):
+        validation.integer("format", card_entry["format"], at_least=FORMAT, at_most=FORMAT)
+        known = {"format", *ModelView.__dataclass_fields__, *cls.__dataclass_fields__}
+        validation.keys("entry of the card", card_entry, known)
+        if not isinstance(card_entry.get("network"), dict):
             raise ConfigurationError("network is not allowed: it must be a table of sizes")
         return cls(
-            validation.choice("algorithm", told.get("algorithm"), POLICIES),
-            validation.choice("activation", told.get("activation"), ACTIVATIONS),
-            str(told.get("actions")),
-            told["network"],
+            validation.choice("algorithm", card_entry.get("algorithm"), POLICIES),
+            validation.choice("activation", card_entry.get("activation"), ACTIVATIONS),
+            str(card_entry.get("actions")),
+            card_entry["network"],
         )
 
 
-def card(algorithm: str, model: BaseAlgorithm, task: Task, local: bool) -> dict[str, Any]:
+def model_card(algorithm: str, model: BaseAlgorithm, task: Task, local: bool) -> dict[str, Any]:
     """A model's card; without a format, and less, if weights alone do not rebuild its policy."""
     view = make_view(task, local)
-    told = {
+    entries = {
         "algorithm": algorithm,
         "observation_names": list(view.names),
         "local": local,
@@ -134,13 +134,13 @@ def card(algorithm: str, model: BaseAlgorithm, task: Task, local: bool) -> dict[
     }
     policy: Any = model.policy
     if type(policy) is not POLICIES.get(algorithm) or set(model.policy_kwargs) - _HARMLESS:
-        return told
+        return entries
     names = [name for name, kind in ACTIVATIONS.items() if kind is policy.activation_fn]
     if not names:
-        return told
-    network = Network.of({name: tuple(w.shape) for name, w in policy.state_dict().items()})
+        return entries
+    network = NetworkShape.of({name: tuple(w.shape) for name, w in policy.state_dict().items()})
     plain = {"activation": names[0], "actions": str(model.action_space), "network": network.plain()}
-    return {"format": FORMAT} | told | plain
+    return {"format": FORMAT} | entries | plain
 
 
 def algorithm_of(data: Mapping[str, Any]) -> str | None:
@@ -148,12 +148,12 @@ def algorithm_of(data: Mapping[str, Any]) -> str | None:
 
     A2C and PPO have one policy class; what is neither, but has it too, decides as A2C does.
     """
-    told = _entry(data).get("algorithm")
-    if isinstance(told, str):
-        return told
+    card_entry = _entry(data).get("algorithm")
+    if isinstance(card_entry, str):
+        return card_entry
     module = _table(data, "policy_class").get("__module__")
-    found = next((n for n, policy in POLICIES.items() if policy.__module__ == module), None)
-    return "ppo" if found == "a2c" and "clip_range" in data else found
+    entry = next((n for n, policy in POLICIES.items() if policy.__module__ == module), None)
+    return "ppo" if entry == "a2c" and "clip_range" in data else entry
 
 
 def _inferred(data: Mapping[str, Any]) -> Blueprint:
@@ -168,10 +168,10 @@ def _inferred(data: Mapping[str, Any]) -> Blueprint:
     if strange:
         raise NeedsTrust(f"its policy was made with {strange}")
     usual = ACTIVATIONS["relu" if algorithm == "dqn" else "tanh"]  # what the policies default to
-    given = settings.get("activation_fn", str(usual))
-    names = [n for n, kind in ACTIVATIONS.items() if str(kind) == given]
+    value = settings.get("activation_fn", str(usual))
+    names = [n for n, kind in ACTIVATIONS.items() if str(kind) == value]
     if not names:
-        raise NeedsTrust(f"its activation is {given!r}")
+        raise NeedsTrust(f"its activation is {value!r}")
     space = _table(data, "action_space")
     kind = re.sub(r".*\.(\w+)'>$", r"\1", str(space.get(":type:")))
     start = "" if str(space.get("start", 0)) == "0" else f", start={space['start']}"
@@ -184,10 +184,10 @@ def _entry(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _table(data: Mapping[str, Any], key: str) -> dict[str, Any]:
-    found = data.get(key)
-    if not isinstance(found, dict):
+    result = data.get(key)
+    if not isinstance(result, dict):
         raise ConfigurationError(f"it is no Stable-Baselines3 model (its {key} is no table)")
-    return found
+    return result
 
 
 def _are_words(value: Any) -> bool:

@@ -135,15 +135,15 @@ class _Search:
             recent=np.zeros(episodes, dtype=np.int64),
         )
         exact = np.ones(episodes, dtype=np.bool_)
-        made: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+        result: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
         for step in range(task.horizon):
             choices = self._choices(candidates, step)
-            kept = self._best(choices.follows)
+            stored = self._best(choices.follows)
             offered = np.bincount(choices.follows.episode, minlength=episodes)
             exact &= offered <= self._width
-            parent, pattern = choices.parent[kept], choices.pattern[kept]
-            candidates = take_runs(choices.follows, kept)
-            made.append((parent, pattern))
+            parent, pattern = choices.parent[stored], choices.pattern[stored]
+            candidates = take_runs(choices.follows, stored)
+            result.append((parent, pattern))
             if step + 1 < task.horizon:
                 delivered = task.system.deliver(
                     take_runs(self._state, parent), np.ascontiguousarray(self._patterns[pattern].T)
@@ -155,14 +155,14 @@ class _Search:
         cost = candidates.cost[place]
         granted = np.empty((task.horizon, task.sensors, episodes), dtype=np.bool_)
         for step in reversed(range(task.horizon)):
-            parent, pattern = made[step]
+            parent, pattern = result[step]
             granted[step] = self._patterns[pattern[place]].T
             place = parent[place]
         return Schedules(granted, cost, exact)
 
     def _choices(self, candidates: _Candidates, step: int) -> _Choices:
         """Every set of transmissions that the network would grant to every candidate."""
-        task, found = self._task, []
+        task, result = self._task, []
         admitted = self._admitted[step].take(candidates.episode, axis=-1)
         steps = np.full(len(candidates.cost), step, dtype=np.int64)
         for number, pattern in enumerate(self._patterns[:, :, None]):
@@ -183,8 +183,8 @@ class _Search:
                 cost=before.cost + self._error(delivered) + self._price * spent[parent],
                 recent=recent if pattern.any() else before.recent,
             )
-            found.append(_Choices(parent, np.full(len(parent), number), follows))
-        return _join(found)
+            result.append(_Choices(parent, np.full(len(parent), number), follows))
+        return _join(result)
 
     def _error(self, delivered: Any) -> Array:
         """The weighted squared error (C,); infinite where it is no number."""
@@ -203,8 +203,8 @@ class _Search:
         order = np.lexsort((choices.cost, behind, choices.episode))
         episode = choices.episode[order]
         rank = np.arange(len(order)) - np.searchsorted(episode, episode)
-        kept = order[rank < self._width]
-        return kept[np.lexsort((choices.cost[kept], choices.episode[kept]))]
+        mask = order[rank < self._width]
+        return mask[np.lexsort((choices.cost[mask], choices.episode[mask]))]
 
 
 def _join(parts: list[_Choices]) -> _Choices:

@@ -1,4 +1,4 @@
-"""Runs as they could be, from what a coordinator believes: for policies that simulate."""
+"""Runs as they could be, from what a scheduler believes: for policies that simulate."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, take_runs
-from fusion_gym.core.beliefs import Shadows
+from fusion_gym.core.beliefs import MemoryStates
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Branch, Position
 from fusion_gym.core.system import Signals, System
 from fusion_gym.core.task import Task
-from fusion_gym.policies.believing import beliefs_of
+from fusion_gym.policies.belief_rule import beliefs_of
 from fusion_gym.validation import ConfigurationError
 
 
@@ -27,7 +27,7 @@ class Imagination:
 
     def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
         self._task, self._memory, self._layout = task, memory, layout
-        for system in (task.system, task.shadow or task.system):
+        for system in (task.system, task.memory_system or task.system):
             if not system.offers("imagine"):
                 raise ConfigurationError(
                     f"{type(system).__name__} cannot be imagined here: what is hidden in it, the "
@@ -52,12 +52,12 @@ class Imagination:
         mean, covariance = (take_runs(part[0], runs) for part in beliefs.best)
 
         def imagined(system: System[Any], state: Any) -> Any:
-            seen = system.visible(take_runs(state, runs))
-            return system.imagine(seen, mean, covariance, first)
+            visible = system.visible(take_runs(state, runs))
+            return system.imagine(visible, mean, covariance, first)
 
-        states, every = None, beliefs.shadows.every
+        states, every = None, beliefs.memory_states.every
         if every is not None:
-            states = Shadows(every=imagined(task.shadow or task.system, every))
+            states = MemoryStates(every=imagined(task.memory_system or task.system, every))
         steps = signals["step"][runs]
         position = Position(
             imagined(task.system, signals["model"]),

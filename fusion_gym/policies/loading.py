@@ -19,9 +19,9 @@ from fusion_gym import validation
 from fusion_gym.core.task import ACTION_KINDS, Task
 from fusion_gym.envs.views import View, make_view
 from fusion_gym.policies.archive import NeedsTrust, read_plain, read_weights
-from fusion_gym.policies.card import ACTIVATIONS, POLICIES, Blueprint, Seen, algorithm_of
+from fusion_gym.policies.card import ACTIVATIONS, POLICIES, Blueprint, ModelView, algorithm_of
 from fusion_gym.policies.model import ALGORITHMS, ModelPolicy, priced
-from fusion_gym.policies.network import Network
+from fusion_gym.policies.network import NetworkShape
 from fusion_gym.validation import ConfigurationError
 
 
@@ -47,9 +47,9 @@ def load_model_policy(
         raise ConfigurationError(f"model {path!r} is not allowed: there is no such file")
     try:
         data = read_plain(file)
-        seen = Seen.read(data)
+        observed = ModelView.read(data)
         load = _unpickled if trust else _rebuilt
-        model, action = load(file, data, priced(task, seen.price_range), seen)
+        model, action = load(file, data, priced(task, observed.price_range), observed)
     except NeedsTrust as error:
         raise ConfigurationError(
             f"model {path!r} is more than a card and weights: {error}; --trust, or "
@@ -58,22 +58,22 @@ def load_model_policy(
     except ConfigurationError as error:
         raise ConfigurationError(f"model {path!r} is not allowed: {error}") from None
     task = dataclasses.replace(task, action=action)
-    return ModelPolicy(model, task, deterministic, price, seen.local, seen.price_range)
+    return ModelPolicy(model, task, deterministic, price, observed.local, observed.price_range)
 
 
 def _rebuilt(
-    file: Path, data: Mapping[str, Any], task: Task, seen: Seen
+    file: Path, data: Mapping[str, Any], task: Task, observed: ModelView
 ) -> tuple[BaseAlgorithm, str]:
     """The model from its card and its weights, and its kind of action."""
     blueprint, weights = Blueprint.read(data), read_weights(file)
-    network = Network.of({name: tuple(weight.shape) for name, weight in weights.items()})
+    network = NetworkShape.of({name: tuple(weight.shape) for name, weight in weights.items()})
     if blueprint.network not in (None, network.plain()):
         raise ConfigurationError(
             f"its card's network is not that of its weights, {network.plain()}"
         )
     if not network.fits(blueprint.algorithm):
         raise NeedsTrust(f"its weights are not those of {blueprint.algorithm}")
-    action, view = _fitted(task, seen, (network.entries,), blueprint.actions)
+    action, view = _fitted(task, observed, (network.entries,), blueprint.actions)
     model = _empty(blueprint.algorithm, view)
     model.policy = _policy(blueprint, network, view)
     try:
@@ -98,7 +98,7 @@ def _empty(algorithm: str, view: View) -> BaseAlgorithm:
     return model
 
 
-def _policy(blueprint: Blueprint, network: Network, view: View) -> Any:
+def _policy(blueprint: Blueprint, network: NetworkShape, view: View) -> Any:
     """The policy with weights that do not matter yet; torch's stream of random numbers stays."""
     kind: Any = POLICIES[blueprint.algorithm]
     with torch.random.fork_rng(devices=[]):
@@ -113,7 +113,7 @@ def _policy(blueprint: Blueprint, network: Network, view: View) -> Any:
 
 
 def _unpickled(
-    file: Path, data: Mapping[str, Any], task: Task, seen: Seen
+    file: Path, data: Mapping[str, Any], task: Task, observed: ModelView
 ) -> tuple[BaseAlgorithm, str]:
     """The model as Stable-Baselines3 loads it: this runs code that the file holds."""
     problems = []
@@ -124,31 +124,33 @@ def _unpickled(
             problems.append(f"{name}: {error}")
             continue
         shape = model.observation_space.shape or ()
-        return model, _fitted(task, seen, shape, str(model.action_space))[0]
+        return model, _fitted(task, observed, shape, str(model.action_space))[0]
     raise ConfigurationError(f"it cannot be loaded as {'; '.join(problems)}")
 
 
 def _candidates(data: Mapping[str, Any]) -> list[str]:
     """The algorithms that may have saved the file, of all that both libraries have."""
-    told, described = algorithm_of(data), data.get("policy_class")
-    if told in ALGORITHMS:
-        return [told]
+    received, described = algorithm_of(data), data.get("policy_class")
+    if received in ALGORITHMS:
+        return [received]
     module = described.get("__module__") if isinstance(described, dict) else None
-    found = [
+    result = [
         name
         for name, kind in ALGORITHMS.items()
         if any(policy.__module__ == module for policy in kind.policy_aliases.values())
     ]
-    return found or (["dqn"] if "exploration_schedule" in data else ["ppo", "a2c"])
+    return result or (["dqn"] if "exploration_schedule" in data else ["ppo", "a2c"])
 
 
-def _fitted(task: Task, seen: Seen, shape: tuple[int, ...], actions: str) -> tuple[str, View]:
+def _fitted(
+    task: Task, observed: ModelView, shape: tuple[int, ...], actions: str
+) -> tuple[str, View]:
     """The kind of action that the model has, and the view of the task with it.
 
     Raises:
         ConfigurationError: the model sees other entries, or decides on other actions.
     """
-    view, names = make_view(task, seen.local), seen.observation_names
+    view, names = make_view(task, observed.local), observed.observation_names
     trained = "it was trained for another observation layout: it expects"
     if names is not None and names != tuple(view.names):
         missing = [name for name in names if name not in view.names]
@@ -164,7 +166,7 @@ def _fitted(task: Task, seen: Seen, shape: tuple[int, ...], actions: str) -> tup
             f"{view.space.shape}"
         )
     allowed = {str(view.actions): (task.action, view)}
-    if not seen.local and task.access != "single":
+    if not observed.local and task.access != "single":
         for kind in set(ACTION_KINDS) - {task.action}:
             other = make_view(dataclasses.replace(task, action=kind))
             allowed[str(other.actions)] = (kind, other)

@@ -13,8 +13,8 @@ from fusion_gym.core.memory import Owner
 from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Requests
-from fusion_gym.policies.believing import knows
-from fusion_gym.policies.planning import Model, transmission_sets
+from fusion_gym.policies.belief_rule import knows
+from fusion_gym.policies.planning import PlanningModel, transmission_sets
 from fusion_gym.validation import ConfigurationError
 
 _MOST_TOGETHER = 8  # sensors whose sets are all weighed
@@ -24,7 +24,7 @@ _MOST_GREEDY = 40  # of which one after another is added, each time the best of 
 class Lookahead:
     r"""Request the sensors with the least expected error over the next steps and price.
 
-    A coordinator that knows all new measurements has the best estimate x̂* by delivering them all;
+    A scheduler that knows all new measurements has the best estimate x̂* by delivering them all;
     with memory, by all that was ever measured. Whatever it lets through, x̂, the fused error's
     second moment is the unavoidable part plus |x̂* - x̂|², so a set of transmissions is worth what
     it takes off the sum of that distance, weighted as in the reward, over ``steps`` times, with no
@@ -37,9 +37,9 @@ class Lookahead:
     it: it adds the transmission that lowers the cost most until none does, each by its own
     probability of arrival as if those before it had arrived.
 
-    It uses the task's model through the system itself (:class:`Model`), so it works for every
-    system; exact for linear systems, plausible for others. This is neither an optimum nor a bound,
-    but a policy that knows the model.
+    It uses the task's model through the system itself (:class:`PlanningModel`), so it works for
+    every system; exact for linear systems, plausible for others. This is neither an optimum nor
+    a bound, but a policy that knows the model.
 
     Args:
         price: p >= 0 of a token, in the reward's units.
@@ -71,7 +71,7 @@ class Lookahead:
     """
 
     stateless: ClassVar[bool] = True
-    remember: ClassVar[Owner] = "coordinator"
+    remember: ClassVar[Owner] = "scheduler"
 
     def __init__(self, task: Task, price: float = 0.01, steps: int = 4) -> None:
         self.steps = validation.integer("steps", steps, at_least=1)
@@ -100,7 +100,7 @@ class Lookahead:
         # The sets with each sensor, and the same sets without it.
         number = self._sets @ (1 << np.arange(task.sensors))
         order = np.argsort(number)
-        self._sent = [np.flatnonzero(chosen) for chosen in self._sets.T]
+        self._sent = [np.flatnonzero(selected) for selected in self._sets.T]
         self._without = [
             order[np.searchsorted(number, number[sent] - (1 << sensor), sorter=order)]
             for sensor, sent in enumerate(self._sent)
@@ -108,7 +108,7 @@ class Lookahead:
 
     @property
     def knowledge(self) -> Knowledge:
-        """A coordinator, with what was never sent if the task has memory."""
+        """A scheduler, with what was never sent if the task has memory."""
         return knows(self._task, own=False)
 
     def reset(self, runs: int, seed: int = 0) -> None:
@@ -116,62 +116,62 @@ class Lookahead:
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
-        model = Model(self._task, signals)
+        model = PlanningModel(self._task, signals)
         best = model.best_means(self.steps)
         return self._one_by_one(model, best) if self.greedy else self._of_all_sets(model, best)
 
-    def _of_all_sets(self, model: Model, best: Array) -> Requests:
+    def _of_all_sets(self, model: PlanningModel, best: Array) -> Requests:
         everyone = np.ones((self._task.sensors, model.runs), dtype=np.bool_)
-        grants = [model.grant(chosen & everyone) for chosen in self._sets[:, :, None]]
+        grants = [model.grant(selected & everyone) for selected in self._sets[:, :, None]]
         cost = self._expected_error(model, best)
         cost = cost + self.price * np.stack([g.spent for g in grants])
-        for place, chosen in enumerate(self._sets[:, :, None]):
+        for place, selected in enumerate(self._sets[:, :, None]):
             # What the network would deny is no choice of its own.
-            cost[place, (grants[place].granted != chosen).any(0)] = np.inf
+            cost[place, (grants[place].granted != selected).any(0)] = np.inf
         return np.ascontiguousarray(self._sets[cost.argmin(0)].T)
 
-    def _one_by_one(self, model: Model, best: Array) -> Requests:
+    def _one_by_one(self, model: PlanningModel, best: Array) -> Requests:
         sensors, lanes = self._task.sensors, np.arange(model.runs)
         arrival = np.ones((sensors, model.runs)) if model.arrival is None else model.arrival
-        chosen = np.zeros((sensors, model.runs), dtype=np.bool_)
-        spent, error = np.zeros(model.runs), self._error(model, chosen, best)
+        selected = np.zeros((sensors, model.runs), dtype=np.bool_)
+        spent, error = np.zeros(model.runs), self._error(model, selected, best)
         for _ in range(sensors):
-            saved = np.full(chosen.shape, -np.inf)
-            after, paid = np.empty(chosen.shape), np.empty(chosen.shape)
+            saved = np.full(selected.shape, -np.inf)
+            after, paid = np.empty(selected.shape), np.empty(selected.shape)
             for sensor in range(sensors):
-                added = chosen.copy()
+                added = selected.copy()
                 added[sensor] = True
                 granted, paid[sensor], _ = model.grant(added)
                 after[sensor] = self._error(model, added, best)
                 gain = arrival[sensor] * (error - after[sensor])
                 gain -= self.price * (paid[sensor] - spent)
-                possible = ~chosen[sensor] & (granted == added).all(0)
+                possible = ~selected[sensor] & (granted == added).all(0)
                 saved[sensor] = np.where(possible, gain, -np.inf)
             place = saved.argmax(0)
             worth = saved[place, lanes] > 0.0
             if not worth.any():
                 break
-            chosen[place[worth], lanes[worth]] = True
+            selected[place[worth], lanes[worth]] = True
             error = np.where(worth, after[place, lanes], error)
             spent = np.where(worth, paid[place, lanes], spent)
-        return chosen
+        return selected
 
-    def _expected_error(self, model: Model, best: Array) -> Array:
+    def _expected_error(self, model: PlanningModel, best: Array) -> Array:
         """Weighted squared distance (sets, N) to the best estimate, summed over the steps.
 
         The mean over what the channel lets arrive of each set: packets are lost independently.
         """
         everyone = np.ones((self._task.sensors, model.runs), np.bool_)
         error = np.empty((len(self._sets), model.runs))
-        for place, chosen in enumerate(self._sets[:, :, None]):
-            error[place] = self._error(model, chosen & everyone, best)
+        for place, selected in enumerate(self._sets[:, :, None]):
+            error[place] = self._error(model, selected & everyone, best)
         if model.arrival is not None:
             for sensor, arrives in enumerate(model.arrival):
                 sent, lost = self._sent[sensor], self._without[sensor]
                 error[sent] = arrives * error[sent] + (1.0 - arrives) * error[lost]
         return error
 
-    def _error(self, model: Model, arriving: Requests, best: Array) -> Array:
+    def _error(self, model: PlanningModel, arriving: Requests, best: Array) -> Array:
         """The same (N,) if these packets (sensors, N) arrive."""
         reward = self._task.reward
         distance = model.fused_means(arriving, self.steps) - best

@@ -14,7 +14,7 @@ from fusion_gym.core.system import Knowledge, Signals, least_covering
 from fusion_gym.core.task import Task
 from fusion_gym.envs.views import Rows, make_view
 from fusion_gym.policies.base import Requests
-from fusion_gym.policies.card import ALGORITHMS, ENTRY, card
+from fusion_gym.policies.card import ALGORITHMS, ENTRY, model_card
 from fusion_gym.validation import ConfigurationError
 
 
@@ -26,7 +26,7 @@ def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
     """
     names = {kind: name for name, kind in ALGORITHMS.items()}
     algorithm = next(names[kind] for kind in type(model).__mro__ if kind in names)
-    setattr(model, ENTRY, card(algorithm, model, task, local))
+    setattr(model, ENTRY, model_card(algorithm, model, task, local))
 
 
 class ModelPolicy:
@@ -51,7 +51,7 @@ class ModelPolicy:
     ) -> None:
         self.model = model
         self.deterministic = deterministic
-        self._shown = task.reward.price.span is not None
+        self._visible = task.reward.price.span is not None
         self.task = priced(task, price_range)
         self.view = make_view(self.task, local)
         self._memory: Any = None  # of a recurrent policy
@@ -62,7 +62,7 @@ class ModelPolicy:
             self.knowledge = least_covering((self.knowledge, "own_memory"))
         span = self.task.reward.price.span
         self.price: float | None = None
-        if price is None and span is not None and not self._shown:
+        if price is None and span is not None and not self._visible:
             fixed = task.reward.price.fixed
             assert fixed is not None  # a drawn price is always shown
             price = min(max(fixed, span[0]), span[1])
@@ -72,8 +72,8 @@ class ModelPolicy:
                     f"price = {price!r} is not allowed: the model was trained without a "
                     "price_range, for one price alone"
                 )
-            chosen = Price.create(price, span)
-            self.price = float(chosen.encode(chosen.draw(np.zeros(1)))[0])
+            price_setting = Price.create(price, span)
+            self.price = float(price_setting.encode(price_setting.draw(np.zeros(1)))[0])
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Forget the memory of a recurrent policy; draw from the stream of ``seed``."""
@@ -99,7 +99,7 @@ class ModelPolicy:
         """What the model is shown, (N·rows_per_run, entries) float32."""
         observation = signals["observation"]
         if self.price is not None:
-            own = observation[:, :-1] if self._shown else observation  # the price comes last
+            own = observation[:, :-1] if self._visible else observation  # the price comes last
             column = np.full((len(own), 1), self.price, dtype=np.float32)
             observation = np.concatenate((own, column), axis=1)
         return self.view.rows(observation)

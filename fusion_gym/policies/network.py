@@ -14,7 +14,7 @@ _VALUES = "q_net.q_net"
 
 
 @dataclass(frozen=True)
-class Memory:
+class _Memory:
     """The LSTM of a recurrent policy; its critic has one of its own, the actor's, or none."""
 
     size: int
@@ -23,15 +23,15 @@ class Memory:
 
 
 @dataclass(frozen=True)
-class Network:
+class NetworkShape:
     """Sizes of the hidden layers: of policy and value ("pi", "vf"), or of the values ("q")."""
 
     hidden: Mapping[str, tuple[int, ...]]
     entries: int  # of an observation
-    memory: Memory | None = None
+    memory: _Memory | None = None
 
     @classmethod
-    def of(cls, shapes: Shapes) -> Network:
+    def of(cls, shapes: Shapes) -> NetworkShape:
         """The networks that have weights of these shapes.
 
         Every size is checked against its neighbours, so that what is built of them is about as
@@ -63,26 +63,26 @@ class Network:
 
     def plain(self) -> dict[str, Any]:
         """As JSON."""
-        told: dict[str, Any] = {head: list(sizes) for head, sizes in self.hidden.items()}
-        return told | ({"memory": vars(self.memory).copy()} if self.memory else {})
+        entries: dict[str, Any] = {head: list(sizes) for head, sizes in self.hidden.items()}
+        return entries | ({"memory": vars(self.memory).copy()} if self.memory else {})
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of Stable-Baselines3's policy class."""
         if "q" in self.hidden:
             return {"net_arch": list(self.hidden["q"])}
         sizes = {head: list(sizes) for head, sizes in self.hidden.items()}
-        found: dict[str, Any] = {"net_arch": sizes, "ortho_init": False}
+        result: dict[str, Any] = {"net_arch": sizes, "ortho_init": False}
         if self.memory:
-            found |= {
+            result |= {
                 "lstm_hidden_size": self.memory.size,
                 "n_lstm_layers": self.memory.layers,
                 "shared_lstm": self.memory.critic == "shared",
                 "enable_critic_lstm": self.memory.critic == "own",
             }
-        return found
+        return result
 
 
-def _memory(shapes: Shapes) -> tuple[Memory, int]:
+def _memory(shapes: Shapes) -> tuple[_Memory, int]:
     """The LSTM, and how many entries it is given."""
     size = _pair(shapes, "lstm_actor.weight_hh_l0")[1]
     layers = 0
@@ -90,25 +90,25 @@ def _memory(shapes: Shapes) -> tuple[Memory, int]:
         layers += 1
     entries = _pair(shapes, "lstm_actor.weight_ih_l0")[1]
     for layer in range(layers):
-        wanted = {"ih": (4 * size, size if layer else entries), "hh": (4 * size, size)}
-        if any(_pair(shapes, f"lstm_actor.weight_{k}_l{layer}") != w for k, w in wanted.items()):
+        required = {"ih": (4 * size, size if layer else entries), "hh": (4 * size, size)}
+        if any(_pair(shapes, f"lstm_actor.weight_{k}_l{layer}") != w for k, w in required.items()):
             raise NeedsTrust("its weights do not fit each other")
     critic: Literal["own", "shared", "none"] = "shared"
     if "lstm_critic.weight_ih_l0" in shapes:
         critic = "own"
     elif "critic.weight" in shapes:
         critic = "none"
-    return Memory(size, layers, critic), entries
+    return _Memory(size, layers, critic), entries
 
 
 def _chain(shapes: Shapes, prefix: str) -> list[tuple[int, int]]:
     """(outputs, inputs) of the linear layers, between which the activations stand."""
-    found: list[tuple[int, int]] = []
-    while f"{prefix}.{2 * len(found)}.weight" in shapes:
-        found.append(_pair(shapes, f"{prefix}.{2 * len(found)}.weight"))
-        if len(found) > 1 and found[-1][1] != found[-2][0]:
+    result: list[tuple[int, int]] = []
+    while f"{prefix}.{2 * len(result)}.weight" in shapes:
+        result.append(_pair(shapes, f"{prefix}.{2 * len(result)}.weight"))
+        if len(result) > 1 and result[-1][1] != result[-2][0]:
             raise NeedsTrust("its weights do not fit each other")
-    return found
+    return result
 
 
 def _pair(shapes: Shapes, name: str) -> tuple[int, int]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from fusion_gym.core.observation import ObservationLayout
-from fusion_gym.core.options import plain
+from fusion_gym.core.options import plain_options
 from fusion_gym.core.system import MEANING, Block, numbered
 from fusion_gym.envs.views import SensorView
 from fusion_gym.policies.model import ALGORITHMS, ModelPolicy
@@ -41,15 +41,15 @@ def onnx_card(
 ) -> dict[str, str]:
     """The metadata of the graph of an agent: ``model`` is how its user calls it."""
     task, local = agent.task, isinstance(agent.view, SensorView)
-    layout = ObservationLayout(task, "own" if local else "coordinator")
+    layout = ObservationLayout(task, "own" if local else "scheduler")
     names = list(graph.entries)
-    shown = {name.partition("[")[0] for name in names}
-    blocks = [_block(block, local) for block in layout.blocks if block.name in shown]
+    visible = {name.partition("[")[0] for name in names}
+    blocks = [_block(block, local) for block in layout.blocks if block.name in visible]
     if local and task.own_number:
         number = Block("sensor", "which sensor it is", np.array, (numbered(task.sensors),))
         blocks.append(_block(number, local))
     price = task.reward.price.span
-    told = {
+    values = {
         "inputs": _ports(graph.inputs),
         "outputs": _ports(graph.outputs),
         "observation_names": names,
@@ -67,11 +67,11 @@ def onnx_card(
         "model": model,
         "algorithm": _algorithm(agent),
         "environment": environment,
-        "decides": "each sensor by itself" if local else "a coordinator of all sensors",
+        "decides": "each sensor by itself" if local else "a scheduler of all sensors",
         "knows": MEANING[agent.knowledge],
         "observation_version": layout_version(environment, names),
     }
-    return words | {key: json.dumps(_finite(plain(value))) for key, value in told.items()}
+    return words | {key: json.dumps(_finite(plain_options(value))) for key, value in values.items()}
 
 
 def layout_version(environment: str, names: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""A saved agent as an ONNX graph: what a sensor or a coordinator runs without this library."""
+"""A saved agent as an ONNX graph: what a sensor or a scheduler runs without this library."""
 
 from __future__ import annotations
 
@@ -77,12 +77,12 @@ class DecisionGraph(torch.nn.Module):
         self._values = isinstance(policy, DQNPolicy)
         self._price = agent.price
         self._place = agent.view.names.index("price") if agent.price is not None else None
-        kept = [place for place in range(len(agent.view.names)) if place != self._place]
-        self.entries = tuple(agent.view.names[place] for place in kept)
+        stored = [place for place in range(len(agent.view.names)) if place != self._place]
+        self.entries = tuple(agent.view.names[place] for place in stored)
         self.low: torch.Tensor
         self.high: torch.Tensor
-        self.register_buffer("low", torch.as_tensor(agent.view.space.low[kept]))
-        self.register_buffer("high", torch.as_tensor(agent.view.space.high[kept]))
+        self.register_buffer("low", torch.as_tensor(agent.view.space.low[stored]))
+        self.register_buffer("high", torch.as_tensor(agent.view.space.high[stored]))
         self.choices = _choices(agent)
         self._table: torch.Tensor | None
         table = None if self.choices is None else torch.as_tensor(self.choices, dtype=torch.float32)
@@ -159,12 +159,12 @@ class DecisionGraph(torch.nn.Module):
 
     def example(self, rows: int) -> tuple[torch.Tensor, ...]:
         """Inputs of so many rows, at the start of an episode."""
-        found = []
+        result = []
         for name, shape in self.inputs.items():
             sizes = [rows if size == "batch" else int(size) for size in shape]
             kind = torch.bool if name == "grantable" else torch.float32
-            found.append((torch.ones if name == "grantable" else torch.zeros)(sizes, dtype=kind))
-        return tuple(found)
+            result.append((torch.ones if name == "grantable" else torch.zeros)(sizes, dtype=kind))
+        return tuple(result)
 
 
 def _choices(agent: ModelPolicy) -> np.ndarray[Any, Any] | None:
@@ -178,8 +178,8 @@ def _choices(agent: ModelPolicy) -> np.ndarray[Any, Any] | None:
     return np.ascontiguousarray(view.requests(np.arange(number), int(number)).T).astype(np.int8)
 
 
-def save_graph(graph: DecisionGraph, path: Path, told: Mapping[str, str]) -> None:
-    """Write the graph as an ONNX file, with ``told`` as its metadata.
+def save_graph(graph: DecisionGraph, path: Path, received: Mapping[str, str]) -> None:
+    """Write the graph as an ONNX file, with ``received`` as its metadata.
 
     Raises:
         ConfigurationError: ONNX is not installed.
@@ -202,6 +202,6 @@ def save_graph(graph: DecisionGraph, path: Path, told: Mapping[str, str]) -> Non
         )
     written = onnx.load(str(path))
     written.graph.name = "fusion_gym"
-    onnx.helper.set_model_props(written, dict(told))
+    onnx.helper.set_model_props(written, dict(received))
     onnx.checker.check_model(written)
     onnx.save(written, str(path))

@@ -59,7 +59,7 @@ class OptimalPolicy:
     @property
     def knowledge(self) -> Knowledge:
         """A sensor's own error, by its thresholds; with a table of two sources both errors."""
-        return "own" if self.optimum.threshold is not None else "coordinator"
+        return "own" if self.optimum.threshold is not None else "scheduler"
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Nothing to forget."""
@@ -78,9 +78,9 @@ class OptimalPolicy:
         assert optimum.choice is not None
         assert optimum.grids is not None
         step = np.minimum(signals["step"], len(optimum.choice) - 1)
-        one, two = (
+        first, two = (
             np.minimum(np.rint(e / grid.points[1]), len(grid.points) - 1).astype(np.int64)
             for e, grid in zip(error, optimum.grids, strict=True)
         )
-        chosen = optimum.choice[step, one, two, level]
-        return (chosen >> np.arange(2)[:, None] & 1).astype(np.bool_)
+        choice = optimum.choice[step, first, two, level]
+        return (choice >> np.arange(2)[:, None] & 1).astype(np.bool_)

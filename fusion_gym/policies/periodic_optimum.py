@@ -221,8 +221,8 @@ def _search(system: System[Any], packets: int, period: int, steps: int | None) -
     best, trace = np.zeros((period, sensors), dtype=np.bool_), math.inf
     while part := list(itertools.islice(every, _TOGETHER)):
         schedules = np.zeros((places, len(part)), dtype=np.bool_)
-        for number, chosen in enumerate(part):
-            schedules[list(chosen), number] = True
+        for number, selection in enumerate(part):
+            schedules[list(selection), number] = True
         shaped = schedules.reshape(period, sensors, -1)
         if steps is None:
             traces = steady_traces(system, shaped)

@@ -12,13 +12,13 @@ from fusion_gym.core.beliefs import silent_path
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import Grants
-from fusion_gym.policies.believing import beliefs_of
+from fusion_gym.policies.belief_rule import beliefs_of
 from fusion_gym.validation import ConfigurationError
 
 _MOST_SENSORS = 12
 
 
-def transmission_sets(task: Task, wanted_by: str) -> NDArray[np.bool_]:
+def transmission_sets(task: Task, expected_by: str) -> NDArray[np.bool_]:
     """Every set of sensors that may transmit in one step, (sets, sensors) bool, silence first.
 
     Raises:
@@ -30,16 +30,16 @@ def transmission_sets(task: Task, wanted_by: str) -> NDArray[np.bool_]:
         return np.concatenate((nobody, np.eye(task.sensors, dtype=np.bool_)[::-1]))
     if task.sensors > _MOST_SENSORS:
         raise ConfigurationError(
-            f"sensors = {task.sensors} is not allowed with {wanted_by}: it must be at most "
+            f"sensors = {task.sensors} is not allowed with {expected_by}: it must be at most "
             f"{_MOST_SENSORS}, for all 2^{task.sensors} sets of sensors would be weighed"
         )
     return np.array(list(product((False, True), repeat=task.sensors)))
 
 
-class Model:
+class PlanningModel:
     """The task's own moves from the signals of one step on, for N runs.
 
-    It knows what a coordinator knows: all new measurements, what the nodes and the centre hold,
+    It knows what a scheduler knows: all new measurements, what the nodes and the centre hold,
     the tokens, and with memory all that was measured and not sent. It has neither the true state
     nor what the channel is about to lose.
 
@@ -82,7 +82,9 @@ class Model:
 
     def best_means(self, steps: int) -> Array:
         """The same of the estimate that holds all that was measured, with memory ever."""
-        shadow = self._task.shadow
-        if shadow is None or self._beliefs is None:
+        memory_system = self._task.memory_system
+        if memory_system is None or self._beliefs is None:
             return self.fused_means(np.ones((self._task.sensors, self.runs), np.bool_), steps)
-        return silent_path(shadow, shadow.visible(self._beliefs.remembered), steps)
+        return silent_path(
+            memory_system, memory_system.visible(self._beliefs.memory_posterior), steps
+        )

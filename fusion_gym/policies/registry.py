@@ -19,7 +19,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import KNOWLEDGE
 from fusion_gym.core.task import Task
 from fusion_gym.docstrings import plain_marks, read, table
-from fusion_gym.importing import named
+from fusion_gym.importing import import_named
 from fusion_gym.policies.base import Policy, owner_of
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError, boolean, choice, keys
@@ -35,7 +35,7 @@ class Context(TypedDict):
     trust: bool
 
 
-class Row(NamedTuple):
+class PolicyRow(NamedTuple):
     """A policy's maker: a callable, or where to import it, as "module:attribute"; and its kind.
 
     The maker takes the policy's parameters by name, the task if it has a parameter ``task``, and
@@ -50,8 +50,8 @@ class Row(NamedTuple):
     kind: Kind | None = None
 
 
-_ROWS: dict[str, Row] = {
-    name: Row(f"fusion_gym.policies.{place}")
+_ROWS: dict[str, PolicyRow] = {
+    name: PolicyRow(f"fusion_gym.policies.{place}")
     for name, place in {
         "adaptive_innovation": "rules.adaptive_innovation:AdaptiveInnovation",
         "adaptive_threshold": "rules.adaptive_threshold:AdaptiveThreshold",
@@ -102,7 +102,7 @@ def register_policy(name: str, maker: Maker, kind: Kind = "rule") -> None:
         raise ConfigurationError(f"name = {name!r} is not allowed: there is a policy of that name")
     choice("kind", kind, get_args(Kind))
     _parameters(name, maker)
-    _ROWS[name] = Row(maker, kind)
+    _ROWS[name] = PolicyRow(maker, kind)
 
 
 def policy_names(kind: Kind | None = None) -> list[str]:
@@ -139,10 +139,10 @@ def policy_table(kind: Kind) -> str:
     """Return the policies of a kind as a Markdown table, from their declarations."""
     rows = []
     for name in policy_names(kind):
-        given = list(policy_parameters(name))
-        shown = f"`{name}:{given.pop(0).upper()}`" if kind == "agent" else f"`{name}`"
+        value = list(policy_parameters(name))
+        text = f"`{name}:{value.pop(0).upper()}`" if kind == "agent" else f"`{name}`"
         summary = plain_marks(read(policy_maker(name)).summary)
-        rows.append((shown, summary, ", ".join(f"`{key}`" for key in given)))
+        rows.append((text, summary, ", ".join(f"`{key}`" for key in value)))
     return table(("policy", "meaning", "parameters"), rows)
 
 
@@ -181,24 +181,24 @@ def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> P
     name, row, text = _asked(spec)
     maker = _maker(row)
     known = _parameters(name, maker)
-    given: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
     if _kind(row) == "agent":
         key, (value, *entries) = next(iter(known)), text.split(",")
-        given[key] = value.removeprefix(f"{key}=")
+        arguments[key] = value.removeprefix(f"{key}=")
     else:
-        text, given = _split_rest(text, getattr(maker, "rest", None))
+        text, arguments = _split_rest(text, getattr(maker, "rest", None))
         entries = text.split(",") if text else []
     settings = parse_settings(f"parameter of policy {name!r}", entries)
-    keys(f"parameter of policy {name!r}", settings, known.keys() - given.keys())
-    given |= defaults.get(name, {}) | settings
-    missing = [key for key, found in known.items() if found.default is found.empty]
+    keys(f"parameter of policy {name!r}", settings, known.keys() - arguments.keys())
+    arguments |= defaults.get(name, {}) | settings
+    missing = [key for key, value in known.items() if value.default is value.empty]
     for key in missing:
-        if key not in given:
+        if key not in arguments:
             raise ConfigurationError(f"policy {spec!r} needs a parameter {key!r}: write {key}=…")
-    wanted = inspect.signature(maker).parameters
-    given |= {key: value for key, value in context.items() if key in wanted}
+    parameters = inspect.signature(maker).parameters
+    arguments |= {key: value for key, value in context.items() if key in parameters}
     try:
-        policy = maker(**given)
+        policy = maker(**arguments)
     except ConfigurationError as error:
         raise ConfigurationError(f"policy {spec!r}: {error}") from None
     declared = getattr(policy, "knowledge", None)
@@ -212,12 +212,12 @@ def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> P
 
 def _split_rest(text: str, rest: str | None) -> tuple[str, dict[str, Any]]:
     """The settings before the parameter that takes the rest of the text, and that one."""
-    if rest is not None and (found := re.search(rf"(^|,)\s*{rest}=", text)):
-        return text[: found.start()], {rest: text[found.end() :]}
+    if rest is not None and (result := re.search(rf"(^|,)\s*{rest}=", text)):
+        return text[: result.start()], {rest: text[result.end() :]}
     return text, {}
 
 
-def _asked(spec: str) -> tuple[str, Row, str]:
+def _asked(spec: str) -> tuple[str, PolicyRow, str]:
     """The name of a policy, its row, and the text behind its name.
 
     Raises:
@@ -229,26 +229,26 @@ def _asked(spec: str) -> tuple[str, Row, str]:
         keys("policy", [name], _ROWS)
         return name, _ROWS[name], text
     name = f"{name}:{own}"
-    found = named("policy", name)
-    lacks = [part for part in ("knowledge", "reset", "__call__") if not hasattr(found, part)]
-    if not isinstance(found, type) or lacks:
+    result = import_named("policy", name)
+    lacks = [part for part in ("knowledge", "reset", "__call__") if not hasattr(result, part)]
+    if not isinstance(result, type) or lacks:
         raise ConfigurationError(
             f"policy = {name!r} is not allowed: it must be a class with knowledge, reset and "
             "__call__, as one derived from fusion_gym.policies.base.Rule"
         )
-    return name, Row(found), behind
+    return name, PolicyRow(result), behind
 
 
-def _maker(row: Row) -> Maker:
+def _maker(row: PolicyRow) -> Maker:
     maker = row.maker
     if isinstance(maker, str):
         module, _, attribute = maker.partition(":")
-        found: Maker = getattr(importlib.import_module(module), attribute)
-        return found
+        member: Maker = getattr(importlib.import_module(module), attribute)
+        return member
     return maker
 
 
-def _kind(row: Row) -> Kind:
+def _kind(row: PolicyRow) -> Kind:
     maker = _maker(row)
     if row.kind is not None:
         return row.kind
@@ -264,18 +264,18 @@ def _parameters(name: str, maker: Maker) -> dict[str, inspect.Parameter]:
         ConfigurationError: no callable whose parameters have names.
     """
     try:
-        found = inspect.signature(maker).parameters
+        names = inspect.signature(maker).parameters
     except (TypeError, ValueError):
-        found = None
-    if found is None or any(
-        p.kind not in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) for p in found.values()
+        names = None
+    if names is None or any(
+        p.kind not in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) for p in names.values()
     ):
         raise ConfigurationError(
             f"maker = {maker!r} of policy {name!r} is not allowed: it must be a callable with "
             "named parameters that returns a policy"
         )
     return {
-        key: parameter for key, parameter in found.items() if key not in Context.__annotations__
+        key: parameter for key, parameter in names.items() if key not in Context.__annotations__
     }
 
 

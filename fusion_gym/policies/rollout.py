@@ -14,7 +14,7 @@ from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.system import Knowledge, Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy, Requests, is_stateless, owner_of
-from fusion_gym.policies.believing import check_owner, knows
+from fusion_gym.policies.belief_rule import check_owner, knows
 from fusion_gym.policies.imagination import Imagination
 from fusion_gym.policies.registry import make_policy
 
@@ -74,7 +74,7 @@ class Rollout:
     """
 
     stateless: ClassVar[bool] = False  # it draws
-    remember: ClassVar[Owner] = "coordinator"
+    remember: ClassVar[Owner] = "scheduler"
     rest: ClassVar[str] = "base"
 
     def __init__(
@@ -106,9 +106,9 @@ class Rollout:
             )
         if owner_of(self.base) == "own":
             raise validation.refusal(
-                "base", base, "a coordinator's policy, for simulations begin with what it believes"
+                "base", base, "a scheduler's policy, for simulations begin with what it believes"
             )
-        memory = Memory(task, "coordinator")
+        memory = Memory(task, "scheduler")
         self._task = task
         self._weights = task.reward.error_weight * task.reward.state_weights
         self._imagination = Imagination(task, memory, ObservationLayout(task))
@@ -116,14 +116,14 @@ class Rollout:
 
     @property
     def knowledge(self) -> Knowledge:
-        """A coordinator, with what was never sent if the task has memory."""
+        """A scheduler, with what was never sent if the task has memory."""
         return knows(self._task, own=False)
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Begin again: run i imagines with a stream of its own, that of ``seed + i``."""
         self.base.reset(runs, seed)
         self._generators = [
-            np.random.default_rng([one, _STREAM]) for one in range(seed, seed + runs)
+            np.random.default_rng([item, _STREAM]) for item in range(seed, seed + runs)
         ]
 
     def __call__(self, signals: Signals) -> Requests:
@@ -159,8 +159,8 @@ class Rollout:
         error = gain.std(-1) / np.sqrt(self.samples)
         mean = gain.mean(-1)
         worth: Array = np.where(mean > self.doubt * error, mean, 0.0)
-        found = worth.argmax(0)
-        return np.where(worth.max(0) > 0.0, found, own)
+        result = worth.argmax(0)
+        return np.where(worth.max(0) > 0.0, result, own)
 
     def _cost(self, signals: Signals, runs: NDArray[np.int64], choices: NDArray[np.bool_]) -> Array:
         """Costs (choices, R, samples) of first decisions (choices, sensors, R) in these runs."""

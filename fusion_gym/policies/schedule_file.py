@@ -36,8 +36,8 @@ class Schedule(NamedTuple):
 def schedule_key(system: System[Any], packets: int, period: int, steps: int | None) -> str:
     """Hash of the system's type and all its numbers, and of what is asked for."""
     digest = hashlib.sha256()
-    asked = (_FORMAT, __version__, packets, period, steps)
-    digest.update(repr(asked).encode())
+    key_fields = (_FORMAT, __version__, packets, period, steps)
+    digest.update(repr(key_fields).encode())
     _feed(digest, system)
     return digest.hexdigest()
 

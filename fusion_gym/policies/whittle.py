@@ -67,7 +67,7 @@ class WhittleIndex:
     @property
     def knowledge(self) -> Knowledge:
         """A sensor's own error; with ``at_most`` all errors, for the largest index is sent."""
-        return "own" if self._at_most is None else "coordinator"
+        return "own" if self._at_most is None else "scheduler"
 
     def reset(self, runs: int, seed: int = 0) -> None:
         """Nothing to forget."""

@@ -67,7 +67,7 @@ def solve_ages(
             f"number 2^{count} of sets of them, must be at most {_MOST_STATES}"
         )
     sets = [s for s in range(2**count) if s.bit_count() <= limit]
-    costs = [_step_cost(problems, size, chosen) for chosen in sets]
+    costs = [_step_cost(problems, size, selected) for selected in sets]
     value = np.zeros((size,) * count)
     for _ in range(iterations):
         options = np.stack(
@@ -92,12 +92,12 @@ def _default_length(problem: SourceProblem, sharing: float) -> int:
     return int(np.ceil(4.0 * max(period, sharing) + losses * max(sharing, 1.0))) + 6
 
 
-def _step_cost(problems: tuple[SourceProblem, ...], size: int, chosen: int) -> Array:
-    """Expected cost of a step (A, ..., A) in which the sources ``chosen`` transmit."""
+def _step_cost(problems: tuple[SourceProblem, ...], size: int, choice: int) -> Array:
+    """Expected cost of a step (A, ..., A) in which the sources ``choice`` transmit."""
     total = np.zeros((size,) * len(problems))
     for i, problem in enumerate(problems):
         cost = problem.error_weight * silent_variances(problem, size)
-        if chosen >> i & 1:
+        if choice >> i & 1:
             cost = problem.price + problem.drop[0] * cost
         shape = [1] * len(problems)
         shape[i] = size
@@ -105,12 +105,12 @@ def _step_cost(problems: tuple[SourceProblem, ...], size: int, chosen: int) -> A
     return total
 
 
-def _ahead(problems: tuple[SourceProblem, ...], value: Array, chosen: int) -> Array:
+def _ahead(problems: tuple[SourceProblem, ...], value: Array, choice: int) -> Array:
     """Expected value of the ages that follow."""
     for i, problem in enumerate(problems):
         size = value.shape[i]
         older = value.take(np.minimum(np.arange(size) + 1, size - 1), axis=i)
-        if chosen >> i & 1:
+        if choice >> i & 1:
             drop = problem.drop[0]
             value = drop * older + (1.0 - drop) * value.take([0], axis=i)
         else:

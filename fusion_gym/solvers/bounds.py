@@ -77,13 +77,13 @@ def lagrangian_bound(
         if value < best:
             break
         best, high = value, 2.0 * high
-    found = minimize_scalar(
+    optimum = minimize_scalar(
         lambda multiplier: -dual(float(multiplier)),
         bounds=(0.0, high),
         method="bounded",
         options={"xatol": _TOLERANCE * high},
     )
     zero = dual(0.0)
-    if zero >= -float(found.fun):
+    if zero >= -float(optimum.fun):
         return DualBound(zero, 0.0)
-    return DualBound(float(-found.fun), float(np.asarray(found.x)))
+    return DualBound(float(-optimum.fun), float(np.asarray(optimum.x)))

@@ -63,7 +63,7 @@ class JointProblem:
     @property
     def allowed(self) -> NDArray[np.bool_]:
         """Which of the four sets of sources may be asked for at each level, (K, 4)."""
-        small = np.array([chosen.bit_count() <= self.at_most for chosen in range(4)])
+        small = np.array([selected.bit_count() <= self.at_most for selected in range(4)])
         return self.tokens.affordable & small
 
     def grids(
@@ -92,12 +92,12 @@ class JointProblem:
             _NEGLIGIBLE,
         )
         points = _POINTS if len(self.tokens.level) == 1 else _POINTS_TOKENS
-        chosen = (
+        selection = (
             min(max(reach / points, deviation / _FINEST), deviation / _COARSEST)
             if step is None
             else step * deviation
         )
-        return ErrorGrid.create(source.coefficient, deviation, reach, chosen)
+        return ErrorGrid.create(source.coefficient, deviation, reach, selection)
 
 
 class JointBellman:
@@ -105,12 +105,12 @@ class JointBellman:
 
     def __init__(self, problem: JointProblem, grids: tuple[ErrorGrid, ErrorGrid]) -> None:
         self.problem, self.grids = problem, grids
-        one, two = (
+        first, two = (
             source.error_weight * grid.points**2
             for source, grid in zip(problem.sources, grids, strict=True)
         )
-        self.error_cost = (one[:, None] + two)[..., None]
-        self.shape = (len(one), len(two), len(problem.tokens.level))
+        self.error_cost = (first[:, None] + two)[..., None]
+        self.shape = (len(first), len(two), len(problem.tokens.level))
 
     def decide(self, value: Array) -> tuple[Array, NDArray[np.int8]]:
         """The least cost (M1, M2, K) and the set of sources that brings it, as bits."""
@@ -119,18 +119,18 @@ class JointBellman:
         remains = self.error_cost + np.matmul(second.kernel, ahead)
         best = remains[..., self.problem.tokens.following[:, 0]]
         choice = np.zeros(self.shape, dtype=np.int8)
-        for chosen in (1, 2, 3):
-            allowed = self.problem.allowed[:, chosen]
+        for selected in (1, 2, 3):
+            allowed = self.problem.allowed[:, selected]
             if not allowed.any():
                 continue
-            cost = remains[..., self.problem.tokens.following[:, chosen]]
+            cost = remains[..., self.problem.tokens.following[:, selected]]
             for i, source in enumerate(self.problem.sources):
-                if chosen >> i & 1:
+                if selected >> i & 1:
                     drop = source.drop[0]
                     cost = source.price + drop * cost + (1.0 - drop) * cost.take([0], axis=i)
             better = (cost < best) & allowed
             best = np.where(better, cost, best)
-            choice[better] = chosen
+            choice[better] = selected
         return best, choice
 
 

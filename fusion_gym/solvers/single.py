@@ -69,7 +69,7 @@ def _mix(weights: Array, value: Array) -> Array:
     return np.stack(rows, axis=1)
 
 
-def thresholds(advantage: Array, points: Array) -> tuple[Array, bool]:
+def source_thresholds(advantage: Array, points: Array) -> tuple[Array, bool]:
     """Where the advantage (M, ...) of a request becomes positive, and whether it then stays so.
 
     Interpolated between two points; infinite where it never does.
@@ -130,7 +130,7 @@ def solve_average(
             f"iterations = {iterations} are not enough: the average cost is only known to lie "
             f"between {lower:.6g} and {upper:.6g}"
         )
-    threshold, ordered = thresholds(advantage, bellman.grid.points)
+    threshold, ordered = source_thresholds(advantage, bellman.grid.points)
     cost = 0.5 * (lower + upper)
     rate = _rate(bellman, threshold, tolerance, iterations)
     error = (cost - problem.price * rate) / problem.error_weight
@@ -181,7 +181,9 @@ def solve_discounted(
         if np.ptp(change) <= tolerance * max(float(np.abs(new[0]).max()), 1e-300):
             break
     first = bellman.grid.kernel[0] @ value[..., problem.tokens.initial]
-    return DiscountedSolution((1.0 - beta) * first, *thresholds(advantage, bellman.grid.points))
+    return DiscountedSolution(
+        (1.0 - beta) * first, *source_thresholds(advantage, bellman.grid.points)
+    )
 
 
 @dataclass(frozen=True)
@@ -216,16 +218,16 @@ def solve_finite(
     spread = validation.number("initial_deviation", initial_deviation, at_least=0.0)
     bellman = Bellman(problem, grid or problem.grid(steps))
     value, sent = np.zeros(bellman.shape), np.zeros(bellman.shape)
-    found = np.empty((steps, *bellman.shape[1:]))
+    values = np.empty((steps, *bellman.shape[1:]))
     ordered = True
     for step in reversed(range(steps)):
         value, advantage = bellman.decide(value)
-        found[step], here = thresholds(advantage, bellman.grid.points)
-        sent = bellman.count(sent, found[step])
+        values[step], here = source_thresholds(advantage, bellman.grid.points)
+        sent = bellman.count(sent, values[step])
         ordered = ordered and here
     deviation = float(np.hypot(problem.coefficient * spread, problem.deviation))
     first = gaussian_rows(np.zeros(1), deviation, bellman.grid.points)[0]
     cost = float(first @ value[..., problem.tokens.initial] @ problem.initial)
     rate = float(first @ sent[..., problem.tokens.initial] @ problem.initial) / steps
     error = (cost / steps - problem.price * rate) / problem.error_weight
-    return FiniteSolution(cost, error, rate, found, ordered)
+    return FiniteSolution(cost, error, rate, values, ordered)

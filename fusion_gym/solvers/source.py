@@ -124,12 +124,12 @@ class SourceProblem:
         return ErrorGrid.create(self.coefficient, self.deviation, reach, step)
 
 
-def _initial_law(transition: Array, given: ArrayLike | None) -> Array:
+def _initial_law(transition: Array, values: ArrayLike | None) -> Array:
     """The given law of the channel's state at time 0, or the stationary one."""
     states = len(transition)
-    if given is not None:
+    if values is not None:
         law = validation.not_negative(
-            "initial", validation.array("initial", given, (states,)), (states,)
+            "initial", validation.array("initial", values, (states,)), (states,)
         )
         if not np.isclose(law.sum(), 1.0, rtol=0.0, atol=1e-9):
             raise ConfigurationError(

@@ -100,14 +100,14 @@ def solve_task(task: Task, criterion: str = "finite") -> Optimum:
     """
     validation.choice("criterion", criterion, CRITERIA)
     problems, bucket = source_problems(task), task.bucket
-    alone = len(problems) == 1
-    if not alone and not (task.access == "any" and bucket.unlimited):
+    single = len(problems) == 1
+    if not single and not (task.access == "any" and bucket.unlimited):
         return _solve_pair(task, problems, criterion)
     # Of several that share nothing each has tokens without limit, of one level.
-    tokens = TokenLevels.create(bucket) if alone else problems[0].tokens
-    costs, errors, rates, found = [], [], [], []
+    tokens = TokenLevels.create(bucket) if single else problems[0].tokens
+    costs, errors, rates, result = [], [], [], []
     for i, priced in enumerate(problems):
-        problem = replace(priced, tokens=tokens) if alone else priced
+        problem = replace(priced, tokens=tokens) if single else priced
         solution: AverageSolution | FiniteSolution
         if criterion == "average":
             solution = solve_average(problem)
@@ -123,13 +123,13 @@ def solve_task(task: Task, criterion: str = "finite") -> Optimum:
         costs.append(solution.cost)
         errors.append(problem.error_weight * solution.error)
         rates.append(solution.rate)
-        found.append(solution.threshold.reshape(-1, *solution.threshold.shape[-2:]))
+        result.append(solution.threshold.reshape(-1, *solution.threshold.shape[-2:]))
     return Optimum(
         cost=sum(costs),
         error=sum(errors),
         rate=sum(rates),
         tokens=tokens,
-        threshold=np.stack(found, axis=1),
+        threshold=np.stack(result, axis=1),
     )
 
 
@@ -150,7 +150,7 @@ def _solve_pair(task: Task, problems: tuple[SourceProblem, ...], criterion: str)
         stationary = solve_joint_average(problem)
         cost, choice, grids = stationary.cost, stationary.choice[None], stationary.grids
     else:
-        one, two = _system(task).initial_deviation.tolist()
-        episode = solve_joint_finite(problem, task.horizon, (one, two))
+        first, two = _system(task).initial_deviation.tolist()
+        episode = solve_joint_finite(problem, task.horizon, (first, two))
         cost, choice, grids = episode.cost, episode.choice, episode.grids
     return Optimum(cost, math.nan, math.nan, problem.tokens, choice=choice, grids=grids)

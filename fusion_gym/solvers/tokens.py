@@ -54,22 +54,22 @@ class TokenLevels:
         if bucket.unlimited:
             everything = np.ones((1, len(choices)), dtype=np.bool_)
             return cls(np.array([start]), 0, everything, np.zeros((1, len(choices)), int), spent)
-        found, new = {round(start, _DIGITS)}, [round(start, _DIGITS)]
+        result, new = {round(start, _DIGITS)}, [round(start, _DIGITS)]
         while new:
             following = {
                 round(float(level), _DIGITS)
                 for source in new
                 for level in bucket.grant(np.full(len(choices), source), sets, choices * 0).tokens
             }
-            new = sorted(following - found)
-            found |= following
-            if len(found) > _MOST_LEVELS:
+            new = sorted(following - result)
+            result |= following
+            if len(result) > _MOST_LEVELS:
                 raise ConfigurationError(
                     f"token_rate = {bucket.rate}, token_capacity = {bucket.capacity} are not "
                     f"allowed for the exact optimum: the bucket must have at most {_MOST_LEVELS} "
                     "levels, so rate, cost and capacity need a common divisor"
                 )
-        level = np.array(sorted(found))
+        level = np.array(sorted(result))
         tokens = np.repeat(level, len(choices))
         grants = bucket.grant(tokens, np.tile(sets, len(level)), np.zeros(len(tokens), int))
         shape = (len(level), len(choices))

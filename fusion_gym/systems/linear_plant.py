@@ -102,8 +102,8 @@ class LinearPlant:
     def unmoved(self) -> tuple[str, ...]:
         """The options of the true plant that can change nothing."""
         still = np.array_equal(self.transition[..., 0], np.eye(self.size))
-        found = {"true_process_noise": not self.process_factor.any(), "true_transition": still}
-        return tuple(name for name, absent in found.items() if absent)
+        result = {"true_process_noise": not self.process_factor.any(), "true_transition": still}
+        return tuple(name for name, absent in result.items() if absent)
 
     def predict(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Prior mean (n, N) and covariance A P Aᵀ + W (n, n, N) of the next state.

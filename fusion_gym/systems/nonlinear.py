@@ -144,7 +144,7 @@ class NonlinearSystem(System[FilteredState]):
                 "logarithm of the predicted variance over its open-loop mean",
                 lambda s: np.log(linalg.diagonal(s.prior_covariance) / self._typical[1][:, None]),
                 (self.state_names,),
-                node="told",
+                node="broadcast",
                 limit=_RANGE,
                 constants={"open-loop mean": self._typical[1]},
             ),
@@ -153,7 +153,7 @@ class NonlinearSystem(System[FilteredState]):
                 "prediction over the state's root mean square",
                 lambda s: s.prior_mean / self._typical[0][:, None],
                 (self.state_names,),
-                node="told",
+                node="broadcast",
                 limit=_RANGE,
                 constants={"root mean square": self._typical[0]},
             ),
@@ -190,8 +190,8 @@ class NonlinearSystem(System[FilteredState]):
         """The centre takes in what was granted (l, N), sensor by sensor."""
         mean, covariance = state.prior_mean, state.prior_covariance
         for sensor in np.flatnonzero(granted.any(1)).tolist():
-            one, other = self.update(mean, covariance, sensor, state.measurement[sensor])
-            mean = np.where(granted[sensor], one, mean)
+            first, other = self.update(mean, covariance, sensor, state.measurement[sensor])
+            mean = np.where(granted[sensor], first, mean)
             covariance = np.where(granted[sensor], linalg.symmetrise(other), covariance)
         return replace(
             state,
@@ -229,7 +229,7 @@ class NonlinearSystem(System[FilteredState]):
         self, state: FilteredState, mean: Array, covariance: Array, noise: Array
     ) -> FilteredState:
         """The state with a truth drawn by what is believed."""
-        return replace(state, truth=linalg.draw(mean, covariance, noise))
+        return replace(state, truth=linalg.draw_normal(mean, covariance, noise))
 
     def adopt(
         self, state: FilteredState, mean: Array, covariance: Array, runs: NDArray[np.bool_]
@@ -254,13 +254,13 @@ class NonlinearSystem(System[FilteredState]):
 
     def _measured(self, state: Array, noise: Array) -> Array:
         shape = (self.sensor_count, self.channels, state.shape[-1])
-        found = np.asarray(self.measure(state, noise.reshape(shape)), dtype=np.float64)
-        if found.shape != shape:
+        values = np.asarray(self.measure(state, noise.reshape(shape)), dtype=np.float64)
+        if values.shape != shape:
             raise ValueError(
-                f"measure of shape {found.shape} is not allowed: it must be {shape}, sensors, "
+                f"measure of shape {values.shape} is not allowed: it must be {shape}, sensors, "
                 "channels and runs"
             )
-        return found
+        return values
 
     def _expected(self, state: FilteredState) -> Array:
         shape = (self.sensor_count * self.channels, state.prior_mean.shape[-1])
@@ -282,11 +282,11 @@ class NonlinearSystem(System[FilteredState]):
     def _reduction(self, state: FilteredState) -> Array:
         mean, covariance = state.prior_mean, state.prior_covariance
         expected = self._expected(state)
-        alone = [
+        single = [
             linalg.trace(self.update(mean, covariance, sensor, expected[sensor])[1])
             for sensor in range(self.sensor_count)
         ]
-        return linalg.trace(covariance) - np.array(alone)
+        return linalg.trace(covariance) - np.array(single)
 
     @functools.cached_property
     def _typical(self) -> tuple[Array, Array]:

@@ -28,11 +28,11 @@ def model_path(name: str) -> str:
         ConfigurationError: no agent of that name (the message lists all), or a file whose SHA-256
             is not the card's.
     """
-    told, path = card(name)["sha256"], _folder().joinpath(f"{name}.zip")
-    found = hashlib.sha256(path.read_bytes()).hexdigest()
-    if found != told:
+    text, path = card(name)["sha256"], _folder().joinpath(f"{name}.zip")
+    value = hashlib.sha256(path.read_bytes()).hexdigest()
+    if value != text:
         raise ConfigurationError(
-            f"zoo = {name!r} is not allowed: {path} has the SHA-256 {found}, its card says {told}; "
+            f"zoo = {name!r} is not allowed: {path} has the SHA-256 {value}, its card says {text}; "
             "install fusion-gym anew"
         )
     return str(path)
@@ -45,8 +45,8 @@ def card(name: str) -> dict[str, Any]:
         ConfigurationError: no agent of that name; the message lists all.
     """
     path = _folder().joinpath(f"{choice('zoo', name, names())}.json")
-    found: dict[str, Any] = json.loads(path.read_text())
-    return found
+    content: dict[str, Any] = json.loads(path.read_text())
+    return content
 
 
 def _folder() -> Any:

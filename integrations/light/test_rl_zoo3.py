@@ -36,17 +36,17 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 
 def test_the_pages_command_trains_in_one_batch(trained: tuple[Path, str]) -> None:
-    folder, said = trained
+    folder, output = trained
     run = folder / "ppo" / "fusion_gym-TobitOscillator-v0_1"
     assert (run / "best_model.zip").exists()
     assert "one_batch" in (run / "fusion_gym-TobitOscillator-v0" / "config.yml").read_text()
     evaluated = np.load(run / "evaluations.npz")
     assert set(evaluated["ep_lengths"].ravel().tolist()) == {100}
     assert (evaluated["results"] < 0.0).all()
-    losses = [float(text) for text in re.findall(r"\|\s+loss\s+\|\s+(\S+)\s+\|", said)]
+    losses = [float(text) for text in re.findall(r"\|\s+loss\s+\|\s+(\S+)\s+\|", output)]
     assert losses
     assert np.isfinite(losses).all()
-    assert int(re.findall(r"total_timesteps\s+\|\s+(\d+)", said)[-1]) == 2 * 64 * 32
+    assert int(re.findall(r"total_timesteps\s+\|\s+(\d+)", output)[-1]) == 2 * 64 * 32
 
 
 def test_its_model_is_a_policy_of_this_package(trained: tuple[Path, str]) -> None:
@@ -83,6 +83,6 @@ def test_options_of_the_command_line_come_first(
     monkeypatch.setattr(sys, "argv", [*command("rl-zoo3")[2:], *words])
     monkeypatch.chdir(ROOT)
     train()
-    said = capsys.readouterr().out
-    assert "Episode length: 7.00 +/- 0.00" in said
-    assert float(re.findall(r"ep_len_mean\s+\|\s+(\S+)", said)[-1]) == 7.0
+    output = capsys.readouterr().out
+    assert "Episode length: 7.00 +/- 0.00" in output
+    assert float(re.findall(r"ep_len_mean\s+\|\s+(\S+)", output)[-1]) == 7.0

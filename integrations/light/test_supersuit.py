@@ -36,8 +36,8 @@ def test_rows_of_sensors_are_those_of_one_batch() -> None:
     for step in range(1, 13):
         actions = random.integers(0, 2, 3)
         observation, reward, terminated, truncated, _ = rows.step(actions)
-        wanted, pay, done, _ = native.step(actions)
-        np.testing.assert_array_equal(observation, wanted)
+        expected, pay, done, _ = native.step(actions)
+        np.testing.assert_array_equal(observation, expected)
         np.testing.assert_allclose(reward, pay, rtol=1e-6)
         assert (terminated | truncated).tolist() == done.tolist() == [step % 6 == 0] * 3
 

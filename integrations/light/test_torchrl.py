@@ -46,11 +46,11 @@ def test_the_page() -> None:
 def test_single_environments(make: Any, action: str) -> None:
     env = make(TOBIT, action=action, **OPTIONS)
     check_env_specs(env)
-    found = env.rollout(12, break_when_any_done=False)
-    assert found["next", "done"].ravel().tolist() == ENDS
-    assert found["next", "truncated"].ravel().tolist() == ENDS
-    assert not found["next", "terminated"].any()
-    assert found["action"].shape == (12, {"binary": 3, "discrete": 8}[action])
+    rollout = env.rollout(12, break_when_any_done=False)
+    assert rollout["next", "done"].ravel().tolist() == ENDS
+    assert rollout["next", "truncated"].ravel().tolist() == ENDS
+    assert not rollout["next", "terminated"].any()
+    assert rollout["action"].shape == (12, {"binary": 3, "discrete": 8}[action])
     clocked = make(TOBIT, action=action, clock=True, **OPTIONS).rollout(5)
     assert clocked["next", "terminated"].ravel().tolist() == ENDS[:5]
 
@@ -61,20 +61,20 @@ def test_vector_environments_run_the_episodes_of_single_ones(mode: str) -> None:
     check_env_specs(envs)
     envs.set_seed(4)
     torch.manual_seed(0)
-    found = envs.rollout(12, break_when_any_done=False)
-    assert found["next", "done"].squeeze(-1).tolist() == [ENDS] * 3
+    rollout = envs.rollout(12, break_when_any_done=False)
+    assert rollout["next", "done"].squeeze(-1).tolist() == [ENDS] * 3
     single = gym.make(TOBIT, **OPTIONS)
     single.reset(seed=4)  # what set_seed does; the rollout begins with a reset of its own
     observation = torch.as_tensor(single.reset()[0])
     for step in range(12):
-        torch.testing.assert_close(found["observation"][0, step], observation, rtol=0, atol=0)
-        after, reward, *_, over, info = single.step(found["action"][0, step].numpy())
+        torch.testing.assert_close(rollout["observation"][0, step], observation, rtol=0, atol=0)
+        after, reward, *_, over, info = single.step(rollout["action"][0, step].numpy())
         torch.testing.assert_close(
-            found["next", "observation"][0, step], torch.as_tensor(after), rtol=0, atol=0
+            rollout["next", "observation"][0, step], torch.as_tensor(after), rtol=0, atol=0
         )
-        assert found["next", "reward"][0, step].item() == pytest.approx(reward, rel=1e-6)
+        assert rollout["next", "reward"][0, step].item() == pytest.approx(reward, rel=1e-6)
         if mode == "SameStep":  # with infos, the last of an episode too
-            assert found["next", "cost"][0, step].item() == info["cost"]
+            assert rollout["next", "cost"][0, step].item() == info["cost"]
         if over and mode == "SameStep":  # TorchRL resets once more where all runs end together
             single.reset()
         observation = torch.as_tensor(single.reset()[0] if over else after)
@@ -86,9 +86,9 @@ def test_the_mode_that_torchrl_refuses() -> None:
 
 
 def test_rewards_of_two_terms() -> None:
-    found = vector("Disabled", reward="vector").rollout(5)
-    assert found["next", "reward"].shape == (3, 5, 2)
-    assert (found["next", "reward"] <= 0.0).all()
+    rollout = vector("Disabled", reward="vector").rollout(5)
+    assert rollout["next", "reward"].shape == (3, 5, 2)
+    assert (rollout["next", "reward"] <= 0.0).all()
 
 
 def test_sensors_as_agents_with_a_joint_state() -> None:
@@ -96,11 +96,11 @@ def test_sensors_as_agents_with_a_joint_state() -> None:
         fusion_gym.parallel_env(TOBIT, **OPTIONS), use_mask=False, return_state=True
     )
     check_env_specs(env)
-    found = env.rollout(12, break_when_any_done=False)
-    assert found["next", "done"].ravel().tolist() == ENDS
-    granted = found["next", "sensor", "info", "granted"]
+    rollout = env.rollout(12, break_when_any_done=False)
+    assert rollout["next", "done"].ravel().tolist() == ENDS
+    granted = rollout["next", "sensor", "info", "granted"]
     assert set(granted.unique().tolist()) <= {0.0, 1.0}
-    spent = found["next", "sensor", "info", "cost"]
+    spent = rollout["next", "sensor", "info", "cost"]
     torch.testing.assert_close(spent, 3.0 * granted)  # three tokens a transmission
 
 

@@ -1,4 +1,4 @@
-"""RLlib, with the Gymnasium that Ray pins: one coordinator, workers, sensors as agents."""
+"""RLlib, with the Gymnasium that Ray pins: one scheduler, workers, sensors as agents."""
 
 from __future__ import annotations
 

@@ -161,17 +161,17 @@ each_id = pytest.mark.parametrize("env_id", IDS, ids=short)
 
 def requests(task: Task, runs: int, steps: int, rate: float = 0.4) -> NDArray[np.bool_]:
     """Random requests (steps, sensors, runs), always the same; one a step with single access."""
-    wanted = np.random.default_rng(7).random((steps, task.sensors, runs)) < rate
-    return wanted & (wanted.cumsum(1) == 1) if task.access == "single" else wanted
+    request = np.random.default_rng(7).random((steps, task.sensors, runs)) < rate
+    return request & (request.cumsum(1) == 1) if task.access == "single" else request
 
 
-def actions(task: Task, wanted: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Actions (runs, …) of a coordinator for the requests (sensors, runs)."""
+def actions(task: Task, request: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Actions (runs, …) of a scheduler for the requests (sensors, runs)."""
     if task.access == "single":
-        return np.where(wanted.any(0), 1 + wanted.argmax(0), 0)
+        return np.where(request.any(0), 1 + request.argmax(0), 0)
     if task.action == "discrete":
-        return (wanted * 2 ** np.arange(task.sensors)[:, None]).sum(0)
-    return wanted.T.astype(np.int64)
+        return (request * 2 ** np.arange(task.sensors)[:, None]).sum(0)
+    return request.T.astype(np.int64)
 
 
 def read(batch: EpisodeBatch) -> Signals:

@@ -55,12 +55,12 @@ class RandomWalk(System[WalkState]):
         return (
             Block("surprise", "whitened innovation", self._surprise, (("0",),), "own", "own", 5.0),
             age_block(("0",)),
-            Block("spread", "ln(P/q) over ten", self._spread, node="told", limit=5.0),
+            Block("spread", "ln(P/q) over ten", self._spread, node="broadcast", limit=5.0),
         )
 
     def start(self, noise: Array) -> WalkState:
-        zero, one = np.zeros_like(noise), np.ones_like(noise)
-        return WalkState(noise.copy(), zero, zero, zero, zero, one, zero, one)
+        zero, ones = np.zeros_like(noise), np.ones_like(noise)
+        return WalkState(noise.copy(), zero, zero, zero, zero, ones, zero, ones)
 
     def sense(self, state: WalkState, noise: Array) -> WalkState:
         truth = state.truth + np.sqrt(self.q) * noise[:1]
@@ -127,6 +127,6 @@ class WalkOptions(CommonOptions):
     horizon: int = 40
 
 
-def build(chosen: WalkOptions) -> Scenario:
+def build(options: WalkOptions) -> Scenario:
     """The scenario of these options."""
-    return Scenario(chosen, RandomWalk(chosen.q, chosen.r))
+    return Scenario(options, RandomWalk(options.q, options.r))

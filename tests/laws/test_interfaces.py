@@ -72,12 +72,12 @@ def test_agents_of_pettingzoo_see_the_rows_of_their_sensors(case: Case) -> None:
     batch = case.batch(1, 7, view.owner)
     observations, _ = env.reset(seed=7)
     assert env.possible_agents == [f"sensor_{m}" for m in range(task.sensors)]
-    for wanted in requests(task, 1, 6):
+    for request in requests(task, 1, 6):
         rows = np.stack(list(observations.values()))
         np.testing.assert_array_equal(rows, view.rows(batch.observe()))
-        outcome = batch.step(wanted)
-        chosen = dict(zip(env.agents, wanted[:, 0].astype(int).tolist(), strict=True))
-        observations, rewards, terminated, truncated, infos = env.step(chosen)
+        outcome = batch.step(request)
+        selection = dict(zip(env.agents, request[:, 0].astype(int).tolist(), strict=True))
+        observations, rewards, terminated, truncated, infos = env.step(selection)
         assert set(rewards.values()) == {outcome.reward[0]}
         assert not any(terminated.values())
         assert not any(truncated.values())
@@ -88,7 +88,7 @@ def test_agents_of_pettingzoo_see_the_rows_of_their_sensors(case: Case) -> None:
 
 
 @each_case
-def test_sensors_rows_of_stable_baselines_are_the_coordinators_runs(case: Case) -> None:
+def test_sensors_rows_of_stable_baselines_are_the_schedulers_runs(case: Case) -> None:
     if not case.local:
         with pytest.raises(ConfigurationError, match="information = 'centre'"):
             fusion_gym.make_sb3_vec_env(case.env_id, 3, local=True, **case.options)
@@ -100,9 +100,9 @@ def test_sensors_rows_of_stable_baselines_are_the_coordinators_runs(case: Case) 
     sensors = case.task().sensors
     assert local.num_envs == 3 * sensors
     np.testing.assert_array_equal(local.reset(), local.view.rows(whole.reset()))
-    for step, wanted in enumerate(requests(case.task(), 3, 6), start=1):
-        rows, row_reward, row_done, row_infos = local.step(wanted.T.ravel().astype(np.int64))
-        plain, reward, done, infos = whole.step(actions(case.task(), wanted))
+    for step, request in enumerate(requests(case.task(), 3, 6), start=1):
+        rows, row_reward, row_done, row_infos = local.step(request.T.ravel().astype(np.int64))
+        plain, reward, done, infos = whole.step(actions(case.task(), request))
         np.testing.assert_array_equal(rows, local.view.rows(plain))
         np.testing.assert_array_equal(row_reward, reward.repeat(sensors))
         np.testing.assert_array_equal(row_done, done.repeat(sensors))
@@ -139,8 +139,8 @@ def test_agrees_with_gymnasiums_vector_of_single_environments(
 
     reset(3, None)
     endings = set()
-    for number, wanted in enumerate(requests(task, 4, 20)):
-        action = actions(task, wanted)
+    for number, request in enumerate(requests(task, 4, 20)):
+        action = actions(task, request)
         mine, other = ours.step(action), theirs.step(action)
         same(mine, other)
         over = other[2 if clock else 3].copy()
@@ -160,8 +160,8 @@ def same(mine: Any, other: Any) -> None:
             same(mine[key], value)
     elif isinstance(other, tuple) or (isinstance(other, np.ndarray) and other.dtype == object):
         assert len(mine) == len(other)
-        for one, two in zip(mine, other, strict=True):
-            same(one, two)
+        for first, two in zip(mine, other, strict=True):
+            same(first, two)
     elif other is None:
         assert mine is None
     else:
@@ -177,8 +177,8 @@ def test_stable_baselines_rows_are_the_vector_environments(case: Case) -> None:
     ours = fusion_gym.make_sb3_vec_env(case.env_id, 3, seed=40, **options)
     np.testing.assert_array_equal(ours.reset(), theirs.reset(seed=40)[0], strict=True)
     returns, spent = np.zeros((2, 3))
-    for step, wanted in enumerate(requests(task, 3, 2 * horizon + 1), start=1):
-        action = actions(task, wanted)
+    for step, request in enumerate(requests(task, 3, 2 * horizon + 1), start=1):
+        action = actions(task, request)
         observation, reward, done, infos = ours.step(action)
         expected, value, terminated, truncated, info = theirs.step(action)
         over = terminated if task.clock else truncated
@@ -206,7 +206,7 @@ def test_stable_baselines_rows_are_the_vector_environments(case: Case) -> None:
 
 
 @each_id
-def test_an_id_makes_every_face(env_id: str) -> None:
+def test_an_id_makes_every_interface(env_id: str) -> None:
     spec = gymnasium.spec(env_id)
     prefix = class_name(env_id)
     assert spec.max_episode_steps is None
@@ -256,11 +256,11 @@ def test_help_shows_every_option_with_its_default(env_id: str) -> None:
     prefix, common = class_name(env_id), {"render_mode": None}
     more = {"num_envs": 1, "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}
     for name, first in ((f"{prefix}Env", common), (f"{prefix}VectorEnv", more | common)):
-        shown = inspect.signature(getattr(registered, name)).parameters
+        parameters = inspect.signature(getattr(registered, name)).parameters
         file = {"system": None}
-        assert {key: one.default for key, one in shown.items()} == first | options | file
+        assert {key: item.default for key, item in parameters.items()} == first | options | file
         for key in options:
-            assert shown[key].kind is inspect.Parameter.KEYWORD_ONLY
+            assert parameters[key].kind is inspect.Parameter.KEYWORD_ONLY
 
 
 @each_default
@@ -284,7 +284,7 @@ def test_an_environment_of_ones_own_is_registered_once() -> None:
     assert isinstance(gymnasium.make(OWN_ID).unwrapped, FusionEnv)
     assert issubclass(registered.mine_RandomWalk_v0VectorEnv, FusionVectorEnv)
     with pytest.raises(ConfigurationError, match="registered already"):
-        fusion_gym.register(OWN_ID, lambda chosen: build(chosen))
+        fusion_gym.register(OWN_ID, lambda selection: build(selection))
     with pytest.raises(ConfigurationError, match="build = None"):
         fusion_gym.register("mine/Other-v0")
     with pytest.raises(ConfigurationError, match="unknown environment 'mine/Other-v0'"):

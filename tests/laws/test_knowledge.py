@@ -30,25 +30,25 @@ def blind(batch: EpisodeBatch) -> Runs:
     """The runs, with nothing left of what no policy may know."""
     branch, task = batch.branch(), batch.task
     branch.state, branch._beliefs = task.system.visible(branch.state), None
-    if branch.shadows is not None:
-        kept = {"every": task.shadow, "own": task.shadow, "alone": task.system}
-        seen = {
+    if branch.memory_states is not None:
+        stored = {"every": task.memory_system, "own": task.memory_system, "alone": task.system}
+        visible = {
             name: system.visible(part)
-            for name, system in kept.items()
-            if system is not None and (part := getattr(branch.shadows, name)) is not None
+            for name, system in stored.items()
+            if system is not None and (part := getattr(branch.memory_states, name)) is not None
         }
-        branch.shadows = dataclasses.replace(branch.shadows, **seen)
+        branch.memory_states = dataclasses.replace(branch.memory_states, **visible)
     return branch
 
 
-def shown(runs: Runs) -> dict[str, Array]:
+def visible_entries(runs: Runs) -> dict[str, Array]:
     """Everything that policies may look at, but the state to plan with."""
     signals = runs.signals()
     names = [name for name in signals if name not in ("model", "beliefs", "own_beliefs")]
     return {name: np.asarray(signals[name]) for name in names}
 
 
-@pytest.mark.parametrize("owner", ["coordinator", "own"])
+@pytest.mark.parametrize("owner", ["scheduler", "own"])
 @each_case
 def test_nothing_shown_depends_on_the_truth(case: Case, owner: Any) -> None:
     """A truth is left in the state to plan with only where it has been measured exactly."""
@@ -56,26 +56,26 @@ def test_nothing_shown_depends_on_the_truth(case: Case, owner: Any) -> None:
         return
     batch = case.batch(owner=owner, **FREE)
     system = batch.task.system
-    for wanted in requests(batch.task, 3, STEPS):
-        seeing, seen = shown(batch), shown(blind(batch))
-        assert seen.keys() == seeing.keys()
+    for request in requests(batch.task, 3, STEPS):
+        seeing, observed = visible_entries(batch), visible_entries(blind(batch))
+        assert observed.keys() == seeing.keys()
         for name, value in seeing.items():
-            np.testing.assert_array_equal(seen[name], value, err_msg=name)
+            np.testing.assert_array_equal(observed[name], value, err_msg=name)
             assert np.isfinite(value).all(), name
         measured = Signals(dict(system.read(batch.state)))["measurement"].reshape(-1, 3)
         model = system.visible(batch.state)
         truth = system.truth(model)
         assert (np.isnan(truth) | (truth[:, None] == measured).any(1)).all()
         planned, arrives = (
-            system.deliver(model, wanted),
-            ~getattr(batch.state, "lost", wanted & False),
+            system.deliver(model, request),
+            ~getattr(batch.state, "lost", request & False),
         )
-        kept = (arrives | ~wanted).all(0)
-        batch.step(wanted)
+        stored = (arrives | ~request).all(0)
+        batch.step(request)
         for part, real in zip(system.fused(planned), system.fused(batch.delivered), strict=True):
             assert np.isfinite(part).all()
             if batch.task.packet == "measurement":
-                np.testing.assert_array_equal(part[..., kept], real[..., kept])
+                np.testing.assert_array_equal(part[..., stored], real[..., stored])
 
 
 @each_id
@@ -111,9 +111,9 @@ def test_what_is_measured_and_not_sent_is_its_sensors_own(case: Case) -> None:
     for signals, _ in steps(batch, np.append(-1, channels), np.zeros((STEPS, task.sensors, 1))):
         reached |= differs(signals["measurement"], 0)[:, 1:]
     groups: list[tuple[int, int, int]] = []  # sensor, first run of its group, changed normal
-    for sensor, alone in enumerate(reached & (reached.sum(0) == 1)):
+    for sensor, single in enumerate(reached & (reached.sum(0) == 1)):
         first = len(groups)
-        groups += [(sensor, first, c) for c in (-1, *np.flatnonzero(alone)[:2].tolist())]
+        groups += [(sensor, first, c) for c in (-1, *np.flatnonzero(single)[:2].tolist())]
     sensor, base, changed = np.array(groups).T
     others, noticed = np.arange(task.sensors)[:, None] != sensor, False
     sent = requests(task, 1, STEPS) & others[None] & (task.packet == "measurement")
@@ -144,10 +144,10 @@ def steps(batch: EpisodeBatch, changed: Array, sent: Array) -> Iterator[tuple[Si
     which each has the normal ``changed`` (N,) turned over, or none."""
     runs, draw = batch.branch(np.zeros(len(changed), dtype=np.int64)), np.random.default_rng(1)
     turned = np.flatnonzero(changed >= 0)
-    for wanted in np.broadcast_to(sent, (*sent.shape[:2], len(changed))):
+    for request in np.broadcast_to(sent, (*sent.shape[:2], len(changed))):
         noise = np.repeat(draw.standard_normal((runs.channels, 1)), len(changed), axis=1)
         noise[changed[turned], turned] *= -1.5
-        runs.step(wanted.astype(np.bool_), noise)
+        runs.step(request.astype(np.bool_), noise)
         yield Signals(dict(batch.task.system.read(runs.state))), runs
 
 
@@ -166,13 +166,13 @@ def after(system: Any, state: Any, *sensors: int) -> tuple[Array, Array]:
         state = dataclasses.replace(state, lost=np.zeros_like(state.lost))
     granted = np.zeros((system.sensor_count, system.truth(state).shape[-1]), dtype=np.bool_)
     granted[list(sensors)] = True
-    found: tuple[Array, Array] = system.fused(system.deliver(state, granted))
-    return found
+    result: tuple[Array, Array] = system.fused(system.deliver(state, granted))
+    return result
 
 
-def joined(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
+def joined(item: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
     """By covariance intersection."""
-    fused = covariance_intersection(*one, *other)
+    fused = covariance_intersection(*item, *other)
     return fused.mean, fused.covariance
 
 
@@ -186,13 +186,13 @@ class Beside:
 
     def add(self, system: Any, sent: Callable[[Array], Array]) -> EpisodeBatch:
         """One with this filter that gets the packets ``sent`` (sensors, N)."""
-        plain = dataclasses.replace(self.task, system=system, memory=False, shadow=None)
+        plain = dataclasses.replace(self.task, system=system, memory=False, memory_system=None)
         self.others.append((EpisodeBatch.seeded(plain, 3, 4), sent))
         return self.others[-1][0]
 
-    def step(self, wanted: Array) -> None:
+    def step(self, request: Array) -> None:
         """All move on."""
-        granted = self.batch.step(wanted).granted
+        granted = self.batch.step(request).granted
         for other, sent in self.others:
             other.step(sent(granted))
 
@@ -207,42 +207,48 @@ def test_a_sensor_believes_by_what_it_measured_and_received(env_id: str, broadca
             fusion_gym.make_task(env_id, broadcast=broadcast)
         return
     task = fusion_gym.make_task(env_id, memory=True, broadcast=broadcast, **FREE, **more)
-    beside, own, alone, packets = Beside(task, "own"), [], [], broadcast == "packets"
+    beside, own, single, packets = Beside(task, "own"), [], [], broadcast == "packets"
     for itself in (np.arange(task.sensors)[:, None] == s for s in range(task.sensors)):
-        if task.shadow is not None:
-            own.append(beside.add(task.shadow, lambda g, i=itself: (g & packets) | i))
-        alone.append(beside.add(task.system, lambda g, i=itself: g & i))
+        if task.memory_system is not None:
+            own.append(beside.add(task.memory_system, lambda g, i=itself: (g & packets) | i))
+        single.append(beside.add(task.system, lambda g, i=itself: g & i))
     distant = broadcast == "none" or (broadcast == "estimate" and not task.feedback)
-    for wanted in requests(task, 3, STEPS):
+    for request in requests(task, 3, STEPS):
         batch = beside.batch
         signals = batch.signals()
         for sensor in range(task.sensors):
-            centre = alone[sensor] if broadcast == "none" else batch
+            centre = single[sensor] if broadcast == "none" else batch
             silent = after(task.system, centre.state)
-            sent = after(task.system, (alone[sensor] if distant else batch).state, sensor)
+            sent = after(task.system, (single[sensor] if distant else batch).state, sensor)
             if broadcast == "estimate" and distant:
                 sent = joined(silent, sent)
             best = sent
             if own:
-                best = after(task.shadow, own[sensor].state, sensor)
+                best = after(task.memory_system, own[sensor].state, sensor)
                 if broadcast == "estimate":
                     best = joined(sent if task.feedback else silent, best)
             check(signals["own_difference"][sensor], best[0] - silent[0])
             value = worth(task, best[0], silent[0], sent[0]) * chance(batch)[sensor]
             check(signals["own_value"][sensor], value)
-        beside.step(wanted)
+        beside.step(request)
 
 
 @each_id
-def test_a_coordinator_believes_by_everything_measured(env_id: str) -> None:
+def test_a_scheduler_believes_by_everything_measured(env_id: str) -> None:
     """x* is the estimate of runs in which everything is delivered."""
     more = {"filter": "tobit"} if "TobitOscillator" in env_id else {}
     task = fusion_gym.make_task(env_id, memory=True, **FREE, **more)
-    beside = Beside(task, "coordinator")
-    whole = beside.add(task.shadow, lambda granted: granted | True) if task.shadow else None
-    for wanted in requests(task, 3, STEPS):
+    beside = Beside(task, "scheduler")
+    whole = (
+        beside.add(task.memory_system, lambda granted: granted | True)
+        if task.memory_system
+        else None
+    )
+    for request in requests(task, 3, STEPS):
         batch = beside.batch
-        system, state = (task.system, batch.state) if whole is None else (task.shadow, whole.state)
+        system, state = (
+            (task.system, batch.state) if whole is None else (task.memory_system, whole.state)
+        )
         best, silent = (
             after(system, state, *range(task.sensors))[0],
             after(task.system, batch.state),
@@ -252,7 +258,7 @@ def test_a_coordinator_believes_by_everything_measured(env_id: str) -> None:
             sent = after(task.system, batch.state, sensor)
             value = worth(task, best, silent[0], sent[0]) * chance(batch)[sensor]
             check(batch.signals()["transmission_value"][sensor], value)
-        beside.step(wanted)
+        beside.step(request)
 
 
 def worth(task: Task, best: Array, silent: Array, sent: Array) -> Array:
@@ -267,6 +273,6 @@ def chance(batch: EpisodeBatch) -> Array:
     return np.ones((batch.task.sensors, batch.num_envs)) if known is None else known
 
 
-def check(found: Array, expected: Array) -> None:
+def check(values: Array, expected: Array) -> None:
     """To rounding."""
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(values, expected, rtol=1e-9, atol=1e-9)

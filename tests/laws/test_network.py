@@ -19,14 +19,14 @@ NOT_ADOPTING = ("MarkovJumpTracking", "UnknownInput", "RemoteEstimation", "Rando
 def test_a_denied_request_changes_nothing(case: Case) -> None:
     """What follows is bitwise what follows without it."""
     batch, denied = case.batch(**SCARCE), 0
-    for wanted in requests(batch.task, 3, STEPS, rate=0.8):
+    for request in requests(batch.task, 3, STEPS, rate=0.8):
         grantable, other = batch.grantable(), batch.branch()
-        assert not (batch.answer(wanted).granted & ~grantable).any()
-        outcome = batch.step(wanted)
-        denied += int((wanted & ~outcome.granted).sum())
-        found = other.step(outcome.granted, batch.normals())
+        assert not (batch.answer(request).granted & ~grantable).any()
+        outcome = batch.step(request)
+        denied += int((request & ~outcome.granted).sum())
+        result = other.step(outcome.granted, batch.normals())
         for name in set(outcome._fields) - {"requested"}:
-            np.testing.assert_array_equal(getattr(found, name), getattr(outcome, name), name)
+            np.testing.assert_array_equal(getattr(result, name), getattr(outcome, name), name)
         np.testing.assert_array_equal(other.observe(), batch.observe())
         np.testing.assert_array_equal(other.tokens, batch.tokens)
     assert denied
@@ -38,14 +38,14 @@ def test_only_who_is_admitted_is_granted(env_id: str, access: str) -> None:
     """With tokens without end, exactly those that are admitted and ask."""
     task = fusion_gym.make_task(env_id, access=access, tokens="unlimited")
     batch, turns = EpisodeBatch.seeded(task, 40, 0), np.zeros(task.sensors)
-    for step, wanted in enumerate(np.random.default_rng(0).random((STEPS, task.sensors, 40)) < 0.7):
+    for step, target in enumerate(np.random.default_rng(0).random((STEPS, task.sensors, 40)) < 0.7):
         admitted = batch.signals()["admitted"]
-        granted = batch.step(wanted).granted
+        granted = batch.step(target).granted
         if access == "single":
-            np.testing.assert_array_equal(granted.sum(0), wanted.any(0))
-            assert not (granted & ~wanted).any()
+            np.testing.assert_array_equal(granted.sum(0), target.any(0))
+            assert not (granted & ~target).any()
             continue
-        np.testing.assert_array_equal(granted, wanted & admitted)
+        np.testing.assert_array_equal(granted, target & admitted)
         turns += admitted.sum(1)
         if access == "round_robin":
             assert (admitted == (np.arange(task.sensors) == step % task.sensors)[:, None]).all()
@@ -60,14 +60,14 @@ def test_only_who_is_admitted_is_granted(env_id: str, access: str) -> None:
 def test_only_grants_cost_tokens_and_the_balance_closes(case: Case) -> None:
     for scarce in ({}, SCARCE):
         batch = case.batch(**scarce)
-        chosen, cost = batch.task.settings, batch.signals()["token_cost"][:, 0]
-        rate, capacity = chosen["token_rate"], chosen["token_capacity"]
-        for wanted in requests(batch.task, 3, STEPS):
+        selection, cost = batch.task.settings, batch.signals()["token_cost"][:, 0]
+        rate, capacity = selection["token_rate"], selection["token_capacity"]
+        for request in requests(batch.task, 3, STEPS):
             before = batch.signals()["tokens"].copy()
-            outcome = batch.step(wanted)
-            assert not (outcome.granted & ~wanted).any()
+            outcome = batch.step(request)
+            assert not (outcome.granted & ~request).any()
             np.testing.assert_allclose(outcome.cost, cost @ outcome.granted)
-            if chosen["tokens"] == "limited":
+            if selection["tokens"] == "limited":
                 assert (outcome.cost <= before + 1e-9).all()
                 before = np.minimum(capacity, before - outcome.cost + rate)
             np.testing.assert_allclose(batch.signals()["tokens"], before, atol=1e-9)
@@ -76,23 +76,23 @@ def test_only_grants_cost_tokens_and_the_balance_closes(case: Case) -> None:
 @each_case
 def test_the_reward_is_minus_weighted_error_and_price(case: Case) -> None:
     batch = case.batch()
-    task, chosen, price = batch.task, batch.task.settings, batch.signals()["price"].copy()
-    if chosen["cost_weight"] == "random":
+    task, selection, price = batch.task, batch.task.settings, batch.signals()["price"].copy()
+    if selection["cost_weight"] == "random":
         assert len(set(price)) == 3
-        assert (np.array(chosen["price_range"])[[0]] <= price).all()
-        assert (np.array(chosen["price_range"])[[1]] >= price).all()
+        assert (np.array(selection["price_range"])[[0]] <= price).all()
+        assert (np.array(selection["price_range"])[[1]] >= price).all()
     else:
-        assert (price == chosen["cost_weight"]).all()
-    for wanted in requests(task, 3, STEPS):
-        outcome = batch.step(wanted)
+        assert (price == selection["cost_weight"]).all()
+    for request in requests(task, 3, STEPS):
+        outcome = batch.step(request)
         mean, covariance = task.system.fused(batch.delivered)
         np.testing.assert_allclose(outcome.error, task.system.truth(batch.delivered) - mean)
         size = outcome.error**2
-        if chosen["error"] == "trace":
+        if selection["error"] == "trace":
             size = np.einsum("iir->ir", covariance)
         weighted = task.reward.state_weights * size
-        error = weighted.max(0) if chosen["error"] == "maximum" else weighted.sum(0)
-        np.testing.assert_allclose(outcome.reward_error, -chosen["error_weight"] * error)
+        error = weighted.max(0) if selection["error"] == "maximum" else weighted.sum(0)
+        np.testing.assert_allclose(outcome.reward_error, -selection["error_weight"] * error)
         np.testing.assert_allclose(outcome.reward_communication, -price * outcome.cost)
         np.testing.assert_array_equal(
             outcome.reward, outcome.reward_error + outcome.reward_communication
@@ -105,10 +105,10 @@ def test_a_delivery_begins_age_and_held_value_anew(case: Case) -> None:
     """And nothing else does. A packet may be lost, or hold nothing where nothing is sampled."""
     batch = case.batch()
     loses, arrived = hasattr(batch.task.system, "arriving"), 0
-    for wanted in requests(batch.task, 3, STEPS):
+    for request in requests(batch.task, 3, STEPS):
         before = read(batch)
         age, new, held = (np.copy(before[name]) for name in ("age", "measurement", "held"))
-        granted = batch.step(wanted).granted
+        granted = batch.step(request).granted
         after = read(batch)
         fresh = granted & (after["age"] == 1)
         assert loses or fresh[granted & before.get("sampled", True)].all()
@@ -130,15 +130,15 @@ def test_an_estimate_is_adopted_where_a_packet_arrives(env_id: str) -> None:
         return
     task = fusion_gym.make_task(env_id, **options)
     batch, denied, adopted = EpisodeBatch.seeded(task, 3, 5), 0, 0
-    for wanted in requests(task, 3, 2 * STEPS, rate=0.7):
+    for request in requests(task, 3, 2 * STEPS, rate=0.7):
         best, silent = batch.beliefs().best, batch.beliefs().silent
-        granted = batch.step(wanted).granted.any(0)
+        granted = batch.step(request).granted.any(0)
         mean, covariance = task.system.fused(batch.delivered)
         np.testing.assert_allclose(mean, np.where(granted, best.mean[0], silent.mean[0]))
         expected = np.where(granted, best.covariance[0], silent.covariance[0])
         np.testing.assert_allclose(covariance, expected, atol=1e-12)
         adopted += int((granted & (best.mean[0] != silent.mean[0]).any(0)).sum())
-        denied += int((wanted.any(0) & ~granted).sum())
+        denied += int((request.any(0) & ~granted).sum())
     assert denied
     assert adopted
 

@@ -22,10 +22,10 @@ def test_noise_is_the_same_whatever_is_requested(case: Case) -> None:
     """Truth, measurements, price and access too, over episodes that are cut short."""
     silent, busy = (case.batch(horizon=6) for _ in range(2))
     apart = False
-    for step, wanted in enumerate(requests(silent.task, 3, 2 * STEPS, rate=0.6)):
+    for step, request in enumerate(requests(silent.task, 3, 2 * STEPS, rate=0.6)):
         for latent in zip(*map(hidden, (silent, busy)), strict=True):
             np.testing.assert_array_equal(*latent)
-        outcomes = silent.step(wanted & False), busy.step(wanted)
+        outcomes = silent.step(request & False), busy.step(request)
         apart |= bool((outcomes[0].error != outcomes[1].error).any())
         begin = outcomes[0].ended | (np.arange(3) == (1 if step in (2, 7) else -1))
         if begin.any():
@@ -38,25 +38,25 @@ def hidden(batch: EpisodeBatch) -> list[Array]:
     """What no policy can change."""
     signals, system = read(batch), batch.task.system
     measured = np.where(signals.get("sampled", True), np.moveaxis(signals["measurement"], 1, 0), 0)
-    found = [batch.noise(), system.truth(batch.state), batch.price, batch.admitted(), measured]
-    return [np.copy(part) for part in found]
+    result = [batch.noise(), system.truth(batch.state), batch.price, batch.admitted(), measured]
+    return [np.copy(part) for part in result]
 
 
 @each_case
-def test_a_run_is_the_same_by_itself_and_in_a_batch(case: Case) -> None:
+def test_a_run_is_the_same_local_and_in_a_batch(case: Case) -> None:
     """Bitwise that of the single environment, though it begins later and others anew."""
     batch = case.batch(70, 100, horizon=6)
     env: Any = FusionEnv(case.task(horizon=6))
-    wanted, run = requests(batch.task, 70, 2 * STEPS), 37  # on no boundary of a vector register
-    for asked in wanted[:2]:
-        batch.step(asked)
+    request, run = requests(batch.task, 70, 2 * STEPS), 37  # on no boundary of a vector register
+    for requested in request[:2]:
+        batch.step(requested)
     batch.seed(np.array([run]), [5])
     batch.reset(np.array([run]))
-    shown, _ = env.reset(seed=5)
-    for step, asked in enumerate(wanted[2:]):
-        np.testing.assert_array_equal(batch.observe()[run], shown, strict=True)
-        outcome = batch.step(asked)
-        shown, reward, *ended, info = env.step(actions(batch.task, asked)[run])
+    visible, _ = env.reset(seed=5)
+    for step, requested in enumerate(request[2:]):
+        np.testing.assert_array_equal(batch.observe()[run], visible, strict=True)
+        outcome = batch.step(requested)
+        visible, reward, *ended, info = env.step(actions(batch.task, requested)[run])
         assert (reward, any(ended)) == (outcome.reward[run], outcome.ended[run])
         assert ended[0] == (outcome.ended[run] and batch.task.clock)
         for name in ("cost", "granted", "squared_error", "reward_error", "diverged"):
@@ -66,10 +66,10 @@ def test_a_run_is_the_same_by_itself_and_in_a_batch(case: Case) -> None:
         if begin.any():
             batch.reset(np.flatnonzero(begin))
         if begin[run]:
-            shown, _ = env.reset()
+            visible, _ = env.reset()
 
 
-@pytest.mark.parametrize("owner", ["coordinator", "own"])
+@pytest.mark.parametrize("owner", ["scheduler", "own"])
 @each_case
 def test_a_branch_takes_the_step_that_would_have_been(case: Case, owner: Any) -> None:
     """Of any runs in any order, and without moving the batch."""
@@ -77,25 +77,25 @@ def test_a_branch_takes_the_step_that_would_have_been(case: Case, owner: Any) ->
         return
     batch, taken = case.batch(RUNS, owner=owner), np.array([3, 1, 1])
     draw = np.random.default_rng(0)
-    for wanted in requests(batch.task, RUNS, 2):
+    for request in requests(batch.task, RUNS, 2):
         before = contents(batch)
         branch, some, elsewhere = batch.branch(), batch.branch(taken), batch.branch()
         assert contents(branch) == before
-        elsewhere.step(~wanted, draw.standard_normal((batch.channels, RUNS)))
+        elsewhere.step(~request, draw.standard_normal((batch.channels, RUNS)))
         assert contents(batch) == before != contents(elsewhere)
-        outcome = batch.step(wanted)
-        for one, two in zip(branch.step(wanted, batch.normals()), outcome, strict=True):
-            np.testing.assert_array_equal(one, two)
-        some.step(wanted[:, taken], batch.normals()[:, taken])
+        outcome = batch.step(request)
+        for first, two in zip(branch.step(request, batch.normals()), outcome, strict=True):
+            np.testing.assert_array_equal(first, two)
+        some.step(request[:, taken], batch.normals()[:, taken])
         assert contents(branch) == contents(batch)
         np.testing.assert_array_equal(some.observe(), batch.observe()[taken])
 
 
 def contents(runs: Any) -> list[bytes]:
     """All that is shown of runs."""
-    shown = [runs.observe(), runs.tokens, runs.price, runs.steps, runs.admitted()]
-    shown += [runs.beliefs().best.mean, runs.beliefs().value()]
-    return [np.ascontiguousarray(part).tobytes() for part in shown]
+    observation = [runs.observe(), runs.tokens, runs.price, runs.steps, runs.admitted()]
+    observation += [runs.beliefs().best.mean, runs.beliefs().value()]
+    return [np.ascontiguousarray(part).tobytes() for part in observation]
 
 
 # --- the observation ------------------------------------------------------------------------------
@@ -108,7 +108,7 @@ def test_an_observation_is_finite_within_its_bounds_and_declared(case: Case) -> 
     layout, system = ObservationLayout(batch.task), batch.task.system
     assert len(set(layout.names)) == len(layout.names) == len(layout.low)
     assert (layout.low < layout.high).all()
-    for step, wanted in enumerate(requests(batch.task, RUNS, 24)):
+    for step, request in enumerate(requests(batch.task, RUNS, 24)):
         observation = batch.observe()
         assert observation.dtype == layout.low.dtype == np.float32
         assert observation.shape == (RUNS, len(layout.names))
@@ -122,7 +122,7 @@ def test_an_observation_is_finite_within_its_bounds_and_declared(case: Case) -> 
             for axis, size in zip(axes, value.shape, strict=True):
                 declared = int(axis) if axis.isdigit() else sizes.setdefault(axis, size)
                 assert size == declared, f"{signal.name}: {axis}"
-        outcome = batch.step(wanted & (step >= 20))
+        outcome = batch.step(request & (step >= 20))
         assert np.isfinite(outcome.reward).all()
 
 
@@ -153,34 +153,34 @@ def place(price: Array, low: float, high: float) -> Array:
 
 @each_case
 def test_blocks_that_every_system_may_have_mean_the_same(case: Case) -> None:
-    batch, found = case.batch(RUNS), 0
+    batch, result = case.batch(RUNS), 0
     ratios: dict[str, list[Array]] = {}
     kind = type(batch.task.system).__name__
-    for wanted in requests(batch.task, RUNS, STEPS):
+    for request in requests(batch.task, RUNS, STEPS):
         observation, signals, first = batch.observe(), read(batch), 0
         for block in batch.layout.blocks:
-            shown = observation[:, first : first + len(block.places)].T
+            visible = observation[:, first : first + len(block.places)].T
             first += len(block.places)
             low, high = block.bounds
             if block.name in FORMULAS and DIFFERING.get(block.name) != kind:
                 value = FORMULAS[block.name](batch, signals).reshape(-1, RUNS)
                 np.testing.assert_allclose(
-                    shown, np.clip(value, low, high), rtol=2e-6, atol=2e-6, err_msg=block.name
+                    visible, np.clip(value, low, high), rtol=2e-6, atol=2e-6, err_msg=block.name
                 )
-                found += 1
+                result += 1
             elif block.name in CONSTANT:
                 value = CONSTANT[block.name](batch, signals).reshape(-1, RUNS)
                 size = len(value)
-                inside = (np.abs(shown[:size]) < high) & (np.abs(value) > 1e-3)
+                inside = (np.abs(visible[:size]) < high) & (np.abs(value) > 1e-3)
                 ratio = np.divide(
-                    shown[:size], value, out=np.full(value.shape, np.nan), where=inside
+                    visible[:size], value, out=np.full(value.shape, np.nan), where=inside
                 )
                 ratios.setdefault(block.name, []).append(ratio)
-        batch.step(wanted)
+        batch.step(request)
     for name, each in ratios.items():
         together = np.concatenate(each, axis=-1)
         together = together[np.isfinite(together).any(-1)]  # a channel may be missing
         middle = np.nanmedian(together, axis=-1, keepdims=True)
         assert (middle > 0.0).all(), name
         assert np.nanmax(np.abs(together / middle - 1.0)) < 1e-2, name
-    assert found
+    assert result

@@ -49,8 +49,8 @@ def verdict(line: str, place: Path) -> tuple[str, float]:
     ended = subprocess.run(
         [*command, *shlex.split(line)], cwd=place, env=os.environ | changed, capture_output=True
     )
-    said = {0: "SURVIVED", RED: "killed", COLLECTED_NOTHING: "NO SUCH TEST"}
-    return said.get(ended.returncode, "BROKEN"), time.monotonic() - begun
+    text = {0: "SURVIVED", RED: "killed", COLLECTED_NOTHING: "NO SUCH TEST"}
+    return text.get(ended.returncode, "BROKEN"), time.monotonic() - begun
 
 
 def main(names: list[str]) -> int:
@@ -62,9 +62,9 @@ def main(names: list[str]) -> int:
     bad = 0
     with ThreadPoolExecutor(2) as pool:
         for patch, rows in zip(patches, pool.map(run, patches), strict=True):
-            for line, said, seconds in rows:
-                bad += said != "killed"
-                print(f"{patch.stem:<34}{said:<14}{seconds:5.0f} s  {line}", flush=True)
+            for line, text, seconds in rows:
+                bad += text != "killed"
+                print(f"{patch.stem:<34}{text:<14}{seconds:5.0f} s  {line}", flush=True)
     return int(bad > 0)
 
 

@@ -27,19 +27,19 @@ def lanes(episodes: int) -> dict[str, Lane]:
     )
 
 
-def compute(episodes: int, seed: int) -> dict[str, Any]:
+def compute_errors(episodes: int, seed: int) -> dict[str, Any]:
     """Everything that Figures 4 to 9 and their claims need, by fusion rule; see :class:`_Record`.
 
     ``lanes`` names the first axis of all arrays whose names end in ``_by_lane``.
     """
     settings = lanes(episodes)
-    found: dict[str, Any] = {"lanes": list(settings)}
+    data: dict[str, Any] = {"lanes": list(settings)}
     for fusion in FUSIONS:
         record = _Record(len(settings), episodes, with_nodes=fusion == FUSIONS[0])
         for step in steps(list(settings.values()), episodes, seed, fusion, track_actual=True):
             record.add(step)
-        found |= {f"{fusion}_{name}": value for name, value in record.arrays().items()}
-    return found
+        data |= {f"{fusion}_{name}": value for name, value in record.arrays().items()}
+    return data
 
 
 class _Record:
@@ -72,7 +72,7 @@ class _Record:
         self.most: dict[str, Array] = {}
         self.compared = 0
         self.rows: dict[str, list[Array]] = {}
-        self.kept: dict[str, Array] = {}
+        self.stored: dict[str, Array] = {}
 
     def arrays(self) -> dict[str, Array]:
         """All of it."""
@@ -84,7 +84,7 @@ class _Record:
             }
             | self.most
             | {name: np.stack(rows, axis=1) for name, rows in self.rows.items()}
-            | self.kept
+            | self.stored
         )
 
     def add(self, step: Step) -> None:
@@ -128,7 +128,7 @@ class _Record:
         if step.number + 1 == ELLIPSES:
             own = np.arange(len(SENSORS) + 1)
             both = np.stack((state.covariance, state.joint[own, own]))
-            self.kept["ellipses"] = self._lanes(both)[..., 0]
+            self.stored["ellipses"] = self._lanes(both)[..., 0]
 
     def _compare(self, step: Step) -> None:
         state = step.state
@@ -153,13 +153,13 @@ class _Record:
 
     def _add(self, **values: NDArray[Any]) -> None:
         for name, value in values.items():
-            found = self._lanes(value).astype(float)
-            self.sums[name] = self.sums[name] + found if name in self.sums else found
+            result = self._lanes(value).astype(float)
+            self.sums[name] = self.sums[name] + result if name in self.sums else result
 
     def _most(self, **values: Array) -> None:
         for name, value in values.items():
-            found = self._lanes(value)
-            self.most[name] = np.maximum(self.most.get(name, found), found)
+            result = self._lanes(value)
+            self.most[name] = np.maximum(self.most.get(name, result), result)
 
     def _row(self, name: str, value: Array) -> None:
         self.rows.setdefault(name, []).append(value)

@@ -9,7 +9,7 @@ from fusion_gym.arrays import Array
 
 from ...output import palette
 from ..judging import percent
-from ..shown import Picture
+from ..piece_result import Picture
 from .errors import AT_BOUND, ELLIPSES, FUSIONS
 from .runs import SCALES, SENSORS, STATES, STEPS, UNITS
 
@@ -22,25 +22,25 @@ _TIME = np.arange(1, STEPS + 1)
 _SUM = "sum over states (SI units)"
 
 
-def pictures(found: dict[str, Any]) -> list[Picture]:
+def tracking_pictures(data: dict[str, Any]) -> list[Picture]:
     """All of them, in the paper's order."""
     return [
-        _tracking(found),
-        _traces(found),
-        _compared(found),
-        _errors(found, "sci", 7),
-        _errors(found, "sici", 8),
-        _ellipses(found),
+        _tracking(data),
+        _traces(data),
+        _compared(data),
+        _errors(data, "sci", 7),
+        _errors(data, "sici", 8),
+        _ellipses(data),
     ]
 
 
-def _lane(found: dict[str, Any], name: str) -> int:
-    return found["lanes"].index(name)
+def _lane(data: dict[str, Any], name: str) -> int:
+    return data["lanes"].index(name)
 
 
-def _tracking(found: dict[str, Any]) -> Picture:
-    lane = _lane(found, AT_BOUND)
-    truth = found["sci_truth"][lane]
+def _tracking(data: dict[str, Any]) -> Picture:
+    lane = _lane(data, AT_BOUND)
+    truth = data["sci_truth"][lane]
 
     def draw(figure: Any) -> None:
         axes = figure.subplots(3, 1, sharex=True)
@@ -49,7 +49,7 @@ def _tracking(found: dict[str, Any]) -> Picture:
             for fusion in FUSIONS:
                 axis.plot(
                     _TIME,
-                    found[f"{fusion}_mean"][lane][:, state],
+                    data[f"{fusion}_mean"][lane][:, state],
                     color=_COLOURS[fusion],
                     lw=2.0 if fusion == "sci" else 1.0,
                     label=_NAMES[fusion],
@@ -62,8 +62,7 @@ def _tracking(found: dict[str, Any]) -> Picture:
 
     share = [
         float(
-            1.0
-            - found[f"{f}_square"][lane].mean(-1).sum() / found[f"{f}_level"][lane].sum(0).mean()
+            1.0 - data[f"{f}_square"][lane].mean(-1).sum() / data[f"{f}_level"][lane].sum(0).mean()
         )
         for f in FUSIONS
     ]
@@ -79,8 +78,8 @@ def _tracking(found: dict[str, Any]) -> Picture:
     )
 
 
-def _traces(found: dict[str, Any]) -> Picture:
-    lane = _lane(found, AT_BOUND)
+def _traces(data: dict[str, Any]) -> Picture:
+    lane = _lane(data, AT_BOUND)
 
     def draw(figure: Any) -> None:
         axes = figure.subplots(2, 1, sharex=True, sharey=True)
@@ -91,7 +90,7 @@ def _traces(found: dict[str, Any]) -> Picture:
                 ("mse", _COLOURS[fusion], "-", f"MSE of {_NAMES[fusion]}"),
             ):
                 axis.plot(
-                    _TIME, found[f"{fusion}_{name}_steps"][lane],
+                    _TIME, data[f"{fusion}_{name}_steps"][lane],
                     color=colour, ls=style, lw=1.6, label=label,
                 )  # fmt: skip
             axis.set_yscale("log")
@@ -108,7 +107,7 @@ def _traces(found: dict[str, Any]) -> Picture:
     return Picture(
         "figure_5",
         "Figure 5: MSE and traces of actual and conservative variances",
-        f"Means over all {_runs(found)} runs at the bounds, at each step. The MSE lies below the "
+        f"Means over all {_runs(data)} runs at the bounds, at each step. The MSE lies below the "
         "conservative trace, as in the paper, but well below the actual trace too, where the "
         "paper sees both close together.",
         draw,
@@ -116,14 +115,14 @@ def _traces(found: dict[str, Any]) -> Picture:
     )
 
 
-def _compared(found: dict[str, Any]) -> Picture:
-    lane = _lane(found, AT_BOUND)
+def _compared(data: dict[str, Any]) -> Picture:
+    lane = _lane(data, AT_BOUND)
     window = slice(_WINDOW[0] - 1, _WINDOW[1])
 
     def draw(figure: Any) -> None:
         axis = figure.subplots()
         for fusion in FUSIONS:
-            mse = found[f"{fusion}_mse_steps"][lane][window]
+            mse = data[f"{fusion}_mse_steps"][lane][window]
             colour, name = _COLOURS[fusion], _NAMES[fusion]
             axis.plot(_TIME[window], mse, color=colour, lw=1.8, label=name)
         axis.set_xlabel("step k")
@@ -135,22 +134,22 @@ def _compared(found: dict[str, Any]) -> Picture:
     return Picture(
         "figure_6",
         "Figure 6: MSE of both fusion rules",
-        f"Means over all {_runs(found)} runs at the bounds, steps 400 to 600: SICI lies below "
+        f"Means over all {_runs(data)} runs at the bounds, steps 400 to 600: SICI lies below "
         "SCI, as in the paper.",
         draw,
         (7.2, 3.6),
     )
 
 
-def _errors(found: dict[str, Any], fusion: str, number: int) -> Picture:
+def _errors(data: dict[str, Any], fusion: str, number: int) -> Picture:
     def draw(figure: Any) -> None:
         axes = figure.subplots(3, 3, sharex=True, sharey="row")
         time = _TIME[::_DRAWN]
         for column, scale in enumerate(SCALES):
-            lane = _lane(found, f"scale {scale}")
-            error = (found[f"{fusion}_truth"][lane] - found[f"{fusion}_mean"][lane])[::_DRAWN]
-            actual = 3.0 * found[f"{fusion}_actual_deviation"][lane][::_DRAWN]
-            bound = 3.0 * found[f"{fusion}_conservative_deviation"][lane][::_DRAWN]
+            lane = _lane(data, f"scale {scale}")
+            error = (data[f"{fusion}_truth"][lane] - data[f"{fusion}_mean"][lane])[::_DRAWN]
+            actual = 3.0 * data[f"{fusion}_actual_deviation"][lane][::_DRAWN]
+            bound = 3.0 * data[f"{fusion}_conservative_deviation"][lane][::_DRAWN]
             for state in range(3):
                 axis = axes[state, column]
                 for sign in (1.0, -1.0):
@@ -158,7 +157,7 @@ def _errors(found: dict[str, Any], fusion: str, number: int) -> Picture:
                     (own,) = axis.plot(time, sign * actual[:, state], color=palette.GREEN)
                     robust.set_linewidth(0.9)
                     own.set_linewidth(0.9)
-                (shown,) = axis.plot(time, error[:, state], color=_COLOURS[fusion], lw=1.1)
+                (curve,) = axis.plot(time, error[:, state], color=_COLOURS[fusion], lw=1.1)
                 if state == 0:
                     axis.set_title(f"({'abc'[column]}) {scale:g} of bounds", loc="left")
                 if column == 0:
@@ -166,16 +165,16 @@ def _errors(found: dict[str, Any], fusion: str, number: int) -> Picture:
                 if state == 2:
                     axis.set_xlabel("step k")
         for row, state in zip(axes, range(3), strict=True):
-            lanes = [_lane(found, f"scale {scale}") for scale in SCALES]
-            bound = found[f"{fusion}_conservative_deviation"][lanes, 60:, state]
+            lanes = [_lane(data, f"scale {scale}") for scale in SCALES]
+            bound = data[f"{fusion}_conservative_deviation"][lanes, 60:, state]
             limit = 3.0 * float(bound.max()) * 1.05
             row[0].set_ylim(-limit, limit)
         names = ("error of the fused estimate", "robust ±3σ", "actual ±3σ")
-        figure.legend((shown, robust, own), names, loc="outside upper center", ncols=3)
+        figure.legend((curve, robust, own), names, loc="outside upper center", ncols=3)
 
-    lanes = [_lane(found, f"scale {scale}") for scale in SCALES]
-    errors = found[f"{fusion}_truth"][lanes] - found[f"{fusion}_mean"][lanes]
-    within = np.abs(errors) <= 3.0 * found[f"{fusion}_actual_deviation"][lanes]
+    lanes = [_lane(data, f"scale {scale}") for scale in SCALES]
+    errors = data[f"{fusion}_truth"][lanes] - data[f"{fusion}_mean"][lanes]
+    within = np.abs(errors) <= 3.0 * data[f"{fusion}_actual_deviation"][lanes]
     share = float(within.mean())
     return Picture(
         f"figure_{number}",
@@ -189,8 +188,8 @@ def _errors(found: dict[str, Any], fusion: str, number: int) -> Picture:
     )
 
 
-def _ellipses(found: dict[str, Any]) -> Picture:
-    lane = _lane(found, f"scale {_ENLARGED}")
+def _ellipses(data: dict[str, Any]) -> Picture:
+    lane = _lane(data, f"scale {_ENLARGED}")
     around = np.linspace(0.0, 2.0 * np.pi, 181)
     circle = np.stack((np.cos(around), np.sin(around)))
 
@@ -200,7 +199,7 @@ def _ellipses(found: dict[str, Any]) -> Picture:
     def draw(figure: Any) -> None:
         axes = figure.subplots(2, 2)
         for row, fusion in zip(axes, FUSIONS, strict=True):
-            both = found[f"{fusion}_ellipses"][lane]
+            both = data[f"{fusion}_ellipses"][lane]
             colours = (_COLOURS[fusion], *palette.SENSORS)
             names = (_NAMES[fusion], *SENSORS)
             for axis in row:
@@ -237,5 +236,5 @@ def _ellipses(found: dict[str, Any]) -> Picture:
     )
 
 
-def _runs(found: dict[str, Any]) -> int:
-    return found["sci_mse"].shape[-1]
+def _runs(data: dict[str, Any]) -> int:
+    return data["sci_mse"].shape[-1]

@@ -7,10 +7,10 @@ import numpy as np
 from fusion_gym.arrays import Array
 from fusion_gym.evaluation.intervals import Interval
 
-from ..judging import below, estimate, percent, told, verdict
-from ..shown import Claim, Number, Shown, Table
+from ..judging import below, cite, estimate, percent, verdict
+from ..piece_result import Claim, Number, NumbersTable, PieceResult
 from .errors import ALWAYS, AT_BOUND, FUSIONS, OTHERS, top
-from .figures import pictures
+from .figures import tracking_pictures
 from .runs import SCALES, SENSORS, STATES
 
 _NAMES = {"sci": "SCI", "sici": "SICI"}
@@ -21,22 +21,22 @@ _SCALED = [f"scale {scale}" for scale in SCALES]
 class _Data:
     """What was computed, by fusion rule, name and setting."""
 
-    def __init__(self, found: dict[str, Any]) -> None:
-        self.found = found
+    def __init__(self, data: dict[str, Any]) -> None:
+        self.data = data
 
     def __call__(self, fusion: str, name: str, lane: str) -> Array:
-        return self.found[f"{fusion}_{name}"][self.found["lanes"].index(lane)]
+        return self.data[f"{fusion}_{name}"][self.data["lanes"].index(lane)]
 
     def relative(self, fusion: str, lane: str) -> Array:
         """MSE over actual trace, minus 1, for each episode's MSE."""
         return self(fusion, "mse", lane) / self(fusion, "actual", lane).mean() - 1.0
 
 
-def show(found: dict[str, Any]) -> Shown:
+def show_fusion(results: dict[str, Any]) -> PieceResult:
     """Figures 4 to 9, tables of errors and traces, and the claims about them."""
-    data = _Data(found)
-    return Shown(
-        pictures=pictures(found),
+    data = _Data(results)
+    return PieceResult(
+        pictures=tracking_pictures(results),
         tables=[_traces(data, _AT_BOUND, "traces"), _traces(data, _BELOW, "scales"), _shares(data)],
         claims=[*_figure_claims(data), *_bounds(data), *_comparisons(data)],
         notes=[_correlation(data)],
@@ -48,12 +48,12 @@ _BELOW = {lane: f"trigger, variances {lane.split()[1]} of the bounds" for lane i
 _QUANTITIES = {"mse": "MSE", "actual": "actual trace", "conservative": "conservative trace"}
 
 
-def _traces(data: _Data, lanes: dict[str, str], name: str) -> Table:
+def _traces(data: _Data, lanes: dict[str, str], name: str) -> NumbersTable:
     titles = {
         "traces": "Errors and traces, actual variances at their bounds",
         "scales": "Errors and traces, actual variances below their bounds",
     }
-    return Table(
+    return NumbersTable(
         name,
         titles[name],
         [
@@ -67,8 +67,8 @@ def _traces(data: _Data, lanes: dict[str, str], name: str) -> Table:
     )
 
 
-def _shares(data: _Data) -> Table:
-    return Table(
+def _shares(data: _Data) -> NumbersTable:
+    return NumbersTable(
         "inside",
         "Share of errors within three actual standard deviations, in per cent",
         [
@@ -142,7 +142,7 @@ def _figure_claims(data: _Data) -> list[Claim]:
         Claim(
             "The MSE lies below the trace of the conservative error variance.",
             "Section 6, Figure 5",
-            verdict(found for found, _ in under),
+            verdict(value for value, _ in under),
             f"On average over the episode, and at {_fine(under[0][1])} (SCI) and "
             f"{_fine(under[1][1])} (SICI) of the steps.",
         ),
@@ -208,16 +208,16 @@ def _bounds(data: _Data) -> list[Claim]:
             f"P - P̄ is positive semidefinite in {shares} of the steps, by actual variances; the "
             f"largest ratio in any direction is {worst['sici']:.2f}. Real errors, mean square in "
             "their largest direction after whitening with P (1 is the bound): "
-            f"{told(real[ALWAYS])} when every sensor always transmits, {told(real[AT_BOUND])} "
+            f"{cite(real[ALWAYS])} when every sensor always transmits, {cite(real[AT_BOUND])} "
             "under the trigger.",
         ),
         Claim(
             "P̄ is the covariance of the actual fused errors.",
             "Corollary 1, (43); Theorem 4, (55)",
             verdict(
-                _close(found)
+                _close(value)
                 for f in FUSIONS
-                for found in (estimate(data.relative(f, lane)) for lane in (AT_BOUND, OTHERS))
+                for value in (estimate(data.relative(f, lane)) for lane in (AT_BOUND, OTHERS))
             ),
             "Traces: relative differences of "
             + "; ".join(
@@ -248,7 +248,7 @@ def _comparisons(data: _Data) -> list[Claim]:
             "SICI is more accurate than SCI.",
             "Section 6, Figure 6",
             verdict([accurate, late[1].mean() < late[0].mean()]),
-            f"MSE {told(estimate(mse['sici']))} against {told(estimate(mse['sci']))}; SICI is the "
+            f"MSE {cite(estimate(mse['sici']))} against {cite(estimate(mse['sci']))}; SICI is the "
             f"better in {percent(wins)} of the runs, and its mean over runs at "
             f"{percent(float((late[1] < late[0]).mean()))} of the steps 400 to 600.",
         ),
@@ -256,8 +256,8 @@ def _comparisons(data: _Data) -> list[Claim]:
             "SICI has higher accuracy, better tightness and better consistency than SCI.",
             "Remark 3",
             verdict([accurate, tight, bounded["sici"] >= bounded["sci"]]),
-            f"Accuracy: as above. Tightness: conservative trace {told(estimate(trace['sici']))} "
-            f"against {told(estimate(trace['sci']))}. Consistency: its variance is a bound in "
+            f"Accuracy: as above. Tightness: conservative trace {cite(estimate(trace['sici']))} "
+            f"against {cite(estimate(trace['sci']))}. Consistency: its variance is a bound in "
             f"{percent(bounded['sici'])} of the steps, SCI's in {percent(bounded['sci'])}.",
         ),
         Claim(
@@ -267,7 +267,7 @@ def _comparisons(data: _Data) -> list[Claim]:
             "The fused conservative trace is at most a node's in at least "
             + " (SCI) and ".join(percent(float(beats[f].min())) for f in FUSIONS)
             + " (SICI) of the steps; MSE of the nodes: "
-            + ", ".join(told(estimate(each)) for each in node)
+            + ", ".join(cite(estimate(each)) for each in node)
             + ".",
         ),
         Claim(
@@ -286,20 +286,20 @@ def _comparisons(data: _Data) -> list[Claim]:
             verdict(below(mse[f], data(f, "mse", OTHERS)) for f in FUSIONS),
             f"Against always transmitting the MSE is larger by {price['sci']} (SCI) and "
             f"{price['sici']} (SICI); with as many requests that do not look at the "
-            f"noise it is {told(estimate(data('sci', 'mse', OTHERS)))} and "
-            f"{told(estimate(data('sici', 'mse', OTHERS)))} against {told(estimate(mse['sci']))} "
-            f"and {told(estimate(mse['sici']))}.",
+            f"noise it is {cite(estimate(data('sci', 'mse', OTHERS)))} and "
+            f"{cite(estimate(data('sici', 'mse', OTHERS)))} against {cite(estimate(mse['sci']))} "
+            f"and {cite(estimate(mse['sici']))}.",
         ),
     ]
 
 
-def _share(found: Interval) -> str:
+def _share(interval: Interval) -> str:
     """A relative difference in per cent."""
-    return told(Interval(*(100.0 * value for value in found))) + " %"
+    return cite(Interval(*(100.0 * value for value in interval))) + " %"
 
 
-def _close(found: Interval) -> bool:
-    return max(abs(found.low), abs(found.high)) <= _CLOSE
+def _close(interval: Interval) -> bool:
+    return max(abs(interval.low), abs(interval.high)) <= _CLOSE
 
 
 def _fine(share: float) -> str:

@@ -11,10 +11,17 @@ PAPER = Paper(
         "innovation event-triggered mechanism for uncertain networked systems”, 2022."
     ),
     pieces=(
-        Piece("rates", "Thresholds and communication rates", rates.compute, rates.show, 45.0, 200),
+        Piece(
+            "rates",
+            "Thresholds and communication rates",
+            rates.compute_rates,
+            rates.show_rates,
+            45.0,
+            200,
+        ),
         Piece(
             "fusion", "Errors, actual and conservative variances",
-            errors.compute, fusion.show, 100.0, 200,
+            errors.compute_errors, fusion.show_fusion, 100.0, 200,
         ),
     ),
 )  # fmt: skip

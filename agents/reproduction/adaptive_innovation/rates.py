@@ -13,9 +13,9 @@ from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
 
 from ...output import palette
-from ..judging import estimate, percent, told, verdict
-from ..shown import Claim, Number, Picture, Shown, Table
-from .runs import SENSORS, STEPS, Lane, steps, thresholds
+from ..judging import cite, estimate, percent, verdict
+from ..piece_result import Claim, Number, NumbersTable, Picture, PieceResult
+from .runs import SENSORS, STEPS, Lane, innovation_thresholds, steps
 
 PRINTED = (0.6067, 0.485, 0.7067)  # Section 6, one run
 WINDOW = (300, 400)  # the steps of Figure 3
@@ -82,7 +82,7 @@ def _lanes() -> dict[str, Lane]:
     }
 
 
-def compute(episodes: int, seed: int) -> dict[str, Any]:
+def compute_rates(episodes: int, seed: int) -> dict[str, Any]:
     """Rates (readings, sensors, E) of every reading; innovations and requests of the first.
 
     ``changes`` (4, E): shares of the steps after a request, then after silence, in which a
@@ -96,7 +96,7 @@ def compute(episodes: int, seed: int) -> dict[str, Any]:
         innovation[step.number] = step.innovation[:, :episodes]
     rates = requested.mean(0).reshape(len(SENSORS), len(lanes), episodes).swapaxes(0, 1)
     first = requested[..., :episodes]
-    levels = thresholds(RULE, innovation, first)
+    levels = innovation_thresholds(RULE, innovation, first)
     moved, after = np.diff(levels, axis=0) != 0.0, first[:-1]
     changes = [
         (moved & where).sum((0, 1)) / np.maximum(where.sum((0, 1)), 1) for where in (after, ~after)
@@ -111,18 +111,18 @@ def compute(episodes: int, seed: int) -> dict[str, Any]:
     }
 
 
-def show(found: dict[str, Any]) -> Shown:
+def show_rates(data: dict[str, Any]) -> PieceResult:
     """Figure 3, the communication rates and what was tried to meet them."""
-    readings, rates = found["readings"], found["rates"]
+    readings, rates = data["readings"], data["rates"]
     ours = rates[readings.index(_OURS)]
     numbers = [
         Number.of(f"{name}, rate", 100.0 * sample, 100.0 * printed, unit="%")
         for name, sample, printed in zip(SENSORS, ours, PRINTED, strict=True)
     ]
-    return Shown(
-        pictures=[_figure_3(found)],
+    return PieceResult(
+        pictures=[_figure_3(data)],
         tables=[
-            Table(
+            NumbersTable(
                 "rates",
                 "Communication rates",
                 numbers,
@@ -132,19 +132,19 @@ def show(found: dict[str, Any]) -> Shown:
             ),
             _tried(readings, rates),
         ],
-        claims=_claims(found, numbers),
+        claims=_claims(data, numbers),
         notes=[_rates_note(numbers), _tried_note(readings, rates)],
     )
 
 
-def _tried(readings: list[str], rates: Array) -> Table:
+def _tried(readings: list[str], rates: Array) -> NumbersTable:
     numbers = [
         Number.of(f"{reading}: {name}", 100.0 * sample, unit="%")
         for reading, each in zip(readings, rates, strict=True)
         if reading not in (_OURS, _FIXED, _TIMED)
         for name, sample in zip(SENSORS, each, strict=True)
     ]
-    return Table("readings", "Rates of other readings of the text", numbers)
+    return NumbersTable("readings", "Rates of other readings of the text", numbers)
 
 
 def _rates_note(numbers: list[Number]) -> str:
@@ -170,11 +170,11 @@ def _tried_note(readings: list[str], rates: Array) -> str:
     )
 
 
-def _claims(found: dict[str, Any], numbers: list[Number]) -> list[Claim]:
-    readings, rates = found["readings"], found["rates"]
+def _claims(data: dict[str, Any], numbers: list[Number]) -> list[Claim]:
+    readings, rates = data["readings"], data["rates"]
     ours, wrong = rates[readings.index(_OURS)], rates[readings.index(_PRINTED_SIGN)]
     fixed, timed = rates[readings.index(_FIXED)], rates[readings.index(_TIMED)]
-    after, silent = found["changes"]
+    after, silent = data["changes"]
     size = np.linspace(0.0, 5.0, 51)
     falls = [bool((np.diff(level(size, size)) < 0.0).all()) for level in (_printed, _ours)]
     saves = [estimate(sample).high < 1.0 for sample in ours]
@@ -228,17 +228,17 @@ def _claims(found: dict[str, Any], numbers: list[Number]) -> list[Claim]:
     ]
 
 
-def _figure_3(found: dict[str, Any]) -> Picture:
-    levels, requested = found["levels"], found["requested"].astype(bool)
+def _figure_3(data: dict[str, Any]) -> Picture:
+    levels, requested = data["levels"], data["requested"].astype(bool)
     window = slice(WINDOW[0] - 1, WINDOW[1])
 
     def draw(figure: Any) -> None:
         time = np.arange(1, STEPS + 1)[window]
         axes = figure.subplots(len(SENSORS), 1, sharex=True, sharey=True)
         for i, (axis, name) in enumerate(zip(axes, SENSORS, strict=True)):
-            colour, asked = palette.SENSORS[i], requested[window, i]
+            colour, requests = palette.SENSORS[i], requested[window, i]
             axis.step(time, levels[window, i], where="mid", color=colour, lw=1.6)
-            axis.plot(time[asked], np.full(asked.sum(), 0.01), "|", color=palette.BLACK, ms=6)
+            axis.plot(time[requests], np.full(requests.sum(), 0.01), "|", color=palette.BLACK, ms=6)
             axis.set_title(f"({'abc'[i]}) {name}", loc="left", color=colour)
             axis.set_ylim(0.0, 1.02 * _A * np.exp(-_B))
             axis.set_ylabel("θ (m²)" if i == 0 else "θ (m²/s²)" if i == 1 else "θ (m²/s⁴)")
@@ -259,7 +259,7 @@ def _figure_3(found: dict[str, Any]) -> Picture:
 
 
 def _rates(sample: Array) -> str:
-    return ", ".join(f"{told(estimate(100.0 * each))}" for each in sample) + " %"
+    return ", ".join(f"{cite(estimate(100.0 * each))}" for each in sample) + " %"
 
 
 def _each(values: Any, digits: int) -> str:

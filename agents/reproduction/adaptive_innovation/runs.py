@@ -72,8 +72,8 @@ def steps(
     lanes: list[Lane], episodes: int, seed: int, fusion: str, track_actual: bool
 ) -> Iterator[Step]:
     """The paper's example, each lane with the same episodes, one lane after another along N."""
-    chosen = CorrelatedTrackingOptions(horizon=STEPS, fusion=fusion, track_actual=track_actual)
-    task = fusion_gym.make_task(chosen)
+    options = CorrelatedTrackingOptions(horizon=STEPS, fusion=fusion, track_actual=track_actual)
+    task = fusion_gym.make_task(options)
     system = SideBySide(
         **vars(task.system),
         scales=np.repeat([lane.scale for lane in lanes], episodes),
@@ -111,11 +111,13 @@ def of_other_episodes(episodes: int) -> Ask:
     return ask
 
 
-def thresholds(rule: AdaptiveInnovation, innovation: Array, requested: NDArray[np.bool_]) -> Array:
+def innovation_thresholds(
+    rule: AdaptiveInnovation, innovation: Array, requested: NDArray[np.bool_]
+) -> Array:
     """Thresholds (H, sensors, N) that were in force at the requests of a run, times first."""
     last = np.zeros(innovation.shape[1:])
-    found = np.empty(innovation.shape)
-    for step, (size, asked) in enumerate(zip(np.abs(innovation), requested, strict=True)):
-        found[step] = rule.threshold_after(last)
-        last = np.where(asked, size, last)
-    return found
+    values = np.empty(innovation.shape)
+    for step, (size, requests) in enumerate(zip(np.abs(innovation), requested, strict=True)):
+        values[step] = rule.threshold_after(last)
+        last = np.where(requests, size, last)
+    return values

@@ -52,7 +52,7 @@ def instants(figure: Any, sent: NDArray[np.bool_]) -> None:
     axes[-1].set_xlabel(_TIME)
 
 
-def tracking(figure: Any, truth: Array, means: Array) -> None:
+def draw_tracking(figure: Any, truth: Array, means: Array) -> None:
     """Figure 3: ``truth`` (H, n), ``means`` (thresholds, H, n)."""
     axes = figure.subplots(len(STATES), 1, sharex=True)
     time = np.arange(1, len(truth) + 1)
@@ -64,7 +64,7 @@ def tracking(figure: Any, truth: Array, means: Array) -> None:
     _above(figure, handles)
 
 
-def errors(figure: Any, few: Array, all_runs: Array) -> None:
+def draw_node_errors(figure: Any, few: Array, all_runs: Array) -> None:
     """Figure 4: RMSE (thresholds, H, n) over ``few`` runs, as in the paper, and over all."""
     axes = figure.subplots(len(STATES), 1, sharex=True)
     time = np.arange(1, all_runs.shape[1] + 1)
@@ -77,10 +77,10 @@ def errors(figure: Any, few: Array, all_runs: Array) -> None:
     _above(figure, handles)
 
 
-def traces(figure: Any, found: Array) -> None:
+def traces(figure: Any, values: Array) -> None:
     """Figure 5: traces (thresholds, H) of the fused covariance."""
     axis = figure.subplots()
-    handles = _curves(axis, np.arange(1, found.shape[1] + 1), found, width=1.8)
+    handles = _curves(axis, np.arange(1, values.shape[1] + 1), values, width=1.8)
     axis.set_ylabel("trace of $P_0$ (m² and m²/s²)")
     axis.set_ylim(bottom=0.0)
     axis.set_xlabel(_TIME)

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ..judging import below, estimate, percent, told, verdict
+from ..judging import below, cite, estimate, percent, verdict
 from ..paper import Paper, Piece
-from ..shown import Claim, Number, Picture, Shown, Table
+from ..piece_result import Claim, Number, NumbersTable, Picture, PieceResult
 from . import figures
 from .others import OTHERS
-from .runs import STATES, THRESHOLDS, example, run, trigger
+from .runs import STATES, THRESHOLDS, example, run_markov_jump, trigger
 from .schedule import SCHEDULE
 from .theorems import THEOREMS
 
@@ -27,13 +27,13 @@ def tracking(episodes: int, seed: int) -> dict[str, Any]:
     task = example()
     means, few, every, squares = [], [], [], []
     for m in THRESHOLDS:
-        found = run(task, trigger(m), episodes, seed)
-        squared = found.squared
-        means.append(found.mean[..., 0])
+        requests = run_markov_jump(task, trigger(m), episodes, seed)
+        squared = requests.squared
+        means.append(requests.mean[..., 0])
         few.append(np.sqrt(squared[..., :_PAPERS_RUNS].mean(-1)))
         every.append(np.sqrt(squared.mean(-1)))
         squares.append(squared.mean(0))
-    silent = run(task, "never", episodes, seed)
+    silent = run_markov_jump(task, "never", episodes, seed)
     return {
         "truth": silent.truth[..., 0],
         "means": np.array(means),
@@ -44,11 +44,11 @@ def tracking(episodes: int, seed: int) -> dict[str, Any]:
     }
 
 
-def show_tracking(found: dict[str, Any]) -> Shown:
+def show_tracking(data: dict[str, Any]) -> PieceResult:
     """Figures 3 and 4."""
     names = [f"mean squared error of the {state}" for state in STATES]
-    rows = [(f"m = {m:g}", square) for m, square in zip(THRESHOLDS, found["squares"], strict=True)]
-    rows.append(("nothing sent", found["silent"]))
+    rows = [(f"m = {m:g}", square) for m, square in zip(THRESHOLDS, data["squares"], strict=True)]
+    rows.append(("nothing sent", data["silent"]))
     numbers = [
         Number.of(f"{row}: {name}", square[state])
         for row, square in rows
@@ -61,7 +61,7 @@ def show_tracking(found: dict[str, Any]) -> Shown:
             "One episode. With larger m the estimates come later and flatter: they follow the "
             "slow course of the position and ever less of the velocity. The paper draws m = 0, "
             "0.9, 1.3, 1.5 in black, blue, green, red.",
-            partial(figures.tracking, truth=found["truth"], means=found["means"]),
+            partial(figures.draw_tracking, truth=data["truth"], means=data["means"]),
             (7.2, 5.0),
         ),
         Picture(
@@ -70,35 +70,35 @@ def show_tracking(found: dict[str, Any]) -> Shown:
             f"Thick: all runs. Thin: the first {_PAPERS_RUNS}, as many as the paper has. The order "
             "of the curves is that of the thresholds, m = 1.5 on top; for the velocity they lie "
             "close together.",
-            partial(figures.errors, few=found["few"], all_runs=found["every"]),
+            partial(figures.draw_node_errors, few=data["few"], all_runs=data["every"]),
             (7.2, 5.0),
         ),
     ]
-    table = Table(
+    table = NumbersTable(
         "errors",
         "Errors at the thresholds",
         numbers,
         "Means over time and runs, m² and m²/s². The paper prints curves only.",
         tuple(names),
     )
-    return Shown(pictures, [table], _claims(found))
+    return PieceResult(pictures, [table], _claims(data))
 
 
-def _claims(found: dict[str, Any]) -> list[Claim]:
-    squares, silent = found["squares"], found["silent"]
+def _claims(data: dict[str, Any]) -> list[Claim]:
+    squares, silent = data["squares"], data["silent"]
     pairs = [(k, state) for k in range(len(THRESHOLDS) - 1) for state in range(len(STATES))]
     ordered = [below(squares[k, s], squares[k + 1, s]) for k, s in pairs]
     roots = [
-        f"{state} " + ", ".join(f"{np.sqrt(one.mean()):.3f}" for one in squares[:, s])
+        f"{state} " + ", ".join(f"{np.sqrt(square.mean()):.3f}" for square in squares[:, s])
         for s, state in enumerate(STATES)
     ]
-    top = (found["every"][-1] >= found["every"].max(0)).mean(0)
-    few_top = (found["few"][-1] >= found["few"].max(0)).mean(0)
+    top = (data["every"][-1] >= data["every"].max(0)).mean(0)
+    few_top = (data["few"][-1] >= data["few"].max(0)).mean(0)
     parts, words = [], []
     for s, state in enumerate(STATES):
         share = [1.0 - square[s].mean() / silent[s].mean() for square in squares]
         parts += [below(square[s], _TRACKED * silent[s]) for square in squares]
-        words.append(f"of the {state} " + ", ".join(percent(one) for one in share))
+        words.append(f"of the {state} " + ", ".join(percent(item) for item in share))
     first = all(below(squares[0, s], squares[k, s]) for k in (1, 2, 3) for s in range(2))
     return [
         Claim(
@@ -128,9 +128,9 @@ def _claims(found: dict[str, Any]) -> list[Claim]:
             "At m = 0 the accuracy is best.",
             "Section 6, of Figure 4",
             verdict([first]),
-            f"Mean squared error of the position {told(estimate(squares[0, 0]))} at m = 0, "
-            f"{told(estimate(squares[1, 0]))} at m = 0.9; of the velocity "
-            f"{told(estimate(squares[0, 1]))} and {told(estimate(squares[1, 1]))}.",
+            f"Mean squared error of the position {cite(estimate(squares[0, 0]))} at m = 0, "
+            f"{cite(estimate(squares[1, 0]))} at m = 0.9; of the velocity "
+            f"{cite(estimate(squares[0, 1]))} and {cite(estimate(squares[1, 1]))}.",
         ),
     ]  # fmt: skip
 

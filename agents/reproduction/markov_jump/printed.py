@@ -58,8 +58,8 @@ def _joint(system: Any, sent: NDArray[np.bool_], swapped: bool) -> list[Array]:
                 a, b = float(everyone[time, i]), float(everyone[time, j])
                 if i == j:  # Theorem 2, with (12)-(22) where the node was sent
                     filtered[i, i] = exact[i, i] if a else ahead
-                    seen = _prior(system, place, i) @ faded[i]
-                    crossed[i, i] = -a * np.outer(seen, own[i])
+                    observed = _prior(system, place, i) @ faded[i]
+                    crossed[i, i] = -a * np.outer(observed, own[i])
                     variance = filters.innovation_covariance[i, i, place]
                     noises[i, i] = model.plant.noise_covariance - a * variance * np.outer(
                         own[i], own[i]

@@ -31,7 +31,7 @@ def trigger(m: float, literal: bool = False) -> str:
     return f"local_variance:m={m:g}" if m or literal else "always"
 
 
-def run(task: Task, policy: str, episodes: int, seed: int) -> Run:
+def run_markov_jump(task: Task, policy: str, episodes: int, seed: int) -> Run:
     """Episodes with the seeds ``seed``, ``seed + 1``, …"""
     rule = fusion_gym.make_policy(policy, task)
     batch = EpisodeBatch.seeded(task, episodes, seed)

@@ -10,9 +10,9 @@ from fusion_gym.arrays import Array
 
 from ..judging import percent, verdict
 from ..paper import Piece
-from ..shown import Claim, Number, Picture, Shown, Table
+from ..piece_result import Claim, Number, NumbersTable, Picture, PieceResult
 from . import figures
-from .runs import THRESHOLDS, example, run, trigger
+from .runs import THRESHOLDS, example, run_markov_jump, trigger
 
 _LONG, _SHOWN, _INSTANTS = 200, 100, 60  # steps
 _LAST = 60  # steps that stand for the settled ones
@@ -24,13 +24,13 @@ _PRINTED = {  # of Section 6, with half of their last digit
 }
 
 
-def compute(episodes: int, seed: int) -> dict[str, Any]:
+def compute_schedule(episodes: int, seed: int) -> dict[str, Any]:
     """Schedules and traces of one run, for none depends on the data."""
     task = example(horizon=_LONG)
     system: Any = task.system
-    runs = [run(task, trigger(m), episodes, seed) for m in THRESHOLDS]
+    runs = [run_markov_jump(task, trigger(m), episodes, seed) for m in THRESHOLDS]
     short = example(horizon=_SHOWN)
-    literal = run(short, trigger(0.0, literal=True), episodes, seed)
+    literal = run_markov_jump(short, trigger(0.0, literal=True), episodes, seed)
     every, time = system.recursion.local_trace, np.arange(1, _LONG + 1)
     local = every[:, system.filters.at(time)]
     cycle = system.filters.period
@@ -39,15 +39,15 @@ def compute(episodes: int, seed: int) -> dict[str, Any]:
     gaps = settled - reference.mean()
     inner, outer = float(gaps.min()), float(gaps.max())
     at_ends = [
-        run(short, f"local_variance:m={m!r}", episodes, seed).sent[-2 * cycle :].mean()
+        run_markov_jump(short, f"local_variance:m={m!r}", episodes, seed).sent[-2 * cycle :].mean()
         for m in (inner - _MARGIN, outer + _MARGIN)
     ]
     sensors = system.sensors
     mean = (sensors.fading_values * sensors.fading_probabilities).sum(1)
     square = (sensors.fading_values**2 * sensors.fading_probabilities).sum(1)
     return {
-        "sent": np.array([one.sent for one in runs]),
-        "trace": np.array([one.trace for one in runs]),
+        "sent": np.array([run.sent for run in runs]),
+        "trace": np.array([run.trace for run in runs]),
         "literal": literal.sent,
         "local": local,
         "periods": sensors.period[:, 0],
@@ -73,9 +73,9 @@ def period_of(values: Array) -> int | None:
     return None
 
 
-def show(found: dict[str, Any]) -> Shown:
+def show_schedule(data: dict[str, Any]) -> PieceResult:
     """Figures 2 and 5."""
-    sent, trace = found["sent"].astype(bool), found["trace"]
+    sent, trace = data["sent"].astype(bool), data["trace"]
     first = sent[:, :_SHOWN]
     columns = ("node 1", "node 2", "node 3", "packets a step", "mean trace", "settled trace")
     numbers = []
@@ -88,10 +88,10 @@ def show(found: dict[str, Any]) -> Shown:
     printed = [
         Number(f"{what} of node {node + 1}", ours, ours, ours, value, half / 1.96)
         for what, (values, half) in _PRINTED.items()
-        for node, (value, ours) in enumerate(zip(values, found[what].tolist(), strict=True))
+        for node, (value, ours) in enumerate(zip(values, data[what].tolist(), strict=True))
     ]
     tables = [
-        Table(
+        NumbersTable(
             "schedule",
             "Share of steps in which a node sends, and the fused covariance",
             numbers,
@@ -99,7 +99,7 @@ def show(found: dict[str, Any]) -> Shown:
             "m² and m²/s² together. Nothing here depends on data, so there are no intervals.",
             columns,
         ),
-        Table("fading", "Fading, from its printed distribution", printed),
+        NumbersTable("fading", "Fading, from its printed distribution", printed),
     ]
     pictures = [
         Picture(
@@ -116,29 +116,29 @@ def show(found: dict[str, Any]) -> Shown:
             "Figure 5: traces of the fused covariance at four thresholds",
             "Larger m, larger trace. After a start the traces are periodic: the saw's teeth are "
             "the packets, and between them the centre predicts.",
-            partial(figures.traces, found=trace[:, :_SHOWN]),
+            partial(figures.traces, values=trace[:, :_SHOWN]),
             (7.2, 3.9),
         ),
     ]
-    return Shown(pictures, tables, [*_of_the_trigger(found), *_of_the_traces(found)])
+    return PieceResult(pictures, tables, [*_of_the_trigger(data), *_of_the_traces(data)])
 
 
 def _exact(what: str, value: float) -> Number:
     return Number(what, value, value, value)
 
 
-def _of_the_trigger(found: dict[str, Any]) -> list[Claim]:
-    sent = found["sent"].astype(bool)[:, :_SHOWN]
+def _of_the_trigger(data: dict[str, Any]) -> list[Claim]:
+    sent = data["sent"].astype(bool)[:, :_SHOWN]
     shares = sent.mean(1)
     packets = shares.sum(-1)
     falling = [bool(now > later) for now, later in pairwise(packets)]
-    literal = found["literal"].astype(bool)
+    literal = data["literal"].astype(bool)
     quiet = int((~literal.all(-1)).nonzero()[0].max(initial=-1)) + 1
-    inner, outer = found["range"]
-    ends = [found["at_ends"][0] == 1.0, found["at_ends"][1] == 0.0]
+    inner, outer = data["range"]
+    ends = [data["at_ends"][0] == 1.0, data["at_ends"][1] == 0.0]
     rates = "; ".join(
-        f"m = {m:g}: " + ", ".join(f"{share:.2f}" for share in one)
-        for m, one in zip(THRESHOLDS, shares, strict=True)
+        f"m = {m:g}: " + ", ".join(f"{share:.2f}" for share in item)
+        for m, item in zip(THRESHOLDS, shares, strict=True)
     )
     return [
         Claim(
@@ -146,7 +146,7 @@ def _of_the_trigger(found: dict[str, Any]) -> list[Claim]:
             "Section 6, of Figure 2",
             verdict(falling),
             f"Shares of nodes 1, 2, 3 at {rates}; together "
-            + ", ".join(f"{one:.2f}" for one in packets)
+            + ", ".join(f"{packet:.2f}" for packet in packets)
             + " packets a step.",
         ),
         Claim(
@@ -163,21 +163,21 @@ def _of_the_trigger(found: dict[str, Any]) -> list[Claim]:
             "Remark 4",
             verdict(ends),
             f"Settled, from {inner:.3f} to {outer:.3f}. Just below, "
-            f"{percent(found['at_ends'][0])} of the estimates are sent, just above "
-            f"{percent(found['at_ends'][1])}.",
+            f"{percent(data['at_ends'][0])} of the estimates are sent, just above "
+            f"{percent(data['at_ends'][1])}.",
         ),
     ]
 
 
-def _of_the_traces(found: dict[str, Any]) -> list[Claim]:
-    trace, local = found["trace"], found["local"]
+def _of_the_traces(data: dict[str, Any]) -> list[Claim]:
+    trace, local = data["trace"], data["local"]
     larger = [
         float((trace[k + 1] >= trace[k] * (1.0 - 1e-12)).mean()) for k in range(len(trace) - 1)
     ]
-    fused = [period_of(one) for one in trace]
-    own = [period_of(one) for one in local]
+    fused = [period_of(item) for item in trace]
+    own = [period_of(item) for item in local]
     steady = [period is not None for period in fused]
-    stable = [radius < 1.0 for radius in found["radii"]]
+    stable = [radius < 1.0 for radius in data["radii"]]
     return [
         Claim(
             "The larger the threshold, the larger the trace of the fused covariance.",
@@ -186,7 +186,7 @@ def _of_the_traces(found: dict[str, Any]) -> list[Claim]:
             "From one threshold to the next it grows or stays in "
             + ", ".join(percent(share) for share in larger)
             + " of all steps; settled means "
-            + ", ".join(f"{one[-_LAST:].mean():.3f}" for one in trace)
+            + ", ".join(f"{item[-_LAST:].mean():.3f}" for item in trace)
             + " at m = 0, 0.9, 1.3, 1.5.",
         ),
         Claim(
@@ -200,7 +200,7 @@ def _of_the_traces(found: dict[str, Any]) -> list[Claim]:
         Claim(
             "A local filter's covariance is periodic with its own sampling period.",
             "Remark 2",
-            verdict(period == int(due) for period, due in zip(own, found["periods"], strict=True)),
+            verdict(period == int(due) for period, due in zip(own, data["periods"], strict=True)),
             "Periods of nodes 1, 2, 3: "
             + ", ".join("none" if period is None else str(period) for period in own)
             + " steps.",
@@ -208,15 +208,14 @@ def _of_the_traces(found: dict[str, Any]) -> list[Claim]:
         Claim(
             "Every mode of the example is stable by itself, ρ(Φ) < 1, and so is the system.",
             "Section 2",
-            verdict((all(stable), found["square_radius"] < 1.0)),
+            verdict((all(stable), data["square_radius"] < 1.0)),
             "ρ(Φ) is "
-            + " and ".join(f"{radius:.3g}" for radius in found["radii"])
+            + " and ".join(f"{radius:.3g}" for radius in data["radii"])
             + f". What counts for the mean square is the jump system's own radius, "
-            f"{found['square_radius']:.4f} < 1.",
+            f"{data['square_radius']:.4f} < 1.",
         ),
     ]
 
 
-SCHEDULE = Piece(
-    "schedule", "What is sent, and the covariances (Figures 2 and 5)", compute, show, 5.0, 2
-)  # fmt: skip
+_TITLE = "What is sent, and the covariances (Figures 2 and 5)"
+SCHEDULE = Piece("schedule", _TITLE, compute_schedule, show_schedule, 5.0, 2)

@@ -37,7 +37,7 @@ LOWER = {
 SHARE = 0.5  # ε of a node, the paper's 1/p
 
 
-class Seen(NamedTuple):
+class Censoring(NamedTuple):
     """What a sensor's filter expects, (N,): α, 1 - α - β, and φ of Theorem 4 without its sign."""
 
     left: Array
@@ -46,7 +46,7 @@ class Seen(NamedTuple):
 
 
 @dataclass
-class Bound(ABC):
+class BoundRecursion(ABC):
     """A bound (states, states, N) of a sensor, beside the covariance P⁻ that it is to bound.
 
     ``inflation`` is 1 for a filter by itself and ε⁻¹ for a node, whose process covariance is
@@ -67,18 +67,18 @@ class Bound(ABC):
         """Whether (N,) it bounds P⁻."""
 
     @abstractmethod
-    def advance(self, covariance: Array, seen: Seen, turn: bool) -> None:
+    def advance(self, covariance: Array, observed: Censoring, turn: bool) -> None:
         """To the next step, from P⁻, what is expected, and whether it is this sensor's turn."""
 
-    def moved(self, kept: Array, share: Array | float = 1.0) -> Array:
-        """A ``kept`` Aᵀ and the process covariance, of which the lower bound may take a share."""
+    def moved(self, stored: Array, share: Array | float = 1.0) -> Array:
+        """A ``stored`` Aᵀ and the process covariance, of which the lower bound may take a share."""
         model = censored(self.task).model
         process = model.process_covariance * self.inflation
-        return linalg.congruence(model.transition, kept) + share * process
+        return linalg.congruence(model.transition, stored) + share * process
 
 
 @dataclass
-class Upper(Bound):
+class Upper(BoundRecursion):
     """P^u of Theorem 4, in a reading of :data:`UPPER`."""
 
     sign: float
@@ -89,24 +89,24 @@ class Upper(Bound):
         self.value = covariance.copy()
 
     def holds(self, covariance: Array) -> NDArray[np.bool_]:
-        """See :class:`Bound`."""
-        return below(covariance, self.value)
+        """See :class:`BoundRecursion`."""
+        return matrix_below(covariance, self.value)
 
-    def advance(self, covariance: Array, seen: Seen, turn: bool) -> None:
-        """See :class:`Bound`."""
-        sensors, kept = censored(self.task).centre.sensors, self.value
+    def advance(self, covariance: Array, observed: Censoring, turn: bool) -> None:
+        """See :class:`BoundRecursion`."""
+        sensors, stored = censored(self.task).centre.sensors, self.value
         if turn:
             row = sensors.measurement_matrix[self.sensor, 0]
             cross = linalg.matvec(self.value if self.own else covariance, row)
-            noise = sensors.variance[self.sensor, 0] * (1.0 + self.sign * seen.narrowing)
-            weight = (1.0 - seen.left) ** 2
+            noise = sensors.variance[self.sensor, 0] * (1.0 + self.sign * observed.narrowing)
+            weight = (1.0 - observed.left) ** 2
             innovation = weight * linalg.dot(row, cross) + noise
-            kept = kept - linalg.outer(cross, cross) * weight / innovation
-        self.value = self.moved(kept)
+            stored = stored - linalg.outer(cross, cross) * weight / innovation
+        self.value = self.moved(stored)
 
 
 @dataclass
-class Lower(Bound):
+class Lower(BoundRecursion):
     """P^l of Theorem 4, in a reading of :data:`LOWER`."""
 
     turns: bool
@@ -117,17 +117,17 @@ class Lower(Bound):
         self.value = np.zeros_like(covariance)
 
     def holds(self, covariance: Array) -> NDArray[np.bool_]:
-        """See :class:`Bound`."""
-        return below(self.value, covariance)
+        """See :class:`BoundRecursion`."""
+        return matrix_below(self.value, covariance)
 
-    def advance(self, covariance: Array, seen: Seen, turn: bool) -> None:
-        """See :class:`Bound`."""
-        inside = seen.inside**2 if turn or not self.turns else np.zeros_like(seen.inside)
+    def advance(self, covariance: Array, observed: Censoring, turn: bool) -> None:
+        """See :class:`BoundRecursion`."""
+        inside = observed.inside**2 if turn or not self.turns else np.zeros_like(observed.inside)
         self.value = self.moved((1.0 - inside) * self.value, inside if self.part else 1.0)
 
 
 def failures(
-    task: Task, policy: Policy, episodes: int, seed: int, bounds: Sequence[Bound]
+    task: Task, policy: Policy, episodes: int, seed: int, bounds: Sequence[BoundRecursion]
 ) -> tuple[Array, Array]:
     """Shares of an episode's steps in which a bound fails.
 
@@ -139,41 +139,41 @@ def failures(
 
     def before(batch: EpisodeBatch, step: int, runs: slice) -> None:
         covariance = batch.state.prior_covariance
-        seen = [_seen(task, batch, sensor) for sensor in range(task.sensors)]
-        for place, one in enumerate(bounds):
-            own = covariance * one.inflation
+        observed = [_seen(task, batch, sensor) for sensor in range(task.sensors)]
+        for place, bound in enumerate(bounds):
+            own = covariance * bound.inflation
             if step == 0:
-                one.begin(own)
-            local[place, runs] += ~one.holds(own)
+                bound.begin(own)
+            local[place, runs] += ~bound.holds(own)
         for place, pair in enumerate(pairs if step else []):
-            ends = _joined([one.value for one in pair]), covariance[:2, :2]
+            ends = _joined([item.value for item in pair]), covariance[:2, :2]
             low, high = ends if isinstance(pair[0], Lower) else ends[::-1]
-            fused[place, runs] += ~below(low, high)
-        for one in bounds:
-            turn = step % task.sensors == one.sensor
-            one.advance(covariance * one.inflation, seen[one.sensor], turn)
+            fused[place, runs] += ~matrix_below(low, high)
+        for bound in bounds:
+            turn = step % task.sensors == bound.sensor
+            bound.advance(covariance * bound.inflation, observed[bound.sensor], turn)
 
     walk(task, policy, episodes, seed, lambda *_: None, before)
     return local / (task.horizon - 1), fused / (task.horizon - 1)
 
 
-def _of(task: Task, sensor: int, inflation: float) -> dict[str, Bound]:
+def _of(task: Task, sensor: int, inflation: float) -> dict[str, BoundRecursion]:
     """Both bounds of a sensor in all their readings."""
     uppers = {f"upper/{name}": Upper(task, sensor, inflation, *how) for name, how in UPPER.items()}
     lowers = {f"lower/{name}": Lower(task, sensor, inflation, *how) for name, how in LOWER.items()}
     return {**uppers, **lowers}
 
 
-def _seen(task: Task, batch: EpisodeBatch, sensor: int) -> Seen:
+def _seen(task: Task, batch: EpisodeBatch, sensor: int) -> Censoring:
     sensors, expected = censored(task).centre.sensors, batch.state.prediction.expectation
     limit, deviation = sensors.threshold[sensor, 0], sensors.deviation[sensor, 0]
     low = (limit - expected.latent[sensor, 0]) / deviation
     hazard = gaussian.hazard(low)
     inside = expected.uncensored_probability[sensor, 0]
-    return Seen(gaussian.upper_tail(-low), inside, hazard * (hazard - low))
+    return Censoring(gaussian.upper_tail(-low), inside, hazard * (hazard - low))
 
 
-def below(first: Array, second: Array) -> NDArray[np.bool_]:
+def matrix_below(first: Array, second: Array) -> NDArray[np.bool_]:
     """Whether (N,) ``first`` ≤ ``second``, both (n, n, N), up to rounding; NaN bounds nothing."""
     scale = np.maximum(linalg.trace(np.abs(first)), linalg.trace(np.abs(second)))
     gap = linalg.add_diagonal(second - first, np.broadcast_to(1e-9 * scale, second.shape[1:]))
@@ -185,18 +185,18 @@ def _joined(parts: list[Array]) -> Array:
     return linalg.inverse(sum((linalg.inverse(part) for part in parts), np.zeros(1)))[:2, :2]
 
 
-def compute(env: str, episodes: int, seed: int, **options: Any) -> dict[str, Array]:
+def compute_bound_recursion(env: str, episodes: int, seed: int, **options: Any) -> dict[str, Array]:
     """Shares of failures (episodes,) by theorem, end, reading and sensor."""
     task = fusion_gym.make_task(env, **options)
-    found: dict[str, Array] = {}
+    data: dict[str, Array] = {}
     for sensor in range(2):
-        alone = _of(task, sensor, 1.0)
-        local, _ = failures(task, Turn(sensor), episodes, seed, list(alone.values()))
-        for name, sample in zip(alone, local, strict=True):
-            found[f"4/{name}/{sensor}"] = sample
+        single = _of(task, sensor, 1.0)
+        local, _ = failures(task, Turn(sensor), episodes, seed, list(single.values()))
+        for name, sample in zip(single, local, strict=True):
+            data[f"4/{name}/{sensor}"] = sample
     nodes = [_of(task, sensor, 1.0 / SHARE) for sensor in range(2)]
     bounds = [node[name] for name in nodes[0] for node in nodes]
     _, fused = failures(task, round_robin(task), episodes, seed, bounds)
     for name, sample in zip(nodes[0], fused, strict=True):
-        found[f"5/{name}"] = sample
-    return found
+        data[f"5/{name}"] = sample
+    return data

@@ -14,7 +14,7 @@ TARGET_STEP = "time step k (0.1 s each)"
 _THIN, _WIDE = 1.3, 2.0
 
 
-class Line(NamedTuple):
+class CurveLine(NamedTuple):
     """A curve over time with its name, colour and dashes; ``values`` (H,), or (3, H) with ends."""
 
     label: str
@@ -24,35 +24,35 @@ class Line(NamedTuple):
     width: float = _WIDE
 
 
-def unaware(values: Array) -> Line:
+def unaware(values: Array) -> CurveLine:
     """The filter that ignores the bias."""
-    return Line("FTKF (bias ignored)", values, palette.PURPLE, "--")
+    return CurveLine("FTKF (bias ignored)", values, palette.PURPLE, "--")
 
 
-def aware(values: Array) -> Line:
+def aware(values: Array) -> CurveLine:
     """The paper's own filter."""
-    return Line("FTKF-DB (fused)", values, palette.FUSED)
+    return CurveLine("FTKF-DB (fused)", values, palette.FUSED)
 
 
-def node(number: int, values: Array, style: str = "-", label: str = "") -> Line:
+def node(number: int, values: Array, style: str = "-", label: str = "") -> CurveLine:
     """A local filter."""
     name = label or f"LTKF-DB-S{number + 1}"
-    return Line(name, values, palette.SENSORS[number], style, _THIN)
+    return CurveLine(name, values, palette.SENSORS[number], style, _THIN)
 
 
-def true(values: Array) -> Line:
+def true(values: Array) -> CurveLine:
     """What the filters want to know."""
-    return Line("true", values, palette.TRUTH, "-", _THIN)
+    return CurveLine("true", values, palette.TRUTH, "-", _THIN)
 
 
-def least(values: Array, label: str) -> Line:
+def least(values: Array, label: str) -> CurveLine:
     """What nobody can go below."""
-    return Line(label, values, palette.CENTRAL, ":", _WIDE)
+    return CurveLine(label, values, palette.CENTRAL, ":", _WIDE)
 
 
 def curves(
     figure: Any,
-    panels: Sequence[tuple[str, Sequence[Line]]],
+    panels: Sequence[tuple[str, Sequence[CurveLine]]],
     step: str = STEP,
     from_zero: bool = False,
 ) -> None:
@@ -69,7 +69,7 @@ def curves(
     legend(figure, axes)
 
 
-def _draw(axis: Any, line: Line) -> None:
+def _draw(axis: Any, line: CurveLine) -> None:
     curve = np.atleast_2d(line.values)
     steps = np.arange(1, curve.shape[1] + 1)
     axis.plot(
@@ -91,7 +91,7 @@ def legend(figure: Any, axes: Sequence[Any], columns: int = 4) -> None:
     )
 
 
-def measurements(figure: Any, whole: Array, clipped: Array, limits: Sequence[float]) -> None:
+def biased_measurements(figure: Any, whole: Array, clipped: Array, limits: Sequence[float]) -> None:
     """Figure 2: what the estimators hold, (H, sensors), uncensored and censored."""
     axes = figure.subplots(whole.shape[1], 1, sharex=True)
     steps = np.arange(1, len(whole) + 1)
@@ -134,14 +134,14 @@ def table_marks(
     axes = figure.subplots(1, 3)
     places = np.arange(len(rows))
     for state, axis in enumerate(axes):
-        for shift, one in zip(np.linspace(-0.18, 0.18, len(marks)), marks, strict=True):
-            values = one.values[:, state]
+        for shift, mark in zip(np.linspace(-0.18, 0.18, len(marks)), marks, strict=True):
+            values = mark.values[:, state]
             ends = None
-            if one.low is not None and one.high is not None:
-                ends = np.stack([values - one.low[:, state], one.high[:, state] - values])
+            if mark.low is not None and mark.high is not None:
+                ends = np.stack([values - mark.low[:, state], mark.high[:, state] - values])
             axis.errorbar(
-                places + shift, values, yerr=ends, fmt=one.marker, color=one.colour,
-                markersize=8, markeredgewidth=2, label=one.label, capsize=3,
+                places + shift, values, yerr=ends, fmt=mark.marker, color=mark.colour,
+                markersize=8, markeredgewidth=2, label=mark.label, capsize=3,
             )  # fmt: skip
         axis.bar(
             places, floors[:, state], width=0.8, color=palette.GREY,

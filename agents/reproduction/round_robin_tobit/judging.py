@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from fusion_gym.arrays import Array
 
-from ..shown import Verdict
+from ..piece_result import Verdict
 
 _CLEAR = 4.0  # standard errors: of 200 comparisons without a difference none is likely to reach it
 _MOST = 0.5  # share of the points
@@ -31,9 +31,9 @@ def always_below(difference: Array) -> tuple[Verdict, str]:
 
 def explained(armse: Sequence[float], silent: Sequence[float]) -> list[float]:
     """Shares of the open-loop variance that an estimate explains, a state each."""
-    return [1.0 - (one / none) ** 2 for one, none in zip(armse, silent, strict=True)]
+    return [1.0 - (first / none) ** 2 for first, none in zip(armse, silent, strict=True)]
 
 
-def listed(values: Sequence[float], form: str = ".3g") -> str:
+def list_numbers(values: Sequence[float], form: str = ".3g") -> str:
     """Numbers side by side."""
     return ", ".join(format(value, form) for value in values)

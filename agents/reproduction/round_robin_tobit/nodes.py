@@ -7,8 +7,8 @@ import fusion_gym
 from fusion_gym.evaluation.episodes import record_episode
 from fusion_gym.evaluation.intervals import Interval
 
-from ..judging import told, verdict
-from ..shown import Claim, Picture, Shown, Table
+from ..judging import cite, verdict
+from ..piece_result import Claim, NumbersTable, Picture, PieceResult
 from . import figures, runs
 from .judging import always_below
 
@@ -20,35 +20,35 @@ _ENDS = ("mean", "low", "high")
 _READINGS = {"alone": "by itself", "node": "node of Table I"}
 
 
-def compute(episodes: int, seed: int) -> dict[str, Any]:
+def compute_nodes(episodes: int, seed: int) -> dict[str, Any]:
     """Local filters by themselves and as nodes to which the fused estimate is fed back."""
     task = fusion_gym.make_task(runs.OSCILLATOR)
     fused, local = runs.node_squares(task, runs.round_robin(task), episodes, seed)
     run = record_episode(task, runs.round_robin(task), seed)
-    found = {
-        "truth": run.truth, "fused_mean": run.mean, "fused_rmse": runs.curve(fused),
+    data = {
+        "truth": run.truth, "fused_mean": run.mean, "fused_rmse": runs.error_curve(fused),
         "fused_armse": runs.armse(fused),
     }  # fmt: skip
     for sensor in range(2):
-        alone = runs.squares(task, runs.Turn(sensor), episodes, seed)
-        found[f"alone_{sensor}_mean"] = record_episode(task, runs.Turn(sensor), seed).mean
-        found[f"node_{sensor}_mean"] = run.local_mean[:, sensor]
-        for name, other in (("alone", alone), ("node", local[:, :, sensor])):
-            found[f"{name}_{sensor}_rmse"] = runs.curve(other)
-            found[f"{name}_{sensor}_armse"] = runs.armse(other)
-            found[f"{name}_{sensor}_difference"] = runs.compared(fused, other)
-            found[f"{name}_{sensor}_increase"] = runs.increase(fused, other)
-    return found
+        single = runs.squares(task, runs.Turn(sensor), episodes, seed)
+        data[f"alone_{sensor}_mean"] = record_episode(task, runs.Turn(sensor), seed).mean
+        data[f"node_{sensor}_mean"] = run.local_mean[:, sensor]
+        for name, other in (("alone", single), ("node", local[:, :, sensor])):
+            data[f"{name}_{sensor}_rmse"] = runs.error_curve(other)
+            data[f"{name}_{sensor}_armse"] = runs.armse(other)
+            data[f"{name}_{sensor}_difference"] = runs.paired_increase(fused, other)
+            data[f"{name}_{sensor}_increase"] = runs.increase(fused, other)
+    return data
 
 
-def show(kept: dict[str, Any]) -> Shown:
+def show_nodes(data: dict[str, Any]) -> PieceResult:
     """Figures 7 to 9 with local filters by themselves, then once more with the nodes."""
-    pictures = [picture for name in _READINGS for picture in _pictures(kept, name)]
-    claims = [_outperforms(kept, "states", range(2), "Fig. 7", name) for name in _READINGS] + [
-        _outperforms(kept, "bias", range(2, 3), "Figs. 8 and 9", name) for name in _READINGS
+    pictures = [picture for name in _READINGS for picture in _pictures(data, name)]
+    claims = [_outperforms(data, "states", range(2), "Fig. 7", name) for name in _READINGS] + [
+        _outperforms(data, "bias", range(2, 3), "Figs. 8 and 9", name) for name in _READINGS
     ]
     rows = [
-        runs.armse_number(f"{label}: ARMSE{state + 1}", kept[f"{key}_armse"], state, None)
+        runs.armse_number(f"{label}: ARMSE{state + 1}", data[f"{key}_armse"], state, None)
         for key, label in (
             ("fused", "FTKF-DB"),
             *((f"alone_{i}", f"LTKF-DB-S{i + 1} by itself") for i in range(2)),
@@ -58,17 +58,17 @@ def show(kept: dict[str, Any]) -> Shown:
     ]
     heads = tuple(f"ARMSE{state + 1}" for state in range(3))
     note = "The paper prints none of them."
-    table = Table("nodes", "Mean over time of the curves", rows, note, heads)
-    return Shown(pictures, [table], claims, [_NOTE])
+    table = NumbersTable("nodes", "Mean over time of the curves", rows, note, heads)
+    return PieceResult(pictures, [table], claims, [_NOTE])
 
 
-def _outperforms(kept: dict[str, Any], what: str, states: range, where: str, name: str) -> Claim:
+def _outperforms(data: dict[str, Any], what: str, states: range, where: str, name: str) -> Claim:
     parts, words = [], []
     for sensor in range(2):
-        found = kept[f"{name}_{sensor}_increase"]
-        parts += [found["low"][state] > 0.0 for state in states]
-        _, often = always_below(kept[f"{name}_{sensor}_difference"][..., states])
-        ends = ", ".join(told(Interval(*(found[key][i] for key in _ENDS))) for i in states)
+        result = data[f"{name}_{sensor}_increase"]
+        parts += [result["low"][state] > 0.0 for state in states]
+        _, often = always_below(data[f"{name}_{sensor}_difference"][..., states])
+        ends = ", ".join(cite(Interval(*(result[key][i] for key in _ENDS))) for i in states)
         words.append(f"S{sensor + 1}'s ARMSE is larger by {ends}; the fused is {often}")
     return Claim(
         f"The fused filter outperforms both local ones in the {what} (each {_READINGS[name]})",
@@ -82,21 +82,21 @@ hears of the other; and the *node* of Table I, before the fusion, which starts e
 fused estimate with twice its covariance."""
 
 
-def _pictures(kept: dict[str, Any], name: str) -> list[Picture]:
+def _pictures(data: dict[str, Any], name: str) -> list[Picture]:
     label = _READINGS[name]
     suffix = "" if name == "alone" else "_nodes"
     which = f"local filter {label}" if name == "alone" else "local filter as node of Table I"
 
-    def lines(kind: str, state: int) -> list[figures.Line]:
-        nodes = [figures.node(i, kept[f"{name}_{i}_{kind}"][..., state]) for i in range(2)]
+    def lines(kind: str, state: int) -> list[figures.CurveLine]:
+        nodes = [figures.node(i, data[f"{name}_{i}_{kind}"][..., state]) for i in range(2)]
         if name == "node" and kind == "rmse":  # their bands are those of the fused
-            nodes = [one._replace(values=one.values[0]) for one in nodes]
-        return [*nodes, figures.aware(kept[f"fused_{kind}"][..., state])]
+            nodes = [node._replace(values=node.values[0]) for node in nodes]
+        return [*nodes, figures.aware(data[f"fused_{kind}"][..., state])]
 
-    means = [kept[f"{name}_{i}_armse"]["mean"] for i in range(2)]
-    fused = kept["fused_armse"]["mean"]
+    means = [data[f"{name}_{i}_armse"]["mean"] for i in range(2)]
+    fused = data["fused_armse"]["mean"]
     states = [(f"RMSE{i + 1} (of x{i + 1})", lines("rmse", i)) for i in range(2)]
-    said = ", ".join(
+    text = ", ".join(
         f"{means[0][i]:.3g} and {means[1][i]:.3g} beside {fused[i]:.3g} in {state}"
         for i, state in enumerate(("x1", "x2", "b"))
     )
@@ -104,7 +104,7 @@ def _pictures(kept: dict[str, Any], name: str) -> list[Picture]:
         Picture(
             f"figure_7{suffix}",
             f"Figure 7: RMSE1 and RMSE2, local and fused ({which})",
-            f"Means over time, sensors 1 and 2 beside the fused: {said}.",
+            f"Means over time, sensors 1 and 2 beside the fused: {text}.",
             partial(figures.curves, panels=states, from_zero=True),
             (7.2, 4.8),
         ),
@@ -114,7 +114,7 @@ def _pictures(kept: dict[str, Any], name: str) -> list[Picture]:
             f"One run, that of Figures 2 to 4. {_EIGHT[name]}",
             partial(
                 figures.curves,
-                panels=[("bias b", [*lines("mean", 2), figures.true(kept["truth"][:, 2])])],
+                panels=[("bias b", [*lines("mean", 2), figures.true(data["truth"][:, 2])])],
             ),
             (7.2, 3.4),
         ),

@@ -18,11 +18,11 @@ PAPER = Paper(
         ),
         Piece(
             "nodes", "The oscillator: local filters and the fused one",
-            nodes.compute, nodes.show, 12.0, 2000,
+            nodes.compute_nodes, nodes.show_nodes, 12.0, 2000,
         ),
         Piece(
             "tables", "The oscillator: censoring intervals and noise variances",
-            tables.compute, tables.show, 30.0, 2000,
+            tables.compute_tables, tables.show_tables, 30.0, 2000,
         ),
         Piece(
             "readings", "What was tried to reach the printed values",
@@ -34,7 +34,7 @@ PAPER = Paper(
         ),
         Piece(
             "theory", "Lemma 1, Theorems 1 and 2, remarks",
-            theory.compute, claims.show, 20.0, 1000,
+            theory.compute_theory, claims.show_round_robin_claims, 20.0, 1000,
         ),
         Piece(
             "bounds", "The bounds of Theorems 4 and 5",

@@ -73,7 +73,7 @@ READINGS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
 }  # fmt: skip
 
 
-def task_of(reading: str, **options: Any) -> Task:
+def reading_task(reading: str, **options: Any) -> Task:
     """The oscillator in a reading of :data:`READINGS`."""
     printed, changed = READINGS[reading]
     task = fusion_gym.make_task(OSCILLATOR, **(dict(changed) | options))

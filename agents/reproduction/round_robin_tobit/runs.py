@@ -18,7 +18,7 @@ from fusion_gym.evaluation.episodes import BATCH
 from fusion_gym.policies.base import Policy, Requests, Rule, parameter, shape_of
 from fusion_gym.systems.tobit.system import CensoredSystem
 
-from ..shown import Number
+from ..piece_result import Number
 
 OSCILLATOR = "fusion_gym/BiasedOscillator-v0"
 TRACKING = "fusion_gym/BiasedTracking-v0"
@@ -79,13 +79,13 @@ def walk(
 
 def squares(task: Task, policy: Policy, episodes: int, seed: int) -> Array:
     """Squared errors (episodes, H, states) of the fused estimate."""
-    found = np.empty((episodes, task.horizon, STATES))
+    values = np.empty((episodes, task.horizon, STATES))
 
     def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
-        found[runs, step] = outcome.squared_error.T
+        values[runs, step] = outcome.squared_error.T
 
     walk(task, policy, episodes, seed, look)
-    return found
+    return values
 
 
 def node_squares(task: Task, policy: Policy, episodes: int, seed: int) -> tuple[Array, Array]:
@@ -152,21 +152,21 @@ def _drawn(squared: Array) -> Array:
 
 
 def armse_number(
-    what: str, found: dict[str, list[float]], state: int, printed: float | None, unit: str = ""
+    what: str, lists: dict[str, list[float]], state: int, printed: float | None, unit: str = ""
 ) -> Number:
     """One entry of :func:`armse` beside the printed one."""
-    mean, low, high, spread = (found[key][state] for key in ("mean", "low", "high", "spread"))
+    mean, low, high, spread = (lists[key][state] for key in ("mean", "low", "high", "spread"))
     return Number(what, mean, low, high, printed, spread, unit)
 
 
-def curve(squared: Array) -> Array:
+def error_curve(squared: Array) -> Array:
     """RMSE over time with its 95 % interval: (3, H, states), the root mean, its low, its high."""
     mean = squared.mean(0)
     half = 1.96 * squared.std(0, ddof=1) / np.sqrt(len(squared))
     return np.sqrt(np.stack([mean, np.maximum(mean - half, 0.0), mean + half]))
 
 
-def compared(ours: Array, others: Array) -> Array:
+def paired_increase(ours: Array, others: Array) -> Array:
     """Paired difference of squared errors over time: (2, H, states), mean and standard error."""
     difference = ours - others
     return np.stack([difference.mean(0), difference.std(0, ddof=1) / np.sqrt(len(difference))])

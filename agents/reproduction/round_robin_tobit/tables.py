@@ -11,10 +11,10 @@ from fusion_gym.evaluation.intervals import mean_interval
 
 from ...output import palette
 from ..judging import verdict
-from ..shown import Claim, Number, Picture, Shown, Table
+from ..piece_result import Claim, Number, NumbersTable, Picture, PieceResult
 from . import figures, runs
-from .judging import listed
-from .readings import READINGS, task_of
+from .judging import list_numbers
+from .readings import READINGS, reading_task
 
 # Tables II and III of the paper: ARMSE1, ARMSE2, ARMSE3.
 TABLE_II = {
@@ -34,7 +34,7 @@ _HEADS = (
 _FILTERS = {"paper": "the paper's filter", "adf": "assumed-density filter"}
 
 
-def compute(episodes: int, seed: int) -> dict[str, Any]:
+def compute_tables(episodes: int, seed: int) -> dict[str, Any]:
     """All rows of both tables, by the paper's filter and by the assumed-density filter."""
     rows: dict[str, Any] = {}
     before: dict[str, Array] = {}
@@ -42,12 +42,12 @@ def compute(episodes: int, seed: int) -> dict[str, Any]:
         row: dict[str, Any] = {}
         for filter_ in _FILTERS:
             task = fusion_gym.make_task(runs.OSCILLATOR, filter=filter_, **options)
-            found = runs.squares(task, runs.round_robin(task), episodes, seed)
+            result = runs.squares(task, runs.round_robin(task), episodes, seed)
             # Both tables begin with the interval [-5, 5] and R = 0.6.
-            first = before.setdefault(f"first {filter_}", found)
-            earlier = before.get(filter_, found) if name != "variance 0.1" else first
-            row[filter_] = runs.armse(found) | _median(found) | {"rise": _rise(earlier, found)}
-            before[filter_] = found
+            first = before.setdefault(f"first {filter_}", result)
+            earlier = before.get(filter_, result) if name != "variance 0.1" else first
+            row[filter_] = runs.armse(result) | _median(result) | {"rise": _rise(earlier, result)}
+            before[filter_] = result
         variance = {"measurement_variance": options["measurement_variance"]}
         row["floor"] = runs.floor(runs.OSCILLATOR, **variance)
         row["floor_all"] = runs.floor(runs.OSCILLATOR, access="any", **variance)
@@ -72,24 +72,24 @@ def _rows() -> dict[str, dict[str, Any]]:
     }
 
 
-def _row(kept: dict[str, Any], name: str) -> dict[str, Any]:
-    return kept["rows"]["interval 5" if name == "variance 0.6" else name]
+def _row(data: dict[str, Any], name: str) -> dict[str, Any]:
+    return data["rows"]["interval 5" if name == "variance 0.6" else name]
 
 
-def _median(found: Array) -> dict[str, list[float]]:
+def _median(values: Array) -> dict[str, list[float]]:
     """Median over runs of a run's RMSE of x1, with its interval."""
-    middle, drawn = runs.medians(found)
+    middle, drawn = runs.medians(values)
     return {"median": [middle, *np.quantile(drawn, [0.025, 0.975]).tolist()]}
 
 
 def _rise(before: Array, after: Array) -> dict[str, Any]:
     """From one row to the next, of ARMSE1, 2, 3 and the median: ends of the paired intervals."""
-    found = runs.increase(before, after)
+    result = runs.increase(before, after)
     middle = np.quantile(runs.medians(after)[1] - runs.medians(before)[1], [0.025, 0.975])
-    return {end: [*found[end], float(middle[i])] for i, end in enumerate(("low", "high"))}
+    return {end: [*result[end], float(middle[i])] for i, end in enumerate(("low", "high"))}
 
 
-def show(kept: dict[str, Any]) -> Shown:
+def show_tables(data: dict[str, Any]) -> PieceResult:
     """Both tables, and what their values would break."""
     second = {f"[{-limit:g}, {limit:g}]": f"interval {limit:g}" for limit in TABLE_II}
     third = {f"R = {variance:g}": f"variance {variance:g}" for variance in TABLE_III}
@@ -101,23 +101,23 @@ def show(kept: dict[str, Any]) -> Shown:
     ):
         numbers = [
             runs.armse_number(
-                f"{label}, ARMSE{state + 1}", _row(kept, row)["paper"], state, values[state]
+                f"{label}, ARMSE{state + 1}", _row(data, row)["paper"], state, values[state]
             )
             for (label, row), values in zip(rows.items(), printed[name], strict=True)
             for state in range(3)
         ]
-        tables.append(Table(name, title, numbers))
-        pictures.append(_picture(kept, name, title, rows, np.array(printed[name])))
-    tables.append(_others(kept, second | third))
-    return Shown(pictures, tables, _claims(kept, list(second.values()), list(third.values())),
-                 [_broken(kept)])  # fmt: skip
+        tables.append(NumbersTable(name, title, numbers))
+        pictures.append(_picture(data, name, title, rows, np.array(printed[name])))
+    tables.append(_others(data, second | third))
+    return PieceResult(pictures, tables, _claims(data, list(second.values()), list(third.values())),
+                 [_broken(data)])  # fmt: skip
 
 
 def _picture(
-    kept: dict[str, Any], name: str, title: str, rows: dict[str, str], printed: Array
+    data: dict[str, Any], name: str, title: str, rows: dict[str, str], printed: Array
 ) -> Picture:
     def of(filter_: str, key: str) -> Array:
-        return np.array([_row(kept, row)[filter_][key] for row in rows.values()])
+        return np.array([_row(data, row)[filter_][key] for row in rows.values()])
 
     marks = [
         figures.Marks("printed", printed, palette.INK, "x"),
@@ -128,7 +128,7 @@ def _picture(
             )
         ),
     ]
-    floors = np.array([_row(kept, row)["floor"] for row in rows.values()])
+    floors = np.array([_row(data, row)["floor"] for row in rows.values()])
     axis = "uncensored interval" if name == "table_2" else "variance R of the sensors' noise"
     plain = [row.split(" = ")[-1] for row in rows]
     draw = partial(figures.table_marks, rows=plain, marks=marks, floors=floors, title=axis)
@@ -141,20 +141,20 @@ def _picture(
     )  # fmt: skip
 
 
-def _others(kept: dict[str, Any], rows: dict[str, str]) -> Table:
+def _others(data: dict[str, Any], rows: dict[str, str]) -> NumbersTable:
     numbers = []
     rows = {"[-5, 5], R = 0.6": "interval 5"} | {
         label: row for label, row in rows.items() if row not in ("interval 5", "variance 0.6")
     }
     for label, row in rows.items():
-        found = _row(kept, row)
+        result = _row(data, row)
         numbers += [
-            runs.armse_number(f"{label}: {head}", found["adf"], i, None)
+            runs.armse_number(f"{label}: {head}", result["adf"], i, None)
             for i, head in enumerate(_HEADS[:3])
         ]
         for filter_, head in zip(("adf", "paper"), _HEADS[3:], strict=True):
-            numbers.append(Number(f"{label}: {head}", *found[filter_]["median"]))
-    return Table(
+            numbers.append(Number(f"{label}: {head}", *result[filter_]["median"]))
+    return NumbersTable(
         "others", "The same rows by the assumed-density filter, and median runs of both", numbers,
         "The assumed-density filter takes a clipped value for what it says: an exact update of a "
         "Gaussian prior. A median run is that of the RMSE of x1 over time which half of all runs "
@@ -163,9 +163,9 @@ def _others(kept: dict[str, Any], rows: dict[str, str]) -> Table:
     )  # fmt: skip
 
 
-def _broken(kept: dict[str, Any]) -> str:
+def _broken(data: dict[str, Any]) -> str:
     entries = [
-        (value, _row(kept, name)["floor"][i], _row(kept, name)["floor_all"][i])
+        (value, _row(data, name)["floor"][i], _row(data, name)["floor_all"][i])
         for name, values in (
             *((f"interval {limit:g}", values) for limit, values in TABLE_II.items()),
             *((f"variance {v:g}", values) for v, values in TABLE_III.items() if v != 0.6),
@@ -179,34 +179,35 @@ def _broken(kept: dict[str, Any]) -> str:
     below = sum(value < chance * least for value, least, _ in entries)
     below_all = sum(value < chance * least for value, _, least in entries)
     bias = [values[2] for values in (TABLE_II[5.0], TABLE_III[0.1], TABLE_III[0.06])]
-    silent = kept["silent"]["mean"]
+    silent = data["silent"]["mean"]
     beyond = sum(
-        value > kept["silent"]["high"][i]
+        value > data["silent"]["high"][i]
         for limit in (1.0, 0.5)
         for i, value in enumerate(TABLE_II[limit])
     )
     rows = [
-        f"| R = {variance:g} | {listed(values, 'g')} | "
-        f"{listed(_row(kept, f'variance {variance:g}')['floor'], '.4f')} | "
-        f"{listed(_row(kept, f'variance {variance:g}')['floor_all'], '.4f')} |"
+        f"| R = {variance:g} | {list_numbers(values, 'g')} | "
+        f"{list_numbers(_row(data, f'variance {variance:g}')['floor'], '.4f')} | "
+        f"{list_numbers(_row(data, f'variance {variance:g}')['floor_all'], '.4f')} |"
         for variance, values in TABLE_III.items()
     ]
     return f"""**Tables II and III cannot be reproduced by any reading of the equations with the
 printed parameters.** The noise ε of (3) is independent of everything measured so far, so the
-bias's RMSE is at least √Ξ = {kept["bias_deviation"]:g} at every step; printed are
-{listed(bias, "g")}. The Kalman filter on the same packets *without* censoring has the least error
-of all filters, and clipping only takes information away: {below} of the {len(entries)} printed
+bias's RMSE is at least √Ξ = {data["bias_deviation"]:g} at every step; printed are
+{list_numbers(bias, "g")}. The Kalman filter on the same packets *without* censoring has the least \
+error of all filters, and clipping only takes information away: {below} of the {len(entries)} \
+printed
 values lie below that by more than chance (four standard deviations of {count:,} runs), and
 {below_all} even below what both sensors at every step would allow. In the two narrow intervals,
 {beyond} of the 6 printed values lie *above* the error without any measurements
-({listed(silent, ".3f")}).
+({list_numbers(silent, ".3f")}).
 
 | [-5, 5] | printed ARMSE1, 2, 3 | least, round robin | least, both sensors |
 |---|---|---|---|
 """ + "\n".join(rows)
 
 
-def _claims(kept: dict[str, Any], second: list[str], third: list[str]) -> list[Claim]:
+def _claims(data: dict[str, Any], second: list[str], third: list[str]) -> list[Claim]:
     claims = []
     for text, rows, source, end, sign in (
         ("The narrower the censoring interval, the larger the error of states and bias", second,
@@ -215,12 +216,12 @@ def _claims(kept: dict[str, Any], second: list[str], third: list[str]) -> list[C
          "Section IV.A, Table III", "high", -1.0),
     ):  # fmt: skip
         moved = {
-            filter_: np.array([sign * np.array(_row(kept, row)[filter_]["rise"][end])
+            filter_: np.array([sign * np.array(_row(data, row)[filter_]["rise"][end])
                                for row in rows[1:]]).min(0) > 0
             for filter_ in _FILTERS
         }  # fmt: skip
-        chain = " → ".join(f"({listed(_row(kept, row)['paper']['mean'])})" for row in rows)
-        middle = " → ".join(f"{_row(kept, row)['paper']['median'][0]:.3g}" for row in rows)
+        chain = " → ".join(f"({list_numbers(_row(data, row)['paper']['mean'])})" for row in rows)
+        middle = " → ".join(f"{_row(data, row)['paper']['median'][0]:.3g}" for row in rows)
         evidence = (
             f"from row to row of the table, {int(moved['paper'][:3].sum())} of 3 ARMSE of the "
             f"paper's filter move as claimed by more than chance: {chain}; the median run's RMSE "
@@ -233,19 +234,19 @@ def _claims(kept: dict[str, Any], second: list[str], third: list[str]) -> list[C
 
 def compute_readings(episodes: int, seed: int) -> dict[str, Any]:
     """ARMSE of every reading at the widest and the narrowest interval."""
-    found: dict[str, Any] = {}
+    data: dict[str, Any] = {}
     for reading in READINGS:
         for limit in (5.0, 0.5):
-            task = task_of(reading, censoring_threshold=-limit, censoring_upper=limit)
+            task = reading_task(reading, censoring_threshold=-limit, censoring_upper=limit)
             name = "always" if task.access == "any" else "round_robin"
             errors = runs.squares(task, fusion_gym.make_policy(name, task), episodes, seed)
             roots = np.sqrt(errors.mean((1, 2)))
             far = mean_interval((roots > 10.0).astype(float))
-            found[f"{reading} {limit:g}"] = runs.armse(errors) | {"far": list(far)}
-    return found
+            data[f"{reading} {limit:g}"] = runs.armse(errors) | {"far": list(far)}
+    return data
 
 
-def show_readings(kept: dict[str, Any]) -> Shown:
+def show_readings(data: dict[str, Any]) -> PieceResult:
     """A table in the notes, for it stands beside what is printed and tries to be none of it."""
     head = "| reading | ARMSE1 | ARMSE2 | ARMSE3 | runs far off |\n|---|---|---|---|---|"
     notes = [
@@ -259,13 +260,13 @@ def show_readings(kept: dict[str, Any]) -> Shown:
         values = " | ".join(f"{value:.4f}" for value in printed)
         rows = [f"| **printed, [{-limit:g}, {limit:g}]** | {values} | |"]
         for reading in READINGS:
-            one = kept[f"{reading} {limit:g}"]
+            single = data[f"{reading} {limit:g}"]
             cells = [
-                f"{one['mean'][i]:.3g} [{one['low'][i]:.3g}, {one['high'][i]:.3g}]"
+                f"{single['mean'][i]:.3g} [{single['low'][i]:.3g}, {single['high'][i]:.3g}]"
                 for i in range(3)
             ]
-            rows.append(f"| {reading} | {' | '.join(cells)} | {100 * one['far'][0]:.1f} % |")
-            factors = [one["mean"][i] / printed[i] for i in range(3)]
+            rows.append(f"| {reading} | {' | '.join(cells)} | {100 * single['far'][0]:.1f} % |")
+            factors = [single["mean"][i] / printed[i] for i in range(3)]
             off[reading] = max(off[reading], *factors, *(1.0 / factor for factor in factors))
         notes.append("\n".join([head, *rows]))
     best = min(off, key=off.__getitem__)
@@ -273,4 +274,4 @@ def show_readings(kept: dict[str, Any]) -> Shown:
         f"The closest over both rows, *{best}*, is off by a factor of {off[best]:.2g} in its worst "
         "entry."
     )
-    return Shown(notes=notes)
+    return PieceResult(notes=notes)

@@ -27,7 +27,7 @@ EXAMPLES: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def compute(episodes: int, seed: int) -> dict[str, Any]:
+def compute_theory(episodes: int, seed: int) -> dict[str, Any]:
     """What the claims of Lemma 1, Theorems 1 and 2 and the remarks are judged by."""
     return {
         **_lemma(episodes, seed),
@@ -75,37 +75,37 @@ def _errors(env: str, episodes: int, seed: int) -> dict[str, Any]:
     """Consistency, censoring probabilities and correlation in time, along the round robin."""
     task = fusion_gym.make_task(env)
     names = ("nees", "predicted", "uncensored", "sure", "surprised", "product", "first", "second")
-    found = {name: np.zeros(episodes) for name in names}
+    values = {name: np.zeros(episodes) for name in names}
     last = np.zeros((episodes, 3))
 
     def before(batch: EpisodeBatch, step: int, runs: slice) -> None:
         error = batch.state.truth - batch.state.prior_mean
         if step:
             earlier = last[runs].T
-            found["product"][runs] += error[2] * earlier[2]
-            found["first"][runs] += earlier[2] ** 2
-            found["second"][runs] += error[2] ** 2
+            values["product"][runs] += error[2] * earlier[2]
+            values["first"][runs] += earlier[2] ** 2
+            values["second"][runs] += error[2] ** 2
         last[runs] = error.T
         sensor = step % task.sensors
         signals = batch.signals()
         inside = np.asarray(signals["uncensored_probability"])[sensor, 0]
         free = ~np.asarray(signals["censored"])[sensor, 0]
         sure = inside < SURE
-        found["predicted"][runs] += inside
-        found["uncensored"][runs] += free
-        found["sure"][runs] += np.where(sure, inside, 0.0)
-        found["surprised"][runs] += sure & free
+        values["predicted"][runs] += inside
+        values["uncensored"][runs] += free
+        values["sure"][runs] += np.where(sure, inside, 0.0)
+        values["surprised"][runs] += sure & free
 
     def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
         assert np.all(scheduled(outcome) == step % task.sensors)
         mean, covariance = task.system.fused(batch.delivered)
         error = task.system.truth(batch.delivered) - mean
-        found["nees"][runs] += linalg.dot(error, linalg.solve_vector(covariance, error)) / 3.0
+        values["nees"][runs] += linalg.dot(error, linalg.solve_vector(covariance, error)) / 3.0
 
     walk(task, round_robin(task), episodes, seed, look, before)
     for name in ("nees", "predicted", "uncensored"):
-        found[name] /= task.horizon
-    return found
+        values[name] /= task.horizon
+    return values
 
 
 def _fusion(episodes: int, seed: int) -> dict[str, Any]:
@@ -130,13 +130,13 @@ def _fusion(episodes: int, seed: int) -> dict[str, Any]:
 
 
 def _means(task: Any, episodes: int, seed: int, policy: str = "round_robin") -> Array:
-    found = np.empty((task.horizon, 3, episodes))
+    values = np.empty((task.horizon, 3, episodes))
 
     def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
-        found[step, :, runs] = task.system.fused(batch.delivered)[0]
+        values[step, :, runs] = task.system.fused(batch.delivered)[0]
 
     walk(task, fusion_gym.make_policy(policy, task), episodes, seed, look)
-    return found
+    return values
 
 
 def _worth(episodes: int, seed: int) -> dict[str, Any]:
@@ -145,13 +145,13 @@ def _worth(episodes: int, seed: int) -> dict[str, Any]:
         "paper": {}, "adf": {"filter": "adf"}, "kalman": {"filter": "kalman"},
         "free": {"filter": "kalman"} | FREE, "calm": {"bias_noise_covariance": [[0.0025]]},
     }  # fmt: skip
-    found: dict[str, Any] = {}
+    data: dict[str, Any] = {}
     for name, options in settings.items():
         task = fusion_gym.make_task(OSCILLATOR, **options)
         errors = squares(task, round_robin(task), episodes, seed)
-        found[f"mse_{name}"] = errors.sum(2).mean(1)
-        found[f"armse_{name}"] = armse(errors)["mean"]
-    return found
+        data[f"mse_{name}"] = errors.sum(2).mean(1)
+        data[f"armse_{name}"] = armse(errors)["mean"]
+    return data
 
 
 def compute_bounds(episodes: int, seed: int) -> dict[str, Any]:
@@ -159,5 +159,5 @@ def compute_bounds(episodes: int, seed: int) -> dict[str, Any]:
     return {
         f"{name}:{key}": value
         for name, (env, options) in EXAMPLES.items()
-        for key, value in bounds.compute(env, episodes, seed, **options).items()
+        for key, value in bounds.compute_bound_recursion(env, episodes, seed, **options).items()
     }

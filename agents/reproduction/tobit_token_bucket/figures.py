@@ -43,11 +43,11 @@ def tokens(
     (refused,) = lower.plot([], [], "x", color=INK, ms=5, mew=1.0)
     for sensor in range(count):
         colour, row = SENSORS[sensor], count - sensor
-        for chosen, mark, size, width in (
+        for selection, mark, size, width in (
             (granted[:, sensor], "|", 9, 1.8),
             (requested[:, sensor] & ~granted[:, sensor], "x", 4, 1.0),
         ):
-            times = time[chosen]
+            times = time[selection]
             lower.plot(times, np.full(len(times), row), mark, color=colour, ms=size, mew=width)
     lower.set_yticks(range(1, count + 1), [f"node {count - row}" for row in range(count)])
     lower.set_ylim(0.4, count + 0.6)
@@ -64,7 +64,7 @@ def tokens(
     above(figure, [line, least, sent, refused], 4)
 
 
-def measurements(figure: Any, measured: Array, held: Array, component: int) -> None:
+def draw_measurements(figure: Any, measured: Array, held: Array, component: int) -> None:
     """Figures 3 and 4: ``measured`` and ``held`` (H, l, m), one panel a node."""
     count = measured.shape[1]
     axes = figure.subplots(count, 1, sharex=True, sharey=True)
@@ -109,20 +109,20 @@ def states(figure: Any, truth: Array, local: Array, fused: Array, sensor: int) -
     above(figure, handles, 4)
 
 
-def errors(figure: Any, one: dict[str, Array], mean: dict[str, Array], sensor: int) -> None:
+def draw_errors(figure: Any, item: dict[str, Array], mean: dict[str, Array], sensor: int) -> None:
     """Figures 8 to 10: lg of squared errors and of the traces of the bounds.
 
-    ``one`` has curves (H,) of a run, ``mean`` those of the mean over runs: ``local_error``,
+    ``item`` has curves (H,) of a run, ``mean`` those of the mean over runs: ``local_error``,
     ``fused_error``, ``local_trace`` and ``fused_trace``.
     """
     axes = figure.subplots(2, 1, sharex=True)
     own = SENSORS[sensor]
-    for axis, found, title in zip(
-        axes, (one, mean), ("one episode", "mean over all episodes"), strict=True
+    for axis, value, title in zip(
+        axes, (item, mean), ("one episode", "mean over all episodes"), strict=True
     ):
-        time = np.arange(1, len(found["fused_error"]) + 1)
+        time = np.arange(1, len(value["fused_error"]) + 1)
         handles = [
-            axis.plot(time, np.log10(found[name]), color=colour, lw=width, ls=line, label=label)[0]
+            axis.plot(time, np.log10(value[name]), color=colour, lw=width, ls=line, label=label)[0]
             for name, colour, width, line, label in (
                 ("local_trace", own, 2.4, "-", f"bound, node {sensor + 1}"),
                 ("local_error", own, 1.3, (0, (2.5, 0.8)), f"squared error, node {sensor + 1}"),

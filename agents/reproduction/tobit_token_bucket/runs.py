@@ -92,20 +92,20 @@ def scheme(**options: Any) -> Task:
     return fusion_gym.make_task(TobitOscillatorOptions(**options))
 
 
-def alone(sensor: int) -> Task:
+def single_sensor(sensor: int) -> Task:
     """A sensor whose filter works by itself, with its third of the bucket and no feedback."""
-    chosen, trigger = TobitOscillatorOptions(), DynamicEvent()
+    options, trigger = TobitOscillatorOptions(), DynamicEvent()
     return scheme(
         measurement_matrices=(np.eye(2).tolist(),),
-        token_rate=chosen.token_rate / SENSORS,
-        token_capacity=chosen.token_capacity / SENSORS,
-        initial_tokens=chosen.initial_tokens / SENSORS,
+        token_rate=options.token_rate / SENSORS,
+        token_capacity=options.token_capacity / SENSORS,
+        initial_tokens=options.initial_tokens / SENSORS,
         trigger_threshold=trigger.column("threshold", SENSORS)[sensor],
         trigger_decay=trigger.column("decay", SENSORS)[sensor],
     )
 
 
-def record(task: Task, episodes: int, seed: int, policy: Policy | None = None) -> History:
+def record_history(task: Task, episodes: int, seed: int, policy: Policy | None = None) -> History:
     """Run the paper's trigger, or another policy, and keep everything."""
     policy = fusion_gym.make_policy(TRIGGER, task) if policy is None else policy
     batch = EpisodeBatch.seeded(task, episodes, seed)
@@ -116,7 +116,7 @@ def record(task: Task, episodes: int, seed: int, policy: Policy | None = None) -
         outcome = batch.step(policy(batch.signals()))
         state = batch.delivered
         planned, expected = state.prediction.outcomes, state.prediction.expectation
-        found = {
+        values = {
             "truth": state.truth,
             "measurement": state.measurement,
             "held": state.held,
@@ -138,6 +138,6 @@ def record(task: Task, episodes: int, seed: int, policy: Policy | None = None) -
             "mean": state.mean,
             "bound": state.covariance,
         }
-        for name, value in found.items():
+        for name, value in values.items():
             rows[name].append(np.array(value))
     return History(**{name: np.array(row) for name, row in rows.items()})

@@ -6,10 +6,10 @@ import numpy as np
 
 import fusion_gym
 
-from ..judging import below, estimate, percent, told, verdict
+from ..judging import below, cite, estimate, percent, verdict
 from ..paper import Piece
-from ..shown import Claim, Number, Shown, Table
-from .runs import SENSORS, TRIGGER, Failing, record, scheme
+from ..piece_result import Claim, Number, NumbersTable, PieceResult
+from .runs import SENSORS, TRIGGER, Failing, record_history, scheme
 from .theory import claimed, conditioned, perturbed, terms
 
 _NODES = range(SENSORS)
@@ -18,25 +18,25 @@ _LONG = 1000  # steps
 _WINDOW = 200
 
 
-def compute(episodes: int, seed: int) -> dict[str, Any]:
+def compute_token_bucket_theorems(episodes: int, seed: int) -> dict[str, Any]:
     """Bounds, gains and condition (42) on recorded episodes; long runs, starved runs, failures."""
     task = scheme()
     few = max(2, episodes // 10)
-    found = record(task, episodes, seed)
-    gaps = [found.truth - found.mean, *(found.truth - found.local_mean[:, m] for m in _NODES)]
-    bounds = [found.bound, *(found.local_bound[:, m] for m in _NODES)]
+    result = record_history(task, episodes, seed)
+    gaps = [result.truth - result.mean, *(result.truth - result.local_mean[:, m] for m in _NODES)]
+    bounds = [result.bound, *(result.local_bound[:, m] for m in _NODES)]
     eigenvalues = [claimed(gap, bound) for gap, bound in zip(gaps, bounds, strict=True)]
-    recorded = record(task, few, seed)
+    recorded = record_history(task, few, seed)
     parts = terms(task, recorded)
-    never = record(task, few, seed, fusion_gym.make_policy("never", task))
-    long = record(scheme(horizon=_LONG), few, seed)
+    never = record_history(task, few, seed, fusion_gym.make_policy("never", task))
+    long = record_history(scheme(horizon=_LONG), few, seed)
     windows = long.fused_error.reshape(-1, _WINDOW, few).mean(1)
     traces = long.fused_trace.reshape(-1, _WINDOW, few).mean(1)
     failed = [
-        record(task, episodes, seed, Failing(fusion_gym.make_policy(TRIGGER, task), m))
+        record_history(task, episodes, seed, Failing(fusion_gym.make_policy(TRIGGER, task), m))
         for m in _NODES
     ]
-    alone = record(task, episodes, seed, fusion_gym.make_policy("never", task))
+    single = record_history(task, episodes, seed, fusion_gym.make_policy("never", task))
     return {
         "eigenvalue": np.array([value for value, _ in eigenvalues]),
         "eigenvalue_error": np.array([error for _, error in eigenvalues]),
@@ -45,36 +45,36 @@ def compute(episodes: int, seed: int) -> dict[str, Any]:
         "growth": np.exp(np.diff(np.log(never.fused_trace), axis=0)).mean(0),
         "windows": windows,
         "traces": traces,
-        "healthy": found.fused_error.mean(0),
-        "failed": np.array([one.fused_error.mean(0) for one in failed]),
+        "healthy": result.fused_error.mean(0),
+        "failed": np.array([item.fused_error.mean(0) for item in failed]),
         "failed_local": np.array([failed[m].local_error[:, m].mean(0) for m in _NODES]),
-        "silent": alone.fused_error.mean(0),
+        "silent": single.fused_error.mean(0),
         "few": few,
     }
 
 
-def show(found: dict[str, Any]) -> Shown:
+def show_token_bucket_theorems(data: dict[str, Any]) -> PieceResult:
     """Verdicts of the theorems; the numbers behind them."""
     theorems = [
-        Number.of("share of gains beside (37) with a larger bound: mean", found["gain_larger"]),
-        Number.of("(42) holds, share of deliveries: mean", found["holds_delivered"]),
-        Number.of("(42) holds, share of steps without: mean", found["holds_silent"]),
-        Number.of("growth a step of the trace if nothing is sent: mean", found["growth"]),
+        Number.of("share of gains beside (37) with a larger bound: mean", data["gain_larger"]),
+        Number.of("(42) holds, share of deliveries: mean", data["holds_delivered"]),
+        Number.of("(42) holds, share of steps without: mean", data["holds_silent"]),
+        Number.of("growth a step of the trace if nothing is sent: mean", data["growth"]),
     ]
     failures = [
-        Number.of("no sensor: fused squared error", found["healthy"]),
-        *(Number.of(f"sensor {m + 1}: fused squared error", found["failed"][m]) for m in _NODES),
-        Number.of("all sensors: fused squared error", found["silent"]),
+        Number.of("no sensor: fused squared error", data["healthy"]),
+        *(Number.of(f"sensor {m + 1}: fused squared error", data["failed"][m]) for m in _NODES),
+        Number.of("all sensors: fused squared error", data["silent"]),
     ]
     tables = [
-        Table(
+        NumbersTable(
             "theorems",
             "Theorems",
             theorems,
-            f"Means over time and {found['few']:,} of the episodes.",
+            f"Means over time and {data['few']:,} of the episodes.",
             ("mean",),
         ),
-        Table(
+        NumbersTable(
             "failures",
             "Sensors that have failed",
             failures,
@@ -82,11 +82,11 @@ def show(found: dict[str, Any]) -> Shown:
             ("fused squared error",),
         ),
     ]
-    return Shown((), tables, [*_bounds(found), _gain(found), _bounded(found), _resilient(found)])
+    return PieceResult((), tables, [*_bounds(data), _gain(data), _bounded(data), _resilient(data)])
 
 
-def _bounds(found: dict[str, Any]) -> list[Claim]:
-    value, error = found["eigenvalue"], found["eigenvalue_error"]
+def _bounds(data: dict[str, Any]) -> list[Claim]:
+    value, error = data["eigenvalue"], data["eigenvalue_error"]
     covered = (value - _CLEAR * error <= 1.0).all(-1)
     largest = value.max(-1)
     what = (
@@ -100,7 +100,7 @@ def _bounds(found: dict[str, Any]) -> list[Claim]:
             "Theorem 1, (28)",
             verdict(covered[1:]),
             f"{what}: its highest value over time is "
-            + ", ".join(f"{one:.2f}" for one in largest[1:])
+            + ", ".join(f"{item:.2f}" for item in largest[1:])
             + f" at nodes 1, 2, 3; its mean says that the bound is {loose:.0f} times too large. "
             "The proof takes censoring as independent of the noise, so this is found, not proven.",
         ),
@@ -115,55 +115,60 @@ def _bounds(found: dict[str, Any]) -> list[Claim]:
     ]
 
 
-def _gain(found: dict[str, Any]) -> Claim:
-    share, used = found["gain_larger"], found["gain_counted"].mean()
+def _gain(data: dict[str, Any]) -> Claim:
+    share, used = data["gain_larger"], data["gain_counted"].mean()
     return Claim(
         "The gain (37) minimises the trace of the bound (30).",
         "Theorem 2",
-        verdict([bool(np.all(share >= 1.0 - 1e-12)), bool(found["gain_difference"].max() < 1e-9)]),
+        verdict([bool(np.all(share >= 1.0 - 1e-12)), bool(data["gain_difference"].max() < 1e-9)]),
         f"Of random other gains {percent(float(share.mean()))} have a larger trace. (30) written "
         "out as printed, with the readings of the environment's page, agrees with the filter's "
-        f"trace to a relative {found['gain_difference'].max():.0e}, in the {percent(float(used))} "
+        f"trace to a relative {data['gain_difference'].max():.0e}, in the {percent(float(used))} "
         "of steps in which no component is nearly surely censored.",
     )
 
 
-def _bounded(found: dict[str, Any]) -> Claim:
-    first, last = found["windows"][1], found["windows"][-1]
-    least = float(found["least_silent"].min())
+def _bounded(data: dict[str, Any]) -> Claim:
+    first, last = data["windows"][1], data["windows"][-1]
+    least = float(data["least_silent"].min())
     always = bool(
-        found["holds_silent"].min() == 1.0 and found["holds_delivered"].min() == 1.0
+        data["holds_silent"].min() == 1.0 and data["holds_delivered"].min() == 1.0
     )  # in every step, as the theorem asks
-    stays = not below(first * 1.2, last) and not below(
-        found["traces"][1] * 1.5, found["traces"][-1]
-    )
+    stays = not below(first * 1.2, last) and not below(data["traces"][1] * 1.5, data["traces"][-1])
     return Claim(
         "Condition (42) holds in the example, and the error is bounded in mean square.",
         "Theorem 3, (42)",
         verdict((always, stays)),
-        f"(42) holds in {percent(float(found['holds_delivered'].mean()))} of the steps in which a "
-        f"node receives and in {percent(float(found['holds_silent'].mean()))} of the others, where "
+        f"(42) holds in {percent(float(data['holds_delivered'].mean()))} of the steps in which a "
+        f"node receives and in {percent(float(data['holds_silent'].mean()))} of the others, where "
         f"its left side is at least {least:.2f}: the theorem does not apply. The error stays "
-        f"bounded all the same: squared error {told(estimate(first))} in steps "
-        f"{_WINDOW + 1} to {2 * _WINDOW} and {told(estimate(last))} in the last {_WINDOW} of "
+        f"bounded all the same: squared error {cite(estimate(first))} in steps "
+        f"{_WINDOW + 1} to {2 * _WINDOW} and {cite(estimate(last))} in the last {_WINDOW} of "
         f"{_LONG}. If nothing is ever sent, the bound grows by a factor of "
-        f"{found['growth'].mean():.2f} a step.",
+        f"{data['growth'].mean():.2f} a step.",
     )  # fmt: skip
 
 
-def _resilient(found: dict[str, Any]) -> Claim:
-    parts = [below(found["failed"][m], found["silent"]) for m in _NODES]
-    kept = [not below(found["healthy"] * 1.1, found["failed"][m]) for m in _NODES]
+def _resilient(data: dict[str, Any]) -> Claim:
+    parts = [below(data["failed"][m], data["silent"]) for m in _NODES]
+    stored = [not below(data["healthy"] * 1.1, data["failed"][m]) for m in _NODES]
     return Claim(
         "If a sensor fails, the others' data keep the filters good.",
         "Section 4, last paragraph",
-        verdict([*parts, *kept]),
-        f"Fused squared error {told(estimate(found['healthy']))} with all sensors; with sensor 1, "
+        verdict([*parts, *stored]),
+        f"Fused squared error {cite(estimate(data['healthy']))} with all sensors; with sensor 1, "
         "2 or 3 silent "
-        + ", ".join(told(estimate(found["failed"][m])) for m in _NODES)
-        + f"; with all three silent {told(estimate(found['silent']))}. That an error falls when a "
+        + ", ".join(cite(estimate(data["failed"][m])) for m in _NODES)
+        + f"; with all three silent {cite(estimate(data['silent']))}. That an error falls when a "
         "sensor fails shows what the held updates cost, and that its tokens serve the others.",
     )
 
 
-THEOREMS = Piece("theorems", "Theorems and failures of sensors", compute, show, 25.0, 2000)
+THEOREMS = Piece(
+    "theorems",
+    "Theorems and failures of sensors",
+    compute_token_bucket_theorems,
+    show_token_bucket_theorems,
+    25.0,
+    2000,
+)

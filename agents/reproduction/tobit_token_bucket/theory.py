@@ -18,14 +18,14 @@ _FLOOR = 1e-140  # of q where it divides and the ratio is squared
 class Terms(NamedTuple):
     """(30) of a node and step as κ₁ (I - K q C) P (I - K q C)ᵀ + K S Kᵀ, in units of q.
 
-    ``prior`` P (…, n, n) · ``seen`` C (…, m, n) · ``probability`` q (…, m) · ``noise`` q⁻¹ S q⁻¹
+    ``prior`` P (…, n, n) · ``matrix`` C (…, m, n) · ``probability`` q (…, m) · ``noise`` q⁻¹ S q⁻¹
     without the held value's square and ``pinned`` √κ₅ ȳ/q, zero where something arrived ·
     ``silent`` where nothing did. Axes: steps, nodes, episodes first.
     """
 
     first: float
     prior: Array
-    seen: Array
+    matrix: Array
     probability: Array
     noise: Array
     pinned: Array
@@ -34,15 +34,15 @@ class Terms(NamedTuple):
     @property
     def gain(self) -> Array:
         """K q by (37), without loss where ȳ/q is huge (Sherman and Morrison)."""
-        cross = self.first * self.prior @ _transposed(self.seen)
-        inverse = np.linalg.inv(self.seen @ cross + self.noise)
+        cross = self.first * self.prior @ _transposed(self.matrix)
+        inverse = np.linalg.inv(self.matrix @ cross + self.noise)
         turned = inverse @ self.pinned[..., None]
         size = 1.0 + self.pinned[..., None, :] @ turned
         return cross @ (inverse - turned / size @ _transposed(turned))
 
     def bound(self, gain: Array) -> Array:
         """Trace of (30) for any K q."""
-        keep = np.eye(self.prior.shape[-1]) - gain @ self.seen
+        keep = np.eye(self.prior.shape[-1]) - gain @ self.matrix
         pinned = gain @ self.pinned[..., None]
         return _trace(
             self.first * keep @ self.prior @ _transposed(keep)
@@ -53,7 +53,7 @@ class Terms(NamedTuple):
     @property
     def contraction(self) -> Array:
         """κ₁ w a² of (42), a the largest singular value of a rotation, which is 1."""
-        keep = np.eye(self.prior.shape[-1]) - self.gain @ self.seen
+        keep = np.eye(self.prior.shape[-1]) - self.gain @ self.matrix
         return self.first * np.linalg.norm(keep, ord=2, axis=(-2, -1)) ** 2
 
 
@@ -67,11 +67,11 @@ def terms(task: Task, history: History) -> Terms:
     horizon, _, episodes = history.truth.shape
     share = centre.feedback.share[:, 0]
     prior = np.moveaxis(history.prior_covariance, -1, 1)[:, None] / share[:, None, None, None]
-    seen = sensors.measurement_matrix[..., 0][:, None]
+    observed = sensors.measurement_matrix[..., 0][:, None]
     q = np.moveaxis(history.uncensored, -1, 2)
     mean = np.moveaxis(history.prior_mean, -1, 1)
-    latent = (seen @ mean[:, None, ..., None])[..., 0]
-    moment = grow * seen @ prior @ _transposed(seen) + shift * _squared(latent)
+    latent = (observed @ mean[:, None, ..., None])[..., 0]
+    moment = grow * observed @ prior @ _transposed(observed) + shift * _squared(latent)
     bias = np.moveaxis(history.hazard, -1, 2) * sensors.deviation[:, None, :, 0]
     time = np.arange(1.0, horizon + 1.0)
     event = centre.filter.event_error.at(time).T[:, :, None, None]
@@ -85,7 +85,7 @@ def terms(task: Task, history: History) -> Terms:
     return Terms(
         first=k1,
         prior=np.broadcast_to(prior, (horizon, len(share), episodes, *prior.shape[-2:])),
-        seen=seen,
+        matrix=observed,
         probability=q,
         noise=noise,
         pinned=np.where(silent[..., None], np.sqrt(k5) * held, 0.0),
@@ -93,7 +93,7 @@ def terms(task: Task, history: History) -> Terms:
     )
 
 
-def perturbed(found: Terms, history: History, seed: int) -> dict[str, Array]:
+def perturbed(value: Terms, history: History, seed: int) -> dict[str, Array]:
     """Theorem 2 by trial: other gains, and the library's bound beside (30).
 
     Per episode (E,), over its steps with q of at least 0.01: ``larger``, the share of gains K + ΔK
@@ -101,15 +101,15 @@ def perturbed(found: Terms, history: History, seed: int) -> dict[str, Array]:
     largest relative difference of the trace from that of the filter.
     """
     generator = np.random.default_rng(seed)
-    usable = found.probability.min(-1) >= _UNCENSORED
-    gain = found.gain
-    least = found.bound(gain)
+    usable = value.probability.min(-1) >= _UNCENSORED
+    gain = value.gain
+    least = value.bound(gain)
     size = np.linalg.norm(gain, axis=(-2, -1))[..., None, None]
     larger = np.zeros(usable.shape)
     scales = (1e-3, 1e-2, 1e-1, 1.0)
     for scale in scales:
         other = gain + scale * size * generator.standard_normal(gain.shape)
-        larger += (found.bound(other) >= least * (1.0 - 1e-12)) / len(scales)
+        larger += (value.bound(other) >= least * (1.0 - 1e-12)) / len(scales)
     library = np.moveaxis(history.local_trace, -1, 2)
     difference = np.where(usable, np.abs(least / library - 1.0), 0.0)
     counted = usable.sum((0, 1))
@@ -120,14 +120,14 @@ def perturbed(found: Terms, history: History, seed: int) -> dict[str, Array]:
     }
 
 
-def conditioned(found: Terms) -> dict[str, Array]:
+def conditioned(value: Terms) -> dict[str, Array]:
     """Condition (42) by episode (E,): the share of steps in which it holds, of each kind."""
-    holds = found.contraction < 1.0
-    silent = found.silent
+    holds = value.contraction < 1.0
+    silent = value.silent
     return {
         "holds_delivered": (holds & ~silent).sum((0, 1)) / np.maximum((~silent).sum((0, 1)), 1),
         "holds_silent": (holds & silent).sum((0, 1)) / np.maximum(silent.sum((0, 1)), 1),
-        "least_silent": np.where(silent, found.contraction, np.inf).min((0, 1)),
+        "least_silent": np.where(silent, value.contraction, np.inf).min((0, 1)),
     }
 
 

@@ -4,9 +4,9 @@ from typing import Any
 
 from fusion_gym.arrays import Array
 
-from ..judging import below, estimate, percent, told, verdict
-from ..shown import Claim, Number, Shown, Table
-from .figures import pictures
+from ..judging import below, cite, estimate, percent, verdict
+from ..piece_result import Claim, Number, NumbersTable, PieceResult
+from .figures import unknown_input_pictures
 from .filters import FIXED, OURS, WALK
 from .runs import CARTS, EXAMPLES, NAMES, PRINTED
 
@@ -16,24 +16,24 @@ _GROWN = 1.1  # second half over first half of an episode: more is growth
 KINDS = ("states", "inputs")
 
 
-def show(found: dict[str, Any]) -> Shown:
+def show_unknown_input_claims(data: dict[str, Any]) -> PieceResult:
     """The paper's figures, a table of other filters, and the claims about both."""
     columns = ("rate in %", "MSE of the states", "MSE of the inputs")
     numbers = []
     for example in EXAMPLES:
-        mse, rates = found[f"{example}_mse"], found[f"{example}_rates"]
-        for place, setting in enumerate(found["settings"]):
+        mse, rates = data[f"{example}_mse"], data[f"{example}_rates"]
+        for place, setting in enumerate(data["settings"]):
             samples = (100.0 * rates[place].mean(0), *mse[place])
             numbers += [
                 Number.of(f"{NAMES[example]}, {setting}: {column}", sample)
                 for column, sample in zip(columns, samples, strict=True)
             ]
-    powers = {e: found[f"{e}_power"].mean(-1) for e in EXAMPLES}
+    powers = {e: data[f"{e}_power"].mean(-1) for e in EXAMPLES}
     own = "; ".join(f"{NAMES[e]} {powers[e][0]:.3g} and {powers[e][1]:.3g}" for e in EXAMPLES)
-    return Shown(
-        pictures=pictures(found),
+    return PieceResult(
+        pictures=unknown_input_pictures(data),
         tables=[
-            Table(
+            NumbersTable(
                 "settings",
                 "Fused errors under several filters and triggers",
                 numbers,
@@ -41,17 +41,17 @@ def show(found: dict[str, Any]) -> Shown:
                 columns,
             )
         ],
-        claims=[*_tracking(found), *_theorems(found), *_saving(found)],
+        claims=[*_tracking(data), *_theorems(data), *_saving(data)],
     )
 
 
-def _relative(found: dict[str, Any], example: str, block: int, setting: str = OURS) -> Array:
+def _relative(data: dict[str, Any], example: str, block: int, setting: str = OURS) -> Array:
     """Fused squared errors (E,) over the mean square of what is estimated."""
-    mse = found[f"{example}_mse"][found["settings"].index(setting), block]
-    return mse / found[f"{example}_power"][block].mean()
+    mse = data[f"{example}_mse"][data["settings"].index(setting), block]
+    return mse / data[f"{example}_power"][block].mean()
 
 
-def _tracking(found: dict[str, Any]) -> list[Claim]:
+def _tracking(data: dict[str, Any]) -> list[Claim]:
     claims = []
     for block, (text, figure) in enumerate(
         (
@@ -59,34 +59,34 @@ def _tracking(found: dict[str, Any]) -> list[Claim]:
             ("The input estimates accurately track the true inputs.", "Figure 2"),
         )
     ):
-        ours, carts = (estimate(_relative(found, e, block)) for e in EXAMPLES)
-        walk = estimate(_relative(found, PRINTED, block, WALK))
+        ours, carts = (estimate(_relative(data, e, block)) for e in EXAMPLES)
+        walk = estimate(_relative(data, PRINTED, block, WALK))
         claims.append(
             Claim(
                 text,
                 f"Section 4, {figure}",
                 verdict([ours.high < _TRACKED]),
-                f"Fused squared error over the mean square of the {KINDS[block]}: {told(ours)} on "
-                f"the printed example, {told(carts)} on the carts (we call less than {_TRACKED:g} "
+                f"Fused squared error over the mean square of the {KINDS[block]}: {cite(ours)} on "
+                f"the printed example, {cite(carts)} on the carts (we call less than {_TRACKED:g} "
                 "accurate). A Kalman filter with a random-walk input reaches "
-                f"{told(walk)} on the printed example with the same packets.",
+                f"{cite(walk)} on the printed example with the same packets.",
             )
         )
     return claims
 
 
-def _theorems(found: dict[str, Any]) -> list[Claim]:
-    under = {e: (found[f"{e}_square"] <= found[f"{e}_bound"]).mean() for e in EXAMPLES}
-    filled = {e: found[f"{e}_filled"] for e in EXAMPLES}
+def _theorems(data: dict[str, Any]) -> list[Claim]:
+    under = {e: (data[f"{e}_square"] <= data[f"{e}_bound"]).mean() for e in EXAMPLES}
+    filled = {e: data[f"{e}_filled"] for e in EXAMPLES}
     tops = {
         e: [[estimate(sample) for sample in place] for place in each] for e, each in filled.items()
     }
     nodes = {e: max(t.high for place in tops[e][1:] for t in place) for e in EXAMPLES}
     fused = {e: max(t.high for t in tops[e][0]) for e in EXAMPLES}
-    radius = {e: float(found[f"{e}_radius"].max()) for e in EXAMPLES}
-    growth = {e: estimate(_growth(found[f"{e}_steady"])) for e in EXAMPLES}
-    ranges = {e: found[f"{e}_rho_range"] for e in EXAMPLES}
-    settled = {e: estimate(found[f"{e}_settled"]) for e in EXAMPLES}
+    radius = {e: float(data[f"{e}_radius"].max()) for e in EXAMPLES}
+    growth = {e: estimate(_growth(data[f"{e}_steady"])) for e in EXAMPLES}
+    ranges = {e: data[f"{e}_rho_range"] for e in EXAMPLES}
+    settled = {e: estimate(data[f"{e}_settled"]) for e in EXAMPLES}
     return [
         Claim(
             "The MSE lies below the trace of the minimum upper bound.",
@@ -119,7 +119,7 @@ def _theorems(found: dict[str, Any]) -> list[Claim]:
                 + [each < 1.0 for each in radius.values()]
             ),
             "Fused squared error in the second half of the episodes over that in the first: "
-            + by_example({e: told(growth[e]) for e in EXAMPLES})
+            + by_example({e: cite(growth[e]) for e in EXAMPLES})
             + "; the error's largest spectral radius, √(1 + ε) included, is "
             + by_example({e: f"{radius[e]:.2g}" for e in EXAMPLES})
             + ". (The theorem's own condition (23) is met by all positive numbers.)",
@@ -133,15 +133,15 @@ def _theorems(found: dict[str, Any]) -> list[Claim]:
             "Its least change is "
             + by_example({e: f"{ranges[e][0]:.2g}" for e in EXAMPLES})
             + ". So it adapts once: every threshold is within 1 % of ρ̄ after "
-            + by_example({e: told(settled[e], 2) for e in EXAMPLES})
+            + by_example({e: cite(settled[e], 2) for e in EXAMPLES})
             + " instants of an episode.",
         ),
         Claim(
             "Whatever is not transmitted differs from the last transmission by at most ρ̄.",
             "(5), (6), Lemma 2",
-            verdict(found[f"{e}_kept"] == 1.0 for e in EXAMPLES),
+            verdict(data[f"{e}_kept"] == 1.0 for e in EXAMPLES),
             "In "
-            + by_example({e: percent(found[f"{e}_kept"]) for e in EXAMPLES})
+            + by_example({e: percent(data[f"{e}_kept"]) for e in EXAMPLES})
             + " of all silent instants.",
         ),
     ]
@@ -151,22 +151,22 @@ def _growth(steady: Array) -> Array:
     return steady[1] / steady[0].mean()
 
 
-def _saving(found: dict[str, Any]) -> list[Claim]:
-    ours, fixed = (found["settings"].index(name) for name in (OURS, FIXED))
-    rates = {e: found[f"{e}_rates"][ours] for e in EXAMPLES}
-    every = {e: [told(estimate(100.0 * each)) for each in rates[e]] for e in EXAMPLES}
-    constant = {e: told(estimate(100.0 * found[f"{e}_rates"][fixed].mean(0))) for e in EXAMPLES}
-    adaptive = {e: told(estimate(100.0 * rates[e].mean(0))) for e in EXAMPLES}
+def _saving(data: dict[str, Any]) -> list[Claim]:
+    ours, fixed = (data["settings"].index(name) for name in (OURS, FIXED))
+    rates = {e: data[f"{e}_rates"][ours] for e in EXAMPLES}
+    every = {e: [cite(estimate(100.0 * each)) for each in rates[e]] for e in EXAMPLES}
+    constant = {e: cite(estimate(100.0 * data[f"{e}_rates"][fixed].mean(0))) for e in EXAMPLES}
+    adaptive = {e: cite(estimate(100.0 * rates[e].mean(0))) for e in EXAMPLES}
     better, evidence = [], []
     for example in EXAMPLES:
-        each = found[f"{example}_each"]
+        each = data[f"{example}_each"]
         for block, kind in enumerate(KINDS):
             fused, nodes = each[0, block], each[1:, block]
             better += [below(fused, node) for node in nodes]
             best = nodes[nodes.mean(-1).argmin()]
             evidence.append(
-                f"{NAMES[example]}, {kind}: {told(estimate(fused))}, best node "
-                f"{told(estimate(best))}"
+                f"{NAMES[example]}, {kind}: {cite(estimate(fused))}, best node "
+                f"{cite(estimate(best))}"
             )
     return [
         Claim(

@@ -7,7 +7,7 @@ from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullLocator
 
 from ...output import palette
 from ..judging import percent
-from ..shown import Picture
+from ..piece_result import Picture
 from .filters import OURS
 from .runs import CARTS, EXAMPLES, PRINTED, STEPS
 
@@ -19,28 +19,28 @@ _INPUTS = {PRINTED: ((2, "$d^1$"), (3, "$d^2$")), CARTS: ((4, "force (N)"),)}
 _WALK = "Kalman filter, random-walk input"
 
 
-def pictures(found: dict[str, Any]) -> list[Picture]:
+def unknown_input_pictures(data: dict[str, Any]) -> list[Picture]:
     """All of them, in the paper's order."""
     return [
-        _states(found),
-        _inputs(found),
-        *(_state_bound(found, place) for place in (0, 1)),
-        _input_bounds(found),
-        _input_trace(found),
-        _instants(found),
+        _states(data),
+        _inputs(data),
+        *(_state_bound(data, place) for place in (0, 1)),
+        _input_bounds(data),
+        _input_trace(data),
+        _instants(data),
     ]
 
 
-def _curves(axis: Any, found: dict[str, Any], example: str, entry: int) -> None:
+def _curves(axis: Any, data: dict[str, Any], example: str, entry: int) -> None:
     """Truth, nodes, fused estimate and the Kalman filter; the fused and true values fill it."""
-    truth, fused = (found[f"{example}_{name}"][:, entry] for name in ("truth", "fused"))
-    local = found[f"{example}_local"][:, :, entry]
+    truth, fused = (data[f"{example}_{name}"][:, entry] for name in ("truth", "fused"))
+    local = data[f"{example}_local"][:, :, entry]
     axis.plot(_TIME, truth, color=palette.TRUTH, lw=3.2, label="true value")
     for node in range(local.shape[1]):
         colour, label = palette.SENSORS[node], f"node {node + 1}"
         axis.plot(_TIME, local[:, node], color=colour, lw=0.9, label=label)
     axis.plot(_TIME, fused, color=palette.FUSED, lw=1.8, label="fused")
-    walk = found[f"{example}_walk"][:, entry]
+    walk = data[f"{example}_walk"][:, entry]
     axis.plot(_TIME, walk, color=palette.GREEN, lw=1.3, label=_WALK)
     every = np.concatenate((truth, fused, walk))
     room = 0.15 * np.ptp(every)
@@ -58,34 +58,34 @@ def _grid(figure: Any, rows: int) -> Any:
 
 def _legend(figure: Any, axes: Any, columns: int) -> None:
     """Over all axes, each label once: the truth, the fused estimate, the nodes, the rest."""
-    found: dict[str, Any] = {}
+    data: dict[str, Any] = {}
     for axis in np.asarray(axes).ravel():
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
+            data.setdefault(label, handle)
     ranks = {"true value": 0, "fused": 1}
-    order = sorted(found, key=lambda label: ranks.get(label, 2 if label[:4] == "node" else 3))
-    handles = [found[label] for label in order]
+    order = sorted(data, key=lambda label: ranks.get(label, 2 if label[:4] == "node" else 3))
+    handles = [data[label] for label in order]
     figure.legend(
         handles, order, loc="outside upper center", ncols=columns, fontsize=9, columnspacing=1.0
     )
 
 
-def _root(found: dict[str, Any], name: str, example: str, block: int) -> float:
-    value = found[f"{example}_{name}"]
+def _root(data: dict[str, Any], name: str, example: str, block: int) -> float:
+    value = data[f"{example}_{name}"]
     own = value[0, block] if name == "each" else value[block]
     return float(np.sqrt(own.mean()))
 
 
-def _states(found: dict[str, Any]) -> Picture:
+def _states(data: dict[str, Any]) -> Picture:
     def draw(figure: Any) -> None:
         axes = _grid(figure, 2)
         for column, example in enumerate(EXAMPLES):
             for row, (entry, label) in enumerate(_STATES[example]):
-                _curves(axes[row, column], found, example, entry)
+                _curves(axes[row, column], data, example, entry)
                 axes[row, column].set_ylabel(label)
         _legend(figure, axes, 6)
 
-    ratio = [_root(found, "each", e, 0) / _root(found, "power", e, 0) for e in EXAMPLES]
+    ratio = [_root(data, "each", e, 0) / _root(data, "power", e, 0) for e in EXAMPLES]
     return Picture(
         "figure_1",
         "Figure 1: states, their estimates by the nodes, and fused",
@@ -98,19 +98,19 @@ def _states(found: dict[str, Any]) -> Picture:
     )
 
 
-def _inputs(found: dict[str, Any]) -> Picture:
+def _inputs(data: dict[str, Any]) -> Picture:
     def draw(figure: Any) -> None:
         axes = _grid(figure, 2)
         for column, example in enumerate(EXAMPLES):
             for row, (entry, label) in enumerate(_INPUTS[example]):
-                _curves(axes[row, column], found, example, entry)
+                _curves(axes[row, column], data, example, entry)
                 axes[row, column].set_ylabel(label)
         axes[1, 1].remove()
         axes[0, 1].tick_params(labelbottom=True)
         axes[0, 1].set_xlabel("sampling instant k")
         _legend(figure, [*axes[:, 0].tolist(), axes[0, 1]], 6)
 
-    ratio = [_root(found, "each", e, 1) / _root(found, "power", e, 1) for e in EXAMPLES]
+    ratio = [_root(data, "each", e, 1) / _root(data, "power", e, 1) for e in EXAMPLES]
     return Picture(
         "figure_2",
         "Figure 2: unknown inputs and their estimates",
@@ -123,17 +123,17 @@ def _inputs(found: dict[str, Any]) -> Picture:
     )
 
 
-def _labels(found: dict[str, Any], example: str) -> list[tuple[str, str]]:
-    nodes = found[f"{example}_square"].shape[1] - 1
+def _labels(data: dict[str, Any], example: str) -> list[tuple[str, str]]:
+    nodes = data[f"{example}_square"].shape[1] - 1
     own = [(f"node {i + 1}", palette.SENSORS[i]) for i in range(nodes)]
     return [("fused", palette.FUSED), *own]
 
 
-def _bounded(axis: Any, found: dict[str, Any], example: str, entries: list[int]) -> None:
+def _bounded(axis: Any, data: dict[str, Any], example: str, entries: list[int]) -> None:
     """Bounds solid, mean squared errors dotted, summed over the entries."""
-    bound = found[f"{example}_bound"][..., entries].sum(-1)
-    square = found[f"{example}_square"][..., entries].sum(-1)
-    for place, (label, colour) in enumerate(_labels(found, example)):
+    bound = data[f"{example}_bound"][..., entries].sum(-1)
+    square = data[f"{example}_square"][..., entries].sum(-1)
+    for place, (label, colour) in enumerate(_labels(data, example)):
         width = 2.2 if place == 0 else 1.3
         axis.plot(_TIME, bound[:, place], color=colour, lw=width, label=label)
         axis.plot(_TIME, square[:, place], ":", color=colour, lw=width)
@@ -146,19 +146,19 @@ def _both(axis: Any) -> None:
     axis.plot([], [], ":", color=palette.INK, label="MSE")
 
 
-def _state_bound(found: dict[str, Any], place: int) -> Picture:
+def _state_bound(data: dict[str, Any], place: int) -> Picture:
     def draw(figure: Any) -> None:
         axes = _grid(figure, 1)
         for column, example in enumerate(EXAMPLES):
             entry, label = _STATES[example][place]
             axis = axes[0, column]
-            _bounded(axis, found, example, [entry])
+            _bounded(axis, data, example, [entry])
             unit = " (m²)" if example == CARTS else ""
             axis.set_ylabel(f"{label.replace(' (m)', '')}: squared error{unit}")
         _both(axes[0, 1])
         _legend(figure, axes, 7)
 
-    least = [_slack(found, e, _STATES[e][place][0]) for e in EXAMPLES]
+    least = [_slack(data, e, _STATES[e][place][0]) for e in EXAMPLES]
     return Picture(
         f"figure_{3 + place}",
         f"Figure {3 + place}: upper bound and MSE of state $x^{1 + place}$".replace("$", ""),
@@ -171,18 +171,18 @@ def _state_bound(found: dict[str, Any], place: int) -> Picture:
     )
 
 
-def _slack(found: dict[str, Any], example: str, entry: int) -> float:
-    ratio = found[f"{example}_bound"][:, 0, entry] / found[f"{example}_square"][:, 0, entry]
+def _slack(data: dict[str, Any], example: str, entry: int) -> float:
+    ratio = data[f"{example}_bound"][:, 0, entry] / data[f"{example}_square"][:, 0, entry]
     return float(ratio.mean())
 
 
-def _input_bounds(found: dict[str, Any]) -> Picture:
+def _input_bounds(data: dict[str, Any]) -> Picture:
     def draw(figure: Any) -> None:
         axes = _grid(figure, 1)
         for column, example in enumerate(EXAMPLES):
-            axis, bound = axes[0, column], found[f"{example}_bound"]
+            axis, bound = axes[0, column], data[f"{example}_bound"]
             for (entry, name), style in zip(_INPUTS[example], ("-", "--"), strict=False):
-                for place, (label, colour) in enumerate(_labels(found, example)):
+                for place, (label, colour) in enumerate(_labels(data, example)):
                     axis.plot(
                         _TIME, bound[:, place, entry], style, color=colour,
                         lw=2.2 if place == 0 else 1.3, label=label if style == "-" else None,
@@ -196,8 +196,8 @@ def _input_bounds(found: dict[str, Any]) -> Picture:
         axes[0, 1].yaxis.set_minor_locator(NullLocator())
         _legend(figure, axes, 7)
 
-    level = float(np.sqrt(found[f"{PRINTED}_bound"][-1, 0, 2:].sum()))
-    power = _root(found, "power", PRINTED, 1)
+    level = float(np.sqrt(data[f"{PRINTED}_bound"][-1, 0, 2:].sum()))
+    power = _root(data, "power", PRINTED, 1)
     return Picture(
         "figure_5",
         "Figure 5: upper bounds of the inputs",
@@ -208,12 +208,12 @@ def _input_bounds(found: dict[str, Any]) -> Picture:
     )
 
 
-def _input_trace(found: dict[str, Any]) -> Picture:
+def _input_trace(data: dict[str, Any]) -> Picture:
     def draw(figure: Any) -> None:
         axes = _grid(figure, 1)
         for column, example in enumerate(EXAMPLES):
             axis = axes[0, column]
-            _bounded(axis, found, example, [entry for entry, _ in _INPUTS[example]])
+            _bounded(axis, data, example, [entry for entry, _ in _INPUTS[example]])
             axis.set_ylabel("trace" + (" (N²)" if example == CARTS else ""))
         _both(axes[0, 1])
         _legend(figure, axes, 7)
@@ -228,11 +228,11 @@ def _input_trace(found: dict[str, Any]) -> Picture:
     )
 
 
-def _instants(found: dict[str, Any]) -> Picture:
+def _instants(data: dict[str, Any]) -> Picture:
     def draw(figure: Any) -> None:
         axes = _grid(figure, 1)
         for column, example in enumerate(EXAMPLES):
-            axis, granted = axes[0, column], found[f"{example}_granted"].astype(bool)
+            axis, granted = axes[0, column], data[f"{example}_granted"].astype(bool)
             nodes = granted.shape[1]
             for node in range(nodes):
                 when = _TIME[granted[:, node]]
@@ -241,9 +241,9 @@ def _instants(found: dict[str, Any]) -> Picture:
             axis.set_ylim(-0.6, nodes - 0.4)
             axis.grid(False, axis="y")
 
-    place = found["settings"].index(OURS)
+    place = data["settings"].index(OURS)
     rates = [
-        ", ".join(percent(float(r)) for r in found[f"{e}_rates"][place].mean(-1)) for e in EXAMPLES
+        ", ".join(percent(float(r)) for r in data[f"{e}_rates"][place].mean(-1)) for e in EXAMPLES
     ]
     return Picture(
         "figure_7",

@@ -8,7 +8,17 @@ import fusion_gym
 from fusion_gym.arrays import Array
 from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
 
-from .runs import EXAMPLES, PRINTED, TRIGGER, Record, halves, leading, make, record, tables
+from .runs import (
+    EXAMPLES,
+    PRINTED,
+    TRIGGER,
+    Record,
+    halves,
+    leading,
+    make_example,
+    record_run,
+    tables,
+)
 
 OURS, FIXED = "paper's filter and trigger", "paper's filter, fixed threshold ρ̄"
 WALK = "Kalman filter with a random-walk input, paper's trigger"
@@ -24,39 +34,39 @@ SETTINGS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def compute(episodes: int, seed: int) -> dict[str, Any]:
+def compute_filters(episodes: int, seed: int) -> dict[str, Any]:
     """Everything by example; ``mse`` (settings, 2, E) and ``rates`` (settings, l, E) by setting."""
-    found: dict[str, Any] = {"settings": list(SETTINGS)}
+    data: dict[str, Any] = {"settings": list(SETTINGS)}
     for example in EXAMPLES:
-        kept = _example(example, episodes, seed)
-        found |= {f"{example}_{name}": value for name, value in kept.items()}
-    return found
+        stored = _example(example, episodes, seed)
+        data |= {f"{example}_{name}": value for name, value in stored.items()}
+    return data
 
 
 def _example(example: str, episodes: int, seed: int) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    data: dict[str, Any] = {}
     mse, rates = [], []
     for name, (policy, options) in SETTINGS.items():
-        chosen = dict(options)
+        settings = dict(options)
         if name == WALK:
-            chosen |= _HOLD.get(example, {})
+            settings |= _HOLD.get(example, {})
         if name == FIXED:
             limit = _rule(example).rho_bar
-            chosen |= {"rho_initial": limit}
-        task, system = make(example=example, **chosen)
-        run = record(task, policy, episodes, seed)
+            settings |= {"rho_initial": limit}
+        task, system = make_example(example=example, **settings)
+        run = record_run(task, policy, episodes, seed)
         states = system.plant.size
         mse.append(halves((run.errors[:, 0] ** 2).mean(0), states, 0))
         rates.append(run.granted.mean(0))
         if name == OURS:
-            found |= _under_the_trigger(example, run)
+            data |= _under_the_trigger(example, run)
         if name == WALK:
-            found["walk"] = run.fused[..., 0]
-    return found | {"mse": np.array(mse), "rates": np.array(rates)}
+            data["walk"] = run.fused[..., 0]
+    return data | {"mse": np.array(mse), "rates": np.array(rates)}
 
 
 def _rule(example: str) -> AdaptiveThreshold:
-    rule = fusion_gym.make_policy(TRIGGER, make(example=example, filter="paper")[0])
+    rule = fusion_gym.make_policy(TRIGGER, make_example(example=example, filter="paper")[0])
     assert isinstance(rule, AdaptiveThreshold)
     return rule
 
@@ -72,7 +82,7 @@ def _under_the_trigger(example: str, run: Record) -> dict[str, Any]:
     ``kept`` the share of silent steps with |σ|² at most ρ̄; ``rho`` (H + 1, l) the mean threshold,
     ``rho_range`` its least step and its extremes over ρ₀ and ρ̄.
     """
-    nodes = tables(make(example=example, filter="paper")[1])
+    nodes = tables(make_example(example=example, filter="paper")[1])
     n, errors = nodes.model.size, run.errors
     bounds = np.concatenate((nodes.fused[None], nodes.tables.covariance))[..., 1:]
     blocks = (slice(None, n), slice(n, None))

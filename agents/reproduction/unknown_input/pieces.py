@@ -14,8 +14,15 @@ PAPER = Paper(
     pieces=(
         Piece(
             "filters", "The printed example beside two carts",
-            filters.compute, claims.show, 20.0, 1000,
+            filters.compute_filters, claims.show_unknown_input_claims, 20.0, 1000,
         ),
-        Piece("printed", "The printed recursion itself", printed.compute, readings.show, 60.0, 500),
+        Piece(
+            "printed",
+            "The printed recursion itself",
+            printed.compute_printed,
+            readings.show_unknown_input_readings,
+            60.0,
+            500,
+        ),
     ),
 )  # fmt: skip

@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 from fusion_gym.arrays import Array
 from fusion_gym.systems.unknown_input.system import UnknownInputSystem
 
-from .runs import CARTS, EXAMPLES, PRINTED, TRIGGER, Record, halves, make, record
+from .runs import CARTS, EXAMPLES, PRINTED, TRIGGER, Record, halves, make_example, record_run
 
 # I - C ℬ L in (20) is a projection, its singular values are 0 or at least 1: what lies between is
 # rounding, and half a 1 tells one from the other.
@@ -91,8 +91,8 @@ def gains(model: Model, bound: Array, silent: NDArray[np.bool_], cutoff: float) 
         ) @ np.broadcast_to(free.T, (len(omega), *free.T.shape))
 
     def spread(n: Array) -> Array:
-        kept = eye_n - n @ c
-        return kept @ phi @ kept.swapaxes(1, 2) + n @ noise @ n.swapaxes(1, 2)
+        retention = eye_n - n @ c
+        return retention @ phi @ retention.swapaxes(1, 2) + n @ noise @ n.swapaxes(1, 2)
 
     return {
         "input": onto_input,
@@ -106,8 +106,8 @@ def gains(model: Model, bound: Array, silent: NDArray[np.bool_], cutoff: float) 
 
 def _pseudo_inverse(matrix: Array, cutoff: float) -> Array:
     left, values, right = np.linalg.svd(matrix)
-    kept = values > cutoff
-    inverted = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
+    mask = values > cutoff
+    inverted = np.where(mask, 1.0 / np.where(mask, values, 1.0), 0.0)
     return (right.swapaxes(1, 2) * inverted[:, None]) @ left.swapaxes(1, 2)
 
 
@@ -126,19 +126,19 @@ def run(model: Model, held: Array, granted: NDArray[np.bool_], cutoff: float) ->
     }
     b, c = model.inputs, model.matrix
     for measurement, sent in zip(held, granted, strict=True):
-        found = gains(model, bound, ~sent, cutoff)
+        result = gains(model, bound, ~sent, cutoff)
         moved = mean @ model.transition.T
         apart = (measurement.T - moved @ c.T)[..., None]
-        mean = moved + (found["gain"] @ apart)[..., 0]
-        bound = found["state_bound"]
+        mean = moved + (result["gain"] @ apart)[..., 0]
+        bound = result["state_bound"]
         least = np.linalg.eigvalsh(0.5 * (bound + bound.swapaxes(1, 2)))[:, 0]
-        trace, best = (np.trace(found[name], axis1=1, axis2=2) for name in _TRACES)
-        estimate = np.concatenate((mean, (found["input"] @ apart)[..., 0]), axis=1)
+        trace, best = (np.trace(result[name], axis1=1, axis2=2) for name in _TRACES)
+        estimate = np.concatenate((mean, (result["input"] @ apart)[..., 0]), axis=1)
         for name, value in (
             ("estimate", estimate),
             ("trace", trace),
             ("least", least),
-            ("hidden", np.abs(b - found["gain"] @ c @ b).max((1, 2))),
+            ("hidden", np.abs(b - result["gain"] @ c @ b).max((1, 2))),
             ("excess", trace / best - 1.0),
         ):
             rows[name].append(value)
@@ -148,27 +148,27 @@ def run(model: Model, held: Array, granted: NDArray[np.bool_], cutoff: float) ->
 _TRACES = ("state_bound", "best_bound")
 
 
-def compute(episodes: int, seed: int) -> dict[str, Any]:
+def compute_printed(episodes: int, seed: int) -> dict[str, Any]:
     """Readings of the printed example, the gain (20) on the carts, Theorem 1 for a small ρ̄.
 
     ``node`` (readings, l, 2, E): mean squared errors of state and input; ``trace``
     (readings, l, E): the mean trace of (18); ``hidden`` (readings, l): the largest residual of
     (14); ``power`` (2, E): the mean squares of state and input themselves.
     """
-    found: dict[str, Any] = {"readings": list(READINGS)}
+    data: dict[str, Any] = {"readings": list(READINGS)}
     node, trace, hidden = [], [], []
     for reading in READINGS.values():
-        task, system = make(example=PRINTED, filter="paper", **reading.get("options", {}))
-        seen = record(task, reading.get("policy", TRIGGER), episodes, seed)
+        task, system = make_example(example=PRINTED, filter="paper", **reading.get("options", {}))
+        observed = record_run(task, reading.get("policy", TRIGGER), episodes, seed)
         cutoff = reading.get("cutoff", _EXACT)
-        every = _nodes(system, seen, _FACTOR[PRINTED], _rho(PRINTED), cutoff)
-        error = seen.truth[:, None] - np.stack([_estimate(each) for each in every], axis=1)
+        every = _nodes(system, observed, _FACTOR[PRINTED], _rho(PRINTED), cutoff)
+        error = observed.truth[:, None] - np.stack([_estimate(each) for each in every], axis=1)
         node.append(halves((error**2).mean(0), system.plant.size, 1))
         trace.append([each["trace"].mean(0) for each in every])
         hidden.append([float(each["hidden"].max()) for each in every])
-    found |= {"node": np.array(node), "trace": np.array(trace), "hidden": hidden}
-    found["power"] = halves((seen.truth**2).mean(0), system.plant.size, 0)
-    return found | _theorems(episodes, seed) | _lifted()
+    data |= {"node": np.array(node), "trace": np.array(trace), "hidden": hidden}
+    data["power"] = halves((observed.truth**2).mean(0), system.plant.size, 0)
+    return data | _theorems(episodes, seed) | _lifted()
 
 
 def _estimate(each: dict[str, Array]) -> Array:
@@ -177,15 +177,15 @@ def _estimate(each: dict[str, Array]) -> Array:
 
 def _rho(example: str) -> float:
     """ρ̄ of the example's trigger."""
-    task, _ = make(example=example, filter="paper")
+    task, _ = make_example(example=example, filter="paper")
     return float(np.max(task.policy_defaults[TRIGGER]["rho_bar"]))
 
 
 def _nodes(
-    system: UnknownInputSystem, seen: Record, factor: float, rho_bar: float, cutoff: float
+    system: UnknownInputSystem, run_record: Record, factor: float, rho_bar: float, cutoff: float
 ) -> list[dict[str, Array]]:
     return [
-        run(model, seen.held[:, i], seen.granted[:, i], cutoff)
+        run(model, run_record.held[:, i], run_record.granted[:, i], cutoff)
         for i, model in enumerate(models(system, factor, rho_bar))
     ]
 
@@ -193,42 +193,42 @@ def _nodes(
 def _theorems(episodes: int, seed: int) -> dict[str, Any]:
     """``excess`` (examples, E) of (18) over its least, ``sent`` and ``silent`` (l, E) traces of
     Ξ_x at the carts, ``negative`` (E): the share of silent instants with an indefinite Ξ_x."""
-    excess, found = [], {}
+    excess, result = [], {}
     for example in EXAMPLES:
-        task, system = make(example=example, filter="paper")
-        seen = record(task, TRIGGER, episodes, seed)
-        every = _nodes(system, seen, _FACTOR[example], _rho(example), _EXACT)
+        task, system = make_example(example=example, filter="paper")
+        observed = record_run(task, TRIGGER, episodes, seed)
+        every = _nodes(system, observed, _FACTOR[example], _rho(example), _EXACT)
         excess.append(np.mean([each["excess"].mean(0) for each in every], axis=0))
         if example == PRINTED:
-            quiet = [~seen.granted[:, i] for i in range(len(every))]
+            quiet = [~observed.granted[:, i] for i in range(len(every))]
             for name, flip in (("silent", False), ("sent", True)):
-                found[name] = np.array(
+                result[name] = np.array(
                     [
                         np.nanmean(np.where(where ^ flip, each["trace"], np.nan), axis=0)
                         for where, each in zip(quiet, every, strict=True)
                     ]
                 )
     small = _SMALL * 0.001
-    task, system = make(example=PRINTED, filter="paper", rho_bar=small, rho_initial=small)
-    seen = record(task, TRIGGER, episodes, seed)
-    every = _nodes(system, seen, _FACTOR[PRINTED], small, _EXACT)
+    task, system = make_example(example=PRINTED, filter="paper", rho_bar=small, rho_initial=small)
+    observed = record_run(task, TRIGGER, episodes, seed)
+    every = _nodes(system, observed, _FACTOR[PRINTED], small, _EXACT)
     least = np.stack([each["least"] for each in every], axis=1)
-    negative = float((least[~seen.granted] < 0.0).mean())
-    return found | {"excess": np.array(excess), "negative": negative, "small": small}
+    negative = float((least[~observed.granted] < 0.0).mean())
+    return result | {"excess": np.array(excess), "negative": negative, "small": small}
 
 
 def _lifted() -> dict[str, Any]:
     """Rank and columns of C ℬ with ℬ as (3) prints it, for a = 2; condition numbers of the C_i and
     of B; :func:`_floor`."""
-    paper = make(example=PRINTED, filter="paper")[1]
-    one = make(example=PRINTED, filter="paper", sampling_period=1)[1].plant
-    a, b = one.transition[..., 0], one.input_matrix[..., 0]
+    paper = make_example(example=PRINTED, filter="paper")[1]
+    single = make_example(example=PRINTED, filter="paper", sampling_period=1)[1].plant
+    a, b = single.transition[..., 0], single.input_matrix[..., 0]
     lifted = block_diag(np.hstack((a @ b, b)), np.hstack((b, 0.0 * b)))
     c = paper.nodes.sensors.matrix[0, ..., 0]
-    seen = np.hstack((c, 0.0 * c)) @ lifted
+    observed = np.hstack((c, 0.0 * c)) @ lifted
     return {
-        "rank": int(np.linalg.matrix_rank(seen)),
-        "columns": int(seen.shape[1]),
+        "rank": int(np.linalg.matrix_rank(observed)),
+        "columns": int(observed.shape[1]),
         "conditions": [float(np.linalg.cond(m)) for m in (*paper.nodes.sensors.matrix[..., 0], b)],
         "floor": _floor(paper),
     }
@@ -237,7 +237,7 @@ def _lifted() -> dict[str, Any]:
 def _floor(system: UnknownInputSystem) -> list[list[float]]:
     """Mean squared errors (l, 2) of state and input of C⁻¹ y, all that (14) leaves, always sent."""
     b = system.plant.input_matrix[..., 0]
-    found = []
+    result = []
     for c, v in zip(
         system.nodes.sensors.matrix[..., 0], system.nodes.sensors.covariance[..., 0], strict=True
     ):
@@ -245,5 +245,5 @@ def _floor(system: UnknownInputSystem) -> list[list[float]]:
         a, w = system.plant.transition[..., 0], system.plant.process_covariance[..., 0]
         into = np.linalg.inv(b)
         inputs = into @ (spread + a @ spread @ a.T + w) @ into.T
-        found.append([float(np.trace(spread)), float(np.trace(inputs))])
-    return found
+        result.append([float(np.trace(spread)), float(np.trace(inputs))])
+    return result

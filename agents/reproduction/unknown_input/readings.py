@@ -7,15 +7,15 @@ import numpy as np
 from fusion_gym.arrays import Array
 
 from ..judging import below, estimate, percent, verdict
-from ..shown import Claim, Number, Shown, Table
+from ..piece_result import Claim, Number, NumbersTable, PieceResult
 from .claims import KINDS, by_example
 from .printed import DEVIATIONS, EXACT, INVERTED, PARTLY
 from .runs import EXAMPLES
 
 
-def show(found: dict[str, Any]) -> Shown:
+def show_unknown_input_readings(data: dict[str, Any]) -> PieceResult:
     """Errors under every reading, and the claims about the equations themselves."""
-    node, readings = found["node"], found["readings"]
+    node, readings = data["node"], data["readings"]
     columns = [f"node {i + 1}, {kind}" for kind in KINDS for i in range(node.shape[1])]
     numbers = [
         Number.of(f"{reading}: node {i + 1}, {kind}", node[place, i, block])
@@ -23,10 +23,10 @@ def show(found: dict[str, Any]) -> Shown:
         for block, kind in enumerate(KINDS)
         for i in range(node.shape[1])
     ]
-    power = found["power"].mean(-1)
-    return Shown(
+    power = data["power"].mean(-1)
+    return PieceResult(
         tables=[
-            Table(
+            NumbersTable(
                 "readings",
                 "Mean squared errors of the printed recursion under several readings",
                 numbers,
@@ -35,27 +35,27 @@ def show(found: dict[str, Any]) -> Shown:
                 columns,
             )
         ],
-        claims=_printed_claims(found),
-        notes=[_degenerate(found), _tried(found)],
+        claims=_printed_claims(data),
+        notes=[_degenerate(data), _tried(data)],
     )
 
 
-def _printed_claims(found: dict[str, Any]) -> list[Claim]:
-    exact = found["readings"].index(EXACT)
-    residual = max(found["hidden"][exact])
-    state, trace = found["node"][exact, :, 0], found["trace"][exact]
+def _printed_claims(data: dict[str, Any]) -> list[Claim]:
+    exact = data["readings"].index(EXACT)
+    residual = max(data["hidden"][exact])
+    state, trace = data["node"][exact, :, 0], data["trace"][exact]
     bounded = [below(own, claim) for own, claim in zip(state, trace, strict=True)]
-    excess = [estimate(sample) for sample in found["excess"]]
+    excess = [estimate(sample) for sample in data["excess"]]
     tighter = [
         estimate(silent).mean / estimate(sent).mean - 1.0
-        for silent, sent in zip(found["silent"], found["sent"], strict=True)
+        for silent, sent in zip(data["silent"], data["sent"], strict=True)
     ]
     return [
         Claim(
             "The lifted system of (3) and (4) can meet the decoupling condition (13).",
             "(3), (4), (13)",
-            "holds" if found["rank"] == found["columns"] else "does not hold",
-            f"With ℬ as printed, C ℬ has {found['columns']} columns and rank {found['rank']}: no L "
+            "holds" if data["rank"] == data["columns"] else "does not hold",
+            f"With ℬ as printed, C ℬ has {data['columns']} columns and rank {data['rank']}: no L "
             "makes L C ℬ the identity. With the input held over a sampling interval it can.",
         ),
         Claim(
@@ -68,13 +68,13 @@ def _printed_claims(found: dict[str, Any]) -> list[Claim]:
         Claim(
             "(18) as printed, with its factor 1 - 2δ, bounds the error covariance.",
             "Theorem 1, (18)",
-            verdict([*bounded, found["negative"] == 0.0]),
+            verdict([*bounded, data["negative"] == 0.0]),
             "On the printed example the squared errors lie below its trace ("
             + _pairs(state, trace)
             + " by node). But the bound is smaller when nothing is sent ("
             + ", ".join(f"{100.0 * each:.1f} %" for each in tighter)
-            + f"), and with ρ̄ = {found['small']:g} it is indefinite in "
-            f"{percent(found['negative'])} of the silent instants.",
+            + f"), and with ρ̄ = {data['small']:g} it is indefinite in "
+            f"{percent(data['negative'])} of the silent instants.",
         ),
         Claim(
             "The gains (19) and (20) minimise the bounds.",
@@ -96,9 +96,9 @@ def _pairs(first: Array, second: Array) -> str:
     )
 
 
-def _degenerate(found: dict[str, Any]) -> str:
-    floor, power = np.sqrt(np.array(found["floor"])), np.sqrt(found["power"].mean(-1))
-    conditions = ", ".join(f"{each:.0f}" for each in found["conditions"])
+def _degenerate(data: dict[str, Any]) -> str:
+    floor, power = np.sqrt(np.array(data["floor"])), np.sqrt(data["power"].mean(-1))
+    conditions = ", ".join(f"{each:.0f}" for each in data["conditions"])
     return (
         "**Why Figures 1 and 2 cannot come out of the printed numbers.** B and both C_i are square "
         "and invertible, so (14) leaves one gain, N = C⁻¹: the estimate is C⁻¹ y, without memory. "
@@ -112,14 +112,14 @@ def _degenerate(found: dict[str, Any]) -> str:
     )
 
 
-def _tried(found: dict[str, Any]) -> str:
-    readings, power = found["readings"], found["power"].mean(-1)
-    share = found["node"].mean(-1) / power[:, None].T
+def _tried(data: dict[str, Any]) -> str:
+    readings, power = data["readings"], data["power"].mean(-1)
+    share = data["node"].mean(-1) / power[:, None].T
     partly, inverted, small = (readings.index(n) for n in (PARTLY, INVERTED, DEVIATIONS))
     best, where = min((float(each), name) for each, name in zip(
         share[:, :, 1].min(1), readings, strict=True
     ))  # fmt: skip
-    hidden = np.array(found["hidden"])
+    hidden = np.array(data["hidden"])
     return (
         "**What was tried.** I - C ℬ L in (20) is exactly zero on this example, and a "
         "pseudo-inverse of what rounding leaves of it makes a gain that does not hide the input. "

@@ -42,7 +42,7 @@ class Record(NamedTuple):
         return self.truth[:, None] - every
 
 
-def make(**options: Any) -> tuple[Task, UnknownInputSystem]:
+def make_example(**options: Any) -> tuple[Task, UnknownInputSystem]:
     """The task of these options with its system."""
     task = fusion_gym.make_task(UnknownInputOptions(horizon=STEPS, **options))
     assert isinstance(task.system, UnknownInputSystem)
@@ -55,15 +55,15 @@ def tables(system: UnknownInputSystem) -> TableNodes:
     return system.nodes
 
 
-def record(task: Task, policy: str, episodes: int, seed: int) -> Record:
+def record_run(task: Task, policy: str, episodes: int, seed: int) -> Record:
     """Run a policy and keep what the figures show."""
-    chosen = fusion_gym.make_policy(policy, task)
+    rule = fusion_gym.make_policy(policy, task)
     batch = EpisodeBatch.seeded(task, episodes, seed)
-    chosen.reset(episodes, seed)
+    rule.reset(episodes, seed)
     rows: dict[str, list[NDArray[Any]]] = {name: [] for name in Record._fields}
     for _ in range(task.horizon):
         apart = batch.state.measurement - batch.state.held
-        outcome = batch.step(chosen(batch.signals()))
+        outcome = batch.step(rule(batch.signals()))
         state = batch.delivered
         for name, value in (
             ("truth", state.truth),

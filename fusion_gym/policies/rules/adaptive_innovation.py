@@ -8,7 +8,14 @@ import numpy as np
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import Knowledge, Signals
-from fusion_gym.policies.base import PerSensor, Requests, Rule, not_negative, parameter, surprise
+from fusion_gym.policies.base import (
+    PerSensor,
+    Requests,
+    Rule,
+    not_negative_parameter,
+    parameter,
+    surprise,
+)
 
 
 @dataclass
@@ -44,9 +51,9 @@ class AdaptiveInnovation(Rule):
     Example: ``adaptive_innovation`` in ``fusion_gym/CorrelatedTracking-v0``.
     """
 
-    threshold: PerSensor = parameter(0.6, not_negative)
-    offset: PerSensor = parameter(0.2, not_negative)
-    sensitivity: PerSensor = parameter(0.9, not_negative)
+    threshold: PerSensor = parameter(0.6, not_negative_parameter)
+    offset: PerSensor = parameter(0.2, not_negative_parameter)
+    sensitivity: PerSensor = parameter(0.9, not_negative_parameter)
 
     @property
     def knowledge(self) -> Knowledge:

@@ -15,7 +15,7 @@ from fusion_gym.policies.base import (
     Requests,
     Rule,
     each_number,
-    not_negative,
+    not_negative_parameter,
     parameter,
     shape_of,
 )
@@ -60,10 +60,10 @@ class DynamicEvent(Rule):
     random_start=True token_rate=2``.
     """
 
-    threshold: PerSensor = parameter((0.1, 0.2, 0.3), not_negative)
-    decay: PerSensor = parameter((0.1, 0.2, 0.1), not_negative)
+    threshold: PerSensor = parameter((0.1, 0.2, 0.3), not_negative_parameter)
+    decay: PerSensor = parameter((0.1, 0.2, 0.1), not_negative_parameter)
     divisor: PerSensor = parameter(5.0, each_number, above=0.0)
-    initial: PerSensor = parameter(1.5, not_negative)
+    initial: PerSensor = parameter(1.5, not_negative_parameter)
     scale: float = parameter(1.0, validation.number, at_least=0.0)
     knowledge: ClassVar[Knowledge] = "own_memory"
 

@@ -11,11 +11,11 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.beliefs import Beliefs
 from fusion_gym.core.system import Signals
 from fusion_gym.policies.base import Requests, check_at_most, parameter, strongest
-from fusion_gym.policies.believing import BelievingRule
+from fusion_gym.policies.belief_rule import BeliefRule
 
 
 @dataclass
-class EstimateDifference(BelievingRule):
+class EstimateDifference(BeliefRule):
     r"""Request when |x* - x̂| >= ``threshold``; of the sensors, those of the highest value.
 
     x* is the estimate that could be made and x̂ the centre's if nobody transmits
@@ -64,10 +64,10 @@ class EstimateDifference(BelievingRule):
         """Requests (sensors, N)."""
         beliefs, age = self.beliefs(signals), signals["age"]
         squared = _whitened(beliefs) if self.whitened else beliefs.loss()
-        wanted = np.broadcast_to(squared >= self.threshold * self.threshold, age.shape)
+        requests = np.broadcast_to(squared >= self.threshold * self.threshold, age.shape)
         if self.own or self.at_most is None:
-            return wanted.copy()
-        return strongest(beliefs.value(), wanted, self.at_most, age)
+            return requests.copy()
+        return strongest(beliefs.value(), requests, self.at_most, age)
 
 
 def _whitened(beliefs: Beliefs) -> Array:

@@ -13,7 +13,7 @@ from fusion_gym.policies.base import (
     Requests,
     Rule,
     check_at_most,
-    not_negative,
+    not_negative_parameter,
     parameter,
     strongest,
     surprise,
@@ -51,17 +51,17 @@ class InnovationThreshold(Rule):
     random_start=True token_rate=2``.
     """
 
-    threshold: PerSensor = parameter(1.0, not_negative)
+    threshold: PerSensor = parameter(1.0, not_negative_parameter)
     whitened: bool = parameter(False, validation.boolean)
     at_most: int | None = parameter(None, check_at_most)
 
     @property
     def knowledge(self) -> Knowledge:
         """A sensor's own measurement; with ``at_most`` all of them, for the largest is sent."""
-        return "own" if self.at_most is None else "coordinator"
+        return "own" if self.at_most is None else "scheduler"
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
         norm = np.sqrt(surprise(signals, self.whitened))
-        wanted = norm >= self.column("threshold", len(norm))
-        return strongest(norm, wanted, self.at_most, signals["age"])
+        requests = norm >= self.column("threshold", len(norm))
+        return strongest(norm, requests, self.at_most, signals["age"])

@@ -11,11 +11,11 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.beliefs import Estimate
 from fusion_gym.core.system import Signals
 from fusion_gym.policies.base import Requests, check_at_most, parameter, strongest
-from fusion_gym.policies.believing import BelievingRule
+from fusion_gym.policies.belief_rule import BeliefRule
 
 
 @dataclass
-class KullbackLeibler(BelievingRule):
+class KullbackLeibler(BeliefRule):
     r"""Request where the divergence of the centre's two densities is at least ``threshold`` nats.
 
     D(s) = ½ (tr P⁻¹ P_s - n + δᵀ P⁻¹ δ + ln det P - ln det P_s): from the Gaussian N(x̂(s), P_s)

@@ -7,7 +7,14 @@ from typing import ClassVar
 
 from fusion_gym import linalg
 from fusion_gym.core.system import Knowledge, Signals
-from fusion_gym.policies.base import PerSensor, Requests, Rule, not_negative, parameter, shape_of
+from fusion_gym.policies.base import (
+    PerSensor,
+    Requests,
+    Rule,
+    not_negative_parameter,
+    parameter,
+    shape_of,
+)
 
 
 @dataclass
@@ -34,7 +41,7 @@ class SendOnDelta(Rule):
     random_start=True token_rate=2``.
     """
 
-    threshold: PerSensor = parameter(1.0, not_negative)
+    threshold: PerSensor = parameter(1.0, not_negative_parameter)
     knowledge: ClassVar[Knowledge] = "own"
 
     def __call__(self, signals: Signals) -> Requests:

@@ -9,7 +9,14 @@ import numpy as np
 
 from fusion_gym import validation
 from fusion_gym.core.system import Knowledge, Signals
-from fusion_gym.policies.base import PerSensor, Requests, Rule, not_negative, parameter, surprise
+from fusion_gym.policies.base import (
+    PerSensor,
+    Requests,
+    Rule,
+    not_negative_parameter,
+    parameter,
+    surprise,
+)
 from fusion_gym.policies.chance import Chance
 
 _STREAM = 0x73746F6368  # keeps the draws apart from the noise of the same seed
@@ -50,7 +57,7 @@ class StochasticEvent(Rule):
     random_start=True token_rate=2``.
     """
 
-    weight: PerSensor = parameter(1.0, not_negative)
+    weight: PerSensor = parameter(1.0, not_negative_parameter)
     whitened: bool = parameter(False, validation.boolean)
     knowledge: ClassVar[Knowledge] = "own"
 

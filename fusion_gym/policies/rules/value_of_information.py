@@ -10,7 +10,7 @@ import numpy as np
 from fusion_gym import validation
 from fusion_gym.core.system import Signals
 from fusion_gym.policies.base import Requests, check_at_most, parameter, strongest
-from fusion_gym.policies.believing import BelievingRule
+from fusion_gym.policies.belief_rule import BeliefRule
 from fusion_gym.validation import ConfigurationError
 
 
@@ -20,7 +20,7 @@ def _optional(name: str, value: float | None) -> None:
 
 
 @dataclass
-class ValueOfInformation(BelievingRule):
+class ValueOfInformation(BeliefRule):
     r"""Request the sensors whose transmission is worth at least ``threshold``, or its ``price``.
 
     v(s) = ‖x* - x̂‖² - E‖x* - x̂(s)‖² with x* the estimate that could be made, x̂ the centre's if

@@ -58,9 +58,9 @@ class SilenceBound:
     def at(self, rate: float) -> tuple[float, PricedCost]:
         """The bound at a rate (transmissions a sensor and step), and the price that shows it."""
         packets = rate * self.sensors
-        found = [(cost.lower - cost.price * packets, cost) for cost in self.costs]
-        best, shown = max(found, key=lambda row: row[0])
-        return max(best, self.floor), shown
+        result = [(cost.lower - cost.price * packets, cost) for cost in self.costs]
+        best, table = max(result, key=lambda row: row[0])
+        return max(best, self.floor), table
 
 
 def silence_bound(
@@ -86,15 +86,15 @@ def silence_bound(
             allowed.
     """
     model = silence_model(task, weights)
-    wanted = [validation.number("rates", rate, above=0.0, at_most=1.0) for rate in rates]
+    required = [validation.number("rates", rate, above=0.0, at_most=1.0) for rate in rates]
     share = validation.number("accuracy", accuracy, above=0.0, at_most=0.5)
     limit = validation.integer("most_points", most_points, at_least=1000)
-    told = progress or (lambda done, text: None)
+    progress_line = progress or (lambda done, text: None)
     costs: list[PricedCost] = []
-    for rate in wanted:
-        told(len(costs), f"rate {rate:g}: looking for the price")
+    for rate in required:
+        progress_line(len(costs), f"rate {rate:g}: looking for the price")
         price, rough = _price(model, rate * task.sensors)
-        told(len(costs), f"rate {rate:g}: price {price:.3g}")
+        progress_line(len(costs), f"rate {rate:g}: price {price:.3g}")
         costs.append(_cost(model, price, rough, rate, share, limit))
     costs.sort(key=lambda cost: cost.price)
     return SilenceBound(model.floor, task.sensors, tuple(costs))

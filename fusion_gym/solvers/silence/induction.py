@@ -14,7 +14,7 @@ from fusion_gym.solvers.silence.lattice import (
     extents,
     interpolated,
     nodes,
-    spread,
+    spread_values,
 )
 from fusion_gym.solvers.silence.problem import SilenceProblem
 from fusion_gym.solvers.silence.survival import Survival
@@ -70,7 +70,7 @@ class _Expectation:
 
     def __init__(self, stage: Stage, price: float) -> None:
         deviations = np.sqrt(stage.coordinates.variance) / stage.step
-        gain, added = spread(stage.gain, deviations)
+        gain, added = spread_values(stage.gain, deviations)
         self.stage = stage
         self.values = stage.ceiling + gain - stage.step**2 * added
         self.far = stage.ceiling - _TAIL * price
@@ -94,9 +94,9 @@ class _Expectation:
         near = np.ones(points.shape[1], dtype=np.bool_)
         for place, half in zip(places, self.half, strict=True):
             near &= np.abs(place) <= half
-        found, parts = interpolated(self.values, places[:, near])
+        results, parts = interpolated(self.values, places[:, near])
         result = np.full(points.shape[1], self.far)
-        result[near] = found - self.stage.step**2 * parts
+        result[near] = results - self.stage.step**2 * parts
         return result
 
 

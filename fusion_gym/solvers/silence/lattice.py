@@ -61,7 +61,7 @@ def hat_weights(deviation: float, count: int) -> Array:
     return np.concatenate([[first], above[:-2] - 2.0 * above[1:-1] + above[2:]])
 
 
-def spread(values: Array, deviations: Array) -> tuple[Array, float]:
+def spread_values(values: Array, deviations: Array) -> tuple[Array, float]:
     """Σ of the hat weights times ``values``, on a larger lattice, and the variance that they add.
 
     ``values`` (points along each axis) are 0 outside; ``deviations`` (n,) and the variance, which
@@ -90,5 +90,5 @@ def interpolated(values: Array, places: Array) -> tuple[Array, Array]:
     """
     middle = (np.array(values.shape) - 1) // 2
     part = places - np.floor(places)
-    found = map_coordinates(values, places + middle[:, None], order=1, mode="nearest")
-    return found, (part * (1.0 - part)).sum(0)
+    result = map_coordinates(values, places + middle[:, None], order=1, mode="nearest")
+    return result, (part * (1.0 - part)).sum(0)

@@ -42,17 +42,17 @@ class SilenceProblem:
         matrix = validation.array("transition", transition, (None, None))
         size = len(matrix)
         matrix = validation.array("transition", matrix, (size, size))
-        found = np.asarray(noise, dtype=np.float64)
-        if found.ndim != 3 or not len(found):
+        values = np.asarray(noise, dtype=np.float64)
+        if values.ndim != 3 or not len(values):
             raise ConfigurationError(
-                f"noise of shape {found.shape} is not allowed: it must be (steps, {size}, {size})"
+                f"noise of shape {values.shape} is not allowed: it must be (steps, {size}, {size})"
             )
-        for covariance in found:
+        for covariance in values:
             validation.covariance("noise", covariance, size)
         return cls(
             transition=matrix,
             weights=validation.positive("weights", weights, (size,)),
-            noise=found,
+            noise=values,
             price=validation.number("price", price, above=0.0),
         )
 

@@ -95,58 +95,58 @@ class CorrelatedTrackingOptions(CommonOptions):
     cost_weight: float | Literal["random"] = 0.001
 
 
-def build(chosen: CorrelatedTrackingOptions) -> Scenario:
+def build_adaptive(options: CorrelatedTrackingOptions) -> Scenario:
     """The scenario of these options, checked before anything runs.
 
     Raises:
         ConfigurationError: a value that is not allowed.
     """
-    horizon = validation.horizon(chosen.horizon)
-    plant, sensors = _plant_and_sensors(chosen)
+    horizon = validation.horizon(options.horizon)
+    plant, sensors = _plant_and_sensors(options)
     open_loop = plant.open_loop(horizon)
     equal = equal_weights(open_loop)
     weights = (
         equal
-        if chosen.state_weights is None
-        else validation.not_negative("state_weights", chosen.state_weights, open_loop.shape)
+        if options.state_weights is None
+        else validation.not_negative("state_weights", options.state_weights, open_loop.shape)
     )
-    nature = Nature.create(chosen, (*plant.unmoved, "true_threshold_shift"))
+    nature = Nature.create(options, (*plant.unmoved, "true_threshold_shift"))
     nature.check_growth(plant.true_radius, horizon)
-    if chosen.track_actual:
+    if options.track_actual:
         nature.refuse("with track_actual=True")
     system = CorrelatedTrackingSystem(
         plant=plant,
         filter=RobustKalmanFilter(sensors),
-        fusion=choose_rule(chosen.fusion, _STRUCTURE, sensors.count, chosen.order),
-        noise_scale=_noise_scale(chosen.noise_scale),
+        fusion=choose_rule(options.fusion, _STRUCTURE, sensors.count, options.order),
+        noise_scale=_noise_scale(options.noise_scale),
         state_names=_state_names(plant.size),
         state_weights=weights,
         magnitude=typical_magnitude(plant, horizon, random_start=False),
         reference=open_loop,
-        joint=JointErrorCovariance.create(plant, sensors) if chosen.track_actual else None,
+        joint=JointErrorCovariance.create(plant, sensors) if options.track_actual else None,
         nature=nature,
     )
-    trigger = _trigger(chosen, sensors.count)
-    return Scenario(chosen, system, weights, {"adaptive_innovation": trigger})
+    trigger = _trigger(options, sensors.count)
+    return Scenario(options, system, weights, {"adaptive_innovation": trigger})
 
 
 def _plant_and_sensors(
-    chosen: CorrelatedTrackingOptions,
+    options: CorrelatedTrackingOptions,
 ) -> tuple[LinearPlant, CorrelatedSensors]:
     """Both on the bounds; the plant's normals are those that the sensors share."""
-    size = len(validation.array("transition", chosen.transition, (None, None)))
-    validation.array("transition", chosen.transition, (size, size))
-    gain = validation.array("process_gain", chosen.process_gain, (size, None))
-    variance = validation.positive("process_variance", chosen.process_variance, gain.shape[1:])
+    size = len(validation.array("transition", options.transition, (None, None)))
+    validation.array("transition", options.transition, (size, size))
+    gain = validation.array("process_gain", options.process_gain, (size, None))
+    variance = validation.positive("process_variance", options.process_variance, gain.shape[1:])
     factor = gain * np.sqrt(variance)
     plant = LinearPlant.create(
-        chosen.transition, factor @ factor.T, chosen.initial_mean, chosen.initial_covariance
+        options.transition, factor @ factor.T, options.initial_mean, options.initial_covariance
     )
     plant = replace(plant, process_factor=factor[..., None])
     return plant, CorrelatedSensors.create(
-        chosen.measurement_matrices,
-        chosen.measurement_variance,
-        chosen.noise_coupling,
+        options.measurement_matrices,
+        options.measurement_variance,
+        options.noise_coupling,
         np.sqrt(variance),
         plant,
     )
@@ -157,20 +157,20 @@ def _noise_scale(value: float | str) -> float | None:
         if value == "random":
             return None
         raise ConfigurationError(
-            f"noise_scale = {validation.shown(value)} is not allowed: it must be a number > 0 "
+            f"noise_scale = {validation.display(value)} is not allowed: it must be a number > 0 "
             "and <= 1, or 'random'"
         )
     return validation.number("noise_scale", value, above=0.0, at_most=1.0)
 
 
-def _trigger(chosen: CorrelatedTrackingOptions, sensors: int) -> dict[str, tuple[float, ...]]:
+def _trigger(options: CorrelatedTrackingOptions, sensors: int) -> dict[str, tuple[float, ...]]:
     """Parameters of the adaptive innovation trigger, one number a sensor."""
     return {
         name: tuple(validation.not_negative(f"trigger_{name}", value, (sensors,)).tolist())
         for name, value in (
-            ("threshold", chosen.trigger_threshold),
-            ("offset", chosen.trigger_offset),
-            ("sensitivity", chosen.trigger_sensitivity),
+            ("threshold", options.trigger_threshold),
+            ("offset", options.trigger_offset),
+            ("sensitivity", options.trigger_sensitivity),
         )
     }
 

@@ -110,7 +110,7 @@ class CorrelatedSensors:
 def _one_each(value: ArrayLike, sensors: int, missing: int) -> ArrayLike:
     """One number a sensor as a column that broadcasts over its ``missing`` later axes."""
     try:
-        given = np.asarray(value)
+        values = np.asarray(value)
     except ValueError:
         return value
-    return given.reshape(-1, *[1] * missing) if given.shape == (sensors,) else value
+    return values.reshape(-1, *[1] * missing) if values.shape == (sensors,) else value

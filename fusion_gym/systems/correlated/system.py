@@ -129,7 +129,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
                 "the same against the fused prediction",
                 self._fused_innovation,
                 components,
-                "coordinator",
+                "scheduler",
             ),
             age_block(nodes),
             block(
@@ -269,7 +269,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
         """The noise scale is drawn by its law, whatever was measured, the truth from that share of
         the covariance: it is a bound, and actual covariances are proportional to the scale."""
         scale = self._scale(noise[-1])
-        truth = linalg.draw(mean, scale * covariance, noise[:-1])
+        truth = linalg.draw_normal(mean, scale * covariance, noise[:-1])
         return replace(state, truth=truth, scale=scale, departure=None)
 
     def adopt(
@@ -351,9 +351,9 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
         silent = linalg.weighted_trace(covariance[0], self.state_weights)
         result = np.empty((self.sensor_count, len(silent)))
         for sensor in range(self.sensor_count):
-            alone = np.zeros(result.shape, dtype=np.bool_)
-            alone[sensor] = True
-            fused = self.fusion.fuse(state.prior_mean, covariance, _with_prediction(alone))
+            single = np.zeros(result.shape, dtype=np.bool_)
+            single[sensor] = True
+            fused = self.fusion.fuse(state.prior_mean, covariance, _with_prediction(single))
             result[sensor] = silent - linalg.weighted_trace(fused.covariance, self.state_weights)
         return result
 

@@ -22,7 +22,7 @@ from fusion_gym.core.system import Block, SignalArray, System, age_block, common
 from fusion_gym.systems.markov_jump.centralised_linear import (
     Belief,
     CentralisedLinearFilter,
-    Prediction,
+    ModePrediction,
 )
 from fusion_gym.systems.markov_jump.interacting_models import InteractingModels
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, Times
@@ -60,7 +60,7 @@ class MarkovJumpCentralState:
     held: Array
     age: Array
     belief: Belief
-    prediction: Prediction | None
+    prediction: ModePrediction | None
     mean: Array
     covariance: Array
     departure: Array | None = None
@@ -177,7 +177,7 @@ class MarkovJumpCentralSystem(System[MarkovJumpCentralState]):
             (numbered(self.plant.modes),),
         )
         return (
-            block("whitened_innovation", innovation, self._whitened, (nodes,), "coordinator"),
+            block("whitened_innovation", innovation, self._whitened, (nodes,), "scheduler"),
             block(
                 "difference",
                 "new minus held measurement over its root mean square",
@@ -339,11 +339,11 @@ class MarkovJumpCentralSystem(System[MarkovJumpCentralState]):
         variance = linalg.diagonal(_sensed(state).covariance)[: self.plant.size]
         return 0.5 * np.log(variance / self.reference[:, None])
 
-    def _innovation(self, state: MarkovJumpCentralState, prediction: Prediction) -> Array:
+    def _innovation(self, state: MarkovJumpCentralState, prediction: ModePrediction) -> Array:
         surprise = state.measurement - prediction.mean[self.plant.size :]
         return np.where(self.sensors.sampled(state.time), surprise, 0.0)
 
-    def _deviation(self, prediction: Prediction) -> Array:
+    def _deviation(self, prediction: ModePrediction) -> Array:
         return np.sqrt(linalg.diagonal(prediction.covariance)[self.plant.size :])
 
     def _reduction(self, covariance: Array, weights: Array, useful: NDArray[np.bool_]) -> Array:
@@ -354,7 +354,7 @@ class MarkovJumpCentralSystem(System[MarkovJumpCentralState]):
         own = linalg.diagonal(covariance)[n:]
         return np.where(useful, squares / np.where(useful, own, 1.0), 0.0)
 
-    def _greedy_variance(self, state: MarkovJumpCentralState, prediction: Prediction) -> Array:
+    def _greedy_variance(self, state: MarkovJumpCentralState, prediction: ModePrediction) -> Array:
         """Samples join one after another, each time the one that lowers the trace most."""
         n, covariance = self.plant.size, prediction.covariance
         left = self.sensors.sampled(state.time)
@@ -362,14 +362,14 @@ class MarkovJumpCentralSystem(System[MarkovJumpCentralState]):
         for _ in range(self.sensor_count):
             gain = np.where(left, self._reduction(covariance, np.ones(n), left), -1.0)
             best = gain.argmax(0)
-            chosen = (sensors == best) & left
+            selected = (sensors == best) & left
             trace = linalg.trace(covariance[:n, :n])
-            result[chosen] = np.broadcast_to(trace, left.shape)[chosen]
+            result[selected] = np.broadcast_to(trace, left.shape)[selected]
             column = np.take_along_axis(covariance, (n + best)[None, None], axis=1)[:, 0]
             own = np.take_along_axis(column, (n + best)[None], axis=0)[0]
-            weight = np.where(chosen.any(0), 1.0 / np.where(chosen.any(0), own, 1.0), 0.0)
+            weight = np.where(selected.any(0), 1.0 / np.where(selected.any(0), own, 1.0), 0.0)
             covariance = covariance - linalg.outer(column, column) * weight
-            left = left & ~chosen
+            left = left & ~selected
         return result
 
 
@@ -386,7 +386,7 @@ def _measured(linear: CentralisedLinearFilter, horizon: int) -> Array:
     return np.asarray(np.sqrt(total / horizon + ((coupling @ noise) * coupling).sum(1)))
 
 
-def _sensed(state: MarkovJumpCentralState) -> Prediction:
+def _sensed(state: MarkovJumpCentralState) -> ModePrediction:
     if state.prediction is None:
         raise RuntimeError("the state has no measurements yet: call sense first")
     return state.prediction

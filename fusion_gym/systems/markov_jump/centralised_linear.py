@@ -36,7 +36,7 @@ class Belief(NamedTuple):
     covariance: Array
 
 
-class Prediction(NamedTuple):
+class ModePrediction(NamedTuple):
     """Moments of col(x, y): the plant's states and all sensors' measurements.
 
     ``mean`` (n + l, N), ``covariance`` (n + l, n + l, N), as if all sensors sampled.
@@ -91,7 +91,7 @@ def condition_on(
     return Belief(belief.probability, mean, covariance), likelihood
 
 
-def mixture(belief: Belief, maps: Array) -> tuple[Array, Array]:
+def mode_mixture(belief: Belief, maps: Array) -> tuple[Array, Array]:
     """Mean (p, N) and covariance (p, p, N) of maps · z, ``maps`` (M, p, s, 1), over all models."""
     means = linalg.matvec(maps, belief.mean)
     spreads = linalg.congruence(maps, belief.covariance)
@@ -103,14 +103,14 @@ def mixture(belief: Belief, maps: Array) -> tuple[Array, Array]:
     return mean, (belief.probability[:, None, None] * spreads).sum(0)
 
 
-def predict_jointly(belief: Belief, maps: Array, variance: Array) -> Prediction:
+def predict_jointly(belief: Belief, maps: Array, variance: Array) -> ModePrediction:
     """The prediction with ``maps`` (M, n + l, s, 1) and the noises' ``variance`` (M, l, N)."""
-    mean, covariance = mixture(belief, maps)
+    mean, covariance = mode_mixture(belief, maps)
     own, sensors = (belief.probability[:, None] * variance).sum(0), variance.shape[1]
     for sensor in range(sensors):
         place = len(mean) - sensors + sensor
         covariance[place, place] += own[sensor]
-    return Prediction(mean, covariance)
+    return ModePrediction(mean, covariance)
 
 
 @dataclass(frozen=True)
@@ -168,8 +168,8 @@ class CentralisedLinearFilter:
         maps[n:, :size], maps[n:, size:] = model.faded, sensors.noise_coupling[..., 0]
         rows: list[tuple[Array, Array, Array]] = []
         for time, step in enumerate(model.steps()):
-            seen = ((model.unfaded @ step.moment) * model.unfaded).sum(1)
-            own = sensors.fading_variance * seen + sensors.variance[:, 0]
+            observed = ((model.unfaded @ step.moment) * model.unfaded).sum(1)
+            own = sensors.fading_variance * observed + sensors.variance[:, 0]
             rows.append((np.hstack((model.transition, step.input)), step.additional, own))
             if time > 0 and all(_same(*pair) for pair in zip(rows[-1], rows[-2], strict=True)):
                 break
@@ -202,7 +202,7 @@ class CentralisedLinearFilter:
         noise = self.model.plant.noise_covariance
         return with_noise(belief.probability, mean[None], covariance[None], noise)
 
-    def prediction(self, belief: Belief, time: Times) -> Prediction:
+    def prediction(self, belief: Belief, time: Times) -> ModePrediction:
         """What a prediction for ``time`` (N,) says of the plant and the measurements."""
         return predict_jointly(belief, self.maps, self._variance(time))
 
@@ -215,7 +215,7 @@ class CentralisedLinearFilter:
 
     def estimate(self, belief: Belief) -> tuple[Array, Array]:
         """Mean (n, N) and covariance (n, n, N) of the plant's state."""
-        return mixture(belief, self.maps[:, : self.model.plant.size])
+        return mode_mixture(belief, self.maps[:, : self.model.plant.size])
 
     def _variance(self, time: Times) -> Array:
         return self.variance.take(self._at(time), -1)[None]

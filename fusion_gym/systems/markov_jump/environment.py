@@ -107,49 +107,49 @@ class MarkovJumpTrackingOptions(CommonOptions):
     sensors. ``"sci"`` and ``"sici"`` join two copies at a time."""
 
 
-def build(chosen: MarkovJumpTrackingOptions) -> Scenario:
+def build_markov(options: MarkovJumpTrackingOptions) -> Scenario:
     """The scenario of these options, checked before anything runs.
 
     Raises:
         ConfigurationError: a value that is not allowed.
     """
-    horizon = validation.horizon(chosen.horizon)
+    horizon = validation.horizon(options.horizon)
     plant = MarkovJumpPlant.create(
-        chosen.transitions,
-        chosen.process_gains,
-        chosen.process_covariance,
-        chosen.mode_transition,
-        chosen.initial_probabilities,
-        chosen.initial_mean,
-        chosen.initial_covariance,
+        options.transitions,
+        options.process_gains,
+        options.process_covariance,
+        options.mode_transition,
+        options.initial_probabilities,
+        options.initial_mean,
+        options.initial_covariance,
     )
     sensors = FadingSensors.create(
-        chosen.measurement_matrices,
-        chosen.sampling_periods,
-        chosen.fading_values,
-        chosen.fading_probabilities,
-        chosen.noise_coupling,
-        chosen.measurement_variance,
+        options.measurement_matrices,
+        options.sampling_periods,
+        options.fading_values,
+        options.fading_probabilities,
+        options.noise_coupling,
+        options.measurement_variance,
         plant,
     )
     weights = (
         None
-        if chosen.state_weights is None
-        else validation.not_negative("state_weights", chosen.state_weights, (plant.size,))
+        if options.state_weights is None
+        else validation.not_negative("state_weights", options.state_weights, (plant.size,))
     )
-    nature = Nature.create(chosen, (*plant.unmoved, "true_threshold_shift"))
+    nature = Nature.create(options, (*plant.unmoved, "true_threshold_shift"))
     nature.check_growth(plant.true_radius, horizon)
-    system = _system(chosen.filter, chosen.fusion, plant, sensors, weights, horizon, nature)
+    system = _system(options.filter, options.fusion, plant, sensors, weights, horizon, nature)
     remembering = None
-    if (kind := chosen.memory_filter) is not None:
-        fusion = chosen.fusion if kind == chosen.filter else None
+    if (kind := options.memory_filter) is not None:
+        fusion = options.fusion if kind == options.filter else None
         remembering = _system(kind, fusion, plant, sensors, weights, horizon, nature)
     defaults, refusal = {}, None
     if isinstance(system, MarkovJumpSystem):
         defaults = {"local_variance": {"reference": float(system.full_rate_traces().mean())}}
         refusal = _ESTIMATES_ALREADY
     return Scenario(
-        chosen,
+        options,
         system,
         system.state_weights,
         defaults,

@@ -16,9 +16,9 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.systems.markov_jump.centralised_linear import (
     Belief,
-    Prediction,
+    ModePrediction,
     condition_on,
-    mixture,
+    mode_mixture,
     predict_jointly,
     with_noise,
 )
@@ -123,7 +123,7 @@ class InteractingModels:
         probability /= probability.sum(0)
         return with_noise(probability, mean, covariance, self.plant.noise_covariance)
 
-    def prediction(self, belief: Belief, time: Times) -> Prediction:
+    def prediction(self, belief: Belief, time: Times) -> ModePrediction:
         """What a prediction for ``time`` (N,) says of the plant and the measurements."""
         del time
         return predict_jointly(belief, self.maps, self._variance(belief))
@@ -142,12 +142,12 @@ class InteractingModels:
 
     def estimate(self, belief: Belief) -> tuple[Array, Array]:
         """Mean (n, N) and covariance (n, n, N) of the plant's state, over all modes."""
-        return mixture(belief, self.maps[:, : self.plant.size])
+        return mode_mixture(belief, self.maps[:, : self.plant.size])
 
     def _variance(self, belief: Belief) -> Array:
         """Variances (M, l, N) of the measurements' own noises, fading included."""
         n = self.plant.size
         mean, covariance = belief.mean[:, :n], belief.covariance[:, :n, :n]
         second = covariance + linalg.outer(mean, mean)
-        seen = linalg.quadratic(self.unfaded, second[:, None])
-        return np.asarray(self.sensors.fading_variance[:, None] * seen + self.sensors.variance)
+        observed = linalg.quadratic(self.unfaded, second[:, None])
+        return np.asarray(self.sensors.fading_variance[:, None] * observed + self.sensors.variance)

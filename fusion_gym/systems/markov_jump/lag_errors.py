@@ -143,20 +143,20 @@ class LagRecursion:
         filtered = self.filtered_cross.take(place, -1)
         crossed = np.zeros((count, count, n, n, runs))
         lag = np.empty((count, count, n, n, runs))
-        seen: dict[tuple[int, int], Array] = {}
+        observed: dict[tuple[int, int], Array] = {}
         for row, (i, j) in enumerate(_ordered(count)):
             rows = _collapse(now.crossed[row], n)
-            seen[i, j] = linalg.matvec(rows, filters.measurement_matrix[j])
+            observed[i, j] = linalg.matvec(rows, filters.measurement_matrix[j])
             block = _collapse(rows.swapaxes(0, 1), n).swapaxes(0, 1)
-            block = block - linalg.outer(seen[i, j], gain[j])
+            block = block - linalg.outer(observed[i, j], gain[j])
             block += linalg.outer(gain[i], filtered[i, j])
             crossed[i, j] = block
         for row, (i, j) in enumerate(_pairs(count)):
             block = _collapse(_collapse(now.lag[row], n).swapaxes(0, 1), n).swapaxes(0, 1)
             right = innovation[i, j] * gain[j]
             if i != j:
-                block = block + linalg.outer(seen[i, j], gain[j])
-                right += seen[j, i]
+                block = block + linalg.outer(observed[i, j], gain[j])
+                right += observed[j, i]
             lag[i, j] = block + linalg.outer(gain[i], right)
             if i != j:
                 lag[j, i] = linalg.transpose(lag[i, j])

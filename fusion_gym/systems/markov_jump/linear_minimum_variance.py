@@ -215,12 +215,12 @@ class LocalFilters:
         shared = sensors.noise_coupling[..., 0] @ plant.noise_covariance
         noise = shared @ sensors.noise_coupling[..., 0].T
         rows: list[_Row] = []
-        seen: list[tuple[Array, ...]] = []
+        observed: list[tuple[Array, ...]] = []
         for time, step in enumerate(model.steps()):
             row, following = _advance(model, step, joint, shared, noise, time)
             rows.append(row)
-            seen.append((joint, step.moment, step.input))
-            if time > period and _same(seen[time], seen[time - period]):
+            observed.append((joint, step.moment, step.input))
+            if time > period and _same(observed[time], observed[time - period]):
                 break
             if time >= max(horizon + 2, _LONGEST):
                 break
@@ -305,24 +305,24 @@ def _advance(
         "la,ab,lb->l", model.unfaded, step.moment, model.unfaded
     )
     noise = noise + np.diag(own + sensors.variance[:, 0])
-    seen = np.einsum("ijab,jb->ija", joint, faded)  # E L_i (c_j L_j)
-    innovation = np.einsum("ia,ija->ij", faded, seen) + noise
+    observed = np.einsum("ijab,jb->ija", joint, faded)  # E L_i (c_j L_j)
+    innovation = np.einsum("ia,ija->ij", faded, observed) + noise
     sampled = (time % sensors.period[:, 0] == 0) & (time > 0)
     scale = np.where(sampled, 1.0 / np.diagonal(innovation), 0.0)[:, None]
-    gain = scale * np.einsum("iia->ia", seen)
+    gain = scale * np.einsum("iia->ia", observed)
     noise_gain = scale * shared
     stride = gain @ transition.T + noise_gain @ step.input.T
-    kept = np.eye(model.size) - gain[:, :, None] * faded[:, None]
+    factor = np.eye(model.size) - gain[:, :, None] * faded[:, None]
     moved = transition - stride[:, :, None] * faded[:, None]
-    covariance = _both_sides(kept, joint) + _both_sides(gain[..., None], noise[..., None, None])
+    covariance = _both_sides(factor, joint) + _both_sides(gain[..., None], noise[..., None, None])
     entering = shared @ step.input.T  # E v*_i (B̄ w)
     crossed = stride[:, None, :, None] * entering[:, None, None]
     process = step.input @ model.plant.noise_covariance @ step.input.T + step.additional
     following = _both_sides(moved, joint) + process
     following -= crossed + crossed.transpose(1, 0, 3, 2)
     following += _both_sides(stride[..., None], noise[..., None, None])
-    filtered_cross = np.einsum("jab,jib->ija", kept, seen) - noise[..., None] * gain
-    predicted_cross = np.einsum("jab,jib->ija", moved, seen) + entering[:, None]
+    filtered_cross = np.einsum("jab,jib->ija", factor, observed) - noise[..., None] * gain
+    predicted_cross = np.einsum("jab,jib->ija", moved, observed) + entering[:, None]
     predicted_cross -= noise[..., None] * stride
     row = _Row(
         input=step.input,

@@ -27,19 +27,19 @@ def probabilities(field: str, value: ArrayLike, shape: tuple[int | None, ...]) -
     Raises:
         ConfigurationError: a wrong shape, an entry outside [0, 1], or another sum.
     """
-    given = validation.array(field, value, shape)
-    total = given.sum(-1, keepdims=True)
-    if np.any(given < 0.0) or np.any(np.abs(total - 1.0) > 1e-9):
-        what = "rows add up" if given.ndim > 1 else "entries add up"
+    values = validation.array(field, value, shape)
+    total = values.sum(-1, keepdims=True)
+    if np.any(values < 0.0) or np.any(np.abs(total - 1.0) > 1e-9):
+        what = "rows add up" if values.ndim > 1 else "entries add up"
         sums = np.round(total[..., 0], 12).tolist()
         raise ConfigurationError(
-            f"{field} = {validation.shown(given)} is not allowed: it must have entries from 0 "
+            f"{field} = {validation.display(values)} is not allowed: it must have entries from 0 "
             f"to 1 whose {what} to 1, not {sums}"
         )
-    return np.asarray(given / total)
+    return np.asarray(values / total)
 
 
-def draw(cumulative: Array, noise: Array) -> Modes:
+def draw_mode(cumulative: Array, noise: Array) -> Modes:
     """Index (...) of a discrete distribution from standard normals (...).
 
     ``cumulative`` (values - 1, ...) holds the cumulative probabilities without the last one.
@@ -93,10 +93,10 @@ class MarkovJumpPlant:
         matrices = validation.array("transitions", transitions, (modes, size, size))
         gains = validation.array("process_gains", process_gains, (modes, size, None))
         noises = gains.shape[2]
-        given: ArrayLike = process_covariance
+        values: ArrayLike = process_covariance
         if isinstance(process_covariance, (int, float, np.number)):
-            given = validation.number("process_covariance", process_covariance) * np.eye(noises)
-        noise = validation.covariance("process_covariance", given, noises)
+            values = validation.number("process_covariance", process_covariance) * np.eye(noises)
+        noise = validation.covariance("process_covariance", values, noises)
         start = validation.covariance("initial_covariance", initial_covariance, size, definite=True)
         plant = cls(
             transition=np.ascontiguousarray(matrices.transpose(1, 2, 0)),
@@ -114,7 +114,7 @@ class MarkovJumpPlant:
         radius = plant.second_moment_radius()
         if radius >= 1.0 - 1e-9:
             raise ConfigurationError(
-                f"transitions = {validation.shown(matrices)} are not allowed: with this "
+                f"transitions = {validation.display(matrices)} are not allowed: with this "
                 "mode_transition "
                 "the plant must be mean-square stable, and the spectral radius of its "
                 f"second-moment operator is {radius:.4g}, which must be < 1"
@@ -159,13 +159,13 @@ class MarkovJumpPlant:
         """The options of the true plant that can change nothing."""
         still = bool((self.transition == np.eye(self.size)[..., None]).all())
         quiet = not (self.noise_factor.any() and self.process_gain.any())
-        found = {"true_process_noise": quiet, "true_transition": still}
-        return tuple(name for name, absent in found.items() if absent)
+        result = {"true_process_noise": quiet, "true_transition": still}
+        return tuple(name for name, absent in result.items() if absent)
 
     def start(self, noise: Array) -> tuple[Array, Modes]:
         """x(0) (n, N) and θ(0) (N,) from standard normals (n + 1, N), the last one the mode's."""
         state = self.initial_mean + linalg.matvec(self.initial_factor, noise[:-1])
-        return state, draw(np.cumsum(self.initial_probabilities)[:-1, None], noise[-1])
+        return state, draw_mode(np.cumsum(self.initial_probabilities)[:-1, None], noise[-1])
 
     def process_noise(self, noise: Array) -> Array:
         """w (r, N) from standard normals (noise_channels, N)."""
@@ -187,4 +187,4 @@ class MarkovJumpPlant:
     def jump(self, mode: Modes, noise: Array) -> Modes:
         """θ(k+1) (N,) from θ(k) (N,) and standard normals (N,)."""
         cumulative = np.cumsum(self.mode_transition, 1).T[:-1]
-        return draw(cumulative.take(mode, -1), noise)
+        return draw_mode(cumulative.take(mode, -1), noise)

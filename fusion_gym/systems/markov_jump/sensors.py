@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes, draw, probabilities
+from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes, draw_mode, probabilities
 from fusion_gym.validation import ConfigurationError
 
 
@@ -67,13 +67,13 @@ class FadingSensors:
         period = validation.spread("sampling_periods", sampling_periods, (sensors,))
         if np.any(period < 1.0) or np.any(period != np.round(period)):
             raise ConfigurationError(
-                f"sampling_periods = {validation.shown(sampling_periods)} is not allowed: "
+                f"sampling_periods = {validation.display(sampling_periods)} is not allowed: "
                 "each must be a whole number >= 1"
             )
         values = validation.array("fading_values", fading_values, (sensors, None))
         if np.any(values < 0.0) or np.any(values > 1.0):
             raise ConfigurationError(
-                f"fading_values = {validation.shown(values)} is not allowed: each must be from "
+                f"fading_values = {validation.display(values)} is not allowed: each must be from "
                 "0 to 1"
             )
         variance = validation.positive("measurement_variance", measurement_variance, (sensors,))
@@ -119,7 +119,7 @@ class FadingSensors:
     def fading(self, noise: Array) -> Array:
         """β (sensors, N) from standard normals (sensors, N)."""
         cumulative = np.cumsum(self.fading_probabilities, 1).T[:-1, :, None]
-        place = draw(cumulative, noise)
+        place = draw_mode(cumulative, noise)
         return np.asarray(np.take_along_axis(self.fading_values, place, 1))
 
     def measure(self, state: Array, mode: Modes, process_noise: Array, noise: Array) -> Array:
@@ -140,7 +140,7 @@ class FadingSensors:
 def _column(value: ArrayLike, sensors: int) -> ArrayLike:
     """One number a sensor as a column that broadcasts over the noises; all else as it is."""
     try:
-        given = np.asarray(value)
+        values = np.asarray(value)
     except ValueError:
         return value
-    return given[:, None] if given.shape == (sensors,) else value
+    return values[:, None] if values.shape == (sensors,) else value

@@ -19,7 +19,7 @@ from fusion_gym.core.nature import true_noise
 from fusion_gym.core.system import Block, Signal, common_signals, numbered
 from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagCovariances
 from fusion_gym.systems.markov_jump.linear_minimum_variance import Times
-from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes, draw
+from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes, draw_mode
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
 
 
@@ -170,8 +170,8 @@ def imagined(
         law[:, state.time == time] = (plant.initial_probabilities @ moved)[:, None]
     return replace(
         state,
-        truth=linalg.draw(mean, covariance, noise[:n]),
-        mode=draw(np.cumsum(law, 0)[:-1], noise[n]),
+        truth=linalg.draw_normal(mean, covariance, noise[:n]),
+        mode=draw_mode(np.cumsum(law, 0)[:-1], noise[n]),
         process_noise=plant.process_noise(noise[n + 1 :]),
         departure=None,
     )

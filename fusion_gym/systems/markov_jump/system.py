@@ -355,9 +355,9 @@ class MarkovJumpSystem(System[MarkovJumpState]):
         for _ in range(self.sensor_count):
             each = self._covariances_with_one_more(state, prediction, sent)
             options = np.where(sent, np.inf, [linalg.trace(covariance) for covariance in each])
-            chosen = sensors == options.argmin(0)
-            result[chosen] = np.broadcast_to(trace, sent.shape)[chosen]
-            trace, sent = options.min(0), sent | chosen
+            selected = sensors == options.argmin(0)
+            result[selected] = np.broadcast_to(trace, sent.shape)[selected]
+            trace, sent = options.min(0), sent | selected
         return result
 
     def _covariances_with_one_more(

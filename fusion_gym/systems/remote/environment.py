@@ -77,35 +77,35 @@ _DROP: dict[str, ArrayLike] = {"independent": 0.2, "gilbert_elliott": (0.7, 0.2)
 _TRANSITION: ArrayLike = ((0.7, 0.3), (0.1, 0.9))
 
 
-def build(chosen: RemoteEstimationOptions) -> Scenario:
+def build_remote(options: RemoteEstimationOptions) -> Scenario:
     """The scenario of these options, checked before anything runs.
 
     Raises:
         ConfigurationError: a value that is not allowed.
     """
     most = validation.MOST_SENSORS
-    sensors = validation.integer("sensors", chosen.sensors, at_least=1, at_most=most)
+    sensors = validation.integer("sensors", options.sensors, at_least=1, at_most=most)
     weights = (
         np.ones(sensors)
-        if chosen.state_weights is None
-        else validation.not_negative("state_weights", chosen.state_weights, (sensors,))
+        if options.state_weights is None
+        else validation.not_negative("state_weights", options.state_weights, (sensors,))
     )
-    deviation = validation.positive("noise_deviation", chosen.noise_deviation, (sensors,))
-    coefficient = validation.spread("coefficient", chosen.coefficient, (sensors,))
+    deviation = validation.positive("noise_deviation", options.noise_deviation, (sensors,))
+    coefficient = validation.spread("coefficient", options.coefficient, (sensors,))
     system = RemoteEstimationSystem(
         state_names=tuple(f"x{i + 1}" for i in range(len(coefficient))),
         coefficient=coefficient,
         deviation=deviation,
         initial_deviation=validation.not_negative(
-            "initial_deviation", chosen.initial_deviation, (sensors,)
+            "initial_deviation", options.initial_deviation, (sensors,)
         ),
-        channel=_channel(chosen, sensors),
-        error_scale=_error_scale(chosen, deviation),
+        channel=_channel(options, sensors),
+        error_scale=_error_scale(options, deviation),
         state_weights=weights,
-        nature=_nature(chosen, coefficient),
+        nature=_nature(options, coefficient),
     )
     return Scenario(
-        chosen,
+        options,
         system,
         weights,
         nodes_remember=True,  # a source's value is all that there is to know of it
@@ -113,37 +113,37 @@ def build(chosen: RemoteEstimationOptions) -> Scenario:
     )
 
 
-def _nature(chosen: RemoteEstimationOptions, coefficient: Array) -> Nature:
+def _nature(options: RemoteEstimationOptions, coefficient: Array) -> Nature:
     """A source moves by c a in the place of a."""
     absent = ("true_measurement_noise", "true_threshold_shift")
-    nature = Nature.create(chosen, absent if coefficient.any() else (*absent, "true_transition"))
+    nature = Nature.create(options, absent if coefficient.any() else (*absent, "true_transition"))
     largest = float(np.abs(coefficient).max())
-    nature.check_growth(lambda factor: factor * largest, validation.horizon(chosen.horizon))
+    nature.check_growth(lambda factor: factor * largest, validation.horizon(options.horizon))
     return nature
 
 
-def _channel(chosen: RemoteEstimationOptions, sensors: int) -> Channel:
-    kind = chosen.channel
-    if kind != "gilbert_elliott" and chosen.channel_transition is not None:
+def _channel(options: RemoteEstimationOptions, sensors: int) -> Channel:
+    kind = options.channel
+    if kind != "gilbert_elliott" and options.channel_transition is not None:
         raise ConfigurationError(
-            f"channel_transition = {validation.shown(chosen.channel_transition)} is not allowed "
+            f"channel_transition = {validation.display(options.channel_transition)} is not allowed "
             f"with channel={kind!r}: it belongs to 'gilbert_elliott'"
         )
     if kind == "perfect":
-        if chosen.drop_probability is not None:
+        if options.drop_probability is not None:
             raise ConfigurationError(
-                f"drop_probability = {validation.shown(chosen.drop_probability)} is not allowed "
+                f"drop_probability = {validation.display(options.drop_probability)} is not allowed "
                 "with channel='perfect': it belongs to 'independent' and 'gilbert_elliott'"
             )
         return Channel.perfect(sensors)
-    drop = _DROP[kind] if chosen.drop_probability is None else chosen.drop_probability
+    drop = _DROP[kind] if options.drop_probability is None else options.drop_probability
     if kind == "independent":
         return Channel.independent(drop, sensors)
-    transition = _TRANSITION if chosen.channel_transition is None else chosen.channel_transition
-    return Channel.gilbert_elliott(transition, drop, sensors, chosen.initial_channel)
+    transition = _TRANSITION if options.channel_transition is None else options.channel_transition
+    return Channel.gilbert_elliott(transition, drop, sensors, options.initial_channel)
 
 
-def _error_scale(chosen: RemoteEstimationOptions, deviation: Array) -> Array:
+def _error_scale(options: RemoteEstimationOptions, deviation: Array) -> Array:
     """What observed errors are divided by (n,): about the optimal threshold of a random walk.
 
     Without a limit that is (6 price)^1/4 in continuous time, at unit noise and the environment's
@@ -151,14 +151,14 @@ def _error_scale(chosen: RemoteEstimationOptions, deviation: Array) -> Array:
     changes it: an agent sees the same whatever it is asked for.
     """
     sensors = len(deviation)
-    if chosen.error_scale is not None:
-        return validation.positive("error_scale", chosen.error_scale, (sensors,))
-    bucket = make_bucket(chosen, sensors)
+    if options.error_scale is not None:
+        return validation.positive("error_scale", options.error_scale, (sensors,))
+    bucket = make_bucket(options, sensors)
     if bucket.unlimited:
-        alone = (6.0 * _USUAL_PRICE) ** 0.25
-        shared = math.sqrt(sensors) if chosen.access != "any" else 1.0
-        return deviation * max(alone, shared)
+        single = (6.0 * _USUAL_PRICE) ** 0.25
+        shared = math.sqrt(sensors) if options.access != "any" else 1.0
+        return deviation * max(single, shared)
     steps = float(bucket.cost.sum()) / max(bucket.rate, 1e-3)
-    if chosen.access != "any":
+    if options.access != "any":
         steps = max(steps, float(sensors))
     return deviation * math.sqrt(max(steps, 1.0))

@@ -27,7 +27,7 @@ from fusion_gym.systems.tobit.options import (
     at_the_nodes,
     classes,
     make_centre,
-    remembering_system,
+    memory_filter_system,
     stochastic_defaults,
     true_nature,
 )
@@ -130,83 +130,83 @@ class BiasedTrackingOptions(BiasedOscillatorOptions):
     censoring_upper: ArrayLike = ((1000.0,), (200.0,))
 
 
-def build_oscillator(chosen: BiasedOscillatorOptions) -> Scenario:
+def build_biased_oscillator(options: BiasedOscillatorOptions) -> Scenario:
     """The oscillator's scenario, checked before anything runs.
 
     Raises:
         ConfigurationError: a value that is not allowed.
     """
-    return _build(chosen)
+    return _build(options)
 
 
-def build_tracking(chosen: BiasedTrackingOptions) -> Scenario:
+def build_biased_tracking(options: BiasedTrackingOptions) -> Scenario:
     """The target's scenario, checked before anything runs.
 
     Raises:
         ConfigurationError: a value that is not allowed.
     """
-    return _build(chosen)
+    return _build(options)
 
 
-def _build(chosen: BiasedOscillatorOptions) -> Scenario:
-    horizon = validation.horizon(chosen.horizon)
-    plant, states = _augmented(chosen, aware=True)
-    model = plant if chosen.bias_aware else _augmented(chosen, aware=False)[0]
+def _build(options: BiasedOscillatorOptions) -> Scenario:
+    horizon = validation.horizon(options.horizon)
+    plant, states = _augmented(options, aware=True)
+    model = plant if options.bias_aware else _augmented(options, aware=False)[0]
     matrices = validation.array(
-        "measurement_matrices", chosen.measurement_matrices, (None, None, states)
+        "measurement_matrices", options.measurement_matrices, (None, None, states)
     )
     sensors = CensoredSensors.create(
         np.pad(matrices, ((0, 0), (0, 0), (0, plant.size - states))),
-        chosen.measurement_variance,
-        chosen.censoring_threshold,
+        options.measurement_variance,
+        options.censoring_threshold,
         plant.size,
-        chosen.censoring_upper,
+        options.censoring_upper,
     )
     biases = plant.size - states
     system = CensoredSystem(
         plant=plant,
         model=model,
-        centre=make_centre(chosen.filter, _FILTERS, chosen, sensors),
-        random_start=chosen.random_start,
+        centre=make_centre(options.filter, _FILTERS, options, sensors),
+        random_start=options.random_start,
         state_names=tuple(f"x{i + 1}" for i in range(states))
         + (("b",) if biases == 1 else tuple(f"b{i + 1}" for i in range(biases))),
-        scale=typical_magnitude(plant, horizon, chosen.random_start),
+        scale=typical_magnitude(plant, horizon, options.random_start),
         reference=plant.open_loop(min(horizon, _REFERENCE_HORIZON)),
-        nature=true_nature(chosen, plant, sensors, horizon),
+        nature=true_nature(options, plant, sensors, horizon),
     )
     weights = equal_weights(system.open_loop(horizon))
-    remembering = remembering_system(system, chosen.memory_filter, _FILTERS, chosen, sensors)
+    remembering = memory_filter_system(system, options.memory_filter, _FILTERS, options, sensors)
     return Scenario(
-        chosen,
+        options,
         system,
         weights,
-        stochastic_defaults(chosen),
+        stochastic_defaults(options),
         feedback=True,
         memory_system=remembering,
     )
 
 
-def _augmented(chosen: BiasedOscillatorOptions, aware: bool) -> tuple[LinearPlant, int]:
+def _augmented(options: BiasedOscillatorOptions, aware: bool) -> tuple[LinearPlant, int]:
     """Plant of ξ = [x; b], equations (10) and (11), and the number of states in x.
 
     A filter that ignores the bias believes that it has no effect on x.
     """
-    transition = validation.array("transition", chosen.transition, (None, None))
+    transition = validation.array("transition", options.transition, (None, None))
     states = len(transition)
-    transition = validation.array("transition", chosen.transition, (states, states))
-    gain = validation.array("bias_gain", chosen.bias_gain, (states, None))
+    transition = validation.array("transition", options.transition, (states, states))
+    gain = validation.array("bias_gain", options.bias_gain, (states, None))
     biases = gain.shape[1]
-    process = validation.covariance("process_covariance", chosen.process_covariance, states)
-    noise = validation.covariance("bias_noise_covariance", chosen.bias_noise_covariance, biases)
+    process = validation.covariance("process_covariance", options.process_covariance, states)
+    noise = validation.covariance("bias_noise_covariance", options.bias_noise_covariance, biases)
     start = validation.covariance(
-        "initial_covariance", chosen.initial_covariance, states, definite=True
+        "initial_covariance", options.initial_covariance, states, definite=True
     )
     bias_start = validation.covariance(
-        "bias_initial_covariance", chosen.bias_initial_covariance, biases, definite=True
+        "bias_initial_covariance", options.bias_initial_covariance, biases, definite=True
     )
-    inner = validation.array("bias_transition", chosen.bias_transition, (biases, biases))
-    mean = validation.array("initial_mean", chosen.initial_mean, (states,))
-    bias_mean = validation.array("bias_initial_mean", chosen.bias_initial_mean, (biases,))
+    inner = validation.array("bias_transition", options.bias_transition, (biases, biases))
+    mean = validation.array("initial_mean", options.initial_mean, (states,))
+    bias_mean = validation.array("bias_initial_mean", options.bias_initial_mean, (biases,))
     joint = np.block([[transition, gain if aware else 0.0 * gain], [np.zeros_like(gain.T), inner]])
     plant = LinearPlant.create(
         joint,

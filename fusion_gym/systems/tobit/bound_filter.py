@@ -270,10 +270,10 @@ class BoundTobitFilter:
         k1, k2, _, k4, _, _, _, _ = self.constants.kappa
         grow, shift = self.constants.second_moment
         matrix = self.sensors.measurement_matrix
-        seen = linalg.matmul(matrix, linalg.factor(covariance))
+        observed = linalg.matmul(matrix, linalg.factor(covariance))
         offsets = np.stack((np.sqrt(k4 * shift) * latent, np.sqrt(k2) * bias), axis=-2)
         noise = [
-            linalg.matmul(gain, np.sqrt(k4 * grow) * seen),
+            linalg.matmul(gain, np.sqrt(k4 * grow) * observed),
             linalg.matmul(gain, offsets),
             pulled,
         ]

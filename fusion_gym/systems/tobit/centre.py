@@ -22,7 +22,7 @@ from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
 from fusion_gym.validation import ConfigurationError
 
 
-class Prediction(NamedTuple):
+class CentrePrediction(NamedTuple):
     """What centre and nodes expect before anything is sent.
 
     ``expectation`` of the measurements, ``deviation`` (sensors, m, N) of the innovation, and the
@@ -61,7 +61,7 @@ class Centre(Protocol):
         """Whether :meth:`alone` is there, and costs less than one update after another."""
         return False
 
-    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> Prediction:
+    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """Expectations under the centre's prediction (n, N), (n, n, N)."""
         ...
 
@@ -69,15 +69,15 @@ class Centre(Protocol):
         self,
         mean: Array,
         covariance: Array,
-        prediction: Prediction,
+        prediction: CentrePrediction,
         measurement: Array,
         granted: NDArray[np.bool_],
     ) -> Posterior:
         """The posterior after the granted (sensors, N) of the measurements (sensors, m, N)."""
         ...
 
-    def alone(
-        self, mean: Array, covariance: Array, prediction: Prediction, measurement: Array
+    def single(
+        self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
     ) -> tuple[Array, Array]:
         """Posterior means (sensors, n, N) and covariances (sensors, n, n, N), one sensor granted.
 
@@ -86,7 +86,7 @@ class Centre(Protocol):
         ...
 
     def variances(
-        self, mean: Array, covariance: Array, prediction: Prediction, weights: Array
+        self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
         """Weighted fused trace (N,) if nobody transmits, its reduction (sensors, N) by each alone.
 
@@ -128,7 +128,7 @@ class Feedback:
         weights = validation.array("information_shares", share, (sensors,))
         if np.any(weights <= 0) or abs(weights.sum() - 1.0) > 1e-9:
             raise ConfigurationError(
-                f"information_shares = {validation.shown(weights)} is not allowed: they must be "
+                f"information_shares = {validation.display(weights)} is not allowed: they must be "
                 f"> 0 with sum 1 (their sum is {weights.sum():.6g})"
             )
         return cls(sensors, weights[:, None])
@@ -175,7 +175,7 @@ class FeedbackCentre(Centre):
         """See :class:`Centre`: where informations add up."""
         return isinstance(self.fusion, InformationFusion)
 
-    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> Prediction:
+    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`."""
         nodes = self.feedback.distribute(mean, covariance)
         expectation = self.filter.expect(nodes[0])
@@ -184,7 +184,7 @@ class FeedbackCentre(Centre):
         q = expectation.uncensored_probability
         floor = 1e-3 * self.sensors.variance
         deviation = np.sqrt(q * q * spread + expectation.noise_variance + floor)
-        return Prediction(
+        return CentrePrediction(
             expectation, deviation, self.filter.outcomes(*nodes, expectation, held, time)
         )
 
@@ -192,7 +192,7 @@ class FeedbackCentre(Centre):
         self,
         mean: Array,
         covariance: Array,
-        prediction: Prediction,
+        prediction: CentrePrediction,
         measurement: Array,
         granted: NDArray[np.bool_],
     ) -> Posterior:
@@ -211,8 +211,8 @@ class FeedbackCentre(Centre):
         local = np.where(grant, outcomes.delivered_covariance, outcomes.silent_covariance)
         return self.fusion.fuse(means, local)
 
-    def alone(
-        self, mean: Array, covariance: Array, prediction: Prediction, measurement: Array
+    def single(
+        self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
     ) -> tuple[Array, Array]:
         """See :class:`Centre`: informations of all nodes but one stay what they are in silence."""
         outcomes = _outcomes(prediction)
@@ -225,13 +225,13 @@ class FeedbackCentre(Centre):
         )
 
     def variances(
-        self, mean: Array, covariance: Array, prediction: Prediction, weights: Array
+        self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
         """See :class:`Centre`; by the bound where the filter minimises one."""
         outcomes = _outcomes(prediction)
-        fused = self.fusion.fuse_alone(outcomes.silent_covariance, outcomes.delivered_covariance)
-        silent, alone = (linalg.weighted_trace(covariance, weights) for covariance in fused)
-        return silent, silent - alone
+        fused = self.fusion.fuse_single(outcomes.silent_covariance, outcomes.delivered_covariance)
+        silent, single = (linalg.weighted_trace(covariance, weights) for covariance in fused)
+        return silent, silent - single
 
 
 @dataclass(frozen=True)
@@ -245,17 +245,17 @@ class SequentialCentre(Centre):
         """The sensors."""
         return self.filter.sensors
 
-    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> Prediction:
+    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
         expectation = self.filter.expect(mean, covariance)
         floor = 1e-3 * self.sensors.variance
-        return Prediction(expectation, np.sqrt(expectation.noise_variance + floor), None)
+        return CentrePrediction(expectation, np.sqrt(expectation.noise_variance + floor), None)
 
     def update(
         self,
         mean: Array,
         covariance: Array,
-        prediction: Prediction,
+        prediction: CentrePrediction,
         measurement: Array,
         granted: NDArray[np.bool_],
     ) -> Posterior:
@@ -264,14 +264,14 @@ class SequentialCentre(Centre):
         local = np.broadcast_to(mean, (self.sensors.count, *mean.shape))
         return Posterior(mean, covariance, local)
 
-    def alone(
-        self, mean: Array, covariance: Array, prediction: Prediction, measurement: Array
+    def single(
+        self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
     ) -> tuple[Array, Array]:
         """See :class:`Centre`: not separable."""
         raise NotImplementedError("one update after another costs no more")
 
     def variances(
-        self, mean: Array, covariance: Array, prediction: Prediction, weights: Array
+        self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
         """See :class:`Centre`; the reduction is the expected one."""
         silent = linalg.weighted_trace(covariance, weights)
@@ -279,13 +279,13 @@ class SequentialCentre(Centre):
         return silent, silent - linalg.weighted_trace(expected, weights)
 
 
-def _correction(outcomes: Outcomes, prediction: Prediction, measurement: Array) -> Array:
+def _correction(outcomes: Outcomes, prediction: CentrePrediction, measurement: Array) -> Array:
     """What a delivery would add to each node's mean (sensors, n, N)."""
     innovation = measurement - prediction.expectation.value
     return linalg.matvec(linalg.transpose(outcomes.correction), innovation)
 
 
-def _outcomes(prediction: Prediction) -> Outcomes:
+def _outcomes(prediction: CentrePrediction) -> Outcomes:
     if prediction.outcomes is None:
         raise RuntimeError("the prediction has no outcomes: it was made by another centre")
     return prediction.outcomes

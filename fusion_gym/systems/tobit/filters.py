@@ -90,8 +90,8 @@ class Outcomes:
         result = np.ascontiguousarray(self.silent_information).copy()
         sensor, run = np.nonzero(granted)
         delivered = np.moveaxis(self.delivered_covariance[sensor, :, :, run], 0, -1)
-        found = linalg.inverse(np.ascontiguousarray(delivered))
-        result[sensor, :, :, run] = np.moveaxis(found, -1, 0)
+        values = linalg.inverse(np.ascontiguousarray(delivered))
+        result[sensor, :, :, run] = np.moveaxis(values, -1, 0)
         return result
 
 
@@ -159,8 +159,8 @@ def joseph_form(
     guidance", 1968.
     """
     keep = linalg.identity(covariance.shape[-2]) - linalg.matmul(gain, matrix)
-    kept = linalg.matmul(keep, linalg.factor(covariance))
-    return sensors.gram(np.concatenate([kept, *noise], axis=-2))
+    retention = linalg.matmul(keep, linalg.factor(covariance))
+    return sensors.gram(np.concatenate([retention, *noise], axis=-2))
 
 
 def in_lanes(values: Array, lanes: NDArray[np.intp]) -> Array:
@@ -198,14 +198,14 @@ class KalmanFilter:
     def expect(self, mean: Array) -> Expectation:
         """See :class:`NodeFilter`."""
         latent = linalg.matvec(self.sensors.measurement_matrix, mean)
-        one = np.ones_like(latent)
+        ones = np.ones_like(latent)
         return Expectation(
             latent=latent,
             value=latent,
-            noise_variance=self.sensors.variance * one,
-            uncensored_probability=one,
+            noise_variance=self.sensors.variance * ones,
+            uncensored_probability=ones,
             hazard=np.zeros_like(latent),
-            truncated_variance=one,
+            truncated_variance=ones,
         )
 
     def outcomes(
@@ -292,9 +292,9 @@ class StochasticEventFilter:
         correction, delivered = linear_update(self.sensors, covariance, matrix, innovation, noise)
         # Both sides times √Z, so that weight 0 is no exception: √Z C measured with √Z S √Z + I.
         weight = self.weight[:, None, None]
-        one = np.ones((matrix.shape[-3], 1))
-        scaled = linalg.add_diagonal(weight * innovation, one)
-        noise = self.weight[:, None] * noise + one
+        ones = np.ones((matrix.shape[-3], 1))
+        scaled = linalg.add_diagonal(weight * innovation, ones)
+        noise = self.weight[:, None] * noise + ones
         matrix = np.sqrt(weight) * matrix
         _, silent = linear_update(self.sensors, covariance, matrix, scaled, noise)
         return Outcomes(correction, delivered, mean, silent)

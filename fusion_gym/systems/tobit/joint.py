@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.systems.tobit.centre import Posterior, Prediction
+from fusion_gym.systems.tobit.centre import CentrePrediction, Posterior
 from fusion_gym.systems.tobit.filters import (
     Expectation,
     KalmanFilter,
@@ -63,18 +63,18 @@ class JointCentre:
         """See :class:`Centre`."""
         return True
 
-    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> Prediction:
+    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
         expectation = KalmanFilter(self.sensors).expect(mean)
         matrix, variance = self.sensors.measurement_matrix, self.sensors.variance
         spread = (matrix * linalg.matmul(matrix, covariance)).sum(-2)
-        return Prediction(expectation, np.sqrt(spread + (1.0 + 1e-3) * variance), None)
+        return CentrePrediction(expectation, np.sqrt(spread + (1.0 + 1e-3) * variance), None)
 
     def update(
         self,
         mean: Array,
         covariance: Array,
-        prediction: Prediction,
+        prediction: CentrePrediction,
         measurement: Array,
         granted: NDArray[np.bool_],
     ) -> Posterior:
@@ -101,8 +101,8 @@ class JointCentre:
         local = np.broadcast_to(mean, (sensors.count, *mean.shape))
         return Posterior(mean, posterior, local)
 
-    def alone(
-        self, mean: Array, covariance: Array, prediction: Prediction, measurement: Array
+    def single(
+        self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
     ) -> tuple[Array, Array]:
         """See :class:`Centre`: by the sensor's own channels, up to rounding."""
         outcomes = self._each(mean, covariance, prediction)
@@ -111,14 +111,14 @@ class JointCentre:
         return mean + correction, outcomes.delivered_covariance
 
     def variances(
-        self, mean: Array, covariance: Array, prediction: Prediction, weights: Array
+        self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
         """See :class:`Centre`."""
         silent = linalg.weighted_trace(covariance, weights)
-        alone = self._each(mean, covariance, prediction)
-        return silent, silent - linalg.weighted_trace(alone.delivered_covariance, weights)
+        single = self._each(mean, covariance, prediction)
+        return silent, silent - linalg.weighted_trace(single.delivered_covariance, weights)
 
-    def _each(self, mean: Array, covariance: Array, prediction: Prediction) -> Outcomes:
+    def _each(self, mean: Array, covariance: Array, prediction: CentrePrediction) -> Outcomes:
         """What each sensor alone makes of the centre's own prediction."""
         priors = np.broadcast_to(covariance, (self.sensors.count, *covariance.shape))
         means = np.broadcast_to(mean, (self.sensors.count, *mean.shape))
@@ -128,14 +128,14 @@ class JointCentre:
         )
 
 
-def joint_centre(chosen: FeedbackOptions, sensors: CensoredSensors) -> JointCentre:
+def joint_centre(options: FeedbackOptions, sensors: CensoredSensors) -> JointCentre:
     """The centre of ``filter="joint"``.
 
     Raises:
         ConfigurationError: an option of the nodes' fusion, for there are no nodes, or more than
             100 channels.
     """
-    refuse_fusion(chosen, "joint")
+    refuse_fusion(options, "joint")
     channels = sensors.noise_channels
     if channels > _MOST_CHANNELS:
         raise ConfigurationError(

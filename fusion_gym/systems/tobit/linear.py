@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
-from fusion_gym.core.options import Scenario, plain
+from fusion_gym.core.options import Scenario, plain_options
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.tobit.joint import JointCentre, joint_centre
 from fusion_gym.systems.tobit.linear_sensors import linear_sensors
@@ -21,7 +21,7 @@ from fusion_gym.systems.tobit.options import (
     at_the_nodes,
     classes,
     make_centre,
-    remembering_system,
+    memory_filter_system,
     stochastic_defaults,
     true_nature,
 )
@@ -100,81 +100,81 @@ class LinearFusionOptions(FeedbackOptions):
     is the Kalman filter for the policy ``stochastic_event``."""
 
 
-def build(chosen: LinearFusionOptions) -> Scenario:
+def build_linear(choice: LinearFusionOptions) -> Scenario:
     """The scenario of these options, checked before anything runs.
 
     Raises:
         ConfigurationError: a value that is not allowed.
     """
-    horizon = validation.horizon(chosen.horizon)
-    plant = _plant(chosen)
-    sensors = _sensors(chosen, plant.size)
+    horizon = validation.horizon(choice.horizon)
+    plant = _plant(choice)
+    sensors = _sensors(choice, plant.size)
     correlated = sensors.noise_correlation is not None
-    if chosen.filter is None:
+    if choice.filter is None:
         default = "joint" if correlated else "kalman"
-        chosen = replace(chosen, filter=default if sensors.unlimited else "adf")
+        choice = replace(choice, filter=default if sensors.unlimited else "adf")
     if correlated:
-        _check_rules(chosen)
+        _check_rules(choice)
     system = CensoredSystem(
         plant=plant,
         model=plant,
-        centre=make_centre(str(chosen.filter), _FILTERS, chosen, sensors),
+        centre=make_centre(str(choice.filter), _FILTERS, choice, sensors),
         random_start=False,
-        state_names=_names(chosen.state_names, plant.size),
+        state_names=_names(choice.state_names, plant.size),
         scale=typical_magnitude(plant, horizon, random_start=False),
         reference=plant.open_loop(min(horizon, _REFERENCE_HORIZON)),
-        nature=true_nature(chosen, plant, sensors, horizon),
+        nature=true_nature(choice, plant, sensors, horizon),
     )
     return Scenario(
-        chosen,
+        choice,
         system,
-        policy_defaults=stochastic_defaults(chosen),
+        policy_defaults=stochastic_defaults(choice),
         feedback=True,
-        memory_system=remembering_system(system, chosen.memory_filter, _FILTERS, chosen, sensors),
+        memory_system=memory_filter_system(system, choice.memory_filter, _FILTERS, choice, sensors),
     )
 
 
-def _plant(chosen: LinearFusionOptions) -> LinearPlant:
-    transition = validation.array("transition", chosen.transition, (None, None))
+def _plant(options: LinearFusionOptions) -> LinearPlant:
+    transition = validation.array("transition", options.transition, (None, None))
     size = len(transition)
-    mean = np.zeros(size) if chosen.initial_mean is None else chosen.initial_mean
-    start = np.eye(size) if chosen.initial_covariance is None else chosen.initial_covariance
-    return LinearPlant.create(transition, chosen.process_covariance, mean, start)
+    mean = np.zeros(size) if options.initial_mean is None else options.initial_mean
+    start = np.eye(size) if options.initial_covariance is None else options.initial_covariance
+    return LinearPlant.create(transition, options.process_covariance, mean, start)
 
 
-def _sensors(chosen: LinearFusionOptions, states: int) -> CensoredSensors:
-    joint, own = chosen.joint_measurement_covariance, chosen.measurement_covariances
+def _sensors(options: LinearFusionOptions, states: int) -> CensoredSensors:
+    joint, own = options.joint_measurement_covariance, options.measurement_covariances
     default = LinearFusionOptions.measurement_covariances
-    if joint is not None and plain(own) != default:
+    if joint is not None and plain_options(own) != default:
         raise validation.refusal(
             "measurement_covariances", own, "left out beside joint_measurement_covariance"
         )
     return linear_sensors(
         states,
-        chosen.measurement_matrices,
+        options.measurement_matrices,
         own,
         joint,
-        chosen.censoring_threshold,
-        chosen.censoring_upper,
+        options.censoring_threshold,
+        options.censoring_upper,
     )
 
 
-def _names(given: Any, states: int) -> tuple[str, ...]:
+def _names(value: Any, states: int) -> tuple[str, ...]:
     """The states' names, by default x1, x2, …
 
     Raises:
         ConfigurationError: another number of them, or some that are no different words.
     """
-    if given is None:
+    if value is None:
         return tuple(f"x{i + 1}" for i in range(states))
-    listed = isinstance(given, (list, tuple)) and len(given) == len(set(map(repr, given))) == states
-    if not listed or not all(isinstance(name, str) and name.isidentifier() for name in given):
+    listed = isinstance(value, (list, tuple)) and len(value) == len(set(map(repr, value))) == states
+    if not listed or not all(isinstance(name, str) and name.isidentifier() for name in value):
         words = f"a list of {states} different words of letters, digits and '_'"
-        raise validation.refusal("state_names", given, words)
-    return tuple(given)
+        raise validation.refusal("state_names", value, words)
+    return tuple(value)
 
 
-def _check_rules(chosen: LinearFusionOptions) -> None:
+def _check_rules(options: LinearFusionOptions) -> None:
     """Whether filter and fusion stay right where sensors share noise.
 
     Raises:
@@ -182,10 +182,10 @@ def _check_rules(chosen: LinearFusionOptions) -> None:
     """
     why = "for the sensors' noises are correlated"
     for name in ("filter", "memory_filter"):
-        kind = getattr(chosen, name)
+        kind = getattr(options, name)
         if kind not in (None, "joint", "kalman"):
             raise validation.refusal(name, kind, f"'joint' or 'kalman', {why}")
-        if kind == "kalman" and chosen.fusion not in ("ci", "sci"):
+        if kind == "kalman" and options.fusion not in ("ci", "sci"):
             raise validation.refusal(
-                "fusion", chosen.fusion, f"'ci' or 'sci' with {name}='kalman', {why}"
+                "fusion", options.fusion, f"'ci' or 'sci' with {name}='kalman', {why}"
             )

@@ -29,7 +29,7 @@ def linear_sensors(
         ConfigurationError: a value that is not allowed, or censoring where noises are correlated.
     """
     rows = _matrices(matrices, states)
-    sizes = [len(one) for one in rows]
+    sizes = [len(row) for row in rows]
     shape = (len(sizes), max(sizes))
     low = _limits("censoring_threshold", threshold, sizes, -np.inf)
     high = _limits("censoring_upper", upper, sizes, np.inf)
@@ -70,51 +70,51 @@ def linear_sensors(
     return replace(sensors, noise_correlation=factor[..., None])
 
 
-def _matrices(given: Any, states: int) -> list[Array]:
-    found = []
-    for place, one in enumerate(_each("measurement_matrices", given, "a matrix")):
+def _matrices(value: Any, states: int) -> list[Array]:
+    result = []
+    for place, item in enumerate(_each("measurement_matrices", value, "a matrix")):
         name = f"measurement_matrices[{place}]"
-        row = _dimensions(one) == 1
-        matrix = validation.array(name, one, (states,) if row else (None, states))
-        found.append(matrix[None] if row else matrix)
-    return found
+        row = _dimensions(item) == 1
+        matrix = validation.array(name, item, (states,) if row else (None, states))
+        result.append(matrix[None] if row else matrix)
+    return result
 
 
-def _covariances(given: Any, sizes: Sequence[int]) -> list[Array]:
+def _covariances(values: Any, sizes: Sequence[int]) -> list[Array]:
     name, count = "measurement_covariances", len(sizes)
-    one = _dimensions(given) == 0
-    each = [given] * count if one else _each(name, given, "a covariance or a variance", count)
-    found = []
+    single = _dimensions(values) == 0
+    each = [values] * count if single else _each(name, values, "a covariance or a variance", count)
+    result = []
     for place, (size, value) in enumerate(zip(sizes, each, strict=True)):
-        full = name if one else f"{name}[{place}]"
+        full = name if single else f"{name}[{place}]"
         if _dimensions(value) == 0:
             value = validation.number(full, value, above=0.0) * np.eye(size)
-        found.append(validation.covariance(full, value, size, definite=True))
-    return found
+        result.append(validation.covariance(full, value, size, definite=True))
+    return result
 
 
-def _limits(name: str, given: Any, sizes: Sequence[int], none: float) -> Array:
+def _limits(name: str, values: Any, sizes: Sequence[int], none: float) -> Array:
     """Limits (sensors, m); ``none`` stands for no limit, as of channels that are absent."""
-    one = _dimensions(given) == 0
-    each = [given] * len(sizes) if one else _each(name, given, "a number or a list", len(sizes))
-    found = np.full((len(sizes), max(sizes)), none)
+    item = _dimensions(values) == 0
+    each = [values] * len(sizes) if item else _each(name, values, "a number or a list", len(sizes))
+    result = np.full((len(sizes), max(sizes)), none)
     for place, (size, value) in enumerate(zip(sizes, each, strict=True)):
-        full = name if one else f"{name}[{place}]"
-        found[place, :size] = validation.spread(full, value, (size,), infinity=int(np.sign(none)))
-    return found
+        full = name if item else f"{name}[{place}]"
+        result[place, :size] = validation.spread(full, value, (size,), infinity=int(np.sign(none)))
+    return result
 
 
-def _each(name: str, given: Any, kind: str, count: int | None = None) -> list[Any]:
+def _each(name: str, value: Any, kind: str, count: int | None = None) -> list[Any]:
     """What is given for each sensor.
 
     Raises:
         ConfigurationError: no list, an empty one, or another number of sensors.
     """
-    listed = isinstance(given, (list, tuple)) or (isinstance(given, np.ndarray) and given.ndim > 0)
-    if not listed or not len(given) or (count is not None and len(given) != count):
+    listed = isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.ndim > 0)
+    if not listed or not len(value) or (count is not None and len(value) != count):
         many = "each sensor" if count is None else f"each of the {count} sensors"
-        raise validation.refusal(name, given, f"a list with {kind} for {many}")
-    return list(given)
+        raise validation.refusal(name, value, f"a list with {kind} for {many}")
+    return list(value)
 
 
 def _dimensions(value: Any) -> int:

@@ -9,8 +9,8 @@ from typing import Annotated, Any, ClassVar
 from numpy.typing import ArrayLike
 
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import CommonOptions, plain
-from fusion_gym.errors import ConfigurationError, shown
+from fusion_gym.core.options import CommonOptions, plain_options
+from fusion_gym.errors import ConfigurationError, display
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.centre import Centre, Feedback, FeedbackCentre, SequentialCentre
@@ -62,7 +62,7 @@ class Filter:
 
 def at_the_nodes(kind: Any) -> Filter:
     """The row of a node filter's class that has no options of its own."""
-    return Filter(kind, lambda chosen, sensors: feedback_centre(chosen, kind(sensors)))
+    return Filter(kind, lambda options, sensors: feedback_centre(options, kind(sensors)))
 
 
 def classes(filters: Mapping[str, Filter]) -> dict[str, type]:
@@ -71,7 +71,7 @@ def classes(filters: Mapping[str, Filter]) -> dict[str, type]:
 
 
 def make_centre(
-    kind: str, filters: Mapping[str, Filter], chosen: FeedbackOptions, sensors: CensoredSensors
+    kind: str, filters: Mapping[str, Filter], options: FeedbackOptions, sensors: CensoredSensors
 ) -> Centre:
     """The centre of the option ``filter``, by a table of filters.
 
@@ -81,12 +81,12 @@ def make_centre(
     choice("filter", kind, filters)
     for name, row in filters.items():
         if name != kind:
-            _refuse(chosen, row.own, f"filter={kind!r}", f"filter={name!r}")
-    return filters[kind].make(chosen, sensors)
+            _refuse(options, row.own, f"filter={kind!r}", f"filter={name!r}")
+    return filters[kind].make(options, sensors)
 
 
 def true_nature(
-    chosen: FeedbackOptions, plant: LinearPlant, sensors: CensoredSensors, horizon: int
+    options: FeedbackOptions, plant: LinearPlant, sensors: CensoredSensors, horizon: int
 ) -> Nature:
     """How the truth departs from this plant and these sensors.
 
@@ -94,16 +94,16 @@ def true_nature(
         ConfigurationError: a departure that is not allowed, or that can change nothing.
     """
     absent = (*plant.unmoved, *(("true_threshold_shift",) if sensors.unlimited else ()))
-    nature = Nature.create(chosen, absent)
+    nature = Nature.create(options, absent)
     nature.check_growth(plant.true_radius, horizon)
     return nature
 
 
-def remembering_system(
+def memory_filter_system(
     system: CensoredSystem,
     kind: str | None,
     filters: Mapping[str, Filter],
-    chosen: FeedbackOptions,
+    options: FeedbackOptions,
     sensors: CensoredSensors,
 ) -> CensoredSystem | None:
     """The same plant with the filter of the option ``memory_filter``; ``None`` is the system's own.
@@ -119,58 +119,58 @@ def remembering_system(
     changed: dict[str, Any] = {"filter": kind}
     if not row.nodes:
         changed |= dict.fromkeys(_OF_FUSION)
-    return replace(system, centre=row.make(replace(chosen, **changed), sensors))
+    return replace(system, centre=row.make(replace(options, **changed), sensors))
 
 
-def feedback_centre(chosen: FeedbackOptions, node: NodeFilter) -> FeedbackCentre:
+def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> FeedbackCentre:
     """Nodes with this filter and the options' fusion.
 
     Raises:
         ConfigurationError: a rule that does not fit, or an option that is not the rule's.
     """
     sensors = node.sensors.count
-    kind = "federated" if chosen.fusion is None else chosen.fusion
-    fusion = choose_rule(kind, _STRUCTURE, sensors, chosen.order)
+    kind = "federated" if options.fusion is None else options.fusion
+    fusion = choose_rule(kind, _STRUCTURE, sensors, options.order)
     if kind == "federated":
-        return FeedbackCentre(node, fusion, Feedback.in_shares(chosen.information_shares, sensors))
-    _refuse(chosen, ("information_shares",), f"fusion={kind!r}", "fusion='federated'")
+        return FeedbackCentre(node, fusion, Feedback.in_shares(options.information_shares, sensors))
+    _refuse(options, ("information_shares",), f"fusion={kind!r}", "fusion='federated'")
     return FeedbackCentre(node, fusion, Feedback(sensors))
 
 
-def stochastic_centre(chosen: FeedbackOptions, sensors: CensoredSensors) -> FeedbackCentre:
+def stochastic_centre(values: FeedbackOptions, sensors: CensoredSensors) -> FeedbackCentre:
     """The centre of ``filter="stochastic"``.
 
     Raises:
         ConfigurationError: no weight or one that is not allowed, or an option that does not fit.
     """
-    return feedback_centre(chosen, StochasticEventFilter.create(sensors, chosen.stochastic_weight))
+    return feedback_centre(values, StochasticEventFilter.create(sensors, values.stochastic_weight))
 
 
-def stochastic_defaults(chosen: FeedbackOptions) -> dict[str, dict[str, Any]]:
+def stochastic_defaults(options: FeedbackOptions) -> dict[str, dict[str, Any]]:
     """The scenario's parameters of the policy ``stochastic_event``, if the filter knows it."""
-    if chosen.stochastic_weight is None:
+    if options.stochastic_weight is None:
         return {}
-    return {"stochastic_event": {"weight": plain(chosen.stochastic_weight)}}
+    return {"stochastic_event": {"weight": plain_options(options.stochastic_weight)}}
 
 
-def assumed_density_centre(chosen: FeedbackOptions, sensors: CensoredSensors) -> SequentialCentre:
+def assumed_density_centre(options: FeedbackOptions, sensors: CensoredSensors) -> SequentialCentre:
     """The centre of ``filter="adf"``.
 
     Raises:
         ConfigurationError: an option of the nodes' fusion, for there are no nodes.
     """
-    refuse_fusion(chosen, "adf")
+    refuse_fusion(options, "adf")
     return SequentialCentre(AssumedDensityFilter(sensors))
 
 
-def refuse_fusion(chosen: FeedbackOptions, kind: str) -> None:
+def refuse_fusion(options: FeedbackOptions, kind: str) -> None:
     """Whether a filter of this name at the centre is asked to join nodes.
 
     Raises:
         ConfigurationError: an option of the nodes' fusion, for there are no nodes.
     """
     belongs = "a filter with nodes (here the centre takes the measurements itself)"
-    _refuse(chosen, _OF_FUSION, f"filter={kind!r}", belongs)
+    _refuse(options, _OF_FUSION, f"filter={kind!r}", belongs)
 
 
 # What every environment of the family offers; each adds its paper's own.
@@ -181,10 +181,10 @@ FILTERS = {
 }
 
 
-def _refuse(chosen: FeedbackOptions, names: tuple[str, ...], where: str, belongs: str) -> None:
+def _refuse(options: FeedbackOptions, names: tuple[str, ...], where: str, belongs: str) -> None:
     for name in names:
-        value = getattr(chosen, name)
+        value = getattr(options, name)
         if value is not None:
             raise ConfigurationError(
-                f"{name} = {shown(value)} is not allowed with {where}: it belongs to {belongs}"
+                f"{name} = {display(value)} is not allowed with {where}: it belongs to {belongs}"
             )

@@ -28,7 +28,7 @@ from fusion_gym.systems.tobit.options import (
     classes,
     feedback_centre,
     make_centre,
-    remembering_system,
+    memory_filter_system,
     stochastic_defaults,
     true_nature,
 )
@@ -46,7 +46,7 @@ _IDENTITY = ((1.0, 0.0), (0.0, 1.0))
 _FILTERS = {
     "paper": Filter(
         BoundTobitFilter,
-        lambda chosen, sensors: feedback_centre(chosen, _bound_filter(chosen, sensors)),
+        lambda options, sensors: feedback_centre(options, _bound_filter(options, sensors)),
     ),
     "tobit": at_the_nodes(TobitKalmanFilter),
     **FILTERS,
@@ -123,115 +123,115 @@ class TobitOscillatorOptions(FeedbackOptions):
     """η₀ of the policy ``dynamic_event`` and of Ξ, equations (11)-(15)."""
 
 
-def build(chosen: TobitOscillatorOptions) -> Scenario:
+def build_tobit(options: TobitOscillatorOptions) -> Scenario:
     """The scenario of these options, checked before anything runs.
 
     Raises:
         ConfigurationError: a value that is not allowed.
     """
-    horizon = validation.horizon(chosen.horizon)
-    plant = _plant(chosen)
+    horizon = validation.horizon(options.horizon)
+    plant = _plant(options)
     sensors = CensoredSensors.create(
-        chosen.measurement_matrices,
-        chosen.measurement_variance,
-        chosen.censoring_threshold,
+        options.measurement_matrices,
+        options.measurement_variance,
+        options.censoring_threshold,
         plant.size,
     )
-    trigger = _trigger(chosen, sensors.count)
-    centre = _centre(chosen, sensors)
-    holds = chosen.filter == "paper" and chosen.silent != "predict"
-    remembering = chosen.memory_filter
-    if remembering is None and chosen.filter == "paper":
+    trigger = _trigger(options, sensors.count)
+    centre = _centre(options, sensors)
+    holds = options.filter == "paper" and options.silent != "predict"
+    remembering = options.memory_filter
+    if remembering is None and options.filter == "paper":
         remembering = "adf"  # the paper's minimises a bound; with every measurement it errs thrice
     system = CensoredSystem(
         plant=plant,
         model=plant,
         centre=centre,
-        random_start=chosen.random_start,
+        random_start=options.random_start,
         state_names=tuple(f"x{i + 1}" for i in range(plant.size)),
-        scale=typical_magnitude(plant, horizon, chosen.random_start),
+        scale=typical_magnitude(plant, horizon, options.random_start),
         reference=plant.open_loop(horizon),
-        nature=true_nature(chosen, plant, sensors, horizon),
+        nature=true_nature(options, plant, sensors, horizon),
     )
-    defaults = {"dynamic_event": trigger} | stochastic_defaults(chosen)
+    defaults = {"dynamic_event": trigger} | stochastic_defaults(options)
     return Scenario(
-        chosen,
+        options,
         system,
         policy_defaults=defaults,
         feedback=True,
-        memory_system=remembering_system(system, remembering, _FILTERS, chosen, sensors),
+        memory_system=memory_filter_system(system, remembering, _FILTERS, options, sensors),
         no_estimates=_HELD if holds else None,
     )
 
 
-def _plant(chosen: TobitOscillatorOptions) -> LinearPlant:
-    transition = validation.array("transition", chosen.transition, (None, None))
+def _plant(options: TobitOscillatorOptions) -> LinearPlant:
+    transition = validation.array("transition", options.transition, (None, None))
     size = len(transition)
-    variance = validation.number("process_variance", chosen.process_variance, above=0.0)
-    if chosen.process_noise == "scalar":
-        gain = validation.array("process_gain", chosen.process_gain, (size,))
+    variance = validation.number("process_variance", options.process_variance, above=0.0)
+    if options.process_noise == "scalar":
+        gain = validation.array("process_gain", options.process_gain, (size,))
         covariance = variance * np.outer(gain, gain)
     else:
         covariance = variance * np.eye(size)
     return LinearPlant.create(
-        transition, covariance, chosen.initial_mean, chosen.initial_covariance
+        transition, covariance, options.initial_mean, options.initial_covariance
     )
 
 
-def _centre(chosen: TobitOscillatorOptions, sensors: CensoredSensors) -> Centre:
-    centre = make_centre(chosen.filter, _FILTERS, chosen, sensors)
-    _bound_filter(chosen, sensors)  # its numbers are checked whatever the filter
+def _centre(choice: TobitOscillatorOptions, sensors: CensoredSensors) -> Centre:
+    centre = make_centre(choice.filter, _FILTERS, choice, sensors)
+    _bound_filter(choice, sensors)  # its numbers are checked whatever the filter
     for name, refused in (("silent", "hold"), ("event_error", True)):
-        if chosen.filter != "paper" and getattr(chosen, name) == refused:
+        if choice.filter != "paper" and getattr(choice, name) == refused:
             raise ConfigurationError(
-                f"{name} = {refused!r} is not allowed with filter={chosen.filter!r}: it belongs to "
+                f"{name} = {refused!r} is not allowed with filter={choice.filter!r}: it belongs to "
                 "filter='paper' (the others predict when nothing arrives and know no event error)"
             )
     return centre
 
 
-def _bound_filter(chosen: TobitOscillatorOptions, sensors: CensoredSensors) -> BoundTobitFilter:
+def _bound_filter(options: TobitOscillatorOptions, sensors: CensoredSensors) -> BoundTobitFilter:
     """The filter of the paper, with its constants and the trigger's Ξ."""
-    constants = BoundConstants.create(chosen.bound_epsilon)
-    if np.min(chosen.bound_epsilon) < _SMALLEST_EPSILON:
+    constants = BoundConstants.create(options.bound_epsilon)
+    if np.min(options.bound_epsilon) < _SMALLEST_EPSILON:
         raise validation.refusal(
             "bound_epsilon",
-            chosen.bound_epsilon,
+            options.bound_epsilon,
             f"at least {_SMALLEST_EPSILON:g} everywhere: its inverse multiplies the bound",
         )
-    trigger = _trigger(chosen, sensors.count)
-    error = EventError.create(**trigger, young=chosen.bound_young, sensors=sensors.count)
-    with_error = chosen.event_error is None or chosen.event_error
-    hold = chosen.silent != "predict"
-    if with_error and chosen.filter == "paper":
-        _refuse_explosion(chosen, error)
+    trigger = _trigger(options, sensors.count)
+    error = EventError.create(**trigger, young=options.bound_young, sensors=sensors.count)
+    with_error = options.event_error is None or options.event_error
+    hold = options.silent != "predict"
+    if with_error and options.filter == "paper":
+        _refuse_explosion(options, error)
     return BoundTobitFilter(sensors, constants, error if with_error else None, hold=hold)
 
 
-def _refuse_explosion(chosen: TobitOscillatorOptions, error: EventError) -> None:
+def _refuse_explosion(options: TobitOscillatorOptions, error: EventError) -> None:
     """The bound of the event error grows by a factor a step, which may be above one."""
-    reached = error.at(np.array([float(chosen.horizon)]))
+    reached = error.at(np.array([float(options.horizon)]))
     if not np.all(reached <= _LARGEST_EVENT_ERROR):
         names = ("trigger_threshold", "trigger_decay", "trigger_divisor", "trigger_initial")
-        given = {name: getattr(chosen, name) for name in (*names, "bound_young", "horizon")}
-        listed = ", ".join(f"{name} = {validation.shown(value)}" for name, value in given.items())
+        args = {name: getattr(options, name) for name in (*names, "bound_young", "horizon")}
+        listed = ", ".join(f"{name} = {validation.display(value)}" for name, value in args.items())
         raise ConfigurationError(
             f"{listed} are not allowed together: the bound of the event error must stay below "
             f"{_LARGEST_EVENT_ERROR:g}; use a smaller decay, a larger divisor or event_error=False"
         )
 
 
-def _trigger(chosen: TobitOscillatorOptions, sensors: int) -> dict[str, tuple[float, ...]]:
+def _trigger(options: TobitOscillatorOptions, sensors: int) -> dict[str, tuple[float, ...]]:
     """Parameters of the dynamic event trigger, one number a sensor."""
-    given: dict[str, Any] = {
-        "threshold": chosen.trigger_threshold,
-        "decay": chosen.trigger_decay,
-        "divisor": chosen.trigger_divisor,
-        "initial": chosen.trigger_initial,
+    arguments: dict[str, Any] = {
+        "threshold": options.trigger_threshold,
+        "decay": options.trigger_decay,
+        "divisor": options.trigger_divisor,
+        "initial": options.trigger_initial,
     }
     paper = {"threshold": (0.1, 0.2, 0.3), "decay": (0.1, 0.2, 0.1)}
     result = {}
-    for name, value in given.items():
+    for name, value in arguments.items():
         if value is None and name in paper:
             value = np.resize(paper[name], sensors)
         values = validation.not_negative(f"trigger_{name}", value, (sensors,))

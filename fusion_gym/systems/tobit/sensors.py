@@ -78,8 +78,8 @@ class CensoredSensors:
         high = validation.spread("censoring_upper", upper, shape, infinity=1)
         if np.any(low >= high):
             raise ConfigurationError(
-                f"censoring_threshold = {validation.shown(low)} is not allowed: each must be below "
-                f"censoring_upper = {validation.shown(high)}"
+                f"censoring_threshold = {validation.display(low)} is not allowed: each must be "
+                f"below censoring_upper = {validation.display(high)}"
             )
         uncensored = np.isneginf(low)
         noise = validation.positive("measurement_variance", variance, shape)[..., None]
@@ -160,9 +160,9 @@ class CensoredSensors:
         1/Σ C² R⁻¹, of a state that no sensor measures the largest of the others.
         """
         information = (self.measurement_matrix**2 / self.variance[:, :, None]).sum((0, 1))
-        seen = information > 0.0
-        found = 1.0 / np.where(seen, information, np.inf)
-        return np.where(seen, found, found.max() if seen.any() else np.inf)
+        observed = information > 0.0
+        values = 1.0 / np.where(observed, information, np.inf)
+        return np.where(observed, values, values.max() if observed.any() else np.inf)
 
     @functools.cached_property
     def _finest(self) -> float:

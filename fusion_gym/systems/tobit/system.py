@@ -27,7 +27,7 @@ from fusion_gym.core.system import (
     numbered,
 )
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.tobit.centre import Centre, Prediction
+from fusion_gym.systems.tobit.centre import Centre, CentrePrediction
 
 _RANGE = 5.0  # whitened quantities and logarithms of variance ratios are clipped here
 
@@ -51,7 +51,7 @@ class CensoredState:
     time: Array
     prior_mean: Array
     prior_covariance: Array
-    prediction: Prediction | None
+    prediction: CentrePrediction | None
     local_mean: Array
     mean: Array
     covariance: Array
@@ -135,7 +135,7 @@ class CensoredSystem(System[CensoredState]):
         sensors, nodes = self.centre.sensors, numbered(self.sensor_count)
         own = partial(Block, labels=(nodes, numbered(sensors.size)), node="own")
         new = partial(own, knowledge="own", limit=_RANGE)
-        told = partial(Block, labels=(self.state_names,), node="told", limit=_RANGE)
+        shared = partial(Block, labels=(self.state_names,), node="broadcast", limit=_RANGE)
         at_threshold = "whether the component is at its threshold"
         uncensored = "predicted probability that the component is not censored"
         moved = "new minus last delivered measurement, over two noise deviations"
@@ -155,13 +155,13 @@ class CensoredSystem(System[CensoredState]):
                 lambda s: _prediction(s).expectation.uncensored_probability,
             ),
             age_block(nodes),
-            told(
+            shared(
                 "log_variance",
                 variance,
                 self._log_variance,
                 constants={"open-loop mean": self.reference},
             ),
-            told(
+            shared(
                 "estimate",
                 "prediction over the state's root mean square",
                 lambda s: s.prior_mean / self.scale[:, None],
@@ -169,7 +169,7 @@ class CensoredSystem(System[CensoredState]):
             ),
         ]
         if sensors.unlimited:  # these two would say nothing
-            blocks = [one for one in blocks if one.name not in _OF_CENSORING]
+            blocks = [block for block in blocks if block.name not in _OF_CENSORING]
         return tuple(blocks)
 
     @property
@@ -178,7 +178,7 @@ class CensoredSystem(System[CensoredState]):
 
         Of states that some sensors measure alone, by their number; the widest where they differ.
         """
-        found: dict[int, tuple[float, float]] = {}
+        result: dict[int, tuple[float, float]] = {}
         sensors = self.centre.sensors
         rows = sensors.measurement_matrix[..., 0].reshape(-1, self.plant.size)
         limits = zip(sensors.threshold.ravel(), sensors.upper.ravel(), strict=True)
@@ -187,9 +187,9 @@ class CensoredSystem(System[CensoredState]):
             if len(states) == 1:
                 state = int(states[0])
                 ends = sorted((low / row[state], high / row[state]))
-                before = found.get(state, (np.inf, -np.inf))
-                found[state] = (min(before[0], ends[0]), max(before[1], ends[1]))
-        return found
+                before = result.get(state, (np.inf, -np.inf))
+                result[state] = (min(before[0], ends[0]), max(before[1], ends[1]))
+        return result
 
     def start(self, noise: Array) -> CensoredState:
         """Time 0: the state is drawn and every first measurement is known, free of charge."""
@@ -259,7 +259,7 @@ class CensoredSystem(System[CensoredState]):
 
     def fused_alone(self, state: CensoredState) -> tuple[Array, Array]:
         """See :class:`System`."""
-        return self.centre.alone(
+        return self.centre.single(
             state.prior_mean, state.prior_covariance, _prediction(state), state.measurement
         )
 
@@ -304,7 +304,7 @@ class CensoredSystem(System[CensoredState]):
         self, state: CensoredState, mean: Array, covariance: Array, noise: Array
     ) -> CensoredState:
         """The state with a truth drawn by what is believed, which moves as the model says."""
-        return replace(state, truth=linalg.draw(mean, covariance, noise), departure=None)
+        return replace(state, truth=linalg.draw_normal(mean, covariance, noise), departure=None)
 
     def adopt(
         self, state: CensoredState, mean: Array, covariance: Array, runs: NDArray[np.bool_]
@@ -331,7 +331,7 @@ def _whitened(state: CensoredState) -> Array:
     return (state.measurement - expectation.value) / deviation
 
 
-def _prediction(state: CensoredState) -> Prediction:
+def _prediction(state: CensoredState) -> CentrePrediction:
     if state.prediction is None:
         raise RuntimeError("the state has no measurements yet: call sense first")
     return state.prediction

@@ -89,7 +89,7 @@ class BoundTables:
         limit = validation.not_negative("rho_bar", rho_bar, (count,))
         if np.any(limit > 1.0):
             raise ConfigurationError(
-                f"rho_bar = {validation.shown(rho_bar)} is not allowed: it must be >= 0 and <= 1"
+                f"rho_bar = {validation.display(rho_bar)} is not allowed: it must be >= 0 and <= 1"
             )
         epsilon = validation.positive("young_factor", young_factor, (count,))[:, None, None, None]
         plain = (1.0 + epsilon) * sensors.covariance
@@ -98,7 +98,7 @@ class BoundTables:
         radius = _radius(joint, model, epsilon[:, 0, 0, 0], noise)
         for sensor in np.flatnonzero(~(radius < 1.0)):
             raise ConfigurationError(
-                f"young_factor = {validation.shown(young_factor)} is not allowed for sensor "
+                f"young_factor = {validation.display(young_factor)} is not allowed for sensor "
                 f"{sensor}: the spectral radius of sqrt(1 + young_factor) (I - N C) A must be "
                 f"below 1, and is {radius[sensor]:.4g}, so that the bound grows without limit; "
                 "use a smaller factor, another sensor, or filter='random_walk'"
@@ -132,7 +132,7 @@ def _radius(joint: JointGain, model: InputModel, epsilon: Array, noise: Array) -
         covariance = joint.covariance(gain, before, noise)
         if not np.all(np.abs(covariance) < _UNBOUNDED):
             break
-    kept = linalg.identity(model.size) - linalg.matmul(gain[:, : model.size], joint.sensors.matrix)
-    closed = linalg.matmul(kept, model.transition)[..., 0] * np.sqrt(growth[..., 0])
+    rest = linalg.identity(model.size) - linalg.matmul(gain[:, : model.size], joint.sensors.matrix)
+    closed = linalg.matmul(rest, model.transition)[..., 0] * np.sqrt(growth[..., 0])
     radius: Array = np.abs(np.linalg.eigvals(closed)).max(-1)
     return radius

@@ -28,7 +28,7 @@ from fusion_gym.systems.unknown_input.nodes import Nodes, RunNodes, TableNodes
 from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
 from fusion_gym.systems.unknown_input.sensors import InputSensors
 from fusion_gym.systems.unknown_input.signals import (
-    GivenInput,
+    ArrayInput,
     InputSignal,
     MeanRevertingWalk,
     Sinusoids,
@@ -41,7 +41,7 @@ _STRUCTURE = Structure(common="all contain the same process noise", holds=("trac
 Signal = Literal["sinusoids", "steps", "random_walk"]
 
 
-class Filter(NamedTuple):
+class _Filter(NamedTuple):
     """A filter's class, whose docstring declares it, and the nodes that it makes."""
 
     kind: type
@@ -49,9 +49,11 @@ class Filter(NamedTuple):
 
 
 FILTERS = {
-    "random_walk": Filter(RandomWalkInputFilter, lambda chosen, parts: _random_walk(chosen, parts)),
-    "predict": Filter(ExactInputStateFilter, lambda chosen, parts: _predict(parts)),
-    "paper": Filter(BoundTables, lambda chosen, parts: _paper(chosen, parts)),
+    "random_walk": _Filter(
+        RandomWalkInputFilter, lambda choice, parts: _random_walk(choice, parts)
+    ),
+    "predict": _Filter(ExactInputStateFilter, lambda selection, parts: _predict(parts)),
+    "paper": _Filter(BoundTables, lambda selection, parts: _paper(selection, parts)),
 }
 
 
@@ -140,78 +142,78 @@ class UnknownInputOptions(CommonOptions):
     """Weight of an input's error in the reward, where a state's is 1."""
 
 
-def build(chosen: UnknownInputOptions) -> Scenario:
+def build_unknown(options: UnknownInputOptions) -> Scenario:
     """The scenario of these options, checked before anything runs.
 
     Raises:
         ConfigurationError: a value that is not allowed.
     """
-    chosen = _with_example(chosen)
-    horizon = validation.horizon(chosen.horizon)
-    plant = _plant(chosen)
-    signal = _signal(chosen, plant.inputs, horizon)
+    options = _with_example(options)
+    horizon = validation.horizon(options.horizon)
+    plant = _plant(options)
+    signal = _signal(options, plant.inputs, horizon)
     sensors = InputSensors.create(
-        _given(chosen.measurement_matrices), _given(chosen.measurement_covariance), plant
+        _given(options.measurement_matrices), _given(options.measurement_covariance), plant
     )
-    trigger = _trigger(chosen, sensors.count)
+    trigger = _trigger(options, sensors.count)
     open_loop = plant.open_loop(signal, horizon)
     if np.any(open_loop[plant.size :] <= 0.0):
         raise ConfigurationError(
-            f"input_signal = {validation.shown(chosen.input_signal)} is not allowed with "
-            f"input_amplitude = {validation.shown(chosen.input_amplitude)}: every input must "
+            f"input_signal = {validation.display(options.input_signal)} is not allowed with "
+            f"input_amplitude = {validation.display(options.input_amplitude)}: every input must "
             "differ from zero somewhere before the horizon, or there is nothing to estimate"
         )
     if np.any(open_loop <= 0.0):
         raise ConfigurationError(
-            f"process_covariance = {validation.shown(chosen.process_covariance)} is not "
+            f"process_covariance = {validation.display(options.process_covariance)} is not "
             "allowed: every state must be moved by the input or by noise before the horizon, or "
             "be uncertain at the start"
         )
-    weights = _weights(chosen, open_loop, plant.inputs)
-    nature = Nature.create(chosen, (*plant.unmoved, "true_threshold_shift"))
+    weights = _weights(options, open_loop, plant.inputs)
+    nature = Nature.create(options, (*plant.unmoved, "true_threshold_shift"))
     nature.check_growth(plant.true_radius, horizon)
     system = UnknownInputSystem(
         plant=plant,
         signal=signal,
-        nodes=_nodes(chosen, plant, sensors, horizon),
-        state_names=_state_names(chosen, plant),
+        nodes=_nodes(options, plant, sensors, horizon),
+        state_names=_state_names(options, plant),
         state_weights=weights,
         magnitude=plant.magnitude(signal, horizon),
         reference=open_loop,
         nature=nature,
     )
     return Scenario(
-        chosen,
+        options,
         system,
         weights,
         {"adaptive_threshold": trigger},
-        memory_system=_remembering(chosen, system, sensors, horizon),
+        memory_system=_remembering(options, system, sensors, horizon),
         no_estimates="the centre makes its estimate anew from what each node sent",
     )
 
 
 def _remembering(
-    chosen: UnknownInputOptions, system: UnknownInputSystem, sensors: InputSensors, horizon: int
+    options: UnknownInputOptions, system: UnknownInputSystem, sensors: InputSensors, horizon: int
 ) -> UnknownInputSystem | None:
     """The system with the filter of ``memory_filter``; ``None`` is its own.
 
     With the paper's filter, which minimises a bound, the random walk's.
     """
-    kind = chosen.memory_filter
+    kind = options.memory_filter
     if kind is None:
-        if chosen.filter != "paper":
+        if options.filter != "paper":
             return None
         kind = "random_walk"
     validation.choice("memory_filter", kind, FILTERS)
-    other = replace(chosen, filter=kind, hold_variance=None)
+    other = replace(options, filter=kind, hold_variance=None)
     return replace(system, nodes=_nodes(other, system.plant, sensors, horizon))
 
 
-def _with_example(chosen: UnknownInputOptions) -> UnknownInputOptions:
+def _with_example(options: UnknownInputOptions) -> UnknownInputOptions:
     """The options with the example's numbers where none were given."""
-    example = EXAMPLES[validation.choice("example", chosen.example, EXAMPLES)]
+    example = EXAMPLES[validation.choice("example", options.example, EXAMPLES)]
     numbers = {name: value for name, value in example.items() if name != "signals"}
-    kind = chosen.input_signal
+    kind = options.input_signal
     if isinstance(kind, str):
         validation.choice("input_signal", kind, get_args(Signal))
         shape = zip(
@@ -220,25 +222,25 @@ def _with_example(chosen: UnknownInputOptions) -> UnknownInputOptions:
             strict=True,
         )
         numbers |= dict(shape)
-    if chosen.transition is not None or chosen.initial_mean is not None:
+    if options.transition is not None or options.initial_mean is not None:
         numbers.pop("initial_half_width", None)
     missing = {
         field.name: numbers[field.name]
-        for field in fields(chosen)
-        if field.name in numbers and getattr(chosen, field.name) is None
+        for field in fields(options)
+        if field.name in numbers and getattr(options, field.name) is None
     }
-    return replace(chosen, **missing)
+    return replace(options, **missing)
 
 
-def _plant(chosen: UnknownInputOptions) -> UnknownInputPlant:
-    half = chosen.initial_half_width
+def _plant(options: UnknownInputOptions) -> UnknownInputPlant:
+    half = options.initial_half_width
     return UnknownInputPlant.create(
-        _given(chosen.transition),
-        _given(chosen.input_matrix),
-        _given(chosen.process_covariance),
-        chosen.sampling_period,
-        _given(chosen.initial_mean),
-        _given(chosen.initial_covariance),
+        _given(options.transition),
+        _given(options.input_matrix),
+        _given(options.process_covariance),
+        options.sampling_period,
+        _given(options.initial_mean),
+        _given(options.initial_covariance),
         half,
     )
 
@@ -249,25 +251,25 @@ def _given(value: ArrayLike | None) -> ArrayLike:
     return value
 
 
-def _signal(chosen: UnknownInputOptions, inputs: int, horizon: int) -> InputSignal:
-    kind = chosen.input_signal
+def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> InputSignal:
+    kind = options.input_signal
     shape = {
-        name: getattr(chosen, name) for name in ("input_amplitude", "input_period", "input_phase")
+        name: getattr(options, name) for name in ("input_amplitude", "input_period", "input_phase")
     }
     if not isinstance(kind, str):
         for name, value in shape.items():
             if value is not None:
                 raise ConfigurationError(
-                    f"{name} = {validation.shown(value)} is not allowed with an array as "
+                    f"{name} = {validation.display(value)} is not allowed with an array as "
                     "input_signal: it must be None"
                 )
-        return GivenInput.create(inputs, kind, horizon)
+        return ArrayInput.create(inputs, kind, horizon)
     amplitude, period, phase = shape.values()
     if kind == "sinusoids":
         return Sinusoids.create(inputs, amplitude, period, phase)
     if not (isinstance(phase, str) and phase == "random"):
         raise ConfigurationError(
-            f"input_phase = {validation.shown(phase)} is not allowed with "
+            f"input_phase = {validation.display(phase)} is not allowed with "
             f"input_signal={kind!r}: phases belong to 'sinusoids'"
         )
     if kind == "steps":
@@ -276,25 +278,25 @@ def _signal(chosen: UnknownInputOptions, inputs: int, horizon: int) -> InputSign
 
 
 def _nodes(
-    chosen: UnknownInputOptions, plant: UnknownInputPlant, sensors: InputSensors, horizon: int
+    options: UnknownInputOptions, plant: UnknownInputPlant, sensors: InputSensors, horizon: int
 ) -> Nodes:
-    kind = validation.choice("filter", chosen.filter, FILTERS)
-    factor = validation.positive("young_factor", _given(chosen.young_factor), (sensors.count,))
+    kind = validation.choice("filter", options.filter, FILTERS)
+    factor = validation.positive("young_factor", _given(options.young_factor), (sensors.count,))
     model = InputModel.create(
         plant,
-        _given(chosen.input_memory),
-        _given(chosen.input_change),
-        _given(chosen.input_deviation),
+        _given(options.input_memory),
+        _given(options.input_change),
+        _given(options.input_deviation),
     )
     joint = JointGain.create(plant, sensors)
-    rule = choose_rule(chosen.fusion, _STRUCTURE, sensors.count)
-    fusion = NodeFusion(rule, plant.size, tracked=chosen.fusion == "ci")
-    if chosen.hold_variance is not None and kind != "random_walk":
+    rule = choose_rule(options.fusion, _STRUCTURE, sensors.count)
+    fusion = NodeFusion(rule, plant.size, tracked=options.fusion == "ci")
+    if options.hold_variance is not None and kind != "random_walk":
         raise ConfigurationError(
-            f"hold_variance = {validation.shown(chosen.hold_variance)} is not allowed with "
+            f"hold_variance = {validation.display(options.hold_variance)} is not allowed with "
             f"filter={kind!r}: it belongs to filter='random_walk'"
         )
-    return FILTERS[kind].make(chosen, _Parts(model, sensors, joint, fusion, factor, horizon))
+    return FILTERS[kind].make(options, _Parts(model, sensors, joint, fusion, factor, horizon))
 
 
 class _Parts(NamedTuple):
@@ -308,11 +310,11 @@ class _Parts(NamedTuple):
     horizon: int
 
 
-def _random_walk(chosen: UnknownInputOptions, parts: _Parts) -> Nodes:
+def _random_walk(options: UnknownInputOptions, parts: _Parts) -> Nodes:
     hold = None
-    if chosen.hold_variance is not None:
+    if options.hold_variance is not None:
         shape = (parts.sensors.count,)
-        hold = validation.not_negative("hold_variance", chosen.hold_variance, shape)
+        hold = validation.not_negative("hold_variance", options.hold_variance, shape)
         hold = hold[:, None, None, None]
     node = RandomWalkInputFilter(parts.model, parts.sensors)
     return RunNodes(parts.model, parts.sensors, node, parts.fusion, hold)
@@ -323,37 +325,37 @@ def _predict(parts: _Parts) -> Nodes:
     return RunNodes(parts.model, parts.sensors, node, parts.fusion)
 
 
-def _paper(chosen: UnknownInputOptions, parts: _Parts) -> Nodes:
-    bound = _given(chosen.rho_bar)
+def _paper(options: UnknownInputOptions, parts: _Parts) -> Nodes:
+    bound = _given(options.rho_bar)
     tables = BoundTables.create(parts.joint, parts.model, bound, parts.factor, parts.horizon)
     return TableNodes.create(parts.model, parts.sensors, tables, parts.fusion)
 
 
-def _trigger(chosen: UnknownInputOptions, sensors: int) -> dict[str, tuple[float, ...]]:
+def _trigger(options: UnknownInputOptions, sensors: int) -> dict[str, tuple[float, ...]]:
     """Parameters of the adaptive threshold trigger, one number a sensor."""
     names = ("rho_bar", "rho_initial", "adaptation")
     spread = {
-        name: tuple(validation.spread(name, _given(getattr(chosen, name)), (sensors,)).tolist())
+        name: tuple(validation.spread(name, _given(getattr(options, name)), (sensors,)).tolist())
         for name in names
     }
     validation.adaptive_thresholds(*spread.values())
     return spread
 
 
-def _weights(chosen: UnknownInputOptions, open_loop: Array, inputs: int) -> Array:
+def _weights(options: UnknownInputOptions, open_loop: Array, inputs: int) -> Array:
     """w_i = g_i/(Σ g · open loop of i), g = 1 for states and ``input_weight`` for inputs."""
-    if chosen.state_weights is not None:
-        return validation.not_negative("state_weights", chosen.state_weights, open_loop.shape)
+    if options.state_weights is not None:
+        return validation.not_negative("state_weights", options.state_weights, open_loop.shape)
     share = np.ones(len(open_loop))
     share[len(share) - inputs :] = validation.number(
-        "input_weight", chosen.input_weight, at_least=0.0
+        "input_weight", options.input_weight, at_least=0.0
     )
     weights: Array = share / (share.sum() * open_loop)
     return weights
 
 
-def _state_names(chosen: UnknownInputOptions, plant: UnknownInputPlant) -> tuple[str, ...]:
-    if chosen.example == "two_carts" and (plant.size, plant.inputs) == (4, 1):
+def _state_names(options: UnknownInputOptions, plant: UnknownInputPlant) -> tuple[str, ...]:
+    if options.example == "two_carts" and (plant.size, plant.inputs) == (4, 1):
         return ("position_1", "velocity_1", "position_2", "velocity_2", "force")
     states = tuple(f"x{i + 1}" for i in range(plant.size))
     return states + tuple(f"d{i + 1}" for i in range(plant.inputs))

@@ -75,10 +75,10 @@ class NodeFusion(FusionRule):
     def _block(self, means: Array, own: Array, active: NDArray[np.bool_] | None) -> Fused:
         if active is not None:
             return self.rule.fuse(means, own, active)
-        one = np.ones((1, means.shape[-1]))
+        ones = np.ones((1, means.shape[-1]))
         if len(means) == 1:
-            identity = linalg.identity(means.shape[1]) * one
-            return Fused(means[0], own[0], lambda: identity[None], one)
+            identity = linalg.identity(means.shape[1]) * ones
+            return Fused(means[0], own[0], lambda: identity[None], ones)
         if isinstance(self.rule, CovarianceIntersection):
             if means.shape[1] == 1:
                 return _smallest_variance(means, own)
@@ -90,8 +90,8 @@ class NodeFusion(FusionRule):
 def _smallest_variance(mean: Array, covariance: Array) -> Fused:
     """Covariance intersection of scalars: the smallest variance takes all, equals share."""
     smallest = covariance.min(0)
-    chosen = (covariance == smallest)[:, 0, 0]
-    weights = chosen / chosen.sum(0)
+    selection = (covariance == smallest)[:, 0, 0]
+    weights = selection / selection.sum(0)
     joined = (weights[:, None] * mean).sum(0)
     return Fused(joined, smallest, lambda: weights[:, None, None], weights)
 

@@ -117,10 +117,10 @@ class InputModel:
             ConfigurationError: a memory outside [0, 1], or a deviation <= 0.
         """
         n, q = plant.size, plant.inputs
-        kept = validation.not_negative("input_memory", memory, (q,))
-        if np.any(kept > 1.0):
+        retention = validation.not_negative("input_memory", memory, (q,))
+        if np.any(retention > 1.0):
             raise ConfigurationError(
-                f"input_memory = {validation.shown(memory)} is not allowed: it must be >= 0 and "
+                f"input_memory = {validation.display(memory)} is not allowed: it must be >= 0 and "
                 "<= 1"
             )
         steps = validation.positive("input_change", change, (q,))
@@ -133,8 +133,8 @@ class InputModel:
         start[:n, :n] = plant.initial_covariance[..., 0]
         start[n:, n:] = np.diag(first**2)
         return cls(
-            state_rows=np.concatenate((plant.transition[..., 0], b * kept), axis=1)[..., None],
-            memory=kept[:, None],
+            state_rows=np.concatenate((plant.transition[..., 0], b * retention), axis=1)[..., None],
+            memory=retention[:, None],
             change=noise[..., None],
             transition=plant.transition,
             process_covariance=plant.process_covariance,

@@ -37,7 +37,7 @@ class Estimates(NamedTuple):
     weights: Array | None
 
 
-class Prediction(NamedTuple):
+class NodePrediction(NamedTuple):
     """Predictions for the coming measurement.
 
     ``mean`` (l, s, N), ``fused_mean`` (s, N), ``expected`` measurements (l, m, N), and
@@ -67,14 +67,14 @@ class Nodes(Protocol):
         """Before any measurement."""
         ...
 
-    def predict(self, estimates: Estimates, time: Array) -> Prediction:
+    def predict(self, estimates: Estimates, time: Array) -> NodePrediction:
         """Predictions for the measurements at ``time`` (N,)."""
         ...
 
     def update(
         self,
         estimates: Estimates,
-        prediction: Prediction,
+        prediction: NodePrediction,
         held: Array,
         granted: NDArray[np.bool_],
         time: Array,
@@ -82,7 +82,7 @@ class Nodes(Protocol):
         """Posteriors; ``held`` (l, m, N) are the last delivered measurements, the new included."""
         ...
 
-    def prior_covariance(self, prediction: Prediction, time: Array) -> Array:
+    def prior_covariance(self, prediction: NodePrediction, time: Array) -> Array:
         """The nodes' covariances (l, s, s, N or 1) before the update at ``time``."""
         ...
 
@@ -91,7 +91,7 @@ class Nodes(Protocol):
         ...
 
     def variances(
-        self, estimates: Estimates, prediction: Prediction, weights: Array, time: Array
+        self, estimates: Estimates, prediction: NodePrediction, weights: Array, time: Array
     ) -> tuple[Array, Array]:
         """Weighted fused trace (N,) if nobody transmits, and its reductions (l, N) by each alone.
 
@@ -110,10 +110,10 @@ def _start(model: InputModel, sensors: InputSensors, runs: int) -> tuple[Array, 
 
 def _predicted(
     model: InputModel, sensors: InputSensors, estimates: Estimates, covariance: Array | None
-) -> Prediction:
+) -> NodePrediction:
     every = np.concatenate((estimates.mean, estimates.fused_mean[None]))
     prior = model.predict(every)
-    return Prediction(prior[:-1], prior[-1], sensors.expect(prior[:-1]), covariance)
+    return NodePrediction(prior[:-1], prior[-1], sensors.expect(prior[:-1]), covariance)
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class TableNodes:
             state_gain=gains[:, :n, :n],
             input_gain=gains[:, n:, n:],
             fused=fused,
-            delivered=fusion.fuse_alone(tables.covariance, tables.delivered)[1],
+            delivered=fusion.fuse_single(tables.covariance, tables.delivered)[1],
             prior=model.predict_covariance(np.roll(tables.covariance, 1, axis=-1)),
         )
 
@@ -167,14 +167,14 @@ class TableNodes:
         mean, fused, _ = _start(self.model, self.sensors, runs)
         return Estimates(mean, fused, None, None, None)
 
-    def predict(self, estimates: Estimates, time: Array) -> Prediction:
+    def predict(self, estimates: Estimates, time: Array) -> NodePrediction:
         """See :class:`Nodes`."""
         return _predicted(self.model, self.sensors, estimates, None)
 
     def update(
         self,
         estimates: Estimates,
-        prediction: Prediction,
+        prediction: NodePrediction,
         held: Array,
         granted: NDArray[np.bool_],
         time: Array,
@@ -191,7 +191,7 @@ class TableNodes:
         fused = np.concatenate((state.sum(0), inputs.sum(0)))
         return Estimates(mean, fused, None, None, None)
 
-    def prior_covariance(self, prediction: Prediction, time: Array) -> Array:
+    def prior_covariance(self, prediction: NodePrediction, time: Array) -> Array:
         """From the table; at time 0, where nothing is predicted, without meaning."""
         return self._at(self.prior, time)
 
@@ -200,7 +200,7 @@ class TableNodes:
         return self._at(self.fused, time)
 
     def variances(
-        self, estimates: Estimates, prediction: Prediction, weights: Array, time: Array
+        self, estimates: Estimates, prediction: NodePrediction, weights: Array, time: Array
     ) -> tuple[Array, Array]:
         """The bound's trace, and how far it falls where one held difference is known to be zero."""
         silent = linalg.weighted_trace(self.fused, weights)
@@ -243,7 +243,7 @@ class RunNodes:
             mean, fused, every, covariance, self.fusion.start(self.sensors.count, runs)
         )
 
-    def predict(self, estimates: Estimates, time: Array) -> Prediction:
+    def predict(self, estimates: Estimates, time: Array) -> NodePrediction:
         """See :class:`Nodes`."""
         prior = self.model.predict_covariance(_own(estimates.covariance))
         return _predicted(self.model, self.sensors, estimates, prior)
@@ -251,7 +251,7 @@ class RunNodes:
     def update(
         self,
         estimates: Estimates,
-        prediction: Prediction,
+        prediction: NodePrediction,
         held: Array,
         granted: NDArray[np.bool_],
         time: Array,
@@ -267,7 +267,7 @@ class RunNodes:
         fused = self.fusion.going_on(estimates.weights).fuse(mean, covariance)
         return Estimates(mean, fused.mean, covariance, fused.covariance, fused.weights)
 
-    def prior_covariance(self, prediction: Prediction, time: Array) -> Array:
+    def prior_covariance(self, prediction: NodePrediction, time: Array) -> Array:
         """The runs' own (l, s, s, N)."""
         return _own(prediction.covariance)
 
@@ -276,7 +276,7 @@ class RunNodes:
         return _own(estimates.fused_covariance)
 
     def variances(
-        self, estimates: Estimates, prediction: Prediction, weights: Array, time: Array
+        self, estimates: Estimates, prediction: NodePrediction, weights: Array, time: Array
     ) -> tuple[Array, Array]:
         """See :class:`Nodes`; with the best fusion weights."""
         nobody = np.zeros((self.sensors.count, prediction.expected.shape[-1]), dtype=np.bool_)
@@ -284,12 +284,12 @@ class RunNodes:
         if self.hold_variance is not None:
             silent = self._outcome(estimates, prediction, nobody)[1]
         delivered = self._outcome(estimates, prediction, ~nobody)[1]
-        together, alone = self.fusion.fuse_alone(silent, delivered)
+        together, single = self.fusion.fuse_single(silent, delivered)
         start = linalg.weighted_trace(together, weights)
-        return start, start - linalg.weighted_trace(alone, weights)
+        return start, start - linalg.weighted_trace(single, weights)
 
     def _outcome(
-        self, estimates: Estimates, prediction: Prediction, granted: NDArray[np.bool_]
+        self, estimates: Estimates, prediction: NodePrediction, granted: NDArray[np.bool_]
     ) -> tuple[Array, Array]:
         """Gain (l, s, m, N) and covariance (l, s, s, N) of an update."""
         noise = self.sensors.covariance

@@ -146,8 +146,8 @@ class UnknownInputPlant:
     def unmoved(self) -> tuple[str, ...]:
         """The options of the true plant that can change nothing."""
         still = np.array_equal(self.transition[..., 0], np.eye(self.size))
-        found = {"true_process_noise": not self.process_factor.any(), "true_transition": still}
-        return tuple(name for name, absent in found.items() if absent)
+        result = {"true_process_noise": not self.process_factor.any(), "true_transition": still}
+        return tuple(name for name, absent in result.items() if absent)
 
     def open_loop(self, signal: InputSignal, horizon: int) -> Array:
         """Mean squared error (n + q,) over k = 1..horizon of a centre that takes the input for 0.

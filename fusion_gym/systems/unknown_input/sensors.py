@@ -90,18 +90,18 @@ class InputSensors:
 def _noise_covariances(value: ArrayLike, sensors: int, size: int) -> Array:
     """V as (l, m, m)."""
     try:
-        given = np.asarray(value)
+        values = np.asarray(value)
     except ValueError:
-        given = np.empty(0)
-    if given.shape == (sensors, size, size):
+        values = np.empty(0)
+    if values.shape == (sensors, size, size):
         return np.array(
             [
-                validation.covariance(f"measurement_covariance[{i}]", one, size, definite=True)
-                for i, one in enumerate(given)
+                validation.covariance(f"measurement_covariance[{i}]", value, size, definite=True)
+                for i, value in enumerate(values)
             ]
         )
-    if given.shape == (sensors,):
-        value = given[:, None]
+    if values.shape == (sensors,):
+        value = values[:, None]
     variances = validation.positive("measurement_covariance", value, (sensors, size))
     return variances[..., None] * np.eye(size)
 
@@ -109,13 +109,13 @@ def _noise_covariances(value: ArrayLike, sensors: int, size: int) -> Array:
 def _seen_input(sensor: int, matrix: Array, plant: UnknownInputPlant) -> tuple[Array, Array]:
     """(C ℬ)⁺ and the kernel of (C ℬ)ᵀ, or an error if C ℬ has deficient rank."""
     inputs = plant.input_matrix[..., 0]
-    q, seen = plant.inputs, matrix @ inputs
-    left, values, right = np.linalg.svd(seen)
+    q, observed = plant.inputs, matrix @ inputs
+    left, values, right = np.linalg.svd(observed)
     possible = np.linalg.norm(matrix, 2) * np.linalg.norm(inputs, 2)
     rank = int(np.sum(values > _RANK * possible))
     if rank < q:
         raise ConfigurationError(
-            f"measurement_matrices[{sensor}] = {validation.shown(matrix)} is not allowed: the "
+            f"measurement_matrices[{sensor}] = {validation.display(matrix)} is not allowed: the "
             "sensor must "
             f"see every input, but rank(C B) is {rank} for {q} input{'s' if q > 1 else ''} (B is "
             "the input matrix over one sampling interval)"

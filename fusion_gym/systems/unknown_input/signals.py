@@ -88,7 +88,7 @@ class Sinusoids:
         random = isinstance(phase, str)
         if random and phase != "random":
             raise ConfigurationError(
-                f"input_phase = {validation.shown(phase)} is not allowed: it must be 'random' "
+                f"input_phase = {validation.display(phase)} is not allowed: it must be 'random' "
                 "or radians"
             )
         shape = (size, _terms(amplitude, period, 0.0 if random else phase))
@@ -154,10 +154,10 @@ def _terms(*values: ArrayLike) -> int:
     lengths = []
     for value in values:
         try:
-            given = np.asarray(value)
+            array = np.asarray(value)
         except ValueError:
             continue
-        lengths.append(given.shape[-1] if given.ndim else 1)
+        lengths.append(array.shape[-1] if array.ndim else 1)
     return max(lengths, default=1)
 
 
@@ -237,8 +237,8 @@ class MeanRevertingWalk(_Stationary):
 
     def advance(self, memory: Array, noise: Array) -> Array:
         """The values (q, N) one instant later."""
-        kept = np.exp(-1.0 / self.period)
-        return kept * memory + self.amplitude * np.sqrt(1.0 - kept * kept) * noise
+        retention = np.exp(-1.0 / self.period)
+        return retention * memory + self.amplitude * np.sqrt(1.0 - retention * retention) * noise
 
     def covariance(self, horizon: int) -> Array:
         """(horizon, q, q): a² exp(-lag/period) on the diagonal."""
@@ -250,7 +250,7 @@ def _scale_and_period(size: int, amplitude: ArrayLike, period: ArrayLike) -> tup
     instants = validation.positive("input_period", period, (size,))
     if np.any(instants < 1.0):
         raise ConfigurationError(
-            f"input_period = {validation.shown(instants)} is not allowed: it must be >= 1 "
+            f"input_period = {validation.display(instants)} is not allowed: it must be >= 1 "
             "everywhere, for an input is constant between two sampling instants"
         )
     return scale[:, None], instants[:, None]
@@ -263,7 +263,7 @@ def _geometric(amplitude: Array, ratio: Array, horizon: int) -> Array:
 
 
 @dataclass(frozen=True)
-class GivenInput:
+class ArrayInput:
     """The same inputs in every episode: ``values`` (rows, q, 1), one row a sampling instant.
 
     After the last row the input stays where it is.
@@ -272,7 +272,7 @@ class GivenInput:
     values: Array
 
     @classmethod
-    def create(cls, size: int, values: ArrayLike, horizon: int) -> GivenInput:
+    def create(cls, size: int, values: ArrayLike, horizon: int) -> ArrayInput:
         """Check an array (horizon + 1, size): d(0), ..., d(horizon).
 
         Raises:

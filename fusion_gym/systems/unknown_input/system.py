@@ -19,7 +19,7 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.system import Block, SignalArray, System, age_block, common_signals, numbered
-from fusion_gym.systems.unknown_input.nodes import Estimates, Nodes, Prediction, RunNodes
+from fusion_gym.systems.unknown_input.nodes import Estimates, NodePrediction, Nodes, RunNodes
 from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
 from fusion_gym.systems.unknown_input.signals import InputSignal
 
@@ -45,7 +45,7 @@ class UnknownInputState:
     held: Array
     age: Array
     estimates: Estimates
-    prediction: Prediction | None
+    prediction: NodePrediction | None
     departure: Array | None = None
 
 
@@ -267,16 +267,16 @@ class UnknownInputSystem(System[UnknownInputState]):
         spread = covariance[n:, n:]
         # The largest of Gumbel numbers moved by log weights is a draw with these weights.
         weight = -0.5 * linalg.dot(apart, linalg.solve_vector(spread, apart))
-        chosen = (weight - np.log(-np.log(ndtr(choice)))).argmax(0)
-        memory = memories.reshape(-1, _IMAGINED, runs)[:, chosen, np.arange(runs)]
-        off = apart[chosen, :, np.arange(runs)].T
+        choices = (weight - np.log(-np.log(ndtr(choice)))).argmax(0)
+        memory = memories.reshape(-1, _IMAGINED, runs)[:, choices, np.arange(runs)]
+        off = apart[choices, :, np.arange(runs)].T
         cross = covariance[:n, n:]
         gained = linalg.solve(spread, linalg.transpose(cross))
         left = linalg.symmetrise(covariance[:n, :n] - linalg.matmul(cross, gained))
         moved = mean[:n] + linalg.matvec(linalg.transpose(gained), off)
         return replace(
             state,
-            truth=np.concatenate((linalg.draw(moved, left, first), mean[n:] + off)),
+            truth=np.concatenate((linalg.draw_normal(moved, left, first), mean[n:] + off)),
             signal=self.signal.advance(memory, moving),
             departure=None,
         )
@@ -340,7 +340,7 @@ def _lanes(value: Array, runs: int) -> Array:
     return np.broadcast_to(value, (*value.shape[:-1], runs))
 
 
-def _sensed(state: UnknownInputState) -> Prediction:
+def _sensed(state: UnknownInputState) -> NodePrediction:
     if state.prediction is None:
         raise RuntimeError("the state has no measurements yet: call sense first")
     return state.prediction

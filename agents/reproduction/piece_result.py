@@ -34,9 +34,9 @@ class Number(NamedTuple):
     ) -> Number:
         """From a sample (episodes,), of which the paper prints the mean over ``runs``."""
         values = np.asarray(sample, dtype=float)
-        found = mean_interval(values)
+        result = mean_interval(values)
         spread = float(values.std(ddof=1)) / np.sqrt(runs) if len(values) > 1 else 0.0
-        return cls(what, found.mean, found.low, found.high, printed, spread, unit)
+        return cls(what, result.mean, result.low, result.high, printed, spread, unit)
 
     @property
     def verdict(self) -> str:
@@ -47,7 +47,7 @@ class Number(NamedTuple):
         return "agrees" if abs(self.printed - self.mean) <= allowed else "differs"
 
 
-class Table(NamedTuple):
+class NumbersTable(NamedTuple):
     """Numbers under a title, ``note`` says what they are and how they were made.
 
     With ``columns`` the numbers, none of which is printed, stand row by row under these heads; each
@@ -85,11 +85,11 @@ class Claim(NamedTuple):
     evidence: str
 
 
-class Shown(NamedTuple):
+class PieceResult(NamedTuple):
     """All that is shown of a piece."""
 
     pictures: Sequence[Picture] = ()
-    tables: Sequence[Table] = ()
+    tables: Sequence[NumbersTable] = ()
     claims: Sequence[Claim] = ()
     notes: Sequence[str] = ()
     """Paragraphs of Markdown: readings that were tried, bounds that a printed value breaks."""

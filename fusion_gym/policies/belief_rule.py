@@ -15,8 +15,8 @@ from fusion_gym.validation import ConfigurationError, boolean, refusal
 
 
 @dataclass
-class BelievingRule(Rule):
-    """A rule on what is believed: the coordinator's, or with ``own`` every sensor's by itself.
+class BeliefRule(Rule):
+    """A rule on what is believed: the scheduler's, or with ``own`` every sensor's by itself.
 
     ``together`` names the parameters that take more than one sensor to decide.
     """
@@ -29,7 +29,7 @@ class BelievingRule(Rule):
         super().__post_init__()
         only = {name: getattr(self, name) for name in self.together}
         check_owner(self.task, self.own, **only)
-        self.remember: Owner = "own" if self.own else "coordinator"
+        self.remember: Owner = "own" if self.own else "scheduler"
 
     @property
     def knowledge(self) -> Knowledge:
@@ -37,15 +37,15 @@ class BelievingRule(Rule):
         return knows(self.task, self.own)
 
     def beliefs(self, signals: Signals) -> Beliefs:
-        """The coordinator's beliefs, or every sensor's own."""
+        """The scheduler's beliefs, or every sensor's own."""
         return beliefs_of(signals, self.own)
 
 
 def knows(task: Task, own: bool) -> Knowledge:
     """The class of a rule that looks at all that is believed, in a task with or without memory."""
     if task.memory:
-        return "own_memory" if own else "coordinator_memory"
-    return "own" if own else "coordinator"
+        return "own_memory" if own else "scheduler_memory"
+    return "own" if own else "scheduler"
 
 
 def check_owner(task: Task, own: bool, **only_together: Any) -> None:
@@ -71,7 +71,7 @@ def check_owner(task: Task, own: bool, **only_together: Any) -> None:
 
 
 def beliefs_of(signals: Signals, own: bool) -> Beliefs:
-    """The coordinator's beliefs, or every sensor's own."""
-    found: Any = signals["own_beliefs" if own else "beliefs"]
-    beliefs: Beliefs = found
+    """The scheduler's beliefs, or every sensor's own."""
+    result: Any = signals["own_beliefs" if own else "beliefs"]
+    beliefs: Beliefs = result
     return beliefs

@@ -33,7 +33,7 @@ def task_of(env_id: str = TOBIT, **options: Any) -> Task:
     return fusion_gym.make_task(env_id, **(BENCHMARK if env_id == TOBIT else {}) | options)
 
 
-def later(task: Task, owner: Any = "coordinator", runs: int = 40, steps: int = 6) -> EpisodeBatch:
+def later(task: Task, owner: Any = "scheduler", runs: int = 40, steps: int = 6) -> EpisodeBatch:
     """Runs after a few steps with few deliveries."""
     batch, draw = EpisodeBatch.seeded(task, runs, 0, owner), np.random.default_rng(0)
     for _ in range(steps):
@@ -54,9 +54,9 @@ def after(task: Task, state: Any, *sensors: int) -> tuple[Array, Array]:
     return task.system.fused(task.system.deliver(state, granted))
 
 
-def share(asked: Array) -> None:
+def share(requests: Array) -> None:
     """Neither none nor all."""
-    assert 0.0 < asked.mean() < 1.0
+    assert 0.0 < requests.mean() < 1.0
 
 
 @pytest.mark.parametrize("memory", [False, True])
@@ -71,9 +71,9 @@ def test_the_value_is_in_squared_units_of_the_states(memory: bool) -> None:
     each = [weighted(task, best - after(task, batch.state, s)[0]) for s in range(3)]
     value = silent - np.array(each)
     np.testing.assert_allclose(batch.signals()["transmission_value"], value, rtol=1e-9, atol=1e-12)
-    asked = ValueOfInformation(task, threshold=0.02)(batch.signals())
-    share(asked)
-    np.testing.assert_array_equal(asked, value >= 0.02)
+    requests = ValueOfInformation(task, threshold=0.02)(batch.signals())
+    share(requests)
+    np.testing.assert_array_equal(requests, value >= 0.02)
     highest = float(batch.signals()["transmission_value"].max())
     assert ValueOfInformation(task, threshold=highest)(batch.signals()).sum() == 1
     assert not ValueOfInformation(task, threshold=np.nextafter(highest, 9.0))(batch.signals()).any()
@@ -83,14 +83,14 @@ def test_the_value_is_in_squared_units_of_the_states(memory: bool) -> None:
 def test_a_price_is_a_threshold_in_the_rewards_units(own: bool) -> None:
     """The tokens of a packet times their price, over what a squared error counts."""
     task = task_of(memory=True, token_cost=(1.0, 2.0, 4.0), error_weight=7.0)
-    signals = later(task, "own" if own else "coordinator").signals()
+    signals = later(task, "own" if own else "scheduler").signals()
     price, costs = 0.05, np.array([1.0, 2.0, 4.0])
-    asked = ValueOfInformation(task, price=price, own=own)(signals)
-    share(asked)
+    requests = ValueOfInformation(task, price=price, own=own)(signals)
+    share(requests)
     for sensor, cost in enumerate(costs):
         threshold = price * cost / (7.0 * task.reward.state_weights.mean())
         other = ValueOfInformation(task, threshold=threshold, own=own)(signals)
-        np.testing.assert_array_equal(asked[sensor], other[sensor])
+        np.testing.assert_array_equal(requests[sensor], other[sensor])
 
 
 def test_at_most_takes_the_most_valuable_and_ties_go_to_the_longest_silent() -> None:
@@ -100,17 +100,17 @@ def test_at_most_takes_the_most_valuable_and_ties_go_to_the_longest_silent() -> 
     every = ValueOfInformation(task, threshold=0.001)(signals)
     assert every.sum(0).max() == 3
     for most in (1, 2):
-        asked = ValueOfInformation(task, threshold=0.001, at_most=most)(signals)
-        assert asked.sum(0).max() == most
+        requests = ValueOfInformation(task, threshold=0.001, at_most=most)(signals)
+        assert requests.sum(0).max() == most
         ranks = (value[:, None] < value[None]).sum(1)  # how many are worth more
         clear = np.diff(np.sort(value, axis=0), axis=0).min(0) > 0.0
-        np.testing.assert_array_equal(asked[:, clear], (every & (ranks < most))[:, clear])
+        np.testing.assert_array_equal(requests[:, clear], (every & (ranks < most))[:, clear])
     tied = dict(signals) | {
         "beliefs": Tied(task),
         "age": np.array([[1.0, 4.0], [3.0, 4.0], [3.0, 2.0]]),
     }
-    asked = ValueOfInformation(task, threshold=0.5, at_most=1)(Signals(tied))
-    np.testing.assert_array_equal(asked.T, [[False, True, False], [True, False, False]])
+    requests = ValueOfInformation(task, threshold=0.5, at_most=1)(Signals(tied))
+    np.testing.assert_array_equal(requests.T, [[False, True, False], [True, False, False]])
 
 
 class Tied:
@@ -137,9 +137,9 @@ def test_steps_ahead_sum_what_is_left_of_the_difference() -> None:
         total += np.array([weighted(task, moved @ (best - centre)) for centre in centres])
     value = total[0] - total[1:]
     np.testing.assert_allclose(batch.beliefs().value(3), value, rtol=1e-9, atol=1e-12)
-    asked = ValueOfInformation(task, threshold=0.1, steps=3)(batch.signals())
-    share(asked)
-    np.testing.assert_array_equal(asked, value >= 0.1)
+    requests = ValueOfInformation(task, threshold=0.1, steps=3)(batch.signals())
+    share(requests)
+    np.testing.assert_array_equal(requests, value >= 0.1)
 
 
 def test_what_differs_is_measured_in_the_states_unit_or_whitened() -> None:
@@ -157,11 +157,11 @@ def test_what_differs_is_measured_in_the_states_unit_or_whitened() -> None:
         parameters: Any = {"threshold": threshold, "whitened": whitened}
         every = EstimateDifference(task, at_most=None, **parameters)(signals)
         np.testing.assert_array_equal(every, np.broadcast_to(size >= threshold, every.shape))
-        one = EstimateDifference(task, **parameters)(signals)
-        np.testing.assert_array_equal(one.sum(0), size >= threshold)
-        chosen = one.any(0)
+        single = EstimateDifference(task, **parameters)(signals)
+        np.testing.assert_array_equal(single.sum(0), size >= threshold)
+        selected = single.any(0)
         value = signals["transmission_value"]
-        np.testing.assert_array_equal(value.T[one.T], value.max(0)[chosen])
+        np.testing.assert_array_equal(value.T[single.T], value.max(0)[selected])
 
 
 @pytest.mark.parametrize("env_id", [TOBIT, "fusion_gym/BiasedOscillator-v0"])
@@ -174,9 +174,9 @@ def test_a_sensor_without_memory_looks_at_what_its_measurement_would_change(env_
     each = [after(task, batch.state, s)[0] - silent for s in range(task.sensors)]
     size = np.sqrt(weighted(task, np.array(each)))
     threshold = float(np.median(size))
-    asked = EstimateDifference(task, threshold=threshold, own=True)(batch.signals())
-    share(asked)
-    np.testing.assert_array_equal(asked, size >= threshold)
+    requests = EstimateDifference(task, threshold=threshold, own=True)(batch.signals())
+    share(requests)
+    np.testing.assert_array_equal(requests, size >= threshold)
 
 
 @pytest.mark.parametrize(
@@ -185,10 +185,10 @@ def test_a_sensor_without_memory_looks_at_what_its_measurement_would_change(env_
 def test_the_divergence_is_that_of_two_gaussians(own: bool, memory: bool) -> None:
     """As the mean of the logarithm of their ratio, by three-point quadrature in each direction."""
     task = task_of(CORRELATED, memory=memory, broadcast="packets")
-    batch = later(task, "own" if own else "coordinator", runs=6)
+    batch = later(task, "own" if own else "scheduler", runs=6)
     beliefs: Beliefs = batch.beliefs()
     estimates = beliefs.best if own else beliefs.sent
-    found = np.zeros((task.sensors, 6))
+    values = np.zeros((task.sensors, 6))
     for sensor in range(task.sensors):
         for run in range(6):
             known = len(beliefs.silent.mean) > 1
@@ -198,11 +198,11 @@ def test_the_divergence_is_that_of_two_gaussians(own: bool, memory: bool) -> Non
             points = np.concatenate((mean + steps, mean - steps))  # exact for squares
             ratio = multivariate_normal(mean, spread).logpdf(points)
             ratio -= multivariate_normal(other, wide).logpdf(points)
-            found[sensor, run] = ratio.mean()
-    threshold = float(np.median(found)) * (1.0 + 1e-9)
-    asked = KullbackLeibler(task, threshold=threshold, own=own)(batch.signals())
-    share(asked)
-    np.testing.assert_array_equal(asked, found >= threshold)
+            values[sensor, run] = ratio.mean()
+    threshold = float(np.median(values)) * (1.0 + 1e-9)
+    requests = KullbackLeibler(task, threshold=threshold, own=own)(batch.signals())
+    share(requests)
+    np.testing.assert_array_equal(requests, values >= threshold)
 
 
 @pytest.mark.parametrize(

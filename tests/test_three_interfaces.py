@@ -62,48 +62,48 @@ def arrays_in(value: Any) -> list[NDArray[Any]]:
     return [value] if isinstance(value, np.ndarray) else []
 
 
-@pytest.mark.parametrize("face", ["single", "sb3", *MODES], ids=str)
-def test_returned_arrays_belong_to_the_caller(face: Any) -> None:
+@pytest.mark.parametrize("interface", ["single", "sb3", *MODES], ids=str)
+def test_returned_arrays_belong_to_the_caller(interface: Any) -> None:
     """What was returned never changes later, and changing it changes nothing later."""
 
     def make() -> Any:
-        if face == "single":
+        if interface == "single":
             return gymnasium.make(ENV_ID, horizon=3)
-        if face == "sb3":
+        if interface == "sb3":
             return fusion_gym.make_sb3_vec_env(ENV_ID, 3, horizon=3)
-        return make_vector(3, face, horizon=3)
+        return make_vector(3, interface, horizon=3)
 
     def reset(env: Any, seed: int | None, over: Any) -> Any:
-        if face == "sb3":
+        if interface == "sb3":
             env.seed(seed)
             return env.reset(), env.reset_infos
-        mask = {} if face == "single" or seed is not None else {"reset_mask": over}
+        mask = {} if interface == "single" or seed is not None else {"reset_mask": over}
         return env.reset(seed=seed, options=mask)
 
     touched, clean = make(), make()
     scribble(reset(touched, 1, None))
-    kept = [reset(clean, 1, None)]
-    texts = [text_of(kept[0])]
-    if face not in ("single", "sb3"):
+    stored = [reset(clean, 1, None)]
+    texts = [text_of(stored[0])]
+    if interface not in ("single", "sb3"):
         mask = np.array([False, True, False])  # from here on episodes end at different times
         for env in (touched, clean):
             env.step(np.ones((3, 3), dtype=np.int64))
             env.reset(options={"reset_mask": mask})
     for action in draw_actions(12, 3):
-        action = action[0] if face == "single" else action
+        action = action[0] if interface == "single" else action
         mine, other = touched.step(action.copy()), clean.step(action.copy())
         assert text_of(mine) == text_of(other)
-        kept.append(other)
+        stored.append(other)
         texts.append(text_of(other))
-        over = np.copy(other[3]) if face != "sb3" else None
-        for one, two in itertools.combinations(arrays_in(mine), 2):
-            assert not np.may_share_memory(one, two)
+        over = np.copy(other[3]) if interface != "sb3" else None
+        for first, two in itertools.combinations(arrays_in(mine), 2):
+            assert not np.may_share_memory(first, two)
         scribble(mine)
-        if face in ("single", AutoresetMode.DISABLED) and np.any(over):
+        if interface in ("single", AutoresetMode.DISABLED) and np.any(over):
             mine, other = reset(touched, None, over.copy()), reset(clean, None, over.copy())
             assert text_of(mine) == text_of(other)
             scribble(mine)
-    assert [text_of(entry) for entry in kept] == texts
+    assert [text_of(entry) for entry in stored] == texts
 
 
 def test_sb3_seeds_and_options_count_once() -> None:

@@ -10,15 +10,15 @@ from fusion_gym.validation import ConfigurationError
 
 from .committed import path_of, read_envelopes
 from .envelope_table import bound_of, hull_of, measured
-from .reports import VERDICT, Agent, Baselines, Tested, Verdict, read
+from .reports import VERDICT, Agent, Baselines, TestRecord, Verdict, read_shape
 
 Points = list[tuple[float, float]]  # rate and error
 
 
-class Found(NamedTuple):
+class SettingResults(NamedTuple):
     """A setting's results.
 
-    ``seeds[class]`` has a training seed's points, by price; ``ahead`` are the coordinator's
+    ``seeds[class]`` has a training seed's points, by price; ``ahead`` are the scheduler's
     references and ``known`` those of the centre; ``validation`` says on which episodes the agents
     were validated, and ``envelopes`` is the file of committed envelopes. What is not there is
     empty.
@@ -48,7 +48,7 @@ class Found(NamedTuple):
 
     @property
     def optimal(self) -> bool:
-        """Whether the coordinator's reference is the optimum."""
+        """Whether the scheduler's reference is the optimum."""
         names = [point.name for point in self.ahead]
         return bool(names) and all(name.startswith("optimal:") for name in names)
 
@@ -66,23 +66,23 @@ class Found(NamedTuple):
         return height(hull, rate) if hull else None
 
 
-def read_results(results: Path) -> dict[str, Found]:
+def read_results(results: Path) -> dict[str, SettingResults]:
     """Every setting that is judged, by name.
 
     Raises:
         ConfigurationError: there are none, or a file that is no such JSON.
     """
-    found = {
+    result = {
         path.parent.name: read_setting(path.parent) for path in sorted(results.glob(f"*/{VERDICT}"))
     }
-    if not found:
+    if not result:
         raise ConfigurationError(
             f"results = {str(results)!r} is not allowed: it must hold results of the benchmark"
         )
-    return found
+    return result
 
 
-def read_setting(folder: Path) -> Found:
+def read_setting(folder: Path) -> SettingResults:
     """One setting's results.
 
     Raises:
@@ -90,20 +90,20 @@ def read_setting(folder: Path) -> Found:
             fit together.
     """
     name, results = folder.name, folder.parent
-    verdict = read(Verdict, folder / VERDICT, "results")
-    baselines = read(Baselines, folder / "baselines.json", "results")
-    named = [one for curve in baselines["curves"].values() for one in curve["policies"]]
+    verdict = read_shape(Verdict, folder / VERDICT, "results")
+    baselines = read_shape(Baselines, folder / "baselines.json", "results")
+    named = [policy for curve in baselines["curves"].values() for policy in curve["policies"]]
     named += [place["name"] for of in verdict["classes"].values() for place in of["envelope"]]
-    for one in named:
-        if one not in baselines["policies"]:
+    for item in named:
+        if item not in baselines["policies"]:
             raise ConfigurationError(
                 f"results = {str(folder)!r} do not fit together: baselines.json has no policy "
-                f"{one!r}, of which it or {VERDICT} speaks"
+                f"{item!r}, of which it or {VERDICT} speaks"
             )
     classes, committed = verdict["classes"], path_of(results, name)
     agents = _agents(folder, classes)
     rollout, episodes = measured(results / "rollout" / f"{name}.json", name)
-    return Found(
+    return SettingResults(
         name,
         verdict,
         baselines,
@@ -120,20 +120,20 @@ def read_setting(folder: Path) -> Found:
 
 def _places(path: Path) -> list[EnvelopePoint]:
     """The policies of a file, if it is there, by rising rate."""
-    policies = read(Tested, path, "results")["policies"] if path.exists() else {}
-    found = [EnvelopePoint(name, rate_of(p), p["mse"]["mean"]) for name, p in policies.items()]
-    return sorted(found, key=lambda point: (point.rate, point.mse))
+    policies = read_shape(TestRecord, path, "results")["policies"] if path.exists() else {}
+    result = [EnvelopePoint(name, rate_of(p), p["mse"]["mean"]) for name, p in policies.items()]
+    return sorted(result, key=lambda point: (point.rate, point.mse))
 
 
 def _agents(folder: Path, classes: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
     """The agents of the classes that are judged, by training seed."""
-    found: dict[str, list[dict[str, Any]]] = {}
+    result: dict[str, list[dict[str, Any]]] = {}
     for path in sorted(folder.glob("agent_*.json")):
         # The class is in the file's name; what else lies there is none of these agents.
         named = re.fullmatch(r"agent_(\w+)_\d+", path.stem)
         if named and named[1] in classes:
-            found.setdefault(named[1], []).append(read(Agent, path, "results"))
-    return found
+            result.setdefault(named[1], []).append(read_shape(Agent, path, "results"))
+    return result
 
 
 def _columns(agents: Sequence[Mapping[str, Any]], prices: int) -> list[Points]:

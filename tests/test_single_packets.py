@@ -41,12 +41,12 @@ def sensed(task: Task, runs: int) -> Any:
 
 def one_by_one(task: Task, state: Any) -> tuple[Array, Array]:
     runs = task.system.truth(state).shape[-1]
-    found = []
+    value = []
     for sensor in range(task.sensors):
-        alone = np.zeros((task.sensors, runs), dtype=np.bool_)
-        alone[sensor] = True
-        found.append(task.system.fused(task.system.deliver(state, alone)))
-    return np.array([mean for mean, _ in found]), np.array([covariance for _, covariance in found])
+        single = np.zeros((task.sensors, runs), dtype=np.bool_)
+        single[sensor] = True
+        value.append(task.system.fused(task.system.deliver(state, single)))
+    return np.array([mean for mean, _ in value]), np.array([covariance for _, covariance in value])
 
 
 KINDS: dict[str, dict[str, Any]] = {
@@ -62,20 +62,20 @@ KINDS: dict[str, dict[str, Any]] = {
 def test_all_at_once_is_bitwise_one_after_another(name: str, runs: int) -> None:
     task = task_of(**KINDS[name])
     assert task.system.offers("fused_alone")
-    wanted = one_by_one(task, sensed(task, runs))
-    found = task.system.fused_alone(sensed(task, runs))
-    np.testing.assert_array_equal(found[0], wanted[0])
-    np.testing.assert_array_equal(found[1], wanted[1])
-    assert len(np.unique(found[0][:, 0, 0])) == MANY
+    expected = one_by_one(task, sensed(task, runs))
+    result = task.system.fused_alone(sensed(task, runs))
+    np.testing.assert_array_equal(result[0], expected[0])
+    np.testing.assert_array_equal(result[1], expected[1])
+    assert len(np.unique(result[0][:, 0, 0])) == MANY
 
 
 def test_the_joint_filter_agrees_up_to_rounding() -> None:
     correlated = np.eye(2 * MANY) + 0.3
     task = task_of(filter="joint", joint_measurement_covariance=correlated.tolist())
     state = sensed(task, 6)
-    wanted, found = one_by_one(task, state), task.system.fused_alone(state)
-    np.testing.assert_allclose(found[0], wanted[0], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found[1], wanted[1], rtol=1e-9, atol=1e-12)
+    expected, result = one_by_one(task, state), task.system.fused_alone(state)
+    np.testing.assert_allclose(result[0], expected[0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(result[1], expected[1], rtol=1e-9, atol=1e-12)
 
 
 def test_where_nothing_is_saved_it_is_not_offered() -> None:
@@ -105,11 +105,11 @@ def test_informations_after_an_answer_are_the_inverses_of_what_results(shared: b
         outcomes = Outcomes(means[:, None], delivered, means, silent)
         assert outcomes.informed == shared
         local = np.where(granted[:, None, None], delivered, silent)
-        wanted = InformationFusion().fuse(means, local)
+        expected = InformationFusion().fuse(means, local)
         for _ in range(2):  # the second time from what is known by then
-            found = InformationFusion().fuse_information(means, outcomes.information(granted))
-            np.testing.assert_array_equal(found.mean, wanted.mean)
-            np.testing.assert_array_equal(found.covariance, wanted.covariance)
+            result = InformationFusion().fuse_information(means, outcomes.information(granted))
+            np.testing.assert_array_equal(result.mean, expected.mean)
+            np.testing.assert_array_equal(result.covariance, expected.covariance)
             assert outcomes.delivered_information is not None
         assert outcomes.informed
 
@@ -122,21 +122,21 @@ def test_diagonal_matrices_are_solved_with_the_same_roundings(rows: int) -> None
     matrix = np.zeros((3, rows, rows, 50))
     matrix[:, np.arange(rows), np.arange(rows)] = diagonal
     vector = rng.normal(size=(3, rows, 50))
-    wanted = linalg.solve(matrix, vector[..., None, :])[..., 0, :]
-    np.testing.assert_array_equal(linalg.solve_vector(matrix, vector), wanted)
+    expected = linalg.solve(matrix, vector[..., None, :])[..., 0, :]
+    np.testing.assert_array_equal(linalg.solve_vector(matrix, vector), expected)
     matrix[..., 0, 1, 7] = matrix[..., 1, 0, 7] = 0.1
-    wanted = linalg.solve(matrix, vector[..., None, :])[..., 0, :]
-    np.testing.assert_array_equal(linalg.solve_vector(matrix, vector), wanted)
+    expected = linalg.solve(matrix, vector[..., None, :])[..., 0, :]
+    np.testing.assert_array_equal(linalg.solve_vector(matrix, vector), expected)
 
 
 def test_sources_believe_as_with_all_covariances(monkeypatch: pytest.MonkeyPatch) -> None:
     """Means alone, and with the covariances that nobody asked for: the same values."""
     for owner, options in (
-        ("coordinator", {}), ("own", {}), ("own", {"broadcast": "estimate"}),
-        ("coordinator", {"channel": "independent"}),
+        ("scheduler", {}), ("own", {}), ("own", {"broadcast": "estimate"}),
+        ("scheduler", {"channel": "independent"}),
     ):  # fmt: skip
         task = fusion_gym.make_task("fusion_gym/RemoteEstimation-v0", sensors=5, **options)
-        found = []
+        result = []
         for means_alone in (True, False):
             if not means_alone:
                 monkeypatch.delattr(type(task.system), "fused_mean")
@@ -144,7 +144,7 @@ def test_sources_believe_as_with_all_covariances(monkeypatch: pytest.MonkeyPatch
             for _ in range(6):
                 batch.step(np.arange(20).reshape(5, 4) % 3 == 0)
             beliefs = batch.beliefs()
-            found.append([beliefs.value(), beliefs.loss(), beliefs.sent.covariance])
+            result.append([beliefs.value(), beliefs.loss(), beliefs.sent.covariance])
             monkeypatch.undo()
-        for ours, theirs in zip(*found, strict=True):
+        for ours, theirs in zip(*result, strict=True):
             np.testing.assert_array_equal(ours, theirs)
