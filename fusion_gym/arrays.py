@@ -1,7 +1,5 @@
 """Arrays of runs: quantities of shape (…, N), and records of them, with the batch axis last."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

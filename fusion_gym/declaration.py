@@ -1,7 +1,5 @@
 """Declarations of options: a dataclass's field with its type, default and docstring (PEP 257)."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import inspect

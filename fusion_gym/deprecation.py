@@ -1,7 +1,5 @@
 """Earlier names of values, accepted until the next minor version."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

@@ -3,8 +3,6 @@
 A label stands at the beginning of a paragraph; indented paragraphs below belong to it.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 import textwrap

@@ -19,8 +19,6 @@ difference of nearly equal numbers; there they come from the continued fraction 
 ``d = 1 / (z + r)`` with ``r = 2 / (z + 3 / (z + 4 / (z + ...)))``, whence ``v = d (r - d)``.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a user names as ``module:name``: imported, or one error that says what is wrong."""
 
-from __future__ import annotations
-
 import importlib
 from types import ModuleType
 from typing import Any

@@ -17,8 +17,6 @@ not positive definite comes back filled with NaN; the other lanes are unaffected
 raised and no NumPy warning is issued.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@ Every check returns the value in the form the library works with (float64 arrays
 and raises :class:`ConfigurationError` otherwise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

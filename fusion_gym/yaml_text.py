@@ -1,7 +1,5 @@
 """YAML as it is read here: plain values alone, and no key given twice."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Hashable
 from typing import Any

@@ -3,8 +3,6 @@
 python -m website.check site
 """
 
-from __future__ import annotations
-
 import posixpath
 import re
 import shutil

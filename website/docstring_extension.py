@@ -1,7 +1,5 @@
 """What the builder's reader of docstrings calls for each of them."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Docstrings as Markdown: their code marks and cross-references."""
 
-from __future__ import annotations
-
 import re
 
 _ROLE = re.compile(r":\w+:`(?P<short>~?)(?P<name>[\w.]+)`")

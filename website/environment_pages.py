@@ -1,7 +1,5 @@
 """What the site adds to an environment's page: an overview, and what ``help`` says."""
 
-from __future__ import annotations
-
 import re
 
 import fusion_gym

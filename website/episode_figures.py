@@ -1,7 +1,5 @@
 """One episode of every rule: the error, and who transmitted when."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a fusion rule makes of two estimates, as ellipses of one standard deviation."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the site's builder calls: pages that are made, links, equations, figures."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys

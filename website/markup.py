@@ -1,7 +1,5 @@
 """Small changes between the repository's Markdown and the site's HTML."""
 
-from __future__ import annotations
-
 import html
 import re
 import warnings

@@ -1,7 +1,5 @@
 """Which pages of a built site scroll sideways on a phone, as headless Chromium lays them out."""
 
-from __future__ import annotations
-
 import functools
 import json
 import queue

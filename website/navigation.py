@@ -1,7 +1,5 @@
 """The site's table of contents; what is not there yet is left out."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The papers of which docstrings speak by a word, and where they are cited in full."""
 
-from __future__ import annotations
-
 import re
 import sys
 

@@ -1,7 +1,5 @@
 """A page each for the rules, the fusion rules and the filters, and a table of each kind."""
 
-from __future__ import annotations
-
 import re
 
 from fusion_gym.docstrings import table

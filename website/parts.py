@@ -1,7 +1,5 @@
 """The policies, fusion rules and filters that have a page each, as their declarations have them."""
 
-from __future__ import annotations
-
 import inspect
 import re
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Which file of the repository is which page of the site, and where a link leads from there."""
 
-from __future__ import annotations
-
 import posixpath
 import re
 from functools import cache

@@ -1,7 +1,5 @@
 """The reference: a page a public module of the library, made of its docstrings."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

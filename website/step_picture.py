@@ -3,8 +3,6 @@
 python -m website.step_picture
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from fusion_gym.agents.output import palette

@@ -1,7 +1,5 @@
 """What the tutorials' hidden lines use: figures on the page."""
 
-from __future__ import annotations
-
 import base64
 import io
 

@@ -1,7 +1,5 @@
 """Medium access: which sensors may use the network in a step, before tokens are asked for."""
 
-from __future__ import annotations
-
 from typing import get_args
 
 import numpy as np

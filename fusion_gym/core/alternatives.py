@@ -1,7 +1,5 @@
 """What a step would have brought, had other requests been made on the same noise."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

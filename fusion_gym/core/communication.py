@@ -1,7 +1,5 @@
 """The communication model: what a packet holds, what a node hears, whether it remembers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple, get_args
 

@@ -13,8 +13,6 @@ its own measurements and what it receives, by the option ``broadcast``:
 What follows from the memory is in :mod:`fusion_gym.core.beliefs`.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Mapping
 from typing import Any, Self

@@ -1,7 +1,5 @@
 """A few steps of a task before it is handed out: what float64 cannot hold shows at once."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from fusion_gym.core.batch import EpisodeBatch

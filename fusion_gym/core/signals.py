@@ -1,7 +1,5 @@
 """What is believed, as signals by name, beside those that a system offers itself."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The live episode as a picture: states and estimates, requests and their answers, tokens."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections import deque
 from collections.abc import Sequence

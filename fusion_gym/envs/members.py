@@ -1,7 +1,5 @@
 """What Gymnasium's own vector environments tell of the single environments that they hold."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

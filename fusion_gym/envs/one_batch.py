@@ -4,8 +4,6 @@ Tools that make their environments one by one, as rl-zoo3 does, train at the spe
 files of hyper-parameters name :func:`one_batch` as ``vec_env_wrapper``.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from gymnasium.envs.registration import EnvSpec

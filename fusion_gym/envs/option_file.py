@@ -1,7 +1,5 @@
 """Options of an environment from a file."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Options as text: name, type with its values, default, and meaning."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from typing import Any, NamedTuple

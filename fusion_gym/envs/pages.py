@@ -6,8 +6,6 @@ between ``<!-- KIND: TEXT -->`` and ``<!-- end -->``, KIND a name of ``TABLES``.
 marked so. ``options`` has ids, and the names of the options in the table.
 """
 
-from __future__ import annotations
-
 import ast
 import inspect
 import re

@@ -3,8 +3,6 @@
 Only credit and rewards are made of it, in training: what a policy sees is what it sees in use.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

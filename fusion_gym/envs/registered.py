@@ -4,8 +4,6 @@
 build for ``fusion_gym/TobitOscillator-v0``; ``help`` shows their page, with every option.
 """
 
-from __future__ import annotations
-
 import inspect
 from typing import Any
 

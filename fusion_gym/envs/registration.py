@@ -1,7 +1,5 @@
 """The registered environments: an id stands for a ``build`` function from options to a scenario."""
 
-from __future__ import annotations
-
 import copy
 import importlib
 import inspect

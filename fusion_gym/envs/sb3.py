@@ -1,7 +1,5 @@
 """Stable-Baselines3's vector environment over the batched core."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from typing import Any

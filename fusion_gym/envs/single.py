@@ -1,7 +1,5 @@
 """Gymnasium's single environment: the batched core with one run."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium

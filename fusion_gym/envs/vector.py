@@ -1,7 +1,5 @@
 """Gymnasium's vector environment over the batched core."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Several policies on the same episodes in one batch: for searches over many parameters."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Sequence
 from functools import partial

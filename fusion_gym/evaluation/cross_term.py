@@ -9,8 +9,6 @@ if x* is the conditional mean given all that x̂ and the policy use. Where x* is
 is not, and a policy that is trained on the mismatch is drawn aside by it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The lower envelope of many policies in the plane of transmission rate and error."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 

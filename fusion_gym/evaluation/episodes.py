@@ -1,7 +1,5 @@
 """Running a policy over episodes whose noise is fixed by their seeds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any

@@ -1,7 +1,5 @@
 """What the error is where everything is always taken in."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Episodes of a clairvoyant: the schedules that a search finds once all noise is known."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import ClassVar
 

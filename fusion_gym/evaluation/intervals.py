@@ -1,7 +1,5 @@
 """Bootstrap confidence intervals over episodes."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

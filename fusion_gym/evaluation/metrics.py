@@ -1,7 +1,5 @@
 """From episodes to the numbers of a report."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 

@@ -1,7 +1,5 @@
 """Whether an ONNX file decides as the agent that it was made of, and how long it takes."""
 
-from __future__ import annotations
-
 import importlib
 import math
 import time

@@ -1,7 +1,5 @@
 """An agent as an ONNX file, written, checked and timed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

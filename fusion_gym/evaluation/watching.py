@@ -1,7 +1,5 @@
 """Policies side by side on the same noise, as pictures of one episode."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 

@@ -5,8 +5,6 @@ rules are scalar, and their trace is a convex sum whose minimum :func:`best_weig
 than two at once: :mod:`fusion_gym.fusion.several`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations

@@ -4,8 +4,6 @@ A rule in a file of its own is a subclass of :class:`FusionRule` and one row of 
 :mod:`fusion_gym.fusion.table`.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass

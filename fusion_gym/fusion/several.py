@@ -5,8 +5,6 @@ one estimate alone is the best, or only two take part (:mod:`fusion_gym.fusion.i
 The others take Newton steps on the simplex of weights.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

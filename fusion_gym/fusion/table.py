@@ -1,7 +1,5 @@
 """The fusion rules by name: what each assumes of the estimates, and why it is refused elsewhere."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

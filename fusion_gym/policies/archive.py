@@ -5,8 +5,6 @@ wrote the file decides what that runs. Here such text stays text, and of the ``.
 policy's alone is read, by torch's loader of plain weights.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import struct

@@ -1,7 +1,5 @@
 """The one interface of every policy, and what the rules share."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable

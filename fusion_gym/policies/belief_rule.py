@@ -1,7 +1,5 @@
 """What the rules share that look at what is believed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 

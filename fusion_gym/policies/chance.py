@@ -1,7 +1,5 @@
 """Uniform numbers for policies that draw: a stream of its own for each run."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from fusion_gym.arrays import Array

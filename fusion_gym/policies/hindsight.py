@@ -9,8 +9,6 @@ future. Where not all can be kept, the cheapest of each such group comes before 
 so that the beam does not fill up with near copies of one schedule.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from typing import Any

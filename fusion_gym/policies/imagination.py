@@ -1,7 +1,5 @@
 """Runs as they could be, from what a scheduler believes: for policies that simulate."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -5,8 +5,6 @@ from its weights; nothing in the file is unpickled. ``trust`` loads it with Stab
 loader instead, which runs whatever code the file holds.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path

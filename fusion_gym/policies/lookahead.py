@@ -1,7 +1,5 @@
 """A model-based reference: weigh what every possible transmission would be worth in a few steps."""
 
-from __future__ import annotations
-
 import warnings
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """A Stable-Baselines3 agent as a policy, and the card that is saved with it."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

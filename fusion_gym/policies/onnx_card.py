@@ -3,8 +3,6 @@
 Every value is text; lists and tables are JSON, in which "inf" and "-inf" are infinite numbers.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

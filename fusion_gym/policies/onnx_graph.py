@@ -1,7 +1,5 @@
 """A saved agent as an ONNX graph: what a sensor or a scheduler runs without this library."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import warnings

@@ -1,7 +1,5 @@
 """The policy that attains the solved optimum of a remote-estimation task."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """The best periodic schedule of all: a reference for systems whose covariances need no data."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

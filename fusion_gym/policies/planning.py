@@ -1,7 +1,5 @@
 """What a reference may plan with: the task's model from the present on, without what is hidden."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

@@ -5,8 +5,6 @@ or ``zoo:NAME`` with settings behind a comma, one of your own as ``package.modul
 ``package.module:Class:key=value``.
 """
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import re

@@ -1,7 +1,5 @@
 """One improvement on a policy: try first decisions, and let it go on, in simulations."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np

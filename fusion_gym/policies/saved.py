@@ -1,7 +1,5 @@
 """Saved agents as policies, by their file or by their name in the model zoo."""
 
-from __future__ import annotations
-
 from fusion_gym import zoo
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy

@@ -1,7 +1,5 @@
 """Searched schedules in a file, found again by all that they depend on."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

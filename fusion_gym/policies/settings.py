@@ -1,7 +1,5 @@
 """Settings as a command line writes them: ``key=value,key=value``."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 from collections.abc import Iterable

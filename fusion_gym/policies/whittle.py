@@ -1,7 +1,5 @@
 """Whittle's index of remote estimation: what a transmission of each source is worth by itself."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np

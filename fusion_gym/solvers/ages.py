@@ -1,7 +1,5 @@
 """Several sources, scheduled by their ages alone: the best that ignores the errors can do."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A lower bound for many sources that share tokens: each on its own, at a common price."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple

@@ -5,8 +5,6 @@ Markovian state", IEEE Trans. Automatic Control 65, 2020 (the dynamic programme 
 events); token levels are added to the state here.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

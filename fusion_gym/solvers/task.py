@@ -1,7 +1,5 @@
 """The solved optimum of a remote-estimation task."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

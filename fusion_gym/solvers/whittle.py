@@ -1,7 +1,5 @@
 """Whittle's index of a source: the thresholds on its error at many prices."""
 
-from __future__ import annotations
-
 import pickle
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The base of a system of one's own: plant, sensors and filter are written, the rest is here."""
 
-from __future__ import annotations
-
 import functools
 from abc import abstractmethod
 from collections.abc import Callable, Mapping

@@ -5,8 +5,6 @@ test numbers, and the SHA-256 of the model. The models are ordinary files of Sta
 ``zoo:NAME`` reads their plain parts and weights alone.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from importlib import resources

@@ -194,9 +194,9 @@ def _broken(data: dict[str, Any]) -> str:
     return f"""**Tables II and III cannot be reproduced by any reading of the equations with the
 printed parameters.** The noise ε of (3) is independent of everything measured so far, so the
 bias's RMSE is at least √Ξ = {data["bias_deviation"]:g} at every step; printed are
-{list_numbers(bias, "g")}. The Kalman filter on the same packets *without* censoring has the least \
-error of all filters, and clipping only takes information away: {below} of the {len(entries)} \
-printed
+{list_numbers(bias, "g")}. The Kalman filter on the same packets *without* censoring has the \
+least error
+of all filters, and clipping only takes information away: {below} of the {len(entries)} printed
 values lie below that by more than chance (four standard deviations of {count:,} runs), and
 {below_all} even below what both sensors at every step would allow. In the two narrow intervals,
 {beyond} of the 6 printed values lie *above* the error without any measurements

@@ -1,7 +1,5 @@
 """The adaptive innovation trigger of the correlated-noise paper."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The adaptive threshold trigger of the unknown-input paper."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Transmit until the centre's own predicted uncertainty is small enough."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

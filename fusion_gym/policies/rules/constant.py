@@ -1,7 +1,5 @@
 """Always and never: the ends of the trade-off."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

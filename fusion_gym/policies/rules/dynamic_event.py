@@ -1,7 +1,5 @@
 """The dynamic event trigger of the token-bucket paper."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

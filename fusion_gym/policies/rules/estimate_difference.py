@@ -1,7 +1,5 @@
 """Transmit when the estimate that could be made differs enough from the centre's."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

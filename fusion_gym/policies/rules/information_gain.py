@@ -1,7 +1,5 @@
 """Greedy choice by predicted reduction of variance per token."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

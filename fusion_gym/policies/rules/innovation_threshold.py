@@ -1,7 +1,5 @@
 """Transmit when the measurement surprises the filter."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

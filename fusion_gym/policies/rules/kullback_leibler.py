@@ -1,7 +1,5 @@
 """Transmit when what could be known diverges from what the centre will claim."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

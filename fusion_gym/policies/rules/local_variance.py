@@ -1,7 +1,5 @@
 """The variance trigger of the Markov jump paper: transmit when the node itself is uncertain."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Requests at an even pace, at any rate."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

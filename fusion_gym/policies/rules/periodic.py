@@ -1,7 +1,5 @@
 """Time-triggered policies: they look at the clock alone."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

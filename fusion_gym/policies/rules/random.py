@@ -1,7 +1,5 @@
 """Random requests at a rate."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

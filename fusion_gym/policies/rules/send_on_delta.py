@@ -1,7 +1,5 @@
 """Send on delta: transmit when the measurement has moved."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

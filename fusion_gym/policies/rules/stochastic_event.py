@@ -1,7 +1,5 @@
 """Stay silent by chance, the less likely the more the measurement surprises the filter."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

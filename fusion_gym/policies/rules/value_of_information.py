@@ -1,7 +1,5 @@
 """Transmit what is worth it: the change of the estimate that a packet brings, against a price."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Transmit when the centre's own uncertainty is too large."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

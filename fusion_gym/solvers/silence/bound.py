@@ -1,7 +1,5 @@
 """A lower bound of every policy's error at a rate, for linear plants measured at every step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """A lower bound of the least cost by backward induction on lattices; docs/bounds.md proves it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a task leaves to decide once censoring and tokens are given away, and where it may be."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

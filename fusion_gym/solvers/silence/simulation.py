@@ -1,7 +1,5 @@
 """What the policy of the lattices costs: no less than the least cost, which shows the gap."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

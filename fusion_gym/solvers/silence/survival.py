@@ -1,7 +1,5 @@
 """How long silence can last, and so how curved the value of being silent can be."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.special import ndtr
 

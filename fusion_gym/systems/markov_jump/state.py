@@ -4,8 +4,6 @@ Source: markov_jump (event-triggered distributed fusion estimation for asynchron
 systems with correlated noises and fading measurements).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple, TypeVar

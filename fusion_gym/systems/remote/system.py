@@ -4,8 +4,6 @@ Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop cha
 Markovian state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 

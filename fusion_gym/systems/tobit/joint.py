@@ -1,7 +1,5 @@
 """The Kalman filter of all delivered measurements together, whose noises may be correlated."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The sensors of a linear system of one's own, from plain lists: each has a size of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

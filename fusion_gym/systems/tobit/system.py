@@ -4,8 +4,6 @@ Source: tobit_token_bucket (Chen, Han, Song and Zhang, Complex Eng. Syst. 4:19, 
 round_robin_tobit (Geng, Wang, Alsaadi, Alharbi and Cheng, 2020).
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

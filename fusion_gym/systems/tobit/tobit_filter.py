@@ -1,7 +1,5 @@
 """The Tobit Kalman filter, and the centre's filter that takes censored values for what they say."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

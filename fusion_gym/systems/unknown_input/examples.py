@@ -5,8 +5,6 @@ cyber-physical systems with unknown inputs under adaptive event-triggered mechan
 Section 4.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

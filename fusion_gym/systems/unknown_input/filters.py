@@ -1,7 +1,5 @@
 """The two filters of a state with an unknown input that predict where nothing arrives."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from fusion_gym import linalg

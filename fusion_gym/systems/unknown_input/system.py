@@ -4,8 +4,6 @@ Source: unknown_input (Y. Sun, M. Fu, J. Mao and G. Wei, "Recursive filtering of
 cyber-physical systems with unknown inputs under adaptive event-triggered mechanisms", 2023).
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
