@@ -4,7 +4,7 @@ import ast
 import importlib
 import sys
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 from fusion_gym.validation import ConfigurationError, choice
 
@@ -36,19 +36,20 @@ def main() -> None:
         if name in ("-h", "--help"):
             print(usage())
             return
-        module = load(name)
+        command = load(name)
         del sys.argv[1]
-        module.main()
+        command.main()
 
 
-def load(name: str) -> ModuleType:
-    """The module of a command.
+def load(name: str) -> Any:
+    """Return the class of a command.
 
     Raises:
         SystemExit: no such command (2), or a package that it needs is not installed (1).
     """
     try:
-        return importlib.import_module(f".{choice('command', name, COMMANDS)}", __package__)
+        module = importlib.import_module(f".{choice('command', name, COMMANDS)}", __package__)
+        return getattr(module, name.capitalize())
     except ConfigurationError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

@@ -17,8 +17,8 @@ from typing import Annotated
 
 from fusion_gym.validation import ConfigurationError, choice
 
-from .command_line import Long, start
-from .input.options import OutputFolder, Steps, Whole, writable_folder
+from .command_line import SuiteCommand
+from .input.options import Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
 from .output.progress import writing
 from .output.tables import console
@@ -38,25 +38,9 @@ USUAL = Path("results")  # of the full benchmark
 
 
 @dataclass(frozen=True)
-class Benchmark(Long):
+class Benchmark(SuiteCommand):
     """The benchmark of policies: tuned baselines, learned fronts and references."""
 
-    config: str = "benchmark"
-    """The suite: a YAML file, or the name of a shipped config."""
-    envs: tuple[str, ...] = ()
-    """Settings by name; none stands for all."""
-    classes: tuple[str, ...] = ()
-    """Agents of these classes, as sensors_memory or local_packets; none stands for all."""
-    quick: bool = False
-    """Less of everything, in minutes; its verdicts are shown beside those in results."""
-    resume: bool = False
-    """Skip what is finished, go on with trainings of one's own: their checkpoints hold pickles."""
-    results: Annotated[Path | None, OutputFolder()] = None
-    """Folder for JSON, instead of results or results/quick."""
-    work: Annotated[Path | None, OutputFolder()] = None
-    """Folder for models and episodes, instead of runs/benchmark/full or quick."""
-    workers: Annotated[int, Whole(1, 512)] = 2
-    """Processes side by side, of this machine."""
     backend: BackendName = "loky"
     """Who works: loky's processes of this machine, or a dask or ray cluster."""
     address: str | None = None
@@ -151,8 +135,3 @@ class Benchmark(Long):
         ):
             return shipped
         return Shelf(suite, folders.results)
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Benchmark)

@@ -21,7 +21,7 @@ from fusion_gym.policies.settings import parse_settings
 from fusion_gym.solvers.silence import SilenceBound, silence_bound, silence_model
 from fusion_gym.validation import choice
 
-from .command_line import Long, SetOptions, start
+from .command_line import Long, SetOptions
 from .input.options import Between, Episodes, OutputFile, Seed, Whole
 from .output import tables
 from .output.files import write
@@ -137,8 +137,3 @@ def _table(report: dict[str, Any]) -> Table:
     ]
     heads = ("rate", "error at least", "price of a packet", "gap at this price")
     return tables.table_tables("no policy has less", heads, rows)
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Bound)

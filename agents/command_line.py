@@ -9,13 +9,14 @@ import shlex
 import sys
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Annotated, ClassVar, TypeVar
 
 import tyro
 
 from fusion_gym.validation import ConfigurationError
 
-from .input.options import check_options
+from .input.options import OutputFolder, Whole, check_options
 from .output.ending import flush, report_errors
 from .output.progress import quietly
 
@@ -32,6 +33,22 @@ _Kind = TypeVar("_Kind", bound="Command")
 @dataclass(frozen=True)
 class Command(ABC):
     """A command: its fields are its options, its docstring and theirs are its help."""
+
+    @classmethod
+    def main(cls) -> None:
+        """Read the command, check its options and do it.
+
+        Raises:
+            SystemExit: as :func:`report_errors`; status 130 after an interrupt.
+        """
+        command: Command | None = None
+        if os.getcwd() not in sys.path:  # an installed script lacks the user's own modules
+            sys.path.append(os.getcwd())
+        with report_errors(lambda: command.interrupted() if command else "interrupted"):
+            command = read_command(cls)
+            check_options(command)
+            with quietly(isinstance(command, Long) and command.quiet):
+                command.run()
 
     @abstractmethod
     def run(self) -> None:
@@ -72,6 +89,28 @@ class Long(Command):
         return shlex.join(["fusion-gym", type(self).__name__.lower(), *words, *more])
 
 
+@dataclass(frozen=True)
+class SuiteCommand(Long):
+    """A command over the settings and classes of the benchmark."""
+
+    config: str = "benchmark"
+    """The suite: a YAML file, or the name of a shipped config."""
+    envs: tuple[str, ...] = ()
+    """Settings by name; none stands for all."""
+    classes: tuple[str, ...] = ()
+    """Classes by name, as sensors_memory or local_packets; none stands for all."""
+    quick: bool = False
+    """Less of everything, in minutes."""
+    resume: bool = False
+    """Keep what is finished, and go on; checkpoints of trainings hold pickles."""
+    results: Annotated[Path | None, OutputFolder()] = None
+    """Folder for JSON, instead of results or results/quick."""
+    work: Annotated[Path | None, OutputFolder()] = None
+    """Folder for models, rules and episodes, instead of runs/benchmark/full or quick."""
+    workers: Annotated[int, Whole(1, 512)] = 2
+    """Processes side by side."""
+
+
 def read_command(kind: type[_Kind]) -> _Kind:
     """The command with the options of the command line.
 
@@ -94,22 +133,6 @@ def read_command(kind: type[_Kind]) -> _Kind:
             print(f"error: {_essence(output.getvalue())}", file=sys.stderr)
         flush()
         raise
-
-
-def start(kind: type[Command]) -> None:
-    """Read the command, check its options and do it.
-
-    Raises:
-        SystemExit: as :func:`report_errors`.
-    """
-    command: Command | None = None
-    if os.getcwd() not in sys.path:  # where modules of one's own lie: an installed script lacks it
-        sys.path.append(os.getcwd())
-    with report_errors(lambda: command.interrupted() if command else "interrupted"):
-        command = read_command(kind)
-        check_options(command)
-        with quietly(isinstance(command, Long) and command.quiet):
-            command.run()
 
 
 def _check_words() -> None:

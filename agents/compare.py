@@ -20,7 +20,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.registry import make_policy, policy_names
 from fusion_gym.validation import refusal
 
-from .command_line import Long, start
+from .command_line import Long
 from .input.options import Episodes, OutputFolder, Seed, Whole
 from .output.progress import writing
 from .suite.comparison import compare, run_all
@@ -88,8 +88,3 @@ class Compare(Long):
         low, high = (repr(float(end)) for end in span)  # to the last digit: it knows no others
         inner = [f"{price:.4g}" for price in np.geomspace(*span, self.prices)[1:-1]]
         return [f"{self.policy},price={price}" for price in (low, *inner, high)]
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Compare)

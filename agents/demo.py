@@ -25,7 +25,7 @@ from fusion_gym.evaluation.episodes import record_episode
 from fusion_gym.evaluation.intervals import Interval
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Long, start
+from .command_line import Long
 from .input.options import Episodes, OutputFolder, Steps
 from .output import figures, front_figure, tables
 from .output.ending import ended_like_by_ctrl_c
@@ -226,8 +226,3 @@ def draw_episodes(folder: Path, learner: Learner, tests: Trials) -> None:
         trajectory = record_episode(task, test.make(task), test.seed)
         path, title = folder / f"episode_{name}.png", f"{test.name}\n{learner.name}"
         figures.episode(path, title, trajectory, task.bucket.capacity)
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Demo)

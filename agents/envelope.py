@@ -10,13 +10,11 @@ interrupted run goes on where it was.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 from fusion_gym.validation import ConfigurationError, choice
 
-from .command_line import Long, start
-from .input.options import OutputFolder, Whole, writable_folder
+from .command_line import SuiteCommand
+from .input.options import writable_folder
 from .output.files import write_text
 from .output.progress import writing
 from .suite.classes import classes_of
@@ -28,25 +26,8 @@ from .suite.team import Team
 
 
 @dataclass(frozen=True)
-class Envelope(Long):
+class Envelope(SuiteCommand):
     """Tune the rules of every setting and class, and commit their envelopes."""
-
-    config: str = "benchmark"
-    """The suite: a YAML file, or the name of a shipped config."""
-    envs: tuple[str, ...] = ()
-    """Settings by name; none stands for all."""
-    classes: tuple[str, ...] = ()
-    """Classes by name, as sensors_memory or local_packets; none stands for all."""
-    quick: bool = False
-    """Less of everything, in minutes."""
-    resume: bool = False
-    """Keep the classes that are there, and add the others."""
-    results: Annotated[Path | None, OutputFolder()] = None
-    """Folder for JSON, instead of results or results/quick."""
-    work: Annotated[Path | None, OutputFolder()] = None
-    """Folder for tuned rules and episodes, instead of runs/benchmark/full or quick."""
-    workers: Annotated[int, Whole(1, 512)] = 2
-    """Processes side by side."""
 
     def run(self) -> None:
         """Do all work that is not finished, and write the table."""
@@ -81,8 +62,3 @@ class Envelope(Long):
             readme = folders.results / FOLDER / "README.md"
             write_text(readme, envelope_text(folders.results, "fusion-gym envelope"))
         print(f"envelopes in {path_of(folders.results, '').parent}, the table in {readme}")
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Envelope)

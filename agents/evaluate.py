@@ -19,7 +19,7 @@ from fusion_gym.evaluation.metrics import paired_difference, robust_summary, sum
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Long, PolicyNames, SetOptions, start
+from .command_line import Long, PolicyNames, SetOptions
 from .input.environment import environment_of
 from .input.files import checked
 from .input.options import Episodes, OutputFile, Seed
@@ -158,8 +158,3 @@ def finished(path: Path | None, report: dict[str, Any]) -> dict[str, Any]:
             )
     checked(Evaluation, earlier, f"json = {str(path)!r}")
     return earlier
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Evaluate)

@@ -18,7 +18,7 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Command, SetOptions, start
+from .command_line import Command, SetOptions
 from .input.environment import environment_of
 from .input.options import OutputFile
 from .output.files import replacing
@@ -129,8 +129,3 @@ def _environment(command: Export, kind: str, name: str) -> tuple[str, dict[str, 
 
 def _shape(shape: tuple[str | int, ...]) -> str:
     return f"({', '.join(map(str, shape))})"
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Export)

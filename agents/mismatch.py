@@ -20,7 +20,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.cross_term import CrossTerm, cross_terms, usual_policies, worst
 from fusion_gym.policies.registry import make_policy
 
-from .command_line import Long, PolicyNames, SetOptions, start
+from .command_line import Long, PolicyNames, SetOptions
 from .input.environment import environment_of
 from .input.options import OutputFile, Seed, Whole
 from .output import tables
@@ -120,8 +120,3 @@ _CAPTION = (
     "error = floor + mismatch + cross term, per step, in the reward's weights with mean 1; "
     "the cross term as a share of the error, with intervals that hold together in 95 %"
 )
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Mismatch)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import quote
 
-from .command_line import Command, start
+from .command_line import Command
 from .input.files import read_text
 from .input.options import OutputFolder
 from .output.files import write_text
@@ -152,8 +152,3 @@ def setting_section(value: SettingResults) -> list[str]:
     ):  # fmt: skip
         lines += [head, "", *rows] if rows else []
     return lines
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Report)

@@ -16,7 +16,7 @@ from typing import Annotated
 
 import tyro
 
-from .command_line import Command, start
+from .command_line import Command
 from .input.options import OutputFolder, Seed, Whole
 from .output.ending import ended_like_by_ctrl_c
 from .output.files import remove_partials
@@ -89,8 +89,3 @@ class Reproduce(Command):
         words = [word for word in sys.argv[1:] if word != "--resume"]
         command = shlex.join(["fusion-gym", "reproduce", *words, "--resume"])
         return f"interrupted; go on with: {command}"
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Reproduce)

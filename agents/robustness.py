@@ -18,7 +18,7 @@ import tyro
 
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Long, start
+from .command_line import Long
 from .input.options import Episodes, InputFolder, OutputFolder, Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
 from .output.folders import alone_in
@@ -161,8 +161,3 @@ def _usual_class(suite: Suite, setting: Setting) -> str:
     """The class of a scheduler that knows most."""
     names = [of.name for of in trained_classes(suite, setting)]
     return "sensors_memory" if "sensors_memory" in names else "sensors"
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Robustness)

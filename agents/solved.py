@@ -16,7 +16,7 @@ from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Long, start
+from .command_line import Long
 from .input.options import Episodes, OutputFolder, Seed, TrainingSeeds
 from .output import tables
 from .output.files import read_json, write
@@ -103,8 +103,3 @@ def is_finished(experiment: Experiment) -> bool:
         return False
     same = summary.get("inputs") == fingerprint(experiment.inputs())
     return same and summary.get("finished") is True and (folder / "final_model.zip").is_file()
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Solved)

@@ -14,7 +14,7 @@ from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.registry import make_policy
 
-from .command_line import Long, start
+from .command_line import Long
 from .input.options import Episodes, Seed
 from .output import tables
 from .output.progress import progress_bar
@@ -86,8 +86,3 @@ def _cells(label: str, results: EpisodeResults) -> tuple[str, ...]:
         tables.table_number(mean_interval(results.bound_trace)._asdict()),
         f"{results.nees.mean():.3f}",
     )
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Table)

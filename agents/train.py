@@ -24,7 +24,7 @@ from typing import Annotated
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Long, SetOptions, start
+from .command_line import Long, SetOptions
 from .input.options import Between, OutputFolder, Steps, TrainingSeed, writable_folder
 from .training.checked import load_checked
 from .training.config import Experiment
@@ -78,8 +78,3 @@ class Train(Long):
         except ConfigurationError:
             begun = False
         return super().interrupted() if begun else "interrupted before the training began"
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Train)

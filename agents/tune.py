@@ -33,7 +33,7 @@ from sqlalchemy.exc import IntegrityError, OperationalError, SQLAlchemyError
 
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Long, start
+from .command_line import Long
 from .input.options import OutputFolder, Steps, Whole
 from .output.files import write_text
 from .output.folders import alone_in, check_inputs, fingerprint
@@ -342,8 +342,3 @@ def best_config(study: optuna.Study, experiment: Experiment, command: str) -> st
     plain = suggestion.model_dump(mode="json", exclude_none=True)
     value = f"best of {ended(study)} trials, validation return {study.best_value:.4g}"
     return f"# Found by {command}: {value}.\n" + yaml.safe_dump(plain, sort_keys=False)
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Tune)

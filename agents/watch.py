@@ -21,7 +21,7 @@ from fusion_gym.evaluation.watching import watch
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Long, SetOptions, start
+from .command_line import Long, SetOptions
 from .input.environment import environment_of
 from .input.options import OutputFile, Seed, Whole
 from .output.films import checked_film, save_film
@@ -94,8 +94,3 @@ class Watch(Long):
                 window.show(frame)
         finally:
             window.close()
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Watch)

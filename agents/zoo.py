@@ -18,7 +18,7 @@ from typing import Annotated, Any
 from fusion_gym import zoo
 from fusion_gym.validation import ConfigurationError, choice
 
-from .command_line import Long, start
+from .command_line import Long
 from .input.options import InputFolder, OutputFolder
 from .output.files import read_json, replacing, write
 from .output.progress import writing
@@ -171,8 +171,3 @@ def remove_others(folder: Path, names: Iterable[str]) -> list[str]:
             card.unlink()
             removed.append(model.stem)
     return removed
-
-
-def main() -> None:
-    """Entry point; exit status 130 after an interrupt."""
-    start(Zoo)

@@ -6,13 +6,13 @@ They are made from the commands' fields, so a new option is tried without a chan
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import typing
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from hostile_folder import BROKEN, ENV
 
+from fusion_gym.agents.__main__ import load
 from fusion_gym.agents.command_line import Command
 from fusion_gym.agents.input.options import OutputFile, OutputFolder
 
@@ -105,9 +105,7 @@ class Try(NamedTuple):
 
 def options(name: str) -> dict[str, Any]:
     """A command's options and their types, with what is annotated."""
-    kind: type[Command] = getattr(
-        importlib.import_module(f"fusion_gym.agents.{name}"), name.capitalize()
-    )
+    kind: type[Command] = load(name)
     hints = typing.get_type_hints(kind, include_extras=True)
     result = {field.name: hints[field.name] for field in dataclasses.fields(kind)}
     for field, option in (("options", "set"), ("of", "class")):

@@ -9,7 +9,6 @@ command's own work. The end must be that of the undisturbed run, bit by bit.
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
 import os
 import random
@@ -28,6 +27,7 @@ from small_suite import small_suite
 from stable_baselines3 import PPO
 from training_configs import small_config
 
+from fusion_gym.agents.__main__ import load
 from fusion_gym.agents.suite import verdict
 
 Outcome = dict[str, Any]
@@ -96,7 +96,7 @@ def attempt(command: str, arguments: list[str], log: Path, seconds: float | None
                 os.dup2(file.fileno(), 1)
                 os.dup2(file.fileno(), 2)
             sys.argv = [f"agents/{command}.py", *arguments]
-            importlib.import_module(f"fusion_gym.agents.{command}").main()
+            load(command).main()
             os._exit(0)
         except SystemExit as end:
             print(end, flush=True)
@@ -132,7 +132,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     make = {"train": train, "tune": tune, "benchmark": benchmark}[args.command]
-    importlib.import_module(f"fusion_gym.agents.{args.command}")
+    load(args.command)
     moments = random.Random(args.seed)
     verdict.RESAMPLES = 20
     with tempfile.TemporaryDirectory() as place:

@@ -325,7 +325,7 @@ def test_demo_from_training_to_figures(
     monkeypatch.setattr(demo, "TEAM", Team(1))
     words = ["--output", str(tmp_path), "--episodes", "2", "--timesteps", "4096"]
     monkeypatch.setattr(sys, "argv", ["demo", *words])
-    demo.main()
+    demo.Demo.main()
     assert learner.title in capsys.readouterr().out
     folder, classes = tmp_path / learner.name, (learner.plain, learner.with_memory)
     for figure in ("front.png", "episode_agent.png", "episode_rule.png"):

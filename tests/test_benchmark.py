@@ -20,6 +20,7 @@ from small_suite import ENV, SMALL, small_suite
 from training_configs import small_config
 
 import fusion_gym
+from fusion_gym.agents import __main__ as everything
 from fusion_gym.agents import benchmark, report, solved, tune, zoo
 from fusion_gym.agents.output.files import load_results, save_results
 from fusion_gym.agents.output.markup import code, page_of
@@ -43,7 +44,7 @@ ROOT = Path(__file__).parent.parent
 
 def run_main(monkeypatch: pytest.MonkeyPatch, module: Any, *arguments: str) -> None:
     monkeypatch.setattr(sys, "argv", ["program", *arguments])
-    module.main()
+    everything.load(module.__name__.rpartition(".")[2]).main()
 
 
 def test_from_tuning_to_report_and_zoo(

@@ -18,7 +18,7 @@ from hostile_commands import BASES, Try, line, options, tries
 from hostile_folder import ROOT, contents, scratch
 
 from fusion_gym.agents import __main__ as everything
-from fusion_gym.agents.command_line import Command, start
+from fusion_gym.agents.command_line import Command
 from fusion_gym.agents.demo import remove
 from fusion_gym.agents.output.ending import report_errors
 from fusion_gym.agents.suite.sweep import SweepCurve
@@ -108,7 +108,7 @@ def test_an_error_of_the_programs_own_keeps_its_traceback(monkeypatch: pytest.Mo
     for kind, error in (("value", ValueError), ("key", KeyError), ("type", TypeError)):
         monkeypatch.setattr(sys, "argv", ["wrong", "--kind", kind])
         with pytest.raises(error):
-            start(Wrong)
+            Wrong.main()
 
 
 @pytest.mark.parametrize(

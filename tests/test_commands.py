@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import subprocess
 import sys
 import typing
@@ -28,14 +27,13 @@ ROOT = Path(__file__).parent.parent
 def test_help_shows_every_option(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    module = importlib.import_module(f"fusion_gym.agents.{name}")
     monkeypatch.setattr(sys, "argv", ["program", "--help"])
     with pytest.raises(SystemExit) as caught:
-        module.main()
+        everything.load(name).main()
     assert caught.value.code == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert text.startswith(f"usage: fusion-gym {name} ")
-    kind = getattr(module, name.capitalize())
+    kind = everything.load(name)
     options = {field.name: field for field in dataclasses.fields(kind)}
     for own, option in (("options", "set"), ("of", "class")):
         if own in options:

@@ -13,7 +13,7 @@ import pytest
 from small_suite import ENV, small_suite
 from training_configs import small_config
 
-from fusion_gym.agents import benchmark, evaluate, train, tune
+from fusion_gym.agents.__main__ import load
 from fusion_gym.agents.suite import verdict
 
 DAMAGES: dict[str, Callable[[bytes, bytes], bytes]] = {
@@ -51,12 +51,6 @@ WRITTEN = {
     "benchmark": ("results/small/verdict.json", "work/small/sensors_0/latest.zip"),
     "evaluate": (),
 }
-MODULES: dict[str, Any] = {
-    "train": train,
-    "tune": tune,
-    "benchmark": benchmark,
-    "evaluate": evaluate,
-}
 
 
 def arguments(command: str, folder: Path, seed: int = 0) -> list[str]:
@@ -82,7 +76,7 @@ def call(command: str, words: list[str]) -> str:
         patch.setattr(sys, "argv", ["program", *words])
         patch.setattr(verdict, "RESAMPLES", 5)
         try:
-            MODULES[command].main()
+            load(command).main()
         except SystemExit as end:
             return str(end.code)
     return ""

@@ -134,7 +134,7 @@ def test_chosen_policies_all_count() -> None:
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
     monkeypatch.setattr(sys, "argv", ["envelope", *words])
-    envelope.main()
+    envelope.Envelope.main()
 
 
 def test_envelopes_are_committed_and_kept(

@@ -492,11 +492,11 @@ def test_commands_load_foreign_code_with_trust_alone(
         (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
     config, sweep = str(tmp_path / "config.yaml"), str(tmp_path / "sweep.yaml")
     for command, arguments in (
-        (evaluate, ["--config", config, "--policies", policy]),
-        (compare, ["--config", config, "--sweep", sweep, "--policy", policy, "--output"]),
-        (table, ["--config", str(tmp_path / "rows.yaml")]),
+        (evaluate.Evaluate, ["--config", config, "--policies", policy]),
+        (compare.Compare, ["--config", config, "--sweep", sweep, "--policy", policy, "--output"]),
+        (table.Table, ["--config", str(tmp_path / "rows.yaml")]),
     ):
-        if command is compare:
+        if command is compare.Compare:
             arguments.append(str(tmp_path / "comparison"))
         line = ["program", *arguments, "--episodes", "3"]
         monkeypatch.setattr(sys, "argv", line)

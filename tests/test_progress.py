@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import itertools
 import json
 import shlex
@@ -25,13 +24,7 @@ EVALUATE = [
     *("--env", "fusion_gym/TobitOscillator-v0", "--set", "horizon=20"),
     *("--policies", "always", "never", "--episodes", "3"),
 ]
-LONG = [
-    name
-    for name in everything.COMMANDS
-    if issubclass(
-        getattr(importlib.import_module(f"fusion_gym.agents.{name}"), name.capitalize()), Long
-    )
-]
+LONG = [name for name in everything.COMMANDS if issubclass(everything.load(name), Long)]
 
 
 class Clock:
@@ -92,7 +85,7 @@ def test_every_long_command_can_be_quiet() -> None:
 def test_the_command_that_goes_on_is_one(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is read as the command that was interrupted, to be resumed where it can be."""
     words = [*line(name, BASES[name]), "--quiet"]
-    kind = getattr(importlib.import_module(f"fusion_gym.agents.{name}"), name.capitalize())
+    kind = everything.load(name)
     monkeypatch.setattr(sys, "argv", [f"agents/{name}.py", *words])
     command = command_line.read_command(kind)
     program, *again = shlex.split(command.again())

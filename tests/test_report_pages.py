@@ -30,15 +30,15 @@ def test_the_command_writes_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     page.write_text(PAGE.format(name="headline"))
     words = ["report", "--results", str(results), "--pages", str(page)]
     monkeypatch.setattr(sys, "argv", words)
-    report.main()
+    report.Report.main()
     settings = read_results(results)
     assert page.read_text() == update_pages(PAGE.format(name="headline"), settings, results)
     page.write_text(PAGE.format(name="nobody"))
     with pytest.raises(SystemExit, match="results = 'nobody'"):
-        report.main()
+        report.Report.main()
     monkeypatch.setattr(sys, "argv", [*words[:-1], str(tmp_path / "absent.md")])
     with pytest.raises(SystemExit, match="pages"):
-        report.main()
+        report.Report.main()
 
 
 def test_perturbed_cases_are_counted(tmp_path: Path) -> None:

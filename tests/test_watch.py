@@ -72,7 +72,7 @@ def test_the_command_writes_films(
     words = f"--env {TOBIT} --policy always --against never --set horizon=6 --save {name} --fps 5"
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["watch", *words.split()])
-    command.main()
+    command.Watch.main()
     with imageio.get_reader(name) as reader:
         film: Any = reader
         visible = [np.asarray(frame)[..., :3] for frame in film]

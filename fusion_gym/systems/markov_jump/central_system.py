@@ -18,7 +18,7 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.reward import equal_weights
-from fusion_gym.core.system import Block, SignalArray, System, age_block, common_signals, numbered
+from fusion_gym.core.system import Block, SignalArray, age_block, common_signals, numbered
 from fusion_gym.systems.markov_jump.centralised_linear import (
     Belief,
     CentralisedLinearFilter,
@@ -30,11 +30,9 @@ from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
 from fusion_gym.systems.markov_jump.state import (
     OF_FAMILY,
-    imagination_channels,
-    imagined,
+    MarkovJumpFamily,
     move,
     sampling_blocks,
-    without_truth,
 )
 
 _RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
@@ -78,7 +76,7 @@ CENTRAL_SIGNALS = (
 
 
 @dataclass(frozen=True)
-class MarkovJumpCentralSystem(System[MarkovJumpCentralState]):
+class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
     """Joins the plant, its sensors and one filter at the centre.
 
     A packet carries the sensor's new measurement. A request of a sensor that does not sample
@@ -133,21 +131,6 @@ class MarkovJumpCentralSystem(System[MarkovJumpCentralState]):
             scale=_measured(linear, horizon),
             nature=nature,
         )
-
-    @property
-    def sensor_count(self) -> int:
-        """Number of sensors."""
-        return self.sensors.count
-
-    @property
-    def noise_channels(self) -> int:
-        """Normals of one step: process noise, the mode, the sensors'."""
-        return self.plant.noise_channels + 1 + self.sensors.noise_channels
-
-    @property
-    def start_channels(self) -> int:
-        """Normals of a start: the state, the mode, the first process noise, nature's."""
-        return self.plant.size + 1 + self.plant.noise_channels + self.nature.channels
 
     def offers(self, capability: str) -> bool:
         """See :class:`System`; covariances of interacting models depend on the data."""
@@ -308,28 +291,9 @@ class MarkovJumpCentralSystem(System[MarkovJumpCentralState]):
             "sampled": lambda: self.sensors.sampled(state.time),
         }
 
-    def visible(self, state: MarkovJumpCentralState) -> MarkovJumpCentralState:
-        """The state without the truth, the mode and the noise that moves the plant next."""
-        return without_truth(state)
-
-    @property
-    def imagination_channels(self) -> int:
-        """Normals of :meth:`imagine`."""
-        return imagination_channels(self.plant)
-
-    def imagine(
-        self, state: MarkovJumpCentralState, mean: Array, covariance: Array, noise: Array
-    ) -> MarkovJumpCentralState:
-        """See :func:`~fusion_gym.systems.markov_jump.state.imagined`."""
-        return imagined(self.plant, state, mean, covariance, noise)
-
     def local_means(self, state: MarkovJumpCentralState) -> Array:
         """The centre's estimate once for each sensor (sensors, n, N): nodes have no filters."""
         return np.repeat(state.mean[None], self.sensor_count, axis=0)
-
-    def open_loop(self, horizon: int) -> Array:
-        """Mean error variance (n,) over t = 1..horizon of a centre that never receives."""
-        return self.model.open_loop(horizon)
 
     def _whitened(self, state: MarkovJumpCentralState) -> Array:
         prediction = _sensed(state)

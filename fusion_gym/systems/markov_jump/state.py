@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_noise
-from fusion_gym.core.system import Block, Signal, common_signals, numbered
+from fusion_gym.core.system import Block, Signal, System, common_signals, numbered
 from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagCovariances
-from fusion_gym.systems.markov_jump.linear_minimum_variance import Times
+from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, Times
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant, Modes, draw_mode
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
 
@@ -137,39 +137,61 @@ def sampling_blocks(sensors: FadingSensors) -> tuple[Block, Block]:
 AnyState = TypeVar("AnyState", bound=Any)
 
 
-def without_truth(state: AnyState) -> AnyState:
-    """A state of this family without truth, mode, process noise to come and departure."""
-    return replace(
-        state,
-        truth=np.full_like(state.truth, np.nan),
-        mode=np.zeros_like(state.mode),
-        process_noise=np.full_like(state.process_noise, np.nan),
-        departure=None,
-    )
+class MarkovJumpFamily(System[AnyState]):
+    """What the systems of the Markov jump plant have in common."""
 
+    plant: MarkovJumpPlant
+    sensors: FadingSensors
+    model: AugmentedModel
 
-def imagination_channels(plant: MarkovJumpPlant) -> int:
-    """Normals of :func:`imagined`: the truth's, the mode's, the process noise's."""
-    return plant.size + 1 + plant.noise_channels
+    @property
+    def sensor_count(self) -> int:
+        """Number of sensors."""
+        return self.sensors.count
 
+    @property
+    def noise_channels(self) -> int:
+        """Normals of one step: process noise, the mode, the sensors'."""
+        return self.plant.noise_channels + 1 + self.sensors.noise_channels
 
-def imagined(
-    plant: MarkovJumpPlant, state: AnyState, mean: Array, covariance: Array, noise: Array
-) -> AnyState:
-    """A state of this family with all that is hidden drawn anew.
+    @property
+    def start_channels(self) -> int:
+        """Normals of a start: the state, the mode, the first process noise, nature's."""
+        return self.plant.size + 1 + self.plant.noise_channels + self.nature.channels
 
-    The truth by what is believed; the mode by the chain's own law at that time and the process
-    noise by its own, whatever the measurements tell of them.
-    """
-    n = plant.size
-    law = np.empty((plant.modes, len(state.time)))
-    for time in np.unique(state.time):
-        moved = np.linalg.matrix_power(plant.mode_transition, int(time))
-        law[:, state.time == time] = (plant.initial_probabilities @ moved)[:, None]
-    return replace(
-        state,
-        truth=linalg.draw_normal(mean, covariance, noise[:n]),
-        mode=draw_mode(np.cumsum(law, 0)[:-1], noise[n]),
-        process_noise=plant.process_noise(noise[n + 1 :]),
-        departure=None,
-    )
+    def visible(self, state: AnyState) -> AnyState:
+        """Return the state without the truth, the mode and the noise that moves the plant next."""
+        return replace(
+            state,
+            truth=np.full_like(state.truth, np.nan),
+            mode=np.zeros_like(state.mode),
+            process_noise=np.full_like(state.process_noise, np.nan),
+            departure=None,
+        )
+
+    @property
+    def imagination_channels(self) -> int:
+        """Normals of the truth, the mode and the process noise."""
+        return self.plant.size + 1 + self.plant.noise_channels
+
+    def imagine(self, state: AnyState, mean: Array, covariance: Array, noise: Array) -> AnyState:
+        """Draw the truth by the belief, the mode by the chain's own law at that time.
+
+        The process noise follows its own law; the measurements are not used for it.
+        """
+        plant, n = self.plant, self.plant.size
+        law = np.empty((plant.modes, len(state.time)))
+        for time in np.unique(state.time):
+            moved = np.linalg.matrix_power(plant.mode_transition, int(time))
+            law[:, state.time == time] = (plant.initial_probabilities @ moved)[:, None]
+        return replace(
+            state,
+            truth=linalg.draw_normal(mean, covariance, noise[:n]),
+            mode=draw_mode(np.cumsum(law, 0)[:-1], noise[n]),
+            process_noise=plant.process_noise(noise[n + 1 :]),
+            departure=None,
+        )
+
+    def open_loop(self, horizon: int) -> Array:
+        """Return the mean error variance (n,) over t = 1..horizon without any delivery."""
+        return self.model.open_loop(horizon)

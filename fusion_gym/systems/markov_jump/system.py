@@ -17,7 +17,7 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.reward import equal_weights
-from fusion_gym.core.system import Block, SignalArray, System, age_block, numbered
+from fusion_gym.core.system import Block, SignalArray, age_block, numbered
 from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
 from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagRecursion
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
@@ -25,12 +25,10 @@ from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
 from fusion_gym.systems.markov_jump.state import (
     SIGNALS,
+    MarkovJumpFamily,
     MarkovJumpState,
-    imagination_channels,
-    imagined,
     move,
     sampling_blocks,
-    without_truth,
 )
 
 _RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
@@ -38,7 +36,7 @@ _FLOOR = 1e-9  # least deviation of a lag, relative to open loop: it is zero rig
 
 
 @dataclass(frozen=True)
-class MarkovJumpSystem(System[MarkovJumpState]):
+class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
     """Joins the plant, its sensors, the nodes' filters, the joint recursion and a fusion rule.
 
     ``state_weights`` (n,) weigh the traces among the signals, ``magnitude`` (n,) divides observed
@@ -88,21 +86,6 @@ class MarkovJumpSystem(System[MarkovJumpState]):
             reference=reference,
             nature=nature,
         )
-
-    @property
-    def sensor_count(self) -> int:
-        """Number of sensors."""
-        return self.sensors.count
-
-    @property
-    def noise_channels(self) -> int:
-        """Normals of one step: process noise, the mode, the sensors'."""
-        return self.plant.noise_channels + 1 + self.sensors.noise_channels
-
-    @property
-    def start_channels(self) -> int:
-        """Normals of a start: the state, the mode, the first process noise, nature's."""
-        return self.plant.size + 1 + self.plant.noise_channels + self.nature.channels
 
     @property
     def covariance_cycle(self) -> int:
@@ -269,28 +252,9 @@ class MarkovJumpSystem(System[MarkovJumpState]):
             "sampled": lambda: self.sensors.sampled(state.time),
         }
 
-    def visible(self, state: MarkovJumpState) -> MarkovJumpState:
-        """The state without the truth, the mode and the noise that moves the plant next."""
-        return without_truth(state)
-
-    @property
-    def imagination_channels(self) -> int:
-        """Normals of :meth:`imagine`."""
-        return imagination_channels(self.plant)
-
-    def imagine(
-        self, state: MarkovJumpState, mean: Array, covariance: Array, noise: Array
-    ) -> MarkovJumpState:
-        """See :func:`~fusion_gym.systems.markov_jump.state.imagined`."""
-        return imagined(self.plant, state, mean, covariance, noise)
-
     def local_means(self, state: MarkovJumpState) -> Array:
         """The nodes' estimates (sensors, n, N); nothing is fed back to them."""
         return self._collapse(state.node_mean)
-
-    def open_loop(self, horizon: int) -> Array:
-        """Mean error variance (n,) over t = 1..horizon of a centre that never receives."""
-        return self.model.open_loop(horizon)
 
     def full_rate_traces(self) -> Array:
         """Trace of the optimal fused covariance over one period at full rate, (period,).
