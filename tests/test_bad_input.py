@@ -148,7 +148,7 @@ def test_number_of_environments(num_envs: Any) -> None:
             lambda: make_task("fusion_gym/TobitOscilator-v0"),
             ("'fusion_gym/TobitOscilator-v0'", "did you mean 'fusion_gym/TobitOscillator-v0'"),
         ),
-        (lambda: make_task("CartPole-v1"), ("'CartPole-v1'", "fusion_gym/TobitOscillator-v0")),
+        (lambda: make_task("CartPole-v1"), ("'CartPole-v1'", "cartpole:CartPoleEnv")),
         (lambda: make_vector(autoreset_mode="same_step"), ("'same_step'", "mean 'SameStep'")),
         (lambda: make_vector(autoreset_mode=3), ("autoreset_mode = 3", "'Disabled'")),
         (lambda: make_vector(max_episode_steps=0), ("max_episode_steps = 0",)),

@@ -129,7 +129,7 @@ def test_the_bounds_floor_counts_what_is_shared() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "broadcast"),
+    ("options", "message"),
     [
         ({"joint_measurement_covariance": np.ones((4, 4))}, "positive definite"),
         ({"filter": "kalman", "fusion": "federated"}, "'ci' or 'sci'"),

@@ -188,7 +188,7 @@ def test_what_lies_beyond_the_bounds_is_clipped_inside(tmp_path: Path) -> None:
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """The command's own check, on fewer observations."""
     shorter = functools.partial(onnx_agreement, observations=500)
-    monkeypatch.setattr("fusion_gym.evaluation.onnx_export.agreement", shorter)
+    monkeypatch.setattr("fusion_gym.evaluation.onnx_export.onnx_agreement", shorter)
 
 
 def command(model: str, path: Path, *options: str, **value: Any) -> list[str]:

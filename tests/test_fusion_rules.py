@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import ConfigurationError
 from fusion_gym.fusion.intersection import SequentialIntersection
-from fusion_gym.fusion.table import REASONS, RULES, Assumption, Structure, choose_rule, offered
+from fusion_gym.fusion.table import REASONS, RULES, Assumption, Structure, choose_rule
 
 Array = NDArray[np.float64]
 RUNS = 40
@@ -104,7 +104,7 @@ def test_assumptions_are_known_by_name() -> None:
 @pytest.mark.parametrize("name", ["cii", "", 3, None, ["ci"]])
 def test_an_unknown_rule_is_refused(name: Any) -> None:
     structure = Structure("all contain the same noise")
-    known = ", ".join(map(repr, offered(structure)))
+    known = ", ".join(map(repr, structure.offered))
     with pytest.raises(ConfigurationError, match=f"fusion = .* one of {known}"):
         choose_rule(name, structure, 2)
 

@@ -145,7 +145,7 @@ def test_every_rule_and_the_best_schedule_run() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "broadcast"),
+    ("options", "message"),
     [
         ({"measurement_matrices": []}, "measurement_matrices = []"),
         ({"state_names": "ab"}, "state_names = 'ab'"),
@@ -198,7 +198,7 @@ def test_a_system_from_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "broadcast"),
+    ("text", "message"),
     [
         ("transitions: [[1]]", "transitions"),
         ("- 1", "a mapping"),

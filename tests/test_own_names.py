@@ -167,7 +167,7 @@ def test_an_error_of_ones_own(own: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "broadcast"),
+    ("make", "message"),
     [
         (lambda task: fusion_gym.make_task("own_names:me/Other-v0"), "me/Other-v0"),
         (lambda task: fusion_gym.make_task("absent_names:me/OwnCart-v0"), "'absent_names' cannot"),

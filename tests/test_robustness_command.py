@@ -43,7 +43,7 @@ def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def build_parts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a suite, its envelope, an agent and a config of cases."""
     folder = tmp_path_factory.mktemp("robust")
     suite_path = small_suite(folder)

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import pydantic
 from pydantic import FiniteFloat
 
-from fusion_gym.core.system import Knowledge
 from fusion_gym.validation import ConfigurationError
 
 from ..output.files import write
@@ -15,7 +14,7 @@ from ..output.folders import check_inputs
 from . import envelopes
 from .classes import Class, classes_of
 from .config import Setting, Suite
-from .reports import IntervalRecord, Shape, read_shape
+from .reports import IntervalRecord, Known, Shape, read_shape
 from .team import Team
 from .workers import Work, side_by_side
 
@@ -36,7 +35,7 @@ class Vertex(Shape):
     policy: str
     options: dict[str, Any]
     family: str
-    knows: Knowledge
+    knows: Known
     tuning: PlaceRecord
     test: PlaceRecord
     convex: bool
@@ -48,7 +47,7 @@ class EnvelopeRecord(Shape):
     mode: str
     memory: bool
     broadcast: str | None
-    knows: Knowledge
+    knows: Known
     options: dict[str, Any]
     contains: list[str]
     families: list[str]

@@ -12,6 +12,7 @@ import pydantic
 from pydantic import FiniteFloat, NonNegativeInt
 
 from fusion_gym.core.system import Knowledge
+from fusion_gym.deprecation import replace_value
 from fusion_gym.evaluation.metrics import METRICS
 
 from ..input.files import checked
@@ -19,6 +20,8 @@ from ..output.files import read_json
 
 NAME = r"^[a-z0-9_]+$"  # of a setting: a part of a path
 VERDICT = "verdict.json"  # in the folder of a setting, or of a class under perturbed cases
+
+Known = Annotated[Knowledge, pydantic.BeforeValidator(replace_value)]  # of earlier files, too
 
 
 class Shape(pydantic.BaseModel):
@@ -125,7 +128,7 @@ class FrontRecord(Shape):
     memory: bool
     broadcast: str | None
     packet: str
-    knows: Knowledge
+    knows: Known
 
     @pydantic.model_validator(mode="after")
     def _closed(self) -> FrontRecord:

@@ -1,5 +1,7 @@
 """What the environments' options have in common, and what an environment makes of them."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal

@@ -5,6 +5,8 @@ based on adaptive innovation event-triggered mechanism for uncertain networked s
 Section 6.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal

@@ -4,6 +4,8 @@ Source: markov_jump (event-triggered distributed fusion estimation for asynchron
 systems with correlated noises and fading measurements), Section 6.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar

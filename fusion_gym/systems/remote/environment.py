@@ -4,6 +4,8 @@ Source: J. Chakravorty and A. Mahajan, "Remote estimation over a packet-drop cha
 Markovian state", IEEE Trans. Automatic Control 65, 2020 (arXiv 1807.09706).
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from typing import Literal

@@ -6,6 +6,8 @@ Round-Robin protocol", IEEE Transactions on Signal and Information Processing ov
 2021, Section IV.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """A linear system of one's own: any plant, any number of sensors, a network and a fusion centre."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar

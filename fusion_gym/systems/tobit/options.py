@@ -1,5 +1,7 @@
 """Options of environments whose nodes get the fused estimate back: filters and fusion rule."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar

@@ -5,6 +5,8 @@ under dynamic event-triggering protocol with token bucket specification", Comple
 Systems 4:19, 2024, Section 4.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
