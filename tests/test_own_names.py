@@ -33,7 +33,7 @@ import fusion_gym
 from fusion_gym.core.options import Scenario
 from fusion_gym.policies.base import Rule
 from fusion_gym.systems.tobit.linear import LinearFusionOptions
-from fusion_gym.systems.tobit.linear import build as build_linear
+from fusion_gym.systems.tobit.linear import build_linear
 
 
 @dataclass(frozen=True)

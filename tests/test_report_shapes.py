@@ -180,4 +180,4 @@ def test_no_error_at_all_can_be_drawn_and_compared(tmp_path: Path) -> None:
     results = run_episodes(task, make_policy("always", task), 2, 0)
     nothing = BaselineComparison(Interval(0.0, 0.0, 0.0), 0.0, ("always",))
     table = comparison_table({"always": nothing}, {"always": results})
-    assert list(table.columns[4].cells) == ["–"]
+    assert list(table.columns[5].cells) == ["–"]

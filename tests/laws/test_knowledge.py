@@ -20,7 +20,7 @@ from fusion_gym.envs.views import SensorView
 from fusion_gym.fusion.intersection import covariance_intersection
 from fusion_gym.validation import ConfigurationError
 
-STEPS = 6
+STEPS = 3
 
 
 # --- the truth ------------------------------------------------------------------------------------
@@ -29,15 +29,16 @@ STEPS = 6
 def blind(batch: EpisodeBatch) -> Runs:
     """The runs, with nothing left of what no policy may know."""
     branch, task = batch.branch(), batch.task
-    branch.state, branch._beliefs = task.system.visible(branch.state), None
-    if branch.memory_states is not None:
-        stored = {"every": task.memory_system, "own": task.memory_system, "alone": task.system}
+    branch.state, states = task.system.visible(branch.state), branch.memory.states
+    if states is not None:
+        filters = {"every": task.memory_system, "own": task.memory_system, "single": task.system}
         visible = {
             name: system.visible(part)
-            for name, system in stored.items()
-            if system is not None and (part := getattr(branch.memory_states, name)) is not None
+            for name, system in filters.items()
+            if system is not None and (part := getattr(states, name)) is not None
         }
-        branch.memory_states = dataclasses.replace(branch.memory_states, **visible)
+        states = dataclasses.replace(states, **visible)
+    branch.memory = branch.memory.with_states(states)
     return branch
 
 
@@ -269,8 +270,9 @@ def worth(task: Task, best: Array, silent: Array, sent: Array) -> Array:
 
 def chance(batch: EpisodeBatch) -> Array:
     """Probability (sensors, N) that a packet sent now arrives."""
-    known = getattr(batch.task.system, "arrival_probability", lambda state: None)(batch.state)
-    return np.ones((batch.task.sensors, batch.num_envs)) if known is None else known
+    if batch.task.system.offers("arrival_probability"):
+        return batch.task.system.arrival_probability(batch.state)
+    return np.ones((batch.task.sensors, batch.num_envs))
 
 
 def check(values: Array, expected: Array) -> None:

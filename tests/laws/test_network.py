@@ -11,7 +11,7 @@ from fusion_gym.core.access import ACCESS_RULES
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.validation import ConfigurationError
 
-STEPS = 8
+STEPS = 6
 NOT_ADOPTING = ("MarkovJumpTracking", "UnknownInput", "RemoteEstimation", "RandomWalk")
 
 
@@ -104,7 +104,7 @@ def test_the_reward_is_minus_weighted_error_and_price(case: Case) -> None:
 def test_a_delivery_begins_age_and_held_value_anew(case: Case) -> None:
     """And nothing else does. A packet may be lost, or hold nothing where nothing is sampled."""
     batch = case.batch()
-    loses, arrived = hasattr(batch.task.system, "arriving"), 0
+    loses, arrived = batch.task.system.offers("arrival_probability"), 0
     for request in requests(batch.task, 3, STEPS):
         before = read(batch)
         age, new, held = (np.copy(before[name]) for name in ("age", "measurement", "held"))

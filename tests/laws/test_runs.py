@@ -14,7 +14,7 @@ from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.system import Signals
 from fusion_gym.envs.single import FusionEnv
 
-RUNS, STEPS = 4, 7
+RUNS, STEPS = 4, 6
 
 
 @each_case
@@ -45,9 +45,9 @@ def hidden(batch: EpisodeBatch) -> list[Array]:
 @each_case
 def test_a_run_is_the_same_local_and_in_a_batch(case: Case) -> None:
     """Bitwise that of the single environment, though it begins later and others anew."""
-    batch = case.batch(70, 100, horizon=6)
+    batch = case.batch(40, 100, horizon=6)
     env: Any = FusionEnv(case.task(horizon=6))
-    request, run = requests(batch.task, 70, 2 * STEPS), 37  # on no boundary of a vector register
+    request, run = requests(batch.task, 40, 2 * STEPS), 29  # on no boundary of a vector register
     for requested in request[:2]:
         batch.step(requested)
     batch.seed(np.array([run]), [5])

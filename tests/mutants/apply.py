@@ -64,7 +64,7 @@ def main(names: list[str]) -> int:
         for patch, rows in zip(patches, pool.map(run, patches), strict=True):
             for line, text, seconds in rows:
                 bad += text != "killed"
-                print(f"{patch.stem:<34}{text:<14}{seconds:5.0f} s  {line}", flush=True)
+                print(f"{patch.stem:<38}{text:<14}{seconds:5.0f} s  {line}", flush=True)
     return int(bad > 0)
 
 
