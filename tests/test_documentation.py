@@ -134,8 +134,6 @@ def test_the_committed_envelopes_are_what_the_pages_say() -> None:
     results = ROOT / "results"
     written = (results / "envelopes" / "README.md").read_text()
     assert written == envelope_table.envelope_text(results, "fusion-gym envelope")
-    missing = [line for line in envelope_table.envelope_headline(results) if line not in TEXTS]
-    assert not missing
 
 
 def test_the_committed_fronts_are_what_the_pages_say() -> None:
@@ -147,8 +145,6 @@ def test_the_committed_fronts_are_what_the_pages_say() -> None:
     command = re.search("Made by `(.*)`;", written)
     assert command
     assert written == learning_table.learning_text(reports, command.group(1))
-    missing = [line for line in learning_table.headline(reports) if line not in TEXTS]
-    assert not missing
 
 
 def doc_of(env_id: str) -> str:

@@ -16,7 +16,7 @@ from website.navigation import navigation
 
 @pytest.mark.parametrize("folder", parts.KIND_NAMES)
 def test_every_page_has_equation_assumption_and_source(folder: str) -> None:
-    pages = part_pages.pages(folder, {})
+    pages = part_pages.pages(folder)
     overview = pages.pop(f"{folder}/index.md")
     assert len(pages) > 7
     for place, text in pages.items():

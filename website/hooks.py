@@ -3,7 +3,6 @@
 import os
 import re
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,6 @@ from mkdocs.structure.pages import Page
 
 from website import (
     environment_pages,
-    episode_figures,
-    fusion_figures,
     markup,
     navigation,
     part_pages,
@@ -49,12 +46,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for place, path in places.pictures().items():
         files.append(File.generated(config, place, abs_src_path=str(path)))
     add("site.css", (Path(__file__).parent / "site.css").read_text(encoding="utf-8"))
-    captions: dict[str, dict[str, str]] = {"rules": {}, "fusion": {}, "filters": {}}
-    for (kind, name), (image, caption) in _figures().items():
-        captions[kind][name] = caption
-        add(f"{kind}/{name}.svg", image)
     for kind in parts.KIND_NAMES:
-        for place, text in part_pages.pages(kind, captions[kind]).items():
+        for place, text in part_pages.pages(kind).items():
             add(place, _RANKED.format(_FIRST) + text)
     for place, text in reference.pages().items():
         add(place, text)
@@ -74,17 +67,6 @@ def on_page_markdown(markdown: str, page: Page, **kwargs: Any) -> str:
 def on_page_content(html: str, **kwargs: Any) -> str:
     """Equations as pictures, pictures as figures."""
     return markup.captioned(markup.drawn(html))
-
-
-def _figures() -> dict[tuple[str, str], tuple[bytes, str]]:
-    """The made figures with their captions, drawn by as many processes as there are cores."""
-    text: list[tuple[str, Any, Any]] = [
-        *(("fusion", fusion_figures.drawn, part) for part in parts.fusions()),
-        *(("rules", episode_figures.drawn, part) for part in parts.policies()),
-    ]
-    with ProcessPoolExecutor(min(2, os.cpu_count() or 1)) as pool:
-        running = {(kind, part.name): pool.submit(draw, part) for kind, draw, part in text}
-        return {key: future.result() for key, future in running.items()}
 
 
 def _of_readme(heading: str, page: str) -> str:

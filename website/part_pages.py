@@ -18,16 +18,15 @@ _INTROS = {
     "the environments. All equations are of one step, after the prediction x̂ ← A x̂, "
     "P ← A P Aᵀ + W; x̂⁺, P⁺ are what follows a delivery, C is the measurement matrix, R the noise.",
 }
-_FIGURES = {"rules": "One episode", "fusion": "In two dimensions"}
 
 
-def pages(folder: str, figures: dict[str, str]) -> dict[str, str]:
-    """The pages of a folder by their places; ``figures`` are captions by a part's name."""
+def pages(folder: str) -> dict[str, str]:
+    """The pages of a folder by their places."""
     every = parts(folder)
     rows = [(f"[`{_name(folder, part)}`]({part.name}.md)", part.meaning) for part in every]
     overview = f"# {KIND_NAMES[folder]}\n\n{_INTROS[folder]}\n\n{table(('', ''), rows)}\n"
     return {f"{folder}/index.md": overview} | {
-        f"{folder}/{part.name}.md": _page(folder, part, figures.get(part.name)) for part in every
+        f"{folder}/{part.name}.md": _page(folder, part) for part in every
     }
 
 
@@ -35,7 +34,7 @@ def _name(folder: str, part: Part) -> str:
     return str(part.owner.__name__) if folder == "filters" else part.name
 
 
-def _page(folder: str, part: Part, caption: str | None) -> str:
+def _page(folder: str, part: Part) -> str:
     text, labelled = part.docstring.text, part.docstring.labelled
     place = f"{part.owner.__module__}.{part.owner.__qualname__}"
     code = ("in code", f"[`{part.owner.__name__}`][{place}]")
@@ -44,8 +43,6 @@ def _page(folder: str, part: Part, caption: str | None) -> str:
         result.append(part.meaning)
     result += [markdown(text), table(("", ""), (*part.rows, code))]
     result += ["## Equation", markdown(labelled["Equation"])]
-    if caption is not None:
-        result += [f"## {_FIGURES[folder]}", f"![{caption}]({part.name}.svg)"]
     result += ["## What it assumes", _sentence(markdown(labelled["Assumes"]))]
     source = markdown(labelled["Source"])
     result += ["## Source", _sentence(source), *citations(source)]

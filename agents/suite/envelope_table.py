@@ -11,7 +11,6 @@ from .committed import FOLDER, read_envelopes
 from .reports import Shape, read_shape
 
 SHARES = (0.05, 0.1, 0.2, 0.4)  # of the rate that transmitting always gets
-HEADLINE = 0.2
 
 
 class Measured(Shape):
@@ -60,33 +59,6 @@ def envelope_text(results: Path, command: str) -> str:
     for envelopes in content:
         lines += vertices_of(envelopes)
     return "\n".join(lines) + "\n"
-
-
-def envelope_headline(results: Path) -> list[str]:
-    """One row a setting, at a fifth of the rate of always transmitting: the front page's table."""
-    lines = [
-        "| setting | rate | scheduler | with memory | bound | alone | alone, with memory |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for path in sorted((results / FOLDER).glob("*.json")):
-        envelopes = read_envelopes(path)
-        name, rate = envelopes["setting"], round(HEADLINE * envelopes["always"], 4)
-        classes = envelopes["classes"]
-        bound = bound_of(results / "bounds" / f"{name}.json")
-        received = envelopes["inputs"]["broadcasts"][0]
-        cells = [
-            cell(hull_of(classes[key]) if key in classes else [], rate)
-            for key in (
-                "sensors",
-                "sensors_memory",
-                f"local_{received}",
-                f"local_{received}_memory",
-            )
-        ]
-        cells.insert(2, "–" if bound is None else f"{at_least(bound, rate):.4g}")
-        title = envelopes["title"].split(",")[0]
-        lines.append(f"| {title} | {rate:.4g} | {' | '.join(cells)} |")
-    return lines
 
 
 def rows_of(envelopes: dict[str, Any], results: Path) -> Iterator[str]:

@@ -81,22 +81,6 @@ def _span(form: str, rows: Sequence[Mapping[str, Any]], name: str) -> str:
     return " to ".join(texts)
 
 
-def headline(reports: Sequence[Report]) -> list[str]:
-    """One row a setting, for the front page."""
-    cells = (
-        "setting", "below the rules without memory after", "plain PPO",
-        "finished, against", "mean", "worst", "above",
-    )  # fmt: skip
-    lines = [_joined(cells), _joined(["---"] * len(cells))]
-    for report in reports:
-        result, whole = report["finished"], row(report)
-        mean = f"{result['mean']:+.1%}" if result else "–"
-        title = report["title"].split(",")[0]
-        above = whole[6].split(" (")[0]
-        lines.append(_joined([title, *whole[3:6], mean, whole[7], above]))
-    return lines
-
-
 def learning_text(reports: Sequence[Report], command: str) -> str:
     """All tables in Markdown, with how they are made."""
     text = Path(__file__).with_suffix(".md").read_text(encoding="utf-8")
