@@ -1,7 +1,5 @@
 """Commands in this process: how they end, and what is wrong with how they refuse."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

@@ -1,7 +1,5 @@
 """Settings for all tests."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

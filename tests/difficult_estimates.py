@@ -1,7 +1,5 @@
 """Estimates to fuse, of several kinds of difficulty, and what a fusion says of them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

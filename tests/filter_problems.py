@@ -1,7 +1,5 @@
 """Random sensors, priors and held values for the tests of node filters."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -4,8 +4,6 @@ All that is known of an environment is its dataclass of options (fields, types, 
 its errors say, so that a new one is covered without a change here.
 """
 
-from __future__ import annotations
-
 import decimal
 import fractions
 import functools

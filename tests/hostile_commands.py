@@ -3,8 +3,6 @@
 They are made from the commands' fields, so a new option is tried without a change here.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import typing
 from collections.abc import Iterator

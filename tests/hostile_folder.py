@@ -1,7 +1,5 @@
 """A folder in which commands are tried: small configs and results, and much that is neither."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

@@ -6,8 +6,6 @@ Every attempt is a fork of this process, which has imported everything: kills fa
 command's own work. The end must be that of the undisturbed run, bit by bit.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -9,8 +9,6 @@ other's names, as a reader of the page does; lines marked ``markdown-exec: hide`
 A first line ``# plant.yaml`` names the file that a block is.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 import shlex

@@ -5,8 +5,6 @@ of the nodes and of the centre's copies, moved by dense matrices, noises stacked
 library is used.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

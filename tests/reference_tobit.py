@@ -8,8 +8,6 @@ is evaluated in many-digit arithmetic exactly as printed, without any simplifica
 Numbers in parentheses are the paper's equations (tobit_token_bucket).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ errors of the committed one, both samples together. The standard error of an epi
 of the committed sample, from its 95 % interval: the fresh one is too small to tell its own.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Results of a tiny benchmark as its commands write them, made up: what readers of them need."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Sequence

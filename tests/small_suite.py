@@ -1,7 +1,5 @@
 """A benchmark that takes seconds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

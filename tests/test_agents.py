@@ -1,7 +1,5 @@
 """The scripts, used as a user does: configs, evaluation, training with interrupts, the demo."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import json

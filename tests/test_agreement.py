@@ -1,7 +1,5 @@
 """The quick benchmark's verdicts beside those of the full one."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What other requests would have brought: the steps that would have been, and nothing moves."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What cannot be used is refused at once, by an error that names the field and its value."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The rules that look at what is believed: their units, their limits, their figures."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

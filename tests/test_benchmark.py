@@ -1,7 +1,5 @@
 """The benchmark of policies: tuning, verdict, report, zoo, resuming, and hyper-parameters."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import multiprocessing

@@ -1,7 +1,5 @@
 """What other libraries ask of an environment: the length of its episodes, rewards of two terms."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

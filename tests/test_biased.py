@@ -1,7 +1,5 @@
 """The biased systems: two-sided censoring, access rules, filters, and the reference figures."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The paper's filter against its printed equations in many digits."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

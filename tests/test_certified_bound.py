@@ -1,7 +1,5 @@
 """What makes the bound of silence a bound on coarse lattices, against closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The benchmark on a cluster: dask's scheduler and workers, one of which is ended in the middle."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """What a command cannot do it says in one line, before it does anything; and how it ends."""
 
-from __future__ import annotations
-
 import collections
 import errno
 import os

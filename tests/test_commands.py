@@ -1,7 +1,5 @@
 """How commands are called: options, help, errors in one line, configs by their name."""
 
-from __future__ import annotations
-
 import dataclasses
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What a packet holds, who hears what: the estimates against Kalman's, and what is refused."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import filterpy.kalman

@@ -1,7 +1,5 @@
 """The adaptive innovation trigger and the correlated-noise environment from the outside."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """LinearFusion with noises that sensors share, against plain matrices and Monte Carlo."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

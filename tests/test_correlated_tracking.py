@@ -5,8 +5,6 @@ lie within four standard errors of both samples together, each from the spread o
 episodes, plus half of the last printed digit.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from functools import cache, partial

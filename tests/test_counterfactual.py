@@ -1,7 +1,5 @@
 """The counterfactual learner: its arithmetic by definition, and models that are plain PPO's."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

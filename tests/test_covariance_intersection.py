@@ -1,7 +1,5 @@
 """Covariance intersection and its inverse form against optimisers, and what their bounds cover."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

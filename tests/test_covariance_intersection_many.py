@@ -1,7 +1,5 @@
 """Covariance intersection of many estimates against optimisers, and the gap that it certifies."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

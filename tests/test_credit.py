@@ -1,7 +1,5 @@
 """What the counterfactual learner is credited with: clipping, ends of episodes, scaled rewards."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

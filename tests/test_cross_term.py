@@ -1,7 +1,5 @@
 """Error, floor, mismatch and cross term: what they are, the command, a training's warning."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Files of a run that are damaged: the command says what is wrong or goes on, and loses nothing."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

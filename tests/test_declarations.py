@@ -1,7 +1,5 @@
 """Every policy, fusion rule, filter, metric and algorithm of the library declares itself."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Earlier values are accepted with a warning, those of files without one."""
 
-from __future__ import annotations
-
 import warnings
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """What a training shows of itself: the lines of TensorBoard, and validation at each price."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

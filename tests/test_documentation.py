@@ -1,7 +1,5 @@
 """What the README and the pages show must run, and their tables must name what exists."""
 
-from __future__ import annotations
-
 import importlib.util
 import pydoc
 import re

@@ -1,7 +1,5 @@
 """Tuning and committed envelopes: what is searched, chosen, measured, hashed and compared."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

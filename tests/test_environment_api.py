@@ -1,7 +1,5 @@
 """What the environment promises beyond the laws: clipping, scales, ends of episodes."""
 
-from __future__ import annotations
-
 import sys
 import warnings
 from collections.abc import Iterator

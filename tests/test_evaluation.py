@@ -1,7 +1,5 @@
 """Episodes, metrics, intervals and the envelope, each against the plainest way to compute it."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The worked examples of LinearFusion: they run, and their files hold what their sources say."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """An exported file decides as the agent does, says what it sees, and is refused where it cannot."""
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """Federated fusion against its formula, and against the centralised Kalman filter."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Covariance intersection of nodes with feedback, and fusion rules in every environment."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files are replaced in one move: what was there stays until all of what is new is written."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

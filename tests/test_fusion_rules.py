@@ -1,7 +1,5 @@
 """Every rule of the table behind one interface, and the table's refusals."""
 
-from __future__ import annotations
-
 from typing import Any, get_args
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Any action at all, at every face: one line that begins with "action", or a step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

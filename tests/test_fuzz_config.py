@@ -1,7 +1,5 @@
 """Any value in any field of a training's YAML: one line that names the field, or a model."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterator
 from pathlib import Path

@@ -3,8 +3,6 @@
 ``-m slow`` draws a thousand for every environment.
 """
 
-from __future__ import annotations
-
 import pytest
 from fuzzing import FREE, Options, flaw, options
 from hypothesis import Phase, given, settings

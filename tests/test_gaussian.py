@@ -1,7 +1,5 @@
 """Truncated and censored normal moments against many-digit arithmetic, and their properties."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Names and texts keep to the words of docs/glossary.md; older prose is listed and only shrinks."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections import defaultdict

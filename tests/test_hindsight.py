@@ -1,7 +1,5 @@
 """Hindsight schedules: against all schedules there are, paired with other policies, refusals."""
 
-from __future__ import annotations
-
 import dataclasses
 from itertools import product
 from typing import Any

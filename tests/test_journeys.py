@@ -1,7 +1,5 @@
 """The journeys of a user: they run as they stand, and the pages show them so."""
 
-from __future__ import annotations
-
 import ast
 import os
 import subprocess

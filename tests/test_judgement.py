@@ -1,7 +1,5 @@
 """Verdicts are of intervals, worst cases the worst, envelopes chosen where they are tuned."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

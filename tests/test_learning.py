@@ -1,7 +1,5 @@
 """How fast agents learn: when a front is below an envelope, and the command that measures it."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,7 +1,5 @@
 """Batch-last linear algebra against numpy.linalg, lane by lane, and at the extremes."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator
 from typing import Any

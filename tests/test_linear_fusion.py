@@ -1,7 +1,5 @@
 """A linear system of one's own, against plain matrices of an independent filter."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

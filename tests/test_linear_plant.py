@@ -1,7 +1,5 @@
 """The plant: its noise, its factors, its closed forms and what it refuses."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

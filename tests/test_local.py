@@ -1,7 +1,5 @@
 """Sensors that decide by themselves: PettingZoo's interface, SB3 rows, and what they may see."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

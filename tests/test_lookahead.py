@@ -1,7 +1,5 @@
 """The model-based lookahead: against its own arithmetic, its limits, and what it may not see."""
 
-from __future__ import annotations
-
 from itertools import product
 from typing import Any
 

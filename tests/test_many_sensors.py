@@ -1,7 +1,5 @@
 """The benchmark of many sensors: its floor, its exponents, and what it plays side by side."""
 
-from __future__ import annotations
-
 import pytest
 
 from benchmarks import many_sensors

@@ -1,7 +1,5 @@
 """Two hundred sensors: what grows with their square goes, what grows faster is refused by name."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

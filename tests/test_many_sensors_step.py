@@ -1,7 +1,5 @@
 """The benchmark of what a step costs: its exponents, what it writes, what the page says of it."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

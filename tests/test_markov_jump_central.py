@@ -4,8 +4,6 @@ Expected figures are of an independent implementation, 1,000 runs of 100 steps: 
 standard error of about 0.5 %, ours of half that, so 2.2 % are four standard errors of a difference.
 """
 
-from __future__ import annotations
-
 import itertools
 from functools import partial
 from typing import Any

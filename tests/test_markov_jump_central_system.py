@@ -1,7 +1,5 @@
 """Systems that filter at the centre of the Markov jump example: signals, leaks, environment."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

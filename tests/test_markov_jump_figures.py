@@ -5,8 +5,6 @@ standard error of about 0.5 %, ours of half that, so 2.2 % are four standard err
 Traces depend on no noise and are held to the printed digits.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

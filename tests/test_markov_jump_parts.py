@@ -1,7 +1,5 @@
 """Parts of the Markov jump system against plain loops, closed forms, samples and FilterPy."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import filterpy.kalman

@@ -1,7 +1,5 @@
 """The Markov jump system, its environment and its triggers from the outside."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Masks of actions: what the network would deny is closed, and masked agents never ask for it."""
 
-from __future__ import annotations
-
 from itertools import product
 from typing import Any
 

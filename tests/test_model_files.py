@@ -1,7 +1,5 @@
 """A model file is data: what is rebuilt from it decides as it did, and nothing in it runs."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

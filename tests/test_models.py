@@ -1,7 +1,5 @@
 """What an untrained policy does: it requests at the rate that the config says."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From an empty folder to a front: the page's own lines run, with less of everything."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

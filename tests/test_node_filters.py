@@ -1,7 +1,5 @@
 """The node filters against FilterPy, quadrature and Joseph's form."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The base of a system of one's own, and the example that uses it."""
 
-from __future__ import annotations
-
 import importlib.util
 import subprocess
 import sys

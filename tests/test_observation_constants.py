@@ -1,7 +1,5 @@
 """With the numbers that its meaning speaks of, an observation gives back what was measured."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A vector of single environments, exchanged for one batch: same episodes, same options."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

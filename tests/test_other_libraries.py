@@ -1,7 +1,5 @@
 """What other libraries ask beside steps: attributes of runs, a joint state, copies, processes."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 from typing import Any

@@ -1,7 +1,5 @@
 """Environments, policies and rewards of one's own, by their names in a module."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """Requests at an even pace: counts in every window, against exact rational arithmetic."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 from typing import Any

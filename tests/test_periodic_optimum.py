@@ -1,7 +1,5 @@
 """The exhaustive periodic schedule: known optima, the recursion by itself, its cache, refusals."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from pathlib import Path

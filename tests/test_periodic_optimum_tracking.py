@@ -1,7 +1,5 @@
 """The best periodic schedules of uncensored tracking, against brute force and Monte Carlo."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Policies look at nothing outside the class that they declare: it is changed, requests are not."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import re

@@ -1,7 +1,5 @@
 """The price of a token: fixed, drawn for each episode, seen by the policy."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where long commands say they are: bars, lines, silence, and the command line that goes on."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json

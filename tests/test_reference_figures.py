@@ -6,8 +6,6 @@ obtained from 500 runs of 100 steps: within four standard errors of the two samp
 from the spread over the library's own episodes, plus the rounding of the printed figure.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from functools import cache

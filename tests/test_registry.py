@@ -1,7 +1,5 @@
 """The registry: policies of one's own, and what is wrong with a name, a maker or a parameter."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The remote-estimation environment from the outside, and its policy against the solved optimum."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """Pictures of the live episode, and the recorders that take them."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

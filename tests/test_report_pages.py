@@ -1,7 +1,5 @@
 """The parts of pages that say who wins: made of results, and only where a page asks for them."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

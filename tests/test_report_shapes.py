@@ -1,7 +1,5 @@
 """JSON of another shape than its reader needs is refused by its field, before anything is drawn."""
 
-from __future__ import annotations
-
 import copy
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Measures of errors on the adaptive innovation paper's page."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The command that makes papers anew: what it keeps, what it makes, its verdicts and its pages."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

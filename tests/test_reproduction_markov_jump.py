@@ -1,7 +1,5 @@
 """The Markov jump paper's recorded runs, its schedule and its printed recursion."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

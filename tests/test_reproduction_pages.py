@@ -1,7 +1,5 @@
 """Every reproduced paper's page against a fresh quick run: numbers, claims and figures."""
 
-from __future__ import annotations
-
 import pytest
 from reproduction_checks import check_claims, check_numbers, check_pictures, committed, quick
 

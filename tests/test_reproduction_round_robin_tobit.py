@@ -1,7 +1,5 @@
 """The page of the round-robin paper against a fresh quick run, and the parts that it is made of."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The page of the token-bucket paper against a fresh quick run, and the theorems' computation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The unknown-input paper's bound and its printed gains."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

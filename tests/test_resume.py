@@ -1,7 +1,5 @@
 """A training that was interrupted or killed ends as an undisturbed one does, bitwise."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

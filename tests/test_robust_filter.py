@@ -4,8 +4,6 @@ Oracles: FilterPy, conditioning of a joint Gaussian, the Lyapunov form of the pa
 matrices, and samples.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

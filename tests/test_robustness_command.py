@@ -1,7 +1,5 @@
 """``fusion-gym robustness`` from the outside: its pieces, its table, how it goes on, its errors."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

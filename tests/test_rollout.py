@@ -1,7 +1,5 @@
 """One improvement by simulation: it beats its base, and is blind to what is hidden."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

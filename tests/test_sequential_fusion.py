@@ -1,7 +1,5 @@
 """Sequential fusion against the two-sensor rules applied by hand, and what its gains are for."""
 
-from __future__ import annotations
-
 from itertools import permutations, product
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The lower bound of every policy's error: against exact optima, policies and itself."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """What each packet alone would do, all at once: the same as one delivery after another."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the site is made of, as far as that needs no builder: `make docs` checks the rest."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path

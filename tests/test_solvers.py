@@ -1,7 +1,5 @@
 """The solved optimum of remote estimation: published costs, integral equations, closed forms."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Filters of censored sensors after long silence and from priors far larger than the noise."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import mpmath

@@ -1,7 +1,5 @@
 """The stochastic event trigger, and the filter for which its silence is a measurement."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The house keeps its arrows: imports run one way, without circles, and rooms stay small."""
 
-from __future__ import annotations
-
 import ast
 import functools
 from pathlib import Path

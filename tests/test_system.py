@@ -1,7 +1,5 @@
 """The contract of systems: what a class may define, and what an instance offers."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Seeds and arrays of Gymnasium's and SB3's environments, and what SB3 expects beside steps."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

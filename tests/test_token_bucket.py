@@ -1,7 +1,5 @@
 """The token bucket against a scalar loop, its properties, and what it refuses."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Every trigger against its rule, written again for one run and one step in plain numbers."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import math

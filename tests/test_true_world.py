@@ -1,7 +1,5 @@
 """The truth departs from what filters, rules and memory assume: by how much, and who knows."""
 
-from __future__ import annotations
-
 import re
 from typing import Any, ClassVar
 

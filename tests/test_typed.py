@@ -1,7 +1,5 @@
 """Types and options as an editor, a type checker, ``help`` and the specification show them."""
 
-from __future__ import annotations
-
 import inspect
 import subprocess
 import sys

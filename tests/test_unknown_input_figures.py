@@ -6,8 +6,6 @@ standard errors of both samples together, from the spread over our episodes, plu
 printed digit.
 """
 
-from __future__ import annotations
-
 import math
 from functools import cache, partial
 from typing import Any, NamedTuple

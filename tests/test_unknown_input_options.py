@@ -1,7 +1,5 @@
 """Options of the unknown-input environment: other sizes, given inputs, and what is refused."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -3,8 +3,6 @@
 Oracles: plain matrices and loops, FilterPy, closed forms with explicit inverses, samples.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import filterpy.kalman

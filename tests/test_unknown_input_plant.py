@@ -3,8 +3,6 @@
 Oracles: small steps one by one, definitions, samples.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

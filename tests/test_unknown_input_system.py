@@ -1,7 +1,5 @@
 """The unknown-input environment: against a plain loop, its options, its errors, its invariances."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The benchmark's verdict: its arithmetic, its interval, and the middle of a front."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Policies side by side on the same noise: the pictures, the command and its films."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

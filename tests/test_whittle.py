@@ -1,7 +1,5 @@
 """Whittle's index: against the optimum of one source and of two, its inverse, and its limits."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Worker processes end with the process that they work for, also where that was killed."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

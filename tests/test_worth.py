@@ -1,7 +1,5 @@
 """What knowledge is worth: errors at a grid of rates, and which classes stand beside each other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from test_verdict import made_up

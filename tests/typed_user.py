@@ -4,8 +4,6 @@ Every ``type: ignore`` stands where the types must tell a mistake: mypy tells th
 need. It runs as well: ``python tests/typed_user.py``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, ClassVar, assert_type
 

@@ -7,8 +7,6 @@ needs what is not here, stands in ``LISTED`` with the reason; such a command is 
 its own options allow, and else its options are read and checked.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

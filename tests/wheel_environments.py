@@ -3,8 +3,6 @@
 The packages are links to those of the interpreter that runs this, so that nothing is loaded twice.
 """
 
-from __future__ import annotations
-
 import csv
 import functools
 import importlib.metadata

@@ -10,8 +10,6 @@ and against constraints.txt. An editable install of the repository stays out of 
 Python runs no path files of a folder that is itself named by one.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The cases of the laws: every registered environment, and the options that change its parts."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass, replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The user's environment is registered while this folder's tests run, and no longer."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import gymnasium

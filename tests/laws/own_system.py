@@ -1,7 +1,5 @@
 """An environment as a user would write one: a random walk, seen through noise by one sensor."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Laws of the interfaces: the other libraries' own checks, and what an id promises."""
 
-from __future__ import annotations
-
 import inspect
 import warnings
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Laws of knowledge: nobody sees the truth, or what others measured and did not send to them."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any

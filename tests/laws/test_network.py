@@ -1,7 +1,5 @@
 """Laws of the network: who is served, what it costs, what the reward pays."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from cases import IDS, SCARCE, Case, each_case, each_id, read, requests, short

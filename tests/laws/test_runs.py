@@ -1,7 +1,5 @@
 """Laws of runs: the noise, the batch, branches, and what an observation holds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
