@@ -172,11 +172,3 @@ def test_a_sensor_local_looks_one_step_ahead() -> None:
     for ask in (beliefs.loss, beliefs.value):
         with pytest.raises(ValueError, match="steps = 2 is not allowed here: it must be 1"):
             ask(2)
-
-
-def test_sensors_by_themselves_do_not_send_everyones_estimate() -> None:
-    task = fusion_gym.make_task(
-        "fusion_gym/TobitOscillator-v0", filter="tobit", memory=True, packet="estimate"
-    )
-    with pytest.raises(ConfigurationError, match="packet = 'estimate' is not allowed"):
-        EpisodeBatch(task, 2, "own")

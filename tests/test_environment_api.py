@@ -8,7 +8,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.wrappers import TimeLimit
 
 import fusion_gym
 
@@ -82,19 +81,6 @@ def test_no_step_after_the_end() -> None:
             assert truncated is (step == horizon)
         with pytest.raises(gymnasium.error.ResetNeeded):
             env.step(env.action_space.sample())
-
-
-@pytest.mark.parametrize(("limit", "length"), [(13, 13), (500, 100)])
-def test_time_limit_of_gymnasium(limit: int, length: int) -> None:
-    env = make(max_episode_steps=limit)
-    assert isinstance(env, TimeLimit)
-    assert env.unwrapped.task.horizon == 100
-    for _ in range(2):
-        env.reset()
-        for step in range(1, length + 1):
-            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
-            assert not terminated
-            assert truncated is (step == length)
 
 
 @pytest.mark.filterwarnings("error")

@@ -112,12 +112,6 @@ def test_censored_sensors_get_a_filter_that_knows_it() -> None:
     assert "censored[0,0]" not in EpisodeBatch(fusion_gym.make_task(LINEAR), 1).layout.names
 
 
-def test_states_have_the_names_that_they_are_given() -> None:
-    task = fusion_gym.make_task(LINEAR, state_names=["angle", "rate"])
-    assert task.system.state_names == ("angle", "rate")
-    assert "estimate[rate]" in EpisodeBatch(task, 1).layout.names
-
-
 def test_a_plant_that_no_noise_moves() -> None:
     """What is unknown at the start is all that there is: measured often enough, it is known."""
     still = {"transition": [[1, 0.1], [0, 1]], "process_covariance": np.zeros((2, 2))}

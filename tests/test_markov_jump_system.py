@@ -145,23 +145,6 @@ def test_whitened_differences_have_unit_variance_under_random_requests() -> None
 # --- the environment -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("fusion", ["matrix", "ci", "sci", "sici"])
-def test_other_sizes_and_fusions_run(fusion: str) -> None:
-    for seed, sensors, n in ((1, 4, 3), (2, 1, 1)):
-        model = random_model(seed, modes=2, n=n, sensors=sensors)
-        task = build(fusion=fusion, horizon=20, **options(model))
-        batch = EpisodeBatch(task, 8)
-        batch.reset()
-        policy = Random(0.4)
-        policy.reset(8)
-        for _ in range(20):
-            outcome = batch.step(policy(batch.signals()))
-            assert np.isfinite(outcome.reward).all()
-            assert np.isfinite(linalg.cholesky(task.system.fused(batch.delivered)[1])).all()
-            assert np.isfinite(batch.observe()).all()
-        assert task.system.state_names == tuple(f"x{i + 1}" for i in range(n))
-
-
 @pytest.mark.slow
 def test_open_loop_is_what_never_costs() -> None:
     results = run_episodes(build(), make_rule("never"), 3000, 0)

@@ -14,7 +14,6 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.fusion.several import covariance_intersection_many
-from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
 from fusion_gym.policies.rules.constant import Always, Never
 from fusion_gym.policies.rules.random import Random
 from fusion_gym.systems.unknown_input.examples import EXAMPLES, two_carts
@@ -158,22 +157,6 @@ def test_there_is_something_to_learn(kind: str) -> None:
         assert never.returns.mean() * 0.6 < single < always.returns.mean() * 1.1
 
 
-@pytest.mark.slow
-@pytest.mark.slow
-def test_larger_thresholds_give_fewer_transmissions_and_larger_errors() -> None:
-    for example in ("two_carts", "paper"):
-        task = build(example=example, filter="random_walk")
-        defaults = task.policy_defaults["adaptive_threshold"]
-        rates, errors = [], []
-        for scale in (0.0, 0.25, 1.0, 4.0, 16.0):
-            results = run_episodes(task, AdaptiveThreshold(**defaults, scale=scale), 60, 0)
-            rates.append(results.rate.mean())
-            errors.append(results.squared_error[:, : task.system.plant.size].mean())
-        assert rates[0] == 1.0
-        assert (np.diff(rates) < 0).all()
-        assert (np.diff(errors) > 0).all()
-
-
 def test_variance_reduction_is_what_a_delivery_brings() -> None:
     """Whatever is measured; the signals' traces have the reward's weights."""
     for options in ({"fusion": "exact_ci"}, {"fusion": "sci", "hold_variance": 0.1}):
@@ -214,16 +197,3 @@ def test_predicted_innovation_deviation_is_the_actual_one() -> None:
 
 
 # --- reward and scales ---------------------------------------------------------------------------
-
-
-def test_reward_weighs_state_and_input() -> None:
-    for weight, share in ((1.0, 0.2), (0.0, 0.0), (6.0, 0.6)):
-        task = build(input_weight=weight)
-        weights = task.reward.state_weights[:, 0]
-        parts = weights * task.system.open_loop(100)
-        assert parts.sum() == pytest.approx(1.0)
-        assert parts[4] == pytest.approx(share)
-        np.testing.assert_allclose(task.system.state_weights, weights)
-    weights_argument = (1.0, 0.0, 2.0, 0.0, 3.0)
-    task = build(state_weights=weights_argument)
-    np.testing.assert_array_equal(task.reward.state_weights[:, 0], weights_argument)
