@@ -10,7 +10,7 @@ QUICK  := tests/laws/test_interfaces.py tests/test_bad_input.py tests/test_envir
 	tests/test_agents.py::test_training_writes_its_results_and_resumes \
 	tests/test_benchmark.py::test_from_tuning_to_report_and_zoo
 
-.PHONY: help demo test test-all test-lowest mutants coverage wheel-test wheel films docs integrations \
+.PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films docs integrations \
 	integrations-tianshou integrations-rllib lines lint format bench clean
 
 help:  ## list the targets
@@ -47,6 +47,11 @@ $(LOWEST)/.installed: pyproject.toml constraints.txt
 
 mutants: $(STAMP)  ## tests that must fail, each on a known wrong variant of the code
 	$(BIN)/python tests/mutants/apply.py
+
+mutants-sample: $(STAMP)  ## the share of killed mutants in ten modules, 300 drawn by a seed
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt mutmut
+	mkdir -p runs
+	$(BIN)/python tests/mutants/sample.py --output runs/mutants.json --resume
 
 test-lowest: $(LOWEST)/.installed  ## quick tests with the lowest versions that pyproject.toml allows
 	$(LOWEST)/bin/python -m pytest -m "not slow" -n 2 $(QUICK)

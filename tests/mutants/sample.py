@@ -1,0 +1,100 @@
+"""Draw mutants of modules by a seed, and count those that tests kill (``make mutants-sample``).
+
+    python tests/mutants/sample.py --output mutants.json [--seed 0] [--count 300] [--resume]
+
+The changes are those of mutmut; ``selection.json`` has the tests of each module.
+"""
+
+import argparse
+import difflib
+import json
+import os
+import random
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import libcst
+from apply import copied
+from libcst.metadata import MetadataWrapper
+from mutmut.mutation.file_mutation import MutationVisitor, deep_replace
+from mutmut.mutation.mutators import mutation_operators
+from mutmut.mutation.pragma_handling import IgnoredCode
+from mutmut.mutation.trampoline_templates import mangle_function_name
+
+SELECTION = Path(__file__).with_name("selection.json")
+SECONDS = 300.0
+
+
+def draw(code: str, count: int, seed: int) -> dict[str, str]:
+    """Draw mutants of a module's code: the changed code by mutmut's name of the mutant."""
+    visitor = MutationVisitor(mutation_operators, IgnoredCode(set(), set(), set()))
+    module = MetadataWrapper(libcst.parse_module(code)).visit(visitor)
+    nodes = {}
+    for node in module.body:
+        owner = node.name.value if isinstance(node, libcst.ClassDef) else None
+        for child in node.body.body if isinstance(node, libcst.ClassDef) else [node]:
+            if isinstance(child, libcst.FunctionDef):
+                name = mangle_function_name(name=child.name.value, class_name=owner)
+                own = (m for m in visitor.mutations if m.contained_by_top_level_function is child)
+                for number, mutation in enumerate(own, start=1):
+                    place = mutation.original_node, mutation.mutated_node
+                    nodes[f"{name}__mutmut_{number}"] = place
+    order = sorted(nodes)
+    random.Random(seed).shuffle(order)  # a smaller count draws the first of a larger one's
+    return {name: deep_replace(module, *nodes[name]).code for name in order[:count]}
+
+
+def killer(module: str, tests: list[str], code: str) -> str:
+    """Return the first failure of the tests in a copy of the tree with this code, if any."""
+    with tempfile.TemporaryDirectory() as folder:
+        copied(Path(folder))
+        (Path(folder) / module).write_text(code)
+        line = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
+        env = os.environ | {"PYTHONPATH": folder, "OMP_NUM_THREADS": "1"}
+        try:
+            done = subprocess.run(
+                line, cwd=folder, env=env, capture_output=True, text=True, timeout=SECONDS
+            )
+        except subprocess.TimeoutExpired:
+            return "timeout"
+    failures = [row for row in done.stdout.splitlines() if row.startswith(("FAILED", "ERROR"))]
+    return "" if done.returncode == 0 else (failures or [f"exit {done.returncode}"])[0]
+
+
+def main() -> None:
+    """Check the mutants and print the share that is killed, and the survivors."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--count", type=int, default=300, help="mutants of all modules together")
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--resume", action="store_true", help="skip mutants in the output")
+    args = parser.parse_args()
+    selection = json.loads(SELECTION.read_text())
+    resumed = args.resume and args.output.exists()
+    results = json.loads(args.output.read_text()) if resumed else {}
+    for module, tests in selection.items():
+        code, result = Path(module).read_text(), results.setdefault(module, {})
+        if failure := killer(module, tests, code):
+            sys.exit(f"error: the tests of {module} fail without a mutant: {failure}")
+        mutants = draw(code, args.count // len(selection), args.seed)
+        mutants = {name: text for name, text in mutants.items() if name not in result}
+        with ThreadPoolExecutor(2) as pool:
+            for (name, text), failure in zip(
+                mutants.items(),
+                pool.map(partial(killer, module, tests), mutants.values()),
+                strict=True,
+            ):
+                change = difflib.unified_diff(code.splitlines(), text.splitlines(), n=1)
+                result[name] = {"killer": failure, "diff": "\n".join(change)}
+                args.output.write_text(json.dumps(results, indent=1))
+        alive = {name: entry["diff"] for name, entry in result.items() if not entry["killer"]}
+        print(f"{module}: {len(result) - len(alive)} of {len(result)} killed", flush=True)
+        print("\n".join(alive.values()))
+
+
+if __name__ == "__main__":
+    main()
