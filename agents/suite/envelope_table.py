@@ -11,6 +11,7 @@ from .committed import FOLDER, read_envelopes
 from .reports import Shape, read_shape
 
 SHARES = (0.05, 0.1, 0.2, 0.4)  # of the rate that transmitting always gets
+HEADLINE = 0.2
 
 
 class Measured(Shape):
