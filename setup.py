@@ -1,0 +1,12 @@
+"""The text of the package's page: the README with absolute links."""
+
+import re
+from pathlib import Path
+
+from setuptools import setup
+
+SITE = "https://github.com/fusion-gym/fusion-gym/blob/main/"
+text = Path(__file__).with_name("README.md").read_text(encoding="utf-8")
+text = re.sub(r"(!\[[^]]*\]\()(?!\w+:)", rf"\g<1>{SITE.replace('blob', 'raw')}", text)
+text = re.sub(r"(?<!!)(\[[^]]*\]\()(?!\w+:|#)", rf"\g<1>{SITE}", text)
+setup(long_description=text, long_description_content_type="text/markdown")
