@@ -39,7 +39,7 @@ def play(envs: VecEnv) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def observe() -> np.ndarray:
+def seen() -> np.ndarray:
     envs = fusion_gym.make_sb3_vec_env(NAME.split(":")[1], 2, seed=5, **OPTIONS)
     return play(envs)
 
