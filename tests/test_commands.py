@@ -77,7 +77,8 @@ def test_configs_go_by_path_or_by_shipped_name(
     monkeypatch.chdir(tmp_path)
     assert load_checked(Experiment, "tobit_oscillator_ppo") == load_checked(Experiment, path)
     Path("benchmark").mkdir()
-    assert config_path("benchmark").samefile(ROOT / "configs" / "benchmark.yaml")
+    shipped = (ROOT / "configs" / "benchmark.yaml").read_text()
+    assert config_path("benchmark").read_text() == shipped
     Path("own").write_text("a: 1")
     assert config_path("own") == Path("own")
     with pytest.raises(ConfigurationError, match="did you mean 'tobit_oscillator_ppo'"):
