@@ -25,7 +25,7 @@ class Rollout:
 
     At every step it tries, as first decisions, nobody, each sensor alone and what the base asks
     for; after each the base goes on for ``steps`` more, in ``samples`` simulations. They begin with
-    what is believed (:class:`~fusion_gym.core.system.ImaginableSystem`), have noise of their own,
+    what is believed (:meth:`~fusion_gym.core.system.System.imagine`), have noise of their own,
     the same for every decision, and know neither the truth nor coming noise and losses. The
     decision of the least mean cost is taken, of those that beat the base's own by ``doubt``
     standard errors of their difference; with 0 it is the least cost itself, whose chance finds
