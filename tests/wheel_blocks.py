@@ -65,7 +65,7 @@ LISTED = (
 READ = """
 import contextlib, io, json, os, sys
 from fusion_gym.agents.__main__ import load
-from fusion_gym.agents.command_line import read
+from fusion_gym.agents.command_line import read_command
 from fusion_gym.agents.input.options import check_options
 from fusion_gym.agents.training.checked import config_path
 from fusion_gym.agents.input.files import read_text
@@ -74,7 +74,7 @@ for place, folder, (program, name, *words) in json.loads(sys.stdin.read()):
     sys.argv, said = [program, *words], io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            given = read(getattr(load(name), name.capitalize()))
+            given = read_command(load(name))
             check_options(given)
             for option in ("config", "sweep"):
                 if getattr(given, option, None) is not None:
