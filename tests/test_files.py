@@ -1,11 +1,14 @@
 """Files are replaced in one move: what was there stays until all of what is new is written."""
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
 
+import fusion_gym
 from fusion_gym.agents.output.files import read_json, remove_partials, replacing, write, write_text
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 
@@ -77,3 +80,21 @@ def test_json_that_cannot_be_read_is_reported_in_one_line(
 def test_text_is_written_as_utf_8(tmp_path: Path) -> None:
     write_text(tmp_path / "a.md", "± λ")
     assert (tmp_path / "a.md").read_bytes().decode("utf-8") == "± λ"
+
+
+def test_a_file_of_the_zoo_is_the_one_that_its_card_describes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = "biased_oscillator_local_packets_memory"
+    for suffix in ("zip", "json"):
+        source = Path(fusion_gym.zoo.__file__).with_name(f"{name}.{suffix}")
+        shutil.copyfile(source, tmp_path / source.name)
+    monkeypatch.setattr(fusion_gym.zoo, "_folder", lambda: tmp_path)
+    card = fusion_gym.zoo.card(name)
+    task = fusion_gym.make_task(card["env"], **card["options"])
+    make_policy(f"zoo:{name}", task)
+    content = bytearray((tmp_path / f"{name}.zip").read_bytes())
+    content[-1] ^= 1
+    (tmp_path / f"{name}.zip").write_bytes(content)
+    with pytest.raises(ConfigurationError, match=f"zoo = '{name}' .* SHA-256"):
+        make_policy(f"zoo:{name}", task)

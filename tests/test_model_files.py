@@ -5,7 +5,6 @@ import io
 import json
 import pickle
 import random
-import shutil
 import sys
 import zipfile
 from collections.abc import Callable
@@ -446,24 +445,6 @@ def test_a_damaged_file_is_refused_or_harmless(
     assert not any("\n" in line for line in text)
 
 
-def test_a_file_of_the_zoo_is_the_one_that_its_card_describes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    name = "biased_oscillator_local_packets_memory"
-    for suffix in ("zip", "json"):
-        source = Path(fusion_gym.zoo.__file__).with_name(f"{name}.{suffix}")
-        shutil.copyfile(source, tmp_path / source.name)
-    monkeypatch.setattr(fusion_gym.zoo, "_folder", lambda: tmp_path)
-    card = fusion_gym.zoo.card(name)
-    task = fusion_gym.make_task(card["env"], **card["options"])
-    make_policy(f"zoo:{name}", task)
-    content = bytearray((tmp_path / f"{name}.zip").read_bytes())
-    content[-1] ^= 1
-    (tmp_path / f"{name}.zip").write_bytes(content)
-    with pytest.raises(ConfigurationError, match=f"zoo = '{name}' .* SHA-256"):
-        make_policy(f"zoo:{name}", task)
-
-
 def test_commands_load_foreign_code_with_trust_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -489,13 +470,13 @@ def test_commands_load_foreign_code_with_trust_alone(
     for name, content in files.items():
         (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
     config, sweep = str(tmp_path / "config.yaml"), str(tmp_path / "sweep.yaml")
+    compared = ["--config", config, "--sweep", sweep, "--policy", policy]
+    compared += ["--output", str(tmp_path / "comparison")]
     for command, arguments in (
         (evaluate.Evaluate, ["--config", config, "--policies", policy]),
-        (compare.Compare, ["--config", config, "--sweep", sweep, "--policy", policy, "--output"]),
+        (compare.Compare, compared),
         (table.Table, ["--config", str(tmp_path / "rows.yaml")]),
     ):
-        if command is compare.Compare:
-            arguments.append(str(tmp_path / "comparison"))
         line = ["program", *arguments, "--episodes", "3"]
         monkeypatch.setattr(sys, "argv", line)
         with pytest.raises(SystemExit, match="--trust"):

@@ -1,4 +1,4 @@
-"""The house keeps its arrows: imports run one way, without circles, and rooms stay small."""
+"""Imports run one way, without circles, and packages stay small."""
 
 import ast
 import functools
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-# Each room may import from the floors below its own, and from itself.
+# Each package may import from the floors below its own, and from itself.
 FLOORS = {
     "arrays": 0,
     "deprecation": 0,
@@ -74,14 +74,14 @@ def floor(module: str) -> int | None:
 
 @pytest.mark.parametrize("module", [name for name in modules() if floor(name) is not None])
 def test_imports_run_downwards(module: str) -> None:
-    room, own = module.split(".")[1], floor(module)
+    package, own = module.split(".")[1], floor(module)
     for other in imports(module):
         below = floor(other)
         assert below is not None, f"{module} imports the whole package"
         assert own is not None
-        same = other.split(".")[1] == room or own == below == 0
+        same = other.split(".")[1] == package or own == below == 0
         assert same or below < own, f"{module} imports {other}"
-        if room == "systems" and other.startswith("fusion_gym.systems."):
+        if package == "systems" and other.startswith("fusion_gym.systems."):
             families = [name.split(".")[2] for name in (module, other) if name.count(".") > 2]
             assert len(set(families)) <= 1, f"{module} imports {other} of another family"
 

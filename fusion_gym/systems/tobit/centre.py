@@ -58,7 +58,7 @@ class Centre(Protocol):
 
     @property
     def separable(self) -> bool:
-        """Whether :meth:`alone` is there, and costs less than one update after another."""
+        """Whether :meth:`single` is there, and costs less than one update after another."""
         return False
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
@@ -82,8 +82,11 @@ class Centre(Protocol):
         """Posterior means (sensors, n, N) and covariances (sensors, n, n, N), one sensor granted.
 
         Those of as many calls of :meth:`update`.
+
+        Raises:
+            RuntimeError: a centre that is not :attr:`separable`.
         """
-        ...
+        raise RuntimeError(f"{type(self).__name__} is not separable")
 
     def variances(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
@@ -263,12 +266,6 @@ class SequentialCentre(Centre):
         mean, covariance = self.filter.update(mean, covariance, measurement, granted)
         local = np.broadcast_to(mean, (self.sensors.count, *mean.shape))
         return Posterior(mean, covariance, local)
-
-    def single(
-        self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
-    ) -> tuple[Array, Array]:
-        """See :class:`Centre`: not separable."""
-        raise NotImplementedError("one update after another costs no more")
 
     def variances(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
