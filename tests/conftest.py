@@ -1,5 +1,6 @@
 """Settings for all tests."""
 
+import os
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,6 +13,7 @@ from fusion_gym.policies import registry
 
 # Two test processes share two cores: more threads would only wait for each other.
 torch.set_num_threads(1)
+os.environ["OMP_NUM_THREADS"] = "1"  # of the commands that tests start
 
 
 @pytest.fixture

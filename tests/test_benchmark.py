@@ -142,6 +142,14 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
     # The policies are made, but the schedules' searches would take minutes, and so would more than
     # one optimum of two sources.
     monkeypatch.setattr("fusion_gym.policies.periodic_optimum.optimum", unsearched)
+    tasks: dict[str, Any] = {}
+
+    def task_of(setting: Any, options: Any = ()) -> Any:
+        name = f"{setting.name} {options}"
+        tasks[name] = tasks.get(name) or jobs.envelope_task(setting, options)
+        return tasks[name]
+
+    monkeypatch.setattr("fusion_gym.agents.suite.envelopes.envelope_task", task_of)
     suite = load_suite(ROOT / "configs" / "benchmark.yaml")
     assert load_suite(ROOT / "configs" / "benchmark.yaml", quick=True).settings == suite.settings
     for setting in suite.settings:

@@ -250,6 +250,12 @@ def test_divergence_is_reported() -> None:
     assert 0.0 < (results.diverged > 0).mean() < 0.1
     assert results.mse[results.diverged > 0].min() > np.median(results.mse)
     assert evaluate(TRACKING, "round_robin").diverged.max() == 0.0
+    batch = EpisodeBatch.seeded(fusion_gym.make_task(TRACKING), 3, 0)
+    silent = np.zeros((batch.task.sensors, 3), dtype=np.bool_)
+    error = batch.branch().deliver(silent).squared_error
+    for level in (error, np.nextafter(error, 0.0)):
+        vars(batch.task)["divergence_level"] = level
+        assert (batch.branch().deliver(silent).diverged == (level < error).any()).all()
 
 
 @pytest.mark.parametrize(

@@ -139,7 +139,7 @@ def test_what_has_no_meaning_is_refused(env_id: str, options: Any, message: str)
     assert "\n" not in str(caught.value)
 
 
-def test_a_sensor_local_cannot_send_the_schedulers_estimate() -> None:
+def test_a_single_sensor_cannot_send_the_schedulers_estimate() -> None:
     options = {"memory": True, "packet": "estimate"}
     message = "packet = 'estimate' .*local view.* 'measurement'"
     for make in (
@@ -151,6 +151,8 @@ def test_a_sensor_local_cannot_send_the_schedulers_estimate() -> None:
     ):
         with pytest.raises(ConfigurationError, match=message):
             make()
+    with pytest.raises(ConfigurationError, match=r"packet = 'estimate' .*by themselves"):
+        EpisodeBatch.seeded(fusion_gym.make_task(CORRELATED, **options), 1, 0, "own")
 
 
 @pytest.mark.parametrize(
@@ -166,7 +168,7 @@ def test_nodes_receive_by_default_what_the_papers_let_them_receive(
     assert EpisodeBatch(task, 1).memory.states is None
 
 
-def test_a_sensor_local_looks_one_step_ahead() -> None:
+def test_a_single_sensor_looks_one_step_ahead() -> None:
     task = fusion_gym.make_task("fusion_gym/TobitOscillator-v0", filter="tobit", memory=True)
     beliefs = EpisodeBatch.seeded(task, 2, 0, "own").beliefs()
     for ask in (beliefs.loss, beliefs.value):

@@ -40,7 +40,7 @@ def held(name: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", ["vehicle", "tanks"])
-def test_it_runs_local_and_keeps_its_budget(name: str, tmp_path: Path) -> None:
+def test_it_runs_and_keeps_its_budget(name: str, tmp_path: Path) -> None:
     """The script beside its file, here with shorter episodes."""
     content = held(name) | {"horizon": 12}
     (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))

@@ -86,7 +86,7 @@ def test_its_episodes_are_those_of_other_policies(env_id: str) -> None:
     assert free.granted.any()
 
 
-def test_each_episode_is_searched_local() -> None:
+def test_each_episode_has_a_search_of_its_own() -> None:
     """Also where the episodes do not fit side by side, and where noise is drawn in blocks."""
     task = fusion_gym.make_task(REMOTE, max_episode_steps=300)
     wide = 3000

@@ -118,7 +118,7 @@ def test_open_loop_by_simulation(linear: Any) -> None:
     assert linear.system.open_loop(30).tolist() == Linear().open_loop(30).tolist()
 
 
-def test_the_example_runs_local() -> None:
+def test_the_example_runs() -> None:
     root = EXAMPLE.parent.parent
     done = subprocess.run([sys.executable, EXAMPLE], cwd=root, capture_output=True, text=True,
                           env={"PYTHONPATH": str(root), "PATH": ""}, check=True)  # fmt: skip

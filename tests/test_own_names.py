@@ -190,7 +190,12 @@ def command(folder: Path, *words: str) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "fusion_gym.agents", *words],
         cwd=folder,
-        env={"PYTHONPATH": str(Path(__file__).parent.parent), "PATH": "/usr/bin:/bin", "HOME": "."},
+        env={
+            "PYTHONPATH": str(Path(__file__).parent.parent),
+            "PATH": "/usr/bin:/bin",
+            "HOME": ".",
+            "OMP_NUM_THREADS": "1",
+        },
         capture_output=True,
         text=True,
         check=False,

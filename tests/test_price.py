@@ -7,6 +7,7 @@ import pytest
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.reward import Price, equal_weights
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
@@ -113,15 +114,52 @@ def test_rewards_of_a_training_over_prices_are_scaled_and_returns_are_not(local:
             FusionSB3VecEnv(task, 5, price_exponent=value)
 
 
+RANGE = "it must be a pair (low, high) with 0 < low < high"
+KINDS = "it must be one of 'squared', 'trace', 'maximum', a function, or 'module:name' of one"
+
+
 @pytest.mark.parametrize(
-    ("options", "parts"),
+    ("options", "message"),
     [
-        ({"cost_weight": "random"}, ("price_range", "0 < low < high")),
-        ({"price_range": (0.1, 0.001)}, ("[0.1, 0.001]", "0 < low < high")),
-        ({"cost_weight": 0.5, "price_range": SPAN}, ("cost_weight = 0.5", "[0.001, 0.1]")),
+        (
+            {"cost_weight": "drawn"},
+            "cost_weight = 'drawn' is not allowed: it must be one of 'random'",
+        ),
+        (
+            {"cost_weight": "random"},
+            f"price_range = None is not allowed with cost_weight='random': {RANGE}",
+        ),
+        (
+            {"price_range": (0.1, 0.001)},
+            "price_range = [0.1, 0.001] is not allowed: it must be a pair with 0 < low < high",
+        ),
+        (
+            {"price_range": "low"},
+            "price_range = 'low' is not allowed: it must be an array of numbers",
+        ),
+        (
+            {"cost_weight": 0.5, "price_range": SPAN},
+            "cost_weight = 0.5 is not allowed: it must lie in price_range = [0.001, 0.1]",
+        ),
+        ({"error": "cubed"}, f"error = 'cubed' is not allowed: {KINDS}"),
+        (
+            {"error": lambda error, covariance: 0.0 * error[0] - 1.0},
+            "error = 'test_price:<lambda>' is not allowed: of errors (2, 3) it must return numbers "
+            ">= 0 of shape (3,), and returned [-1.0, -1.0, -1.0] of shape (3,)",
+        ),
     ],
 )
-def test_prices_that_cannot_be_are_refused(options: dict[str, Any], parts: tuple[str, ...]) -> None:
+def test_a_reward_that_cannot_be_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         fusion_gym.make_task(ENV_ID, **options)
-    assert [part for part in parts if part not in str(caught.value)] == []
+    assert str(caught.value) == message
+
+
+def test_open_loop_costs_one_with_equal_weights() -> None:
+    variances = np.array([0.5, 2.0, 8.0])
+    np.testing.assert_allclose(equal_weights(variances) * variances, 1.0 / 3.0)
+    ending = "every state must be moved by noise before the horizon, or be uncertain at the start"
+    with pytest.raises(ConfigurationError, match=f"^a squared error of .0.0. without .*{ending}$"):
+        equal_weights(np.zeros(1))
+    with pytest.raises(ConfigurationError, match=r"^price_range = None .* observed$"):
+        Price.create(0.1).encode(variances)

@@ -43,7 +43,7 @@ def test_squared_errors_are_those_of_the_evaluation() -> None:
     np.testing.assert_allclose(armse(result)["mean"], np.sqrt(results.squared_error).mean(0))
 
 
-def test_a_sensor_local_transmits_at_its_turns_alone() -> None:
+def test_a_single_sensor_transmits_at_its_turns_alone() -> None:
     task = fusion_gym.make_task(OSCILLATOR)
     for sensor in range(2):
         rate = run_episodes(task, Turn(sensor), 2, 0).rate

@@ -107,14 +107,11 @@ class Runs:
 
     def answer(self, requests: NDArray[np.bool_]) -> Grants:
         """The network's answer to requests (sensors, k·N): k of each run, one after another."""
-        task, runs = self.task, len(self.tokens)
-        many = np.arange(requests.shape[1]) % runs if requests.shape[1] != runs else slice(None)
-        steps = self.steps[many]
-        if task.access == "single":
+        run = np.arange(requests.shape[1]) % len(self.tokens)
+        requests, steps = requests & self.admitted()[:, run], self.steps[run]
+        if self.task.access == "single":
             requests = first_request(requests, steps)
-        elif task.access != "any":
-            requests = requests & self.admitted()[:, many]
-        return task.bucket.grant(self.tokens[many], requests, steps)
+        return self.task.bucket.grant(self.tokens[run], requests, steps)
 
     def sense(self, noise: Array) -> None:
         """The second half: the plant moves, the sensors measure, with noise (channels, N)."""
@@ -236,7 +233,7 @@ class Branch(Runs):
     ) -> Outcome:
         """Both halves of a step, with standard normals (channels, N).
 
-        ``best`` is x* after the step, for runs that were taken by :meth:`Runs.remembering`.
+        ``best`` is x* after the step, for runs that were taken by :meth:`Runs.branch_memory`.
         """
         outcome = self.deliver(requests)
         self.sense(noise)

@@ -41,7 +41,7 @@ def hidden(batch: EpisodeBatch) -> list[Array]:
 
 
 @each_case
-def test_a_run_is_the_same_local_and_in_a_batch(case: Case) -> None:
+def test_a_run_is_the_same_by_itself_and_in_a_batch(case: Case) -> None:
     """Bitwise that of the single environment, though it begins later and others anew."""
     batch = case.batch(40, 100, horizon=6)
     env: Any = FusionEnv(case.task(horizon=6))
