@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 
 import fusion_gym
-from fusion_gym.core.access import access_mask, first_request
+from fusion_gym.core.access import first_request
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
@@ -220,15 +220,6 @@ def test_two_sided_sensors_clip_and_tell() -> None:
     np.testing.assert_array_equal(
         sensors.censored(measured)[:, 0], [[True, False, True], [False, False, True]]
     )
-
-
-def test_round_robin_and_random_access_admit_one_sensor() -> None:
-    step = np.array([0, 1, 2, 3])
-    assert access_mask("round_robin", 3, step, None).argmax(0).tolist() == [0, 1, 2, 0]
-    noise = np.random.default_rng(0).normal(size=30_000)
-    admitted = access_mask("random", 3, np.zeros(30_000, dtype=np.int64), noise)
-    assert np.all(admitted.sum(0) == 1)
-    np.testing.assert_allclose(admitted.mean(1), 1 / 3, atol=4 * np.sqrt(2 / 9 / 30_000))
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)

@@ -70,19 +70,6 @@ def test_silence_costs_about_one_a_step() -> None:
     assert np.mean(rewards) == pytest.approx(-1.0, abs=0.1)
 
 
-def test_no_step_after_the_end() -> None:
-    horizon = 7
-    env = make(horizon=horizon)
-    for _ in range(2):
-        env.reset()
-        for step in range(1, horizon + 1):
-            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
-            assert terminated is False
-            assert truncated is (step == horizon)
-        with pytest.raises(gymnasium.error.ResetNeeded):
-            env.step(env.action_space.sample())
-
-
 @pytest.mark.filterwarnings("error")
 def test_a_bound_starved_for_thousands_of_steps_does_not_overflow() -> None:
     env = gymnasium.make("fusion_gym/TobitOscillator-v0", horizon=2500)

@@ -43,31 +43,25 @@ def diagonal(covariance: Array) -> Array:
 # For each word of a constant and block what the entries stand for, from signals.
 PHYSICAL: dict[tuple[str, str], Any] = {
     ("estimate", "root mean square"): lambda e, c, s: (e * c, s["prior_mean"]),
-    ("log_variance", "open-loop mean"): lambda e, c, s: (
-        np.exp(e) * c,
-        diagonal(s["prior_covariance"]),
+    ("log_variance", "open-loop mean"): (
+        lambda e, c, s: (np.exp(e) * c, diagonal(s["prior_covariance"]))
     ),
-    ("log_deviation", "open-loop deviation"): lambda e, c, s: (
-        np.exp(e) * c,
-        np.sqrt(diagonal(s["prior_covariance"])),
+    ("log_deviation", "open-loop deviation"): (
+        lambda e, c, s: (np.exp(e) * c, np.sqrt(diagonal(s["prior_covariance"])))
     ),
-    ("held_difference", "two noise deviations"): lambda e, c, s: (
-        e * c,
-        s["measurement"] - s["held"],
+    ("held_difference", "two noise deviations"): (
+        lambda e, c, s: (e * c, s["measurement"] - s["held"])
     ),
-    ("held_difference", "√2 noise deviations"): lambda e, c, s: (
-        e * c,
-        s["measurement"] - s["held"],
+    ("held_difference", "√2 noise deviations"): (
+        lambda e, c, s: (e * c, s["measurement"] - s["held"])
     ),
     ("error", "error_scale"): lambda e, c, s: (e * c, s["innovation"][:, 0]),
-    ("belief_difference", "open-loop deviations"): lambda e, c, s: (
-        np.sinh(e) / 4.0 * c,
-        s["belief_difference"],
+    ("belief_difference", "open-loop deviations"): (
+        lambda e, c, s: (np.sinh(e) / 4.0 * c, s["belief_difference"])
     ),
     ("tokens", "capacity"): lambda e, c, s: (e * c, s["tokens"]),
-    ("transmission_value", "open loop"): lambda e, c, s: (
-        np.sign(e[1:]) * (e[1:] / 2.0) ** 2 * c,
-        s["transmission_value"],
+    ("transmission_value", "open loop"): (
+        lambda e, c, s: (np.sign(e[1:]) * (e[1:] / 2.0) ** 2 * c, s["transmission_value"])
     ),
 }
 

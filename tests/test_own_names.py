@@ -83,6 +83,7 @@ def below(error, covariance):
 
 '''
 
+ROOT = Path(__file__).parent.parent
 VARIANT = "own_variants:mine/Tobit-v0"
 VARIANTS = """
 import gymnasium as gym
@@ -190,12 +191,7 @@ def command(folder: Path, *words: str) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "fusion_gym.agents", *words],
         cwd=folder,
-        env={
-            "PYTHONPATH": str(Path(__file__).parent.parent),
-            "PATH": "/usr/bin:/bin",
-            "HOME": ".",
-            "OMP_NUM_THREADS": "1",
-        },
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "HOME": ".", "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
         check=False,

@@ -17,10 +17,7 @@ SPAN = (0.001, 0.1)
 
 
 def started(runs: int, **options: Any) -> EpisodeBatch:
-    batch = EpisodeBatch(fusion_gym.make_task(ENV_ID, **options), runs)
-    batch.seed(np.arange(runs), list(range(runs)))
-    batch.reset()
-    return batch
+    return EpisodeBatch.seeded(fusion_gym.make_task(ENV_ID, **options), runs, 0)
 
 
 def test_a_random_price_is_even_in_the_logarithm_and_observed() -> None:
@@ -118,37 +115,21 @@ RANGE = "it must be a pair (low, high) with 0 < low < high"
 KINDS = "it must be one of 'squared', 'trace', 'maximum', a function, or 'module:name' of one"
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (
-            {"cost_weight": "drawn"},
-            "cost_weight = 'drawn' is not allowed: it must be one of 'random'",
-        ),
-        (
-            {"cost_weight": "random"},
-            f"price_range = None is not allowed with cost_weight='random': {RANGE}",
-        ),
-        (
-            {"price_range": (0.1, 0.001)},
-            "price_range = [0.1, 0.001] is not allowed: it must be a pair with 0 < low < high",
-        ),
-        (
-            {"price_range": "low"},
-            "price_range = 'low' is not allowed: it must be an array of numbers",
-        ),
-        (
-            {"cost_weight": 0.5, "price_range": SPAN},
-            "cost_weight = 0.5 is not allowed: it must lie in price_range = [0.001, 0.1]",
-        ),
-        ({"error": "cubed"}, f"error = 'cubed' is not allowed: {KINDS}"),
-        (
-            {"error": lambda error, covariance: 0.0 * error[0] - 1.0},
-            "error = 'test_price:<lambda>' is not allowed: of errors (2, 3) it must return numbers "
-            ">= 0 of shape (3,), and returned [-1.0, -1.0, -1.0] of shape (3,)",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), [
+    ({"cost_weight": "drawn"}, "cost_weight = 'drawn' is not allowed: it must be one of 'random'"),
+    ({"cost_weight": "random"},
+     f"price_range = None is not allowed with cost_weight='random': {RANGE}"),
+    ({"price_range": (0.1, 0.001)},
+     "price_range = [0.1, 0.001] is not allowed: it must be a pair with 0 < low < high"),
+    ({"price_range": "low"},
+     "price_range = 'low' is not allowed: it must be an array of numbers"),
+    ({"cost_weight": 0.5, "price_range": SPAN},
+     "cost_weight = 0.5 is not allowed: it must lie in price_range = [0.001, 0.1]"),
+    ({"error": "cubed"}, f"error = 'cubed' is not allowed: {KINDS}"),
+    ({"error": lambda error, covariance: 0.0 * error[0] - 1.0},
+     "error = 'test_price:<lambda>' is not allowed: of errors (2, 3) it must return numbers "
+     ">= 0 of shape (3,), and returned [-1.0, -1.0, -1.0] of shape (3,)"),
+])  # fmt: skip
 def test_a_reward_that_cannot_be_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         fusion_gym.make_task(ENV_ID, **options)

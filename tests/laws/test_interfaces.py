@@ -237,6 +237,9 @@ def test_episodes_end_by_truncation_alone(env_id: str, limit: str) -> None:
     for step in range(1, 9):
         if step % 4 == 1:
             single.reset()
+        if step % 4 == 0 and limit == "horizon":
+            with pytest.raises(gymnasium.error.ResetNeeded):
+                single.step(single.action_space.sample())
         *_, truncated, _ = vector.step(vector.action_space.sample())
         assert (truncated == (step % 4 == 3)).all()  # every fourth step is the reset
         if step % 4:
