@@ -8,6 +8,7 @@ from pathlib import Path
 
 import fusion_gym
 from fusion_gym.envs import registered
+from fusion_gym.envs.pages import _MARKED
 from fusion_gym.envs.registration import ENVIRONMENTS, class_name
 
 ROOT = Path(__file__).parent.parent
@@ -51,12 +52,13 @@ def named_by_environments() -> set[str]:
 def texts() -> Iterator[tuple[str, str]]:
     for path in sorted((ROOT / "docs").rglob("*.md")):
         if path.name != "glossary.md":
-            yield path.relative_to(ROOT).as_posix(), path.read_text()
+            yield path.relative_to(ROOT).as_posix(), _MARKED.sub("", path.read_text())
     for name, tree in TREES.items():
         values = (getattr(n.value, "value", 0) for n in ast.walk(tree) if isinstance(n, ast.Expr))
         yield name, "\n".join(value for value in values if isinstance(value, str))
-    for env_id in ENVIRONMENTS:
-        yield env_id, str(getattr(registered, f"{class_name(env_id)}Env").__doc__)
+    kinds = (getattr(registered, f"{class_name(env_id)}Env") for env_id in ENVIRONMENTS)
+    lines = (line for kind in kinds for line in str(kind.__doc__).splitlines())
+    yield "help", "\n".join(dict.fromkeys(lines))
 
 
 def test_public_names_hold_no_rejected_word() -> None:
