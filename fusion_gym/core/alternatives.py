@@ -41,8 +41,8 @@ def alternatives(
     answered as in the step taken not at all. Nothing that is given moves.
     """
     many, sensors, runs = requests.shape
-    granted = before.answer(requests.transpose(1, 0, 2).reshape(sensors, -1)).granted
     values = np.tile(np.arange(runs), many)  # where each one's results are; first the taken ones
+    granted = before.answer(requests.transpose(1, 0, 2).reshape(sensors, -1), values).granted
     other = np.flatnonzero((granted != np.tile(taken.granted, many)).any(0))
     error, communication = taken.error, taken.reward_communication
     if other.size:

@@ -105,13 +105,16 @@ class Runs:
             ended=self.steps >= self._limit,
         )
 
-    def answer(self, requests: NDArray[np.bool_]) -> Grants:
-        """The network's answer to requests (sensors, k·N): k of each run, one after another."""
-        run = np.arange(requests.shape[1]) % len(self.tokens)
-        requests, steps = requests & self.admitted()[:, run], self.steps[run]
+    def answer(
+        self, requests: NDArray[np.bool_], runs: NDArray[np.int64] | slice = slice(None)
+    ) -> Grants:
+        """The network's answer to requests (sensors, R), each of one of the R ``runs``."""
+        steps = self.steps[runs]
         if self.task.access == "single":
             requests = first_request(requests, steps)
-        return self.task.bucket.grant(self.tokens[run], requests, steps)
+        elif self.task.access in ("round_robin", "random"):
+            requests = requests & self.admitted()[:, runs]
+        return self.task.bucket.grant(self.tokens[runs], requests, steps)
 
     def sense(self, noise: Array) -> None:
         """The second half: the plant moves, the sensors measure, with noise (channels, N)."""
