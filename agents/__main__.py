@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fusion_gym.validation import ConfigurationError, choice
+from fusion_gym.version import __version__
 
 from . import missing_extra
 from .output.ending import report_errors
@@ -33,8 +34,8 @@ def main() -> None:
     """
     name = sys.argv[1] if sys.argv[1:] else "--help"
     with report_errors():
-        if name in ("-h", "--help"):
-            print(usage())
+        if name in ("-h", "--help", "--version"):
+            print(__version__ if name == "--version" else usage())
             return
         command = load(name)
         del sys.argv[1]

@@ -1,6 +1,7 @@
 """How every command reads its options, reports an error and ends."""
 
 import contextlib
+import inspect
 import io
 import itertools
 import os
@@ -8,12 +9,13 @@ import re
 import shlex
 import sys
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
 import tyro
 
+from fusion_gym.docstrings import plain_marks
 from fusion_gym.validation import ConfigurationError
 
 from .input.options import OutputFolder, Whole, check_options
@@ -111,6 +113,24 @@ class SuiteCommand(Long):
     """Processes side by side."""
 
 
+_REGISTRY = tyro.constructors.ConstructorRegistry()
+
+
+@_REGISTRY.primitive_rule
+def _optional(
+    info: tyro.constructors.PrimitiveTypeInfo,
+) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+    """Read and show ``X | None`` as X: an option that is left out is None."""
+    parts = get_args(info.type)
+    if len(parts) != 2 or parts[1] is not type(None):
+        return None
+    spec = _REGISTRY.get_primitive_spec(
+        tyro.constructors.PrimitiveTypeInfo.make(parts[0], info.markers)
+    )
+    assert isinstance(spec, tyro.constructors.PrimitiveConstructorSpec)
+    return replace(spec, is_instance=lambda value: value is None or spec.is_instance(value))
+
+
 def read_command(kind: type[_Kind]) -> _Kind:
     """The command with the options of the command line.
 
@@ -126,6 +146,8 @@ def read_command(kind: type[_Kind]) -> _Kind:
             return tyro.cli(
                 kind,
                 prog=f"fusion-gym {kind.__name__.lower()}",
+                description=plain_marks(inspect.getmodule(kind).__doc__ or ""),
+                registry=_REGISTRY,
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
     except SystemExit as end:

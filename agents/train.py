@@ -1,6 +1,7 @@
 """Train a Stable-Baselines3 agent on the native vector environment.
 
-    fusion-gym train --config configs/tobit_oscillator_ppo.yaml [--resume]
+    fusion-gym train --config tobit_oscillator_ppo [--resume]
+    fusion-gym train --env fusion_gym/LinearFusion-v0 --algorithm ppo --timesteps 200000
 
 Into the config's ``output`` folder go, as they are made: ``config.yaml``, ``latest.zip`` (the
 checkpoint), ``best_model.zip`` (best return on the validation seeds), ``validation.jsonl``,
@@ -16,6 +17,7 @@ A checkpoint holds pickles and is loaded by Stable-Baselines3's own loader: resu
 own alone, for a foreign folder runs whatever code is in it.
 """
 
+import re
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -26,21 +28,27 @@ from fusion_gym.validation import ConfigurationError
 
 from .command_line import Long, SetOptions
 from .input.options import Between, OutputFolder, Steps, TrainingSeed, writable_folder
-from .training.checked import load_checked
+from .training.checked import load_checked, parse
 from .training.config import Experiment
 from .training.run import holds_training, train
+
+TIMESTEPS = 1_000_000  # of a training without a config
 
 
 @dataclass(frozen=True)
 class Train(Long):
     """Train a Stable-Baselines3 agent on the native vector environment."""
 
-    config: str
+    config: str | None = None
     """The experiment: a YAML file, or the name of a shipped config."""
+    env: str | None = None
+    """Id of a registered environment, in the place of a config."""
+    algorithm: str | None = None
+    """Algorithm for --env, with its defaults: ppo if none is given."""
     options: SetOptions = ()
     """Options of gym.make for the environment; they go before the config's."""
     timesteps: Steps = None
-    """Steps of all runs together, instead of the config's."""
+    """Steps of all runs together, instead of the config's, or of a million with --env."""
     seed: TrainingSeed = None
     """Seed of the training, instead of the config's."""
     target_rate: Annotated[float | None, Between(0, 1)] = None
@@ -56,13 +64,36 @@ class Train(Long):
         Raises:
             ConfigurationError: a config or a value that is not allowed.
         """
-        return load_checked(Experiment, self.config).changed(
+        return self._described().changed(
             self.output,
             parse_settings("option", list(chain(*self.options))),
             timesteps=self.timesteps,
             seed=self.seed,
             target_rate=self.target_rate,
         )
+
+    def _described(self) -> Experiment:
+        """Return the config, or one of ``env`` and ``algorithm`` with defaults."""
+        if (self.config is None) == (self.env is None):
+            raise ConfigurationError(
+                f"config = {self.config!r} is not allowed with env = {self.env!r}: give one of them"
+            )
+        if self.config is not None:
+            if self.algorithm is not None:
+                raise ConfigurationError(
+                    f"algorithm = {self.algorithm!r} is not allowed with config = "
+                    f"{self.config!r}: the config names the algorithm"
+                )
+            return load_checked(Experiment, self.config)
+        algorithm = self.algorithm or "ppo"
+        name = re.sub(r"\W+", "_", f"{str(self.env).rpartition('/')[2]}_{algorithm}").lower()
+        content = {
+            "environment": {"id": self.env},
+            "algorithm": {"name": algorithm},
+            "training": {"timesteps": TIMESTEPS},
+            "output": f"runs/{name}",
+        }
+        return parse(Experiment, content, "command line")
 
     def run(self) -> None:
         """Train as far as the config says."""

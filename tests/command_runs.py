@@ -87,6 +87,8 @@ SAID = {
     "seeds": {"seed"},
     "model": {"the command line"},
     "papers": {"the command line", "paper"},
+    "kinds": {"the command line", "kind"},
+    "name": {"the command line"},
 }
 
 

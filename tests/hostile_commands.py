@@ -35,6 +35,8 @@ BASES: dict[str, dict[str, list[str]]] = {
         "config": ["training.yaml"], "sweep": ["sweep.yaml"], "policy": ["always"],
         "output": ["made"], "episodes": ["2"],
     },
+    "list": {"kinds": ["rules"]},
+    "info": {"name": ["whittle"]},
     "report": {"results": ["results"]},
     "table": {"config": ["rows.yaml"], "episodes": ["2"]},
     "reproduce": {
@@ -84,7 +86,7 @@ FILES = ["folder", "text/made.json", "locked/made.json", f"{LONG}.json", "loop",
 UNREADABLE = ["absent.yaml", "absent", "folder", "locked/file.yaml", "text/below.yaml", LONG,
               "loop.yaml"]  # fmt: skip
 # Words without a name before them.
-POSITIONAL = {("reproduce", "papers"), ("export", "model")}
+POSITIONAL = {("reproduce", "papers"), ("export", "model"), ("list", "kinds"), ("info", "name")}
 # Numbers among the hostile ones that an option may have after all.
 ALLOWED = {("seed", "0"), ("seeds", "0"), ("seed", "9" * 30)}
 

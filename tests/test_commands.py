@@ -1,6 +1,7 @@
 """How commands are called: options, help, errors in one line, configs by their name."""
 
 import dataclasses
+import re
 import subprocess
 import sys
 import typing
@@ -8,10 +9,14 @@ from pathlib import Path
 
 import pytest
 import tyro
+from command_runs import call
 
+import fusion_gym
 from fusion_gym.agents import __main__ as everything
 from fusion_gym.agents import command_line
 from fusion_gym.agents.benchmark import Benchmark
+from fusion_gym.agents.input.catalogue import catalogue
+from fusion_gym.agents.train import Train
 from fusion_gym.agents.training.algorithms import TABLE
 from fusion_gym.agents.training.checked import config_path, load_checked, parse
 from fusion_gym.agents.training.config import Experiment
@@ -31,6 +36,10 @@ def test_help_shows_every_option(
     assert caught.value.code == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert text.startswith(f"usage: fusion-gym {name} ")
+    assert re.search(rf" (fusion-gym|python -m fusion_gym.agents) {name}\b", text[10:]), (
+        "no example"
+    )
+    assert "{None}" not in text
     kind = everything.load(name)
     options = {field.name: field for field in dataclasses.fields(kind)}
     for own, option in (("options", "set"), ("of", "class")):
@@ -59,6 +68,7 @@ def test_all_commands_under_one_name() -> None:
         line = [sys.executable, "-m", "fusion_gym.agents", *words]
         return subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
 
+    assert run("--version").stdout == f"{fusion_gym.__version__}\n"
     listed = run().stdout
     assert all(f"\n  {name} " in listed for name in everything.COMMANDS)
     unknown = run("trian")
@@ -68,6 +78,37 @@ def test_all_commands_under_one_name() -> None:
     absent = run("report", "--results", "absent")
     assert absent.returncode == 1
     assert absent.stderr.startswith("error: results = 'absent'")
+
+
+def test_list_and_info_show_every_entry() -> None:
+    entries = catalogue()
+    listed = call("list", []).out
+    for kind, named in entries.items():
+        assert named, kind
+        for name, entry in named.items():
+            assert name in listed
+            assert len(entry.meaning) > 5, name
+            assert len(entry.page()) > 10, name
+    assert call("list", ["zoo"]).out.split()[:2] == ["zoo", "biased_oscillator_centre"]
+    assert "whittle:price=5" in call("info", ["whittle"]).out
+    page = call("info", ["LinearFusion"]).out
+    assert "## Observation space" in page
+    assert "variance_reduction" in page
+    assert call("info", ["whitle"]).err.endswith("fusion-gym list; did you mean 'whittle'?\n")
+    assert "'agent': known are algorithms" in call("list", ["agent"]).err
+
+
+def test_a_training_needs_no_config(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = "train --env fusion_gym/LinearFusion-v0 --set horizon=9 --timesteps 64 --seed 3"
+    monkeypatch.setattr(sys, "argv", words.split())
+    experiment = command_line.read_command(Train).experiment()
+    assert experiment.environment.options == {"horizon": 9}
+    assert (experiment.algorithm.name, experiment.output) == ("ppo", "runs/linearfusion_v0_ppo")
+    assert (experiment.training.timesteps, experiment.training.seed) == (64, 3)
+    for more in ([], ["--env", "fusion_gym/LinearFusion-v0", "--config", "tobit_oscillator_ppo"]):
+        assert "give one of them" in call("train", more).err
+    given = ["--config", "tobit_oscillator_ppo", "--algorithm", "dqn"]
+    assert "the config names the algorithm" in call("train", given).err
 
 
 def test_configs_go_by_path_or_by_shipped_name(

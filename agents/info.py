@@ -1,0 +1,48 @@
+"""Show the page of an environment, rule, filter, signal, agent or config.
+
+    fusion-gym info fusion_gym/LinearFusion-v0
+    fusion-gym info value_of_information
+
+``fusion-gym list`` has all names.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+from rich.markdown import Markdown
+
+from fusion_gym.validation import ConfigurationError, nearest
+
+from .command_line import Command
+from .input.catalogue import catalogue
+from .output.tables import console
+
+
+@dataclass(frozen=True)
+class Info(Command):
+    """Show the page of an environment, rule, filter, signal, agent or config."""
+
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
+    """A name from fusion-gym list; an environment may go without fusion_gym/ and -v0."""
+
+    def run(self) -> None:
+        """Print the page of every entry of this name.
+
+        Raises:
+            ConfigurationError: an unknown name.
+        """
+        entries = catalogue()
+        alias = f"fusion_gym/{self.name}-v0"
+        name = alias if alias in entries["environments"] else self.name
+        names = [entry for named in entries.values() for entry in named]
+        if name not in names:
+            hint = f"; did you mean {nearest(name, names)!r}?" if nearest(name, names) else ""
+            raise ConfigurationError(
+                f"name = {name!r} is not allowed: it must be a name of fusion-gym list{hint}"
+            )
+        for kind, named in entries.items():
+            if name in named:
+                text = f"# {name} ({kind})\n\n{named[name].page()}"
+                terminal = console()
+                terminal.print(Markdown(text) if terminal.is_terminal else text, markup=False)
