@@ -47,8 +47,6 @@ class Compare(Long):
     """Seed of the first episode."""
     prices: Annotated[int | None, Whole(2, 1000)] = None
     """Ask an agent that sees the price at as many, over the config's price_range."""
-    trust: bool = False
-    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
 
     keeps = False
 

@@ -51,8 +51,6 @@ class Evaluate(Long):
     """Write the results to this file."""
     resume: bool = False
     """Keep what the JSON already holds."""
-    trust: bool = False
-    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
 
     def run(self) -> None:
         """Evaluate and print the tables."""

@@ -41,7 +41,7 @@ class Export(Command):
     options: SetOptions = ()
     """Options of gym.make for the environment; they go before all others."""
     trust: bool = False
-    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
+    """Run code of files: what they name as module:name, and what model:PATH holds besides data."""
 
     def run(self) -> None:
         """Write the file, check it and say what it is."""

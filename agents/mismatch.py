@@ -48,8 +48,6 @@ class Mismatch(Long):
     """Seed of the first episode."""
     json: Annotated[Path | None, OutputFile()] = None
     """Write the results to this file."""
-    trust: bool = False
-    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
 
     keeps = False
 

@@ -36,8 +36,6 @@ class Table(Long):
     """Seed of the first episode."""
     markdown: bool = False
     """Print the table as the documentation holds it."""
-    trust: bool = False
-    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
 
     keeps = False
 

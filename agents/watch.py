@@ -50,8 +50,6 @@ class Watch(Long):
     """Steps, instead of the whole episode."""
     fps: Annotated[int, Whole(1, 50)] = 10
     """Steps a second."""
-    trust: bool = False
-    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
 
     def run(self) -> None:
         """Show or save the episode.

@@ -1,10 +1,60 @@
-"""What a user names as ``module:name``: imported, or one error that says what is wrong."""
+"""What a user names as ``module:name``: imported, or one error that says what is wrong.
 
+A file may name code where the user trusts it: with ``--trust``, or in :func:`trust_files`.
+"""
+
+import contextlib
 import importlib
+import re
+from collections.abc import Iterator, Mapping
+from contextvars import ContextVar
 from types import ModuleType
 from typing import Any
 
 from fusion_gym.errors import ConfigurationError
+
+TRUST: ContextVar[bool] = ContextVar("trust", default=False)
+_ENVIRONMENTS = ("env", "environment", "id", "error")  # whose texts name code by any colon
+_POLICY = re.compile(r"(?:^|base=)\s*(?!(?:model|zoo):)[^\W\d][\w.]*:\s*[^\W\d]\w*\s*(?::|$)")
+
+
+@contextlib.contextmanager
+def trust_files(trust: bool = True) -> Iterator[None]:
+    """Allow files to name code of the user's, as ``--trust`` does, while this is entered."""
+    token = TRUST.set(trust or TRUST.get())
+    try:
+        yield
+    finally:
+        TRUST.reset(token)
+
+
+def refuse_code(content: Any, source: str) -> None:
+    """Refuse a file's content that names code to import, unless files are trusted.
+
+    Raises:
+        ConfigurationError: an ``error``, an environment or a policy of the form ``module:name``.
+    """
+    if not TRUST.get() and (named := next(_code_in(content, ""), None)):
+        raise ConfigurationError(
+            f"{source}: {named[0]} = {named[1]!r} is not allowed: it names code that would run; "
+            "if you trust the file, add --trust (in Python: fusion_gym.importing.trust_files)"
+        )
+
+
+def _code_in(content: Any, key: str) -> Iterator[tuple[str, str]]:
+    """Every text that names code, with its key."""
+    if isinstance(content, Mapping):
+        for name, value in content.items():
+            if ":" in str(name):
+                yield key or "key", str(name)
+            yield from _code_in(value, str(name))
+    elif isinstance(content, (list, tuple)):
+        for value in content:
+            yield from _code_in(value, key)
+    elif isinstance(content, str) and (
+        ":" in content if key in _ENVIRONMENTS else _POLICY.search(content)
+    ):
+        yield key, content
 
 
 def imported(field: str, text: str, module: str) -> ModuleType:

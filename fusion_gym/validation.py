@@ -4,7 +4,9 @@ Every check returns the value in the form the library works with (float64 arrays
 and raises :class:`ConfigurationError` otherwise.
 """
 
-from collections.abc import Iterable
+import copy
+import itertools
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,10 @@ SMALLEST, LARGEST = 1e-15, 1e15
 LONGEST = 100  # entries of an axis of any length; matrices are multiplied entry by entry
 MOST_SENSORS = 1000  # the network serves them in a loop
 MOST_RUNS = 1_000_000  # each has a generator and a block of noise
+MOST_STEPS = 1000  # ahead, of a policy that plans
+MOST_PERIOD = 10**9  # of a policy that requests by the clock
+DEEPEST, MOST_ENTRIES = 32, 100_000  # of nested values
+CONTROL = r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]"  # in no name, path or word
 LONGEST_HORIZON = 50_000  # scales and tables are worked out step by step
 
 
@@ -140,6 +146,29 @@ def integer(field: str, value: Any, *, at_least: int, at_most: int | None = None
     return int(value)
 
 
+def limit_options(value: Mapping[str, Any]) -> None:
+    """Check that options can be copied, and are neither deep nor large, whatever they hold.
+
+    Raises:
+        ConfigurationError: one that cannot; names it.
+    """
+    for name, entry in value.items():
+        left, count = [(entry, 0)], 0
+        while left:
+            part, depth = left.pop()
+            count += 1
+            if depth > DEEPEST or count > MOST_ENTRIES:
+                allowed = f"nested at most {DEEPEST} times, with at most {MOST_ENTRIES:,} entries"
+                raise refusal(name, entry, allowed)
+            if isinstance(part, (list, tuple, set, frozenset, Mapping)):
+                inner = part.values() if isinstance(part, Mapping) else part
+                left += [(item, depth + 1) for item in itertools.islice(inner, MOST_ENTRIES)]
+        try:
+            copy.deepcopy(entry)
+        except Exception:
+            raise refusal(name, entry, "a value that can be copied") from None
+
+
 def boolean(field: str, value: Any) -> bool:
     """``True`` or ``False``.
 
@@ -175,6 +204,17 @@ def keys(kind: str, value: Iterable[str], known: Iterable[str]) -> None:
     for key in value:
         if key not in names:
             raise ConfigurationError(f"unknown {kind} {display(key)}: {_known(key, names)}")
+
+
+def reset_options(value: Any, known: Iterable[str]) -> None:
+    """The options of a reset are a mapping, or None, and every key is known.
+
+    Raises:
+        ConfigurationError: anything else.
+    """
+    if value is not None and not isinstance(value, Mapping):
+        raise refusal("options", value, "a dictionary of reset options, or None")
+    keys("reset option", value or {}, known)
 
 
 def arguments(owner: str, value: Iterable[str], known: Iterable[str]) -> None:

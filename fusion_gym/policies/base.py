@@ -130,7 +130,7 @@ def check_at_most(name: str, value: int | None) -> None:
         ConfigurationError: anything else.
     """
     if value is not None:
-        validation.integer(name, value, at_least=1)
+        validation.integer(name, value, at_least=1, at_most=validation.MOST_SENSORS)
 
 
 def shape_of(signals: Signals) -> tuple[int, int]:
