@@ -25,7 +25,7 @@ from .output.tables import console
 from .suite.agreement import agreement_table
 from .suite.beside_rules import SHIPPED
 from .suite.classes import names_of, trained_classes
-from .suite.committed import FOLDER, Shelf, complete
+from .suite.committed import FOLDER, Shelf, complete, missing_classes
 from .suite.config import Setting, Suite, load_suite
 from .suite.envelopes import envelope_task, run_test
 from .suite.jobs import Folders, job_finished, jobs, rules_of
@@ -81,13 +81,16 @@ class Benchmark(SuiteCommand):
         classes = self.classes or names_of(suite)
         for setting in settings:
             envelope_task(setting)
+        self._check_resumed(folders, settings)
+        shelf = self._shelf(suite, settings, folders)
+        compared = [[of.name for of in trained_classes(suite, setting)] for setting in settings]
+        for setting, names in zip(settings, compared, strict=True):
+            missing_classes(shelf.suite, setting, names, shelf.results)
+        team.check()
         with folders.lock():
-            self._check_resumed(folders, settings)
             writing(("finished pieces", folders.results), ("trainings and episodes", folders.work))
-            shelf = self._shelf(suite, settings, folders)
-            for setting in settings:
-                compared = [of.name for of in trained_classes(suite, setting)]
-                complete(shelf.suite, [setting], compared, shelf.results, folders.work, team)
+            for setting, names in zip(settings, compared, strict=True):
+                complete(shelf.suite, [setting], names, shelf.results, folders.work, team)
             rules = [
                 Work(4.0, run_test, (test, folders.work))
                 for setting in settings

@@ -40,7 +40,7 @@ from .suite.trainings import train_beside
 from .suite.workers import side_by_side
 from .training.checked import load_checked
 from .training.config import Experiment
-from .training.run import holds_training
+from .training.run import earlier, holds_training
 
 SETTING = "tobit_oscillator"
 TEAM = Team(2)
@@ -103,6 +103,12 @@ class Demo(Long):
             )
             for learner in LEARNERS
         }
+        if self.fresh:
+            demo_folders(folders.values())
+        else:
+            for experiment in experiments.values():
+                folder = Path(experiment.output)
+                earlier(experiment, folder, holds_training(folder))
         with ended_like_by_ctrl_c(), alone_in(self.output, "output"):
             if self.fresh:
                 remove(folders.values())
@@ -127,11 +133,11 @@ class Demo(Long):
         return f"interrupted; go on with: {self.again(without=('--fresh',))}"
 
 
-def remove(folders: Iterable[Path]) -> None:
-    """Remove what an earlier demo left in these folders, and nothing else.
+def demo_folders(folders: Iterable[Path]) -> list[Path]:
+    """Return the existing ones of these folders, which hold an earlier demo or nothing.
 
     Raises:
-        ConfigurationError: one holds something else; all are kept.
+        ConfigurationError: one holds something else.
     """
     there = [folder for folder in folders if folder.exists()]
     for folder in there:
@@ -140,7 +146,16 @@ def remove(folders: Iterable[Path]) -> None:
                 f"fresh = True is not allowed: {str(folder)!r} holds no results of a demo, and is "
                 "kept"
             )
-    for folder in there:
+    return there
+
+
+def remove(folders: Iterable[Path]) -> None:
+    """Remove what an earlier demo left in these folders, and nothing else.
+
+    Raises:
+        ConfigurationError: one holds something else; all are kept.
+    """
+    for folder in demo_folders(folders):
         shutil.rmtree(folder)
 
 

@@ -18,7 +18,7 @@ from .input.options import writable_folder
 from .output.files import write_text
 from .output.progress import writing
 from .suite.classes import classes_of
-from .suite.committed import FOLDER, complete, path_of, present
+from .suite.committed import FOLDER, complete, missing_classes, path_of, present
 from .suite.config import load_suite
 from .suite.envelope_table import envelope_text
 from .suite.jobs import Folders
@@ -40,18 +40,20 @@ class Envelope(SuiteCommand):
         known = dict.fromkeys(c.name for setting in settings for c in classes_of(setting))
         for name in self.classes:
             choice("classes", name, known)
+        there = [
+            name
+            for setting in settings
+            for name in present(suite, setting, folders.results)
+            if not self.classes or name in self.classes
+        ]
+        if there and not self.resume:
+            raise ConfigurationError(
+                f"results = {str(folders.results)!r} holds {len(there)} of these envelopes: go "
+                "on with --resume, or give another --results"
+            )
+        for setting in settings:
+            missing_classes(suite, setting, self.classes, folders.results)
         with folders.lock():
-            there = [
-                name
-                for setting in settings
-                for name in present(suite, setting, folders.results)
-                if not self.classes or name in self.classes
-            ]
-            if there and not self.resume:
-                raise ConfigurationError(
-                    f"results = {str(folders.results)!r} holds {len(there)} of these envelopes: go "
-                    "on with --resume, or give another --results"
-                )
             writing(
                 ("finished envelopes", folders.results / FOLDER),
                 ("what was tuned and tested", folders.work),

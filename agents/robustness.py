@@ -82,17 +82,20 @@ class Robustness(Long):
         trials = [self._trial(config, item, folders) for item in select_settings(config, self.envs)]
         place = self.results / FOLDER
         writable_folder("results", place)
+        there = [
+            path
+            for trial in trials
+            for path in place.glob(f"{trial.setting.name}/{trial.of.name}/*/*.json")
+        ]
+        if there and not self.resume:
+            raise ConfigurationError(
+                f"results = {str(self.results)!r} holds {len(there)} finished pieces of work: "
+                "go on with --resume, or give another --results and --work"
+            )
+        for trial in trials:
+            for piece in trial.pieces(("rules", "agents")):
+                folders.finished(piece)
         with alone_in(place, "results"), alone_in(self.work, "work"):
-            there = [
-                path
-                for trial in trials
-                for path in place.glob(f"{trial.setting.name}/{trial.of.name}/*/*.json")
-            ]
-            if there and not self.resume:
-                raise ConfigurationError(
-                    f"results = {str(self.results)!r} holds {len(there)} finished pieces of work: "
-                    "go on with --resume, or give another --results and --work"
-                )
             writing(("finished pieces", place), ("trainings and episodes", self.work))
             self._work(trials, ("rules", "agents"), folders)
             trainings = [training for trial in trials for training in trial.trainings]

@@ -25,7 +25,7 @@ from .output.progress import progress_bar, writing
 from .suite.verdict import excess
 from .training.checked import load_checked
 from .training.config import Experiment
-from .training.run import holds_training, train
+from .training.run import check_run, earlier, holds_training, train
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,11 @@ class Solved(Long):
         name, environment = experiment.algorithm.name, experiment.environment
         task = make_task(environment.id, **environment.options)
         task.system.nature.refuse("for the solved optimum")
+        for seed in self.seeds:
+            choice = experiment.changed(self.output / f"{name}_{seed}", seed=seed)
+            if not is_finished(choice):
+                check_run(choice)
+                earlier(choice, Path(choice.output), holds_training(Path(choice.output)))
         best = self._tested(task, "optimal", "testing the optimum")
         if best.returns.mean() == 0.0:
             raise ConfigurationError(
