@@ -104,11 +104,9 @@ class Demo(Long):
             for learner in LEARNERS
         }
         if self.fresh:
-            demo_folders(folders.values())
-        else:
-            for experiment in experiments.values():
-                folder = Path(experiment.output)
-                earlier(experiment, folder, holds_training(folder))
+            remove(folders.values(), only_check=True)
+        for item in () if self.fresh else experiments.values():
+            earlier(item, Path(item.output), holds_training(Path(item.output)))
         with ended_like_by_ctrl_c(), alone_in(self.output, "output"):
             if self.fresh:
                 remove(folders.values())
@@ -133,11 +131,11 @@ class Demo(Long):
         return f"interrupted; go on with: {self.again(without=('--fresh',))}"
 
 
-def demo_folders(folders: Iterable[Path]) -> list[Path]:
-    """Return the existing ones of these folders, which hold an earlier demo or nothing.
+def remove(folders: Iterable[Path], only_check: bool = False) -> None:
+    """Remove what an earlier demo left in these folders, and nothing else.
 
     Raises:
-        ConfigurationError: one holds something else.
+        ConfigurationError: one holds something else; all are kept.
     """
     there = [folder for folder in folders if folder.exists()]
     for folder in there:
@@ -146,16 +144,7 @@ def demo_folders(folders: Iterable[Path]) -> list[Path]:
                 f"fresh = True is not allowed: {str(folder)!r} holds no results of a demo, and is "
                 "kept"
             )
-    return there
-
-
-def remove(folders: Iterable[Path]) -> None:
-    """Remove what an earlier demo left in these folders, and nothing else.
-
-    Raises:
-        ConfigurationError: one holds something else; all are kept.
-    """
-    for folder in demo_folders(folders):
+    for folder in () if only_check else there:
         shutil.rmtree(folder)
 
 

@@ -68,7 +68,7 @@ def export(command: Export) -> list[str]:
 
     require_onnx("onnx")
     task = make_task(env_id, **options)
-    agent = make_policy(f"{kind}:{rest}", task, trust=command.trust)
+    agent = make_policy(f"{kind}:{rest}", task)
     try:
         with replacing(command.onnx) as unfinished:
             model = export_onnx(agent, task, unfinished, env_id, command.model)

@@ -49,8 +49,11 @@ class Solved(Long):
         name, environment = experiment.algorithm.name, experiment.environment
         task = make_task(environment.id, **environment.options)
         task.system.nature.refuse("for the solved optimum")
-        for seed in self.seeds:
-            choice = experiment.changed(self.output / f"{name}_{seed}", seed=seed)
+        choices = {
+            seed: experiment.changed(self.output / f"{name}_{seed}", seed=seed)
+            for seed in self.seeds
+        }
+        for choice in choices.values():
             if not is_finished(choice):
                 check_run(choice)
                 earlier(choice, Path(choice.output), holds_training(Path(choice.output)))
@@ -65,8 +68,8 @@ class Solved(Long):
         table = tables.table_tables(f"{self.config}: {self.episodes} episodes", heads)
         report: dict[str, Any] = {"config": self.config, "agents": {}}
         table.add_row("optimal", f"{-best.returns.mean():.4f}", f"{best.rate.mean():.4f}", "")
-        for seed in self.seeds:
-            model = trained(experiment, seed, self.output)
+        for seed, choice in choices.items():
+            model = trained(choice)
             agent = self._tested(task, f"model:{model}", f"testing training seed {seed}")
             result = excess(agent.returns, best.returns)
             report["agents"][str(seed)] = result
@@ -85,15 +88,14 @@ class Solved(Long):
             return run_episodes(task, policy, self.episodes, self.seed, bar.update)
 
 
-def trained(experiment: Experiment, seed: int, folder: Path) -> Path:
-    """The final model of a training seed, trained as far as it is not.
+def trained(choice: Experiment) -> Path:
+    """The final model of a training, trained as far as it is not.
 
     Raises:
         ConfigurationError: the folder holds another training.
         KeyboardInterrupt: the training was interrupted.
     """
-    output = folder / f"{experiment.algorithm.name}_{seed}"
-    choice = experiment.changed(output, seed=seed)
+    output = Path(choice.output)
     if not is_finished(choice) and not train(choice, resume=holds_training(output))["finished"]:
         raise KeyboardInterrupt
     return output / "final_model.zip"

@@ -66,7 +66,7 @@ class Watch(Long):
             raise ConfigurationError(
                 f"against = {self.against!r} is not allowed: it is the policy itself"
             )
-        policies = {name: make_policy(name, task, trust=self.trust) for name in names}
+        policies = {name: make_policy(name, task) for name in names}
         frames = watch(task, policies, self.seed, self.steps)
         if self.save is None:
             self._show(frames, " against ".join(names))

@@ -6,12 +6,12 @@ A file may name code where the user trusts it: with ``--trust``, or in :func:`tr
 import contextlib
 import importlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextvars import ContextVar
 from types import ModuleType
 from typing import Any
 
-from fusion_gym.errors import ConfigurationError
+from fusion_gym.validation import ConfigurationError, nested
 
 TRUST: ContextVar[bool] = ContextVar("trust", default=False)
 _ENVIRONMENTS = ("env", "environment", "id", "error")  # whose texts name code by any colon
@@ -34,27 +34,13 @@ def refuse_code(content: Any, source: str) -> None:
     Raises:
         ConfigurationError: an ``error``, an environment or a policy of the form ``module:name``.
     """
-    if not TRUST.get() and (named := next(_code_in(content, ""), None)):
-        raise ConfigurationError(
-            f"{source}: {named[0]} = {named[1]!r} is not allowed: it names code that would run; "
-            "if you trust the file, add --trust (in Python: fusion_gym.importing.trust_files)"
-        )
-
-
-def _code_in(content: Any, key: str) -> Iterator[tuple[str, str]]:
-    """Every text that names code, with its key."""
-    if isinstance(content, Mapping):
-        for name, value in content.items():
-            if ":" in str(name):
-                yield key or "key", str(name)
-            yield from _code_in(value, str(name))
-    elif isinstance(content, (list, tuple)):
-        for value in content:
-            yield from _code_in(value, key)
-    elif isinstance(content, str) and (
-        ":" in content if key in _ENVIRONMENTS else _POLICY.search(content)
-    ):
-        yield key, content
+    for key, part in () if TRUST.get() else nested("file", content):
+        text = part if isinstance(part, str) else ""
+        if ":" in (key + text if key in _ENVIRONMENTS else key) or _POLICY.search(text):
+            raise ConfigurationError(
+                f"{source}: {key} = {part!r} is not allowed: it names code that would run; if you "
+                "trust the file, add --trust (in Python: fusion_gym.importing.trust_files)"
+            )
 
 
 def imported(field: str, text: str, module: str) -> ModuleType:

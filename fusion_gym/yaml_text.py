@@ -1,18 +1,17 @@
 """YAML as it is read here: plain values alone, no key given twice, and limits of size."""
 
-import itertools
 import re
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable
 from typing import Any
 
 import yaml
 
-from fusion_gym.errors import ConfigurationError
+from fusion_gym.errors import ConfigurationError, refusal
 from fusion_gym.importing import refuse_code
-from fusion_gym.validation import CONTROL, DEEPEST, MOST_ENTRIES
+from fusion_gym.validation import CONTROL, LONGEST_YAML, MOST_ENTRIES, nested
 
 _CONTROL = re.compile(rf"(?![\t\n]){CONTROL}")  # texts have lines
-_NUMBERS = {  # without YAML 1.1's sexagesimal 1:30 and octal 010, and with 1e-3, as in YAML 1.2
+_NUMBERS = {  # without the sexagesimal 1:30 and the octal 010 of YAML 1.1, and with 1e-3
     "int": r"[-+]?(0|[1-9][\d_]*|0x[\da-fA-F_]+|0b[01_]+)$",
     "float": r"[-+]?((\d[\d_]*\.[\d_]*|\.\d[\d_]*)([eE][-+]?\d+)?|\d+[eE][-+]?\d+)$"
     r"|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$",
@@ -20,46 +19,22 @@ _NUMBERS = {  # without YAML 1.1's sexagesimal 1:30 and octal 010, and with 1e-3
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML whose keys are given once, and whose depth and size, aliases expanded, are limited."""
+    """YAML with unique keys and the numbers of YAML 1.2."""
 
     yaml_implicit_resolvers = {  # noqa: RUF012
         first: [row for row in rows if row[0].rpartition(":")[2] not in _NUMBERS]
         for first, rows in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
 
-    def __init__(self, text: str) -> None:
-        super().__init__(text)
-        self._depth = 0
-        self._sizes: dict[yaml.Node, int] = {}
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Compose a node.
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Merge what ``<<`` names.
 
         Raises:
-            ConstructorError: too deep, too large, within itself, or control characters.
+            ConstructorError: that is too large.
         """
-        self._depth += 1
-        alias = self.check_event(yaml.AliasEvent)
-        parts: Iterable[yaml.Node] = ()
-        self._require(self._depth <= DEEPEST, f"it is nested more than {DEEPEST} times")
-        node = super().compose_node(parent, index)
-        assert node is not None
-        self._depth -= 1
-        if alias:
-            self._require(node in self._sizes, "an alias stands within its own anchor")
-        else:
-            match node:
-                case yaml.ScalarNode():
-                    self._require(not _CONTROL.search(node.value), "it holds a control character")
-                case yaml.MappingNode():
-                    parts = itertools.chain.from_iterable(node.value)
-                case _:
-                    parts = node.value
-            self._sizes[node] = 1 + sum(self._sizes[part] for part in parts)
-        self._require(
-            self._sizes[node] <= MOST_ENTRIES, f"it has more than {MOST_ENTRIES:,} entries"
-        )
-        return node
+        super().flatten_mapping(node)
+        if len(node.value) > MOST_ENTRIES:
+            raise _problem("it merges too many entries", node)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """A mapping.
@@ -72,15 +47,14 @@ class _Loader(yaml.SafeLoader):
             if key_node.tag == "tag:yaml.org,2002:merge":
                 continue
             key = self.construct_object(key_node, deep=True)
-            repeats = isinstance(key, Hashable) and key in visited
-            self._require(not repeats, f"the key {key!r} is given twice", key_node)
+            if isinstance(key, Hashable) and key in visited:
+                raise _problem(f"the key {key!r} is given twice", key_node)
             visited.add(key)
         return super().construct_mapping(node, deep)
 
-    def _require(self, allowed: bool, problem: str, node: yaml.Node | None = None) -> None:
-        if not allowed:
-            mark = self.get_mark() if node is None else node.start_mark
-            raise yaml.constructor.ConstructorError(None, None, problem, mark)
+
+def _problem(text: str, node: yaml.Node) -> yaml.YAMLError:
+    return yaml.constructor.ConstructorError(None, None, text, node.start_mark)
 
 
 for _kind, _pattern in _NUMBERS.items():
@@ -96,10 +70,15 @@ def parsed(text: str, source: str) -> Any:
         ConfigurationError: it is no YAML, or names code.
     """
     try:
+        if len(text) > LONGEST_YAML:
+            raise ValueError(f"it has more than {LONGEST_YAML:,} characters")
         result = yaml.load(text, _Loader)  # a safe loader
     # PyYAML lets through what its types raise: a date of 31 February, tags without a value.
     except (yaml.YAMLError, ValueError, AttributeError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise ConfigurationError(f"{source} is no YAML: {reason}") from None
+    for key, part in nested(source, result):
+        if isinstance(part, str) and _CONTROL.search(key + part):
+            raise refusal(f"{source}: {key}", part, "text without control characters")
     refuse_code(result, source)
     return result

@@ -31,7 +31,8 @@ def report_errors(interrupted: Callable[[], str] = lambda: "interrupted") -> Ite
     """
     try:
         _write_anything()
-        yield
+        with name_user_code():
+            yield
         flush()
     except ConfigurationError as error:
         sys.exit(f"error: {_joined(error)}")
@@ -47,23 +48,30 @@ def report_errors(interrupted: Callable[[], str] = lambda: "interrupted") -> Ite
         sys.exit(f"error: {place}{_joined(error.strerror or error)}")
     except MemoryError as error:
         sys.exit(f"error: there is not enough memory. {_joined(error)}".rstrip(". "))
+
+
+@contextlib.contextmanager
+def name_user_code() -> Iterator[None]:
+    """Turn an error in a user's code that the library called into one line with its place.
+
+    Raises:
+        ConfigurationError: names file, line and error. Errors of ours pass.
+    """
+    try:
+        yield
+    except (ConfigurationError, BrokenPipeError):
+        raise
     except Exception as error:
-        if (refused := user_error(error)) is None:
+        place, called = "", False
+        for frame, line in traceback.walk_tb(error.__traceback__):
+            name, file = frame.f_globals.get("__name__", ""), frame.f_code.co_filename
+            if name.partition(".")[0] == "fusion_gym":
+                place, called = "", not name.startswith("fusion_gym.agents.")
+            elif called and not file.startswith(_INSTALLED):
+                place = f"{file}, line {line}, in {frame.f_code.co_name}: {type(error).__name__}"
+        if not place:
             raise
-        sys.exit(f"error: {refused}")
-
-
-def user_error(error: Exception) -> ConfigurationError | None:
-    """Return an error in a user's code that the library called, by file and line; none in ours."""
-    place, called = "", False
-    for frame, line in traceback.walk_tb(error.__traceback__):
-        name, file = frame.f_globals.get("__name__", ""), frame.f_code.co_filename
-        if name.partition(".")[0] == "fusion_gym":
-            called = not name.startswith("fusion_gym.agents.")
-            place = ""
-        elif called and not file.startswith(_INSTALLED):
-            place = f"{file}, line {line}, in {frame.f_code.co_name}"
-    return ConfigurationError(f"{place}: {type(error).__name__}: {error}") if place else None
+        raise ConfigurationError(f"{place}: {error}".rstrip(": ")) from None
 
 
 @contextlib.contextmanager

@@ -140,7 +140,8 @@ def missing_classes(
             that name code.
     """
     there = present(suite, setting, results)
-    refuse_code(there, str(path_of(results, setting.name)))
+    rules = [content["vertices"] for content in there.values()]
+    refuse_code(rules, str(path_of(results, setting.name)))
     every = [c for c in classes_of(setting) if not names or c.name in names]
     missing = [c for c in every if c.name not in there]
     for search in envelopes.searches_of(suite, setting, missing):

@@ -176,7 +176,7 @@ def envelope_of(shelf: Shelf, setting: Setting, of: Class) -> dict[str, Any]:
     if of.name not in result:
         path = str(path_of(shelf.results, setting.name))
         raise ConfigurationError(f"results: {path!r} has no class {of.name!r}: tune it first")
-    refuse_code(result[of.name], str(path_of(shelf.results, setting.name)))
+    refuse_code(result[of.name]["vertices"], str(path_of(shelf.results, setting.name)))
     return result[of.name]
 
 

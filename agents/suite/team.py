@@ -67,18 +67,6 @@ class Team:
             except ray.exceptions.RayTaskError as error:
                 raise error.cause from None
 
-    def check(self) -> None:
-        """Look whether the backend is installed, and whether a cluster is at the address.
-
-        Raises:
-            ConfigurationError: as :meth:`gathered`.
-        """
-        if not self.here:
-            self._package()
-        if self.address is not None:
-            with self.gathered():
-                pass
-
     @contextlib.contextmanager
     def gathered(self) -> Iterator[None]:
         """Work goes to the team while this is entered.

@@ -8,10 +8,9 @@ from collections.abc import Callable, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, NamedTuple
 
-from fusion_gym.importing import TRUST, trust_files
 from fusion_gym.validation import ConfigurationError
 
-from ..output.ending import user_error
+from ..output.ending import name_user_code
 from ..output.progress import progress_bar
 from .team import Team
 
@@ -38,7 +37,7 @@ def side_by_side(work: Sequence[Work], team: Team, description: str) -> None:
     total, done = sum(item.weight for item in work), 0.0
     parent = os.getpid() if team.here else None
     with progress_bar(len(work), description, unit="pieces") as bar, team.gathered():
-        weights = team.done(functools.partial(_do, parent, TRUST.get()), work)
+        weights = team.done(functools.partial(_do, parent), work)
         try:
             for place, weight in enumerate(weights, 1):
                 done += weight
@@ -50,17 +49,12 @@ def side_by_side(work: Sequence[Work], team: Team, description: str) -> None:
             ) from None
 
 
-def _do(parent: int | None, trust: bool, work: Work) -> float:
+def _do(parent: int | None, work: Work) -> float:
     """Do a piece of work; returns its weight. A worker of this machine ends with its ``parent``."""
     if parent is not None and os.getpid() != parent:
         end_with(parent)
-    try:
-        with trust_files(trust):
-            work.function(*work.arguments)
-    except Exception as error:
-        if refused := user_error(error):
-            raise refused from None
-        raise
+    with name_user_code():
+        work.function(*work.arguments)
     return work.weight
 
 

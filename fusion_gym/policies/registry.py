@@ -17,7 +17,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import KNOWLEDGE, SignalError
 from fusion_gym.core.task import Task
 from fusion_gym.docstrings import plain_marks, read, table
-from fusion_gym.importing import import_named
+from fusion_gym.importing import TRUST, import_named
 from fusion_gym.policies.base import Policy, owner_of
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError, boolean, choice, keys, refusal
@@ -155,7 +155,7 @@ def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
             that cannot be read or was trained for another observation layout, or a policy that
             looks at signals which the task withholds.
     """
-    context: Context = {"task": task, "trust": boolean("trust", trust)}
+    context: Context = {"task": task, "trust": boolean("trust", trust) or TRUST.get()}
     policy = _make(spec, task.policy_defaults, context)
     if _kind(_asked(spec)[1]) != "agent":  # loading it has checked all that it sees
         _try_out(spec, policy, task)
