@@ -11,6 +11,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from fusion_gym.core.system import SignalError
 from fusion_gym.validation import ConfigurationError
 
 # Where Python and packages are, whose frames are not a user's.
@@ -61,6 +62,8 @@ def name_user_code() -> Iterator[None]:
         yield
     except (ConfigurationError, BrokenPipeError):
         raise
+    except SignalError as error:
+        raise ConfigurationError(str(error)) from None
     except Exception as error:
         place, called = "", False
         for frame, line in traceback.walk_tb(error.__traceback__):
