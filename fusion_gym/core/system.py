@@ -88,7 +88,7 @@ class Signal:
     joint: bool = False
 
     def known_to(self, knower: Knowledge) -> bool:
-        """Whether a policy of this class may read it: a sensor also its row of what is told."""
+        """Return whether a policy of this class may read it; a sensor reads its own row, too."""
         node = self.knowledge == "centre" and self.axes.startswith("(sensors") and not self.joint
         return covers(knower, self.knowledge) or (node and covers(knower, "own"))
 
