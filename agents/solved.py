@@ -25,7 +25,7 @@ from .output.progress import progress_bar, writing
 from .suite.verdict import excess
 from .training.checked import load_checked
 from .training.config import Experiment
-from .training.run import check_run, earlier, holds_training, train
+from .training.run import holds_training, train
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,6 @@ class Solved(Long):
         name, environment = experiment.algorithm.name, experiment.environment
         task = make_task(environment.id, **environment.options)
         task.system.nature.refuse("for the solved optimum")
-        choices = {
-            seed: experiment.changed(self.output / f"{name}_{seed}", seed=seed)
-            for seed in self.seeds
-        }
-        for choice in choices.values():
-            if not is_finished(choice):
-                check_run(choice)
-                earlier(choice, Path(choice.output), holds_training(Path(choice.output)))
         best = self._tested(task, "optimal", "testing the optimum")
         if best.returns.mean() == 0.0:
             raise ConfigurationError(
@@ -68,8 +60,8 @@ class Solved(Long):
         table = tables.table_tables(f"{self.config}: {self.episodes} episodes", heads)
         report: dict[str, Any] = {"config": self.config, "agents": {}}
         table.add_row("optimal", f"{-best.returns.mean():.4f}", f"{best.rate.mean():.4f}", "")
-        for seed, choice in choices.items():
-            model = trained(choice)
+        for seed in self.seeds:
+            model = trained(experiment, seed, self.output)
             agent = self._tested(task, f"model:{model}", f"testing training seed {seed}")
             result = excess(agent.returns, best.returns)
             report["agents"][str(seed)] = result
@@ -88,14 +80,15 @@ class Solved(Long):
             return run_episodes(task, policy, self.episodes, self.seed, bar.update)
 
 
-def trained(choice: Experiment) -> Path:
-    """The final model of a training, trained as far as it is not.
+def trained(experiment: Experiment, seed: int, folder: Path) -> Path:
+    """The final model of a training seed, trained as far as it is not.
 
     Raises:
         ConfigurationError: the folder holds another training.
         KeyboardInterrupt: the training was interrupted.
     """
-    output = Path(choice.output)
+    output = folder / f"{experiment.algorithm.name}_{seed}"
+    choice = experiment.changed(output, seed=seed)
     if not is_finished(choice) and not train(choice, resume=holds_training(output))["finished"]:
         raise KeyboardInterrupt
     return output / "final_model.zip"

@@ -37,10 +37,9 @@ def refuse_code(content: Any, source: str) -> None:
     for key, part in () if TRUST.get() else nested("file", content):
         text = part if isinstance(part, str) else ""
         if ":" in (key + text if key in _ENVIRONMENTS else key) or _POLICY.search(text):
-            raise ConfigurationError(
-                f"{source}: {key} = {part!r} is not allowed: it names code that would run; if you "
-                "trust the file, add --trust (in Python: fusion_gym.importing.trust_files)"
-            )
+            why = "it names code that would run; if you trust the file, add --trust"
+            python = "(in Python: fusion_gym.importing.trust_files)"
+            raise ConfigurationError(f"{source}: {key} = {part!r} is not allowed: {why} {python}")
 
 
 def imported(field: str, text: str, module: str) -> ModuleType:

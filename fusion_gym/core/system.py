@@ -124,14 +124,8 @@ def common_signals(axes: str = "(sensors, m, N)", **meanings: str) -> tuple[Sign
     ``axes`` are those of a measurement; ``meanings`` replace the general ones by name.
     """
     return tuple(
-        Signal(
-            name,
-            known,
-            _COMMON_AXES.get(name, axes),
-            meanings.get(name, meaning),
-            joint=name == "variance_reduction",
-        )
-        for name, known, meaning in _COMMON
+        Signal(n, k, _COMMON_AXES.get(n, axes), meanings.get(n, text), n == "variance_reduction")
+        for n, k, text in _COMMON
     )
 
 
