@@ -15,17 +15,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from fusion_gym.validation import ConfigurationError, choice
+from fusion_gym.validation import choice
 
 from .command_line import SuiteCommand
 from .input.options import Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
+from .output.folders import refuse_earlier
 from .output.progress import writing
 from .output.tables import console
 from .suite.agreement import agreement_table
 from .suite.beside_rules import SHIPPED
 from .suite.classes import names_of, trained_classes
-from .suite.committed import FOLDER, Shelf, complete
+from .suite.committed import FOLDER, Shelf, complete, missing_classes
 from .suite.config import Setting, Suite, load_suite
 from .suite.envelopes import envelope_task, run_test
 from .suite.jobs import Folders, job_finished, jobs, rules_of
@@ -81,13 +82,21 @@ class Benchmark(SuiteCommand):
         classes = self.classes or names_of(suite)
         for setting in settings:
             envelope_task(setting)
+        files = [f"{item.name}/*.json" for item in settings]
+        files += [f"{FOLDER}/{item.name}.json" for item in settings]
+        there = [path for name in files for path in folders.results.glob(name)]
+        refuse_earlier(folders.results, len(there), self.resume)
+        shelf = self._shelf(suite, settings, folders)
+        compared = [[of.name for of in trained_classes(suite, setting)] for setting in settings]
+        for setting, names in zip(settings, compared, strict=True):
+            missing_classes(shelf.suite, setting, names, shelf.results)
+        if not team.here:
+            with team.gathered():  # nobody is there, or a package is absent
+                pass
         with folders.lock():
-            self._check_resumed(folders, settings)
             writing(("finished pieces", folders.results), ("trainings and episodes", folders.work))
-            shelf = self._shelf(suite, settings, folders)
-            for setting in settings:
-                compared = [of.name for of in trained_classes(suite, setting)]
-                complete(shelf.suite, [setting], compared, shelf.results, folders.work, team)
+            for setting, names in zip(settings, compared, strict=True):
+                complete(shelf.suite, [setting], names, shelf.results, folders.work, team)
             rules = [
                 Work(4.0, run_test, (test, folders.work))
                 for setting in settings
@@ -115,16 +124,6 @@ class Benchmark(SuiteCommand):
                 console().print(beside)
         report = f"fusion-gym report --results {folders.results}"
         print(f"results in {folders.results}: {report}")
-
-    def _check_resumed(self, folders: Folders, values: Sequence[Setting]) -> None:
-        """Raises ConfigurationError where there are results and no --resume."""
-        names = [f"{s.name}/*.json" for s in values] + [f"{FOLDER}/{s.name}.json" for s in values]
-        there = [path for name in names for path in folders.results.glob(name)]
-        if there and not self.resume:
-            raise ConfigurationError(
-                f"results = {str(folders.results)!r} holds {len(there)} finished pieces of "
-                "work: go on with --resume, or give another --results and --work"
-            )
 
     def _shelf(self, suite: Suite, settings: Sequence[Setting], folders: Folders) -> Shelf:
         """The quick benchmark takes the envelopes that are shipped, if they are of this config."""

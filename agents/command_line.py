@@ -16,7 +16,8 @@ from typing import Annotated, Any, ClassVar, TypeVar, get_args
 import tyro
 
 from fusion_gym.docstrings import plain_marks
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.importing import trust_files
+from fusion_gym.validation import CONTROL, ConfigurationError
 
 from .input.options import OutputFolder, Whole, check_options
 from .output.ending import flush, report_errors
@@ -48,8 +49,11 @@ class Command(ABC):
             sys.path.append(os.getcwd())
         with report_errors(lambda: command.interrupted() if command else "interrupted"):
             command = read_command(cls)
-            check_options(command)
-            with quietly(isinstance(command, Long) and command.quiet):
+            with (
+                trust_files(getattr(command, "trust", False)),
+                quietly(isinstance(command, Long) and command.quiet),
+            ):
+                check_options(command)
                 command.run()
 
     @abstractmethod
@@ -72,6 +76,8 @@ class Long(Command):
 
     quiet: bool = field(default=False, kw_only=True)
     """Show neither progress nor remarks: results and errors alone."""
+    trust: bool = field(default=False, kw_only=True)
+    """Run code of files: what they name as module:name, and what model:PATH holds besides data."""
 
     keeps: ClassVar[bool] = True  # what is finished, before all of it is
 
@@ -171,8 +177,9 @@ def _check_words() -> None:
         option = word.strip("-").partition("=")[0] if named else option
         if not word or (named and word.endswith("=")):
             raise ConfigurationError(f"{option} = '' is not allowed: it must not be empty")
-        if any("\udc80" <= letter <= "\udcff" for letter in word):  # bytes that were no text
-            raise ConfigurationError(f"{option} = {word!r} is not allowed: it must be UTF-8")
+        if re.search(CONTROL, word):  # bytes that were no text among them
+            allowed = "UTF-8 without control characters"
+            raise ConfigurationError(f"{option} = {word!r} is not allowed: it must be {allowed}")
 
 
 def _essence(message: str) -> str:

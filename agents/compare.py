@@ -47,8 +47,6 @@ class Compare(Long):
     """Seed of the first episode."""
     prices: Annotated[int | None, Whole(2, 1000)] = None
     """Ask an agent that sees the price at as many, over the config's price_range."""
-    trust: bool = False
-    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
 
     keeps = False
 
@@ -61,12 +59,10 @@ class Compare(Long):
         task = make_task(world.id, **world.options)
         requested = self.policies_of(task)
         for policy in requested:
-            make_policy(policy, task, trust=self.trust)
+            make_policy(policy, task)
         writing(("evaluation, comparison and figure", self.output))
-        baselines = run_all(
-            task, sweep.policies, self.episodes, self.seed, "baselines", trust=self.trust
-        )
-        compare(world.id, task, sweep, baselines, requested, self.seed, self.output, self.trust)
+        baselines = run_all(task, sweep.policies, self.episodes, self.seed, "baselines")
+        compare(world.id, task, sweep, baselines, requested, self.seed, self.output)
 
     def policies_of(self, task: Task) -> list[str]:
         """The policy, or the policy at each of the prices.

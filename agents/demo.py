@@ -40,7 +40,7 @@ from .suite.trainings import train_beside
 from .suite.workers import side_by_side
 from .training.checked import load_checked
 from .training.config import Experiment
-from .training.run import holds_training
+from .training.run import earlier, holds_training
 
 SETTING = "tobit_oscillator"
 TEAM = Team(2)
@@ -103,6 +103,10 @@ class Demo(Long):
             )
             for learner in LEARNERS
         }
+        if self.fresh:
+            remove(folders.values(), only_check=True)
+        for item in () if self.fresh else experiments.values():
+            earlier(item, Path(item.output), holds_training(Path(item.output)))
         with ended_like_by_ctrl_c(), alone_in(self.output, "output"):
             if self.fresh:
                 remove(folders.values())
@@ -127,7 +131,7 @@ class Demo(Long):
         return f"interrupted; go on with: {self.again(without=('--fresh',))}"
 
 
-def remove(folders: Iterable[Path]) -> None:
+def remove(folders: Iterable[Path], only_check: bool = False) -> None:
     """Remove what an earlier demo left in these folders, and nothing else.
 
     Raises:
@@ -140,7 +144,7 @@ def remove(folders: Iterable[Path]) -> None:
                 f"fresh = True is not allowed: {str(folder)!r} holds no results of a demo, and is "
                 "kept"
             )
-    for folder in there:
+    for folder in () if only_check else there:
         shutil.rmtree(folder)
 
 

@@ -11,14 +11,15 @@ interrupted run goes on where it was.
 
 from dataclasses import dataclass
 
-from fusion_gym.validation import ConfigurationError, choice
+from fusion_gym.validation import choice
 
 from .command_line import SuiteCommand
 from .input.options import writable_folder
 from .output.files import write_text
+from .output.folders import refuse_earlier
 from .output.progress import writing
 from .suite.classes import classes_of
-from .suite.committed import FOLDER, complete, path_of, present
+from .suite.committed import FOLDER, complete, missing_classes, path_of, present
 from .suite.config import load_suite
 from .suite.envelope_table import envelope_text
 from .suite.jobs import Folders
@@ -40,18 +41,16 @@ class Envelope(SuiteCommand):
         known = dict.fromkeys(c.name for setting in settings for c in classes_of(setting))
         for name in self.classes:
             choice("classes", name, known)
+        there = [
+            name
+            for setting in settings
+            for name in present(suite, setting, folders.results)
+            if not self.classes or name in self.classes
+        ]
+        refuse_earlier(folders.results, len(there), self.resume)
+        for setting in settings:
+            missing_classes(suite, setting, self.classes, folders.results)
         with folders.lock():
-            there = [
-                name
-                for setting in settings
-                for name in present(suite, setting, folders.results)
-                if not self.classes or name in self.classes
-            ]
-            if there and not self.resume:
-                raise ConfigurationError(
-                    f"results = {str(folders.results)!r} holds {len(there)} of these envelopes: go "
-                    "on with --resume, or give another --results"
-                )
             writing(
                 ("finished envelopes", folders.results / FOLDER),
                 ("what was tuned and tested", folders.work),

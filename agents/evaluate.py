@@ -51,8 +51,6 @@ class Evaluate(Long):
     """Write the results to this file."""
     resume: bool = False
     """Keep what the JSON already holds."""
-    trust: bool = False
-    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
 
     def run(self) -> None:
         """Evaluate and print the tables."""
@@ -88,7 +86,7 @@ def evaluate(command: Evaluate) -> dict[str, Any]:
             f"resume = True is not allowed with reference = {command.reference!r}: paired "
             "differences need the episodes of every policy, and the JSON holds only their means"
         )
-    policies = {name: make_policy(name, task, trust=command.trust) for name in names}
+    policies = {name: make_policy(name, task) for name in names}
     report: dict[str, Any] = {
         "env": env_id,
         "episodes": command.episodes,

@@ -41,7 +41,7 @@ class Export(Command):
     options: SetOptions = ()
     """Options of gym.make for the environment; they go before all others."""
     trust: bool = False
-    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
+    """Run code of files: what they name as module:name, and what model:PATH holds besides data."""
 
     def run(self) -> None:
         """Write the file, check it and say what it is."""
@@ -68,7 +68,7 @@ def export(command: Export) -> list[str]:
 
     require_onnx("onnx")
     task = make_task(env_id, **options)
-    agent = make_policy(f"{kind}:{rest}", task, trust=command.trust)
+    agent = make_policy(f"{kind}:{rest}", task)
     try:
         with replacing(command.onnx) as unfinished:
             model = export_onnx(agent, task, unfinished, env_id, command.model)

@@ -48,8 +48,6 @@ class Mismatch(Long):
     """Seed of the first episode."""
     json: Annotated[Path | None, OutputFile()] = None
     """Write the results to this file."""
-    trust: bool = False
-    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
 
     keeps = False
 
@@ -61,7 +59,7 @@ class Mismatch(Long):
             filter_name = experiment.training.error_filter
         system = reference_system(env_id, options, filter_name)
         names = list(dict.fromkeys(chain(*self.policies))) or usual_policies(task)
-        policies = {name: make_policy(name, task, trust=self.trust) for name in names}
+        policies = {name: make_policy(name, task) for name in names}
         if self.json is not None:
             writing(("the results", self.json))
         total = len(policies) * self.episodes * task.horizon

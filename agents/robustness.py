@@ -16,12 +16,10 @@ from typing import Annotated
 
 import tyro
 
-from fusion_gym.validation import ConfigurationError
-
 from .command_line import Long
 from .input.options import Episodes, InputFolder, OutputFolder, Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
-from .output.folders import alone_in
+from .output.folders import alone_in, refuse_earlier
 from .output.progress import writing
 from .suite import robust_pieces
 from .suite.classes import trained_classes
@@ -82,17 +80,16 @@ class Robustness(Long):
         trials = [self._trial(config, item, folders) for item in select_settings(config, self.envs)]
         place = self.results / FOLDER
         writable_folder("results", place)
+        there = [
+            path
+            for trial in trials
+            for path in place.glob(f"{trial.setting.name}/{trial.of.name}/*/*.json")
+        ]
+        refuse_earlier(self.results, len(there), self.resume)
+        for trial in trials:
+            for piece in trial.pieces(("rules", "agents")):
+                folders.finished(piece)
         with alone_in(place, "results"), alone_in(self.work, "work"):
-            there = [
-                path
-                for trial in trials
-                for path in place.glob(f"{trial.setting.name}/{trial.of.name}/*/*.json")
-            ]
-            if there and not self.resume:
-                raise ConfigurationError(
-                    f"results = {str(self.results)!r} holds {len(there)} finished pieces of work: "
-                    "go on with --resume, or give another --results and --work"
-                )
             writing(("finished pieces", place), ("trainings and episodes", self.work))
             self._work(trials, ("rules", "agents"), folders)
             trainings = [training for trial in trials for training in trial.trainings]

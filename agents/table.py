@@ -36,16 +36,12 @@ class Table(Long):
     """Seed of the first episode."""
     markdown: bool = False
     """Print the table as the documentation holds it."""
-    trust: bool = False
-    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
 
     keeps = False
 
     def run(self) -> None:
         """Run every row and print the table."""
-        rows = _rows_of(
-            load_checked(SweepSettings, self.config), self.episodes, self.seed, trust=self.trust
-        )
+        rows = _rows_of(load_checked(SweepSettings, self.config), self.episodes, self.seed)
         if self.markdown:
             lines = [COLUMNS, ("---",) * len(COLUMNS), *rows]
             print("\n".join("| " + " | ".join(line) + " |" for line in lines))
@@ -54,10 +50,8 @@ class Table(Long):
         tables.console().print(tables.table_tables(title, COLUMNS, rows))
 
 
-def _rows_of(
-    comparison: SweepSettings, episodes: int, seed: int, *, trust: bool = False
-) -> list[tuple[str, ...]]:
-    """One row of text for each of the config's rows; ``trust`` as in ``make_policy``.
+def _rows_of(comparison: SweepSettings, episodes: int, seed: int) -> list[tuple[str, ...]]:
+    """One row of text for each of the config's rows.
 
     Raises:
         ConfigurationError: a row that is not allowed, before the first episode.
@@ -65,7 +59,7 @@ def _rows_of(
     result = []
     for row in comparison.rows:
         task = make_task(row.environment or comparison.environment, **row.options)
-        result.append((row.label, task, make_policy(row.policy, task, trust=trust)))
+        result.append((row.label, task, make_policy(row.policy, task)))
     total = sum(episodes * task.horizon for _, task, _ in result)
     results = []
     with progress_bar(total, "rows") as bar:

@@ -138,6 +138,8 @@ def tune(
     check_run(experiment)
     try:
         shared = None if storage is None else shared_study(experiment, storage)
+        if shared is None and ((folder / "study.db").exists() or any(folder.glob("trial_*"))):
+            open_study(experiment, folder)  # refuses before anything is made
         with alone_in(folder, "output"):
             writing(("study, trials and best.yaml", folder))
             if shared is not None:

@@ -50,8 +50,6 @@ class Watch(Long):
     """Steps, instead of the whole episode."""
     fps: Annotated[int, Whole(1, 50)] = 10
     """Steps a second."""
-    trust: bool = False
-    """Load model:PATH with Stable-Baselines3's loader, which runs any code that the file holds."""
 
     def run(self) -> None:
         """Show or save the episode.
@@ -68,7 +66,7 @@ class Watch(Long):
             raise ConfigurationError(
                 f"against = {self.against!r} is not allowed: it is the policy itself"
             )
-        policies = {name: make_policy(name, task, trust=self.trust) for name in names}
+        policies = {name: make_policy(name, task) for name in names}
         frames = watch(task, policies, self.seed, self.steps)
         if self.save is None:
             self._show(frames, " against ".join(names))

@@ -34,6 +34,7 @@ SENSORS, STATES = (3, 6, 12, 25, 50, 100, 200), (2, 5, 10, 20)
 RUNS, HORIZON, TURNS = 16, 1000, 3
 LARGE = {"sensors": 25, "states": 5}  # from which on growth is fitted: below, a step has a floor
 MIDDLE = {"sensors": 50, "states": 10}  # what the figure holds fixed
+plt.rcParams["text.parse_math"] = True  # of the numbers on logarithmic axes
 # What is timed, and how it is drawn. A part is the environment's own, or a policy's decision.
 RULES = {
     "information gain": "information_gain:threshold=0.01",

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import itertools
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -41,16 +42,24 @@ def refusal(field: str, value: Any, allowed: str) -> ConfigurationError:
 
 def display(value: Any) -> str:
     """A value as Python writes it, arrays as lists, on one line, and cut where it is long."""
-    text = " ".join(repr(_plain(value)).split())
+    try:
+        text = " ".join(repr(_plain(value, itertools.count())).split())
+    except Exception:  # whatever a class of the user's raises
+        text = f"<{type(value).__name__}>"
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
 
-def _plain(value: Any) -> Any:
-    """Arrays as lists, also those within lists; of long ones as much as is shown."""
+def _plain(value: Any, shown: Iterator[int]) -> Any:
+    """Arrays as lists, also those within lists; of long ones as much as is ``shown``."""
+    if next(shown) > _SHOWN:
+        return ...
     if isinstance(value, np.ndarray):
         return (value[:_SHOWN] if value.ndim else value).tolist()
     if type(value) in (list, tuple):
-        return type(value)(_plain(entry) for entry in value[:_SHOWN])
+        return type(value)(_plain(entry, shown) for entry in value[:_SHOWN])
+    if type(value) is dict:
+        entries = itertools.islice(value.items(), _SHOWN)
+        return {key: _plain(entry, shown) for key, entry in entries}
     return value
 
 

@@ -1,10 +1,45 @@
-"""What a user names as ``module:name``: imported, or one error that says what is wrong."""
+"""What a user names as ``module:name``: imported, or one error that says what is wrong.
 
+A file may name code where the user trusts it: with ``--trust``, or in :func:`trust_files`.
+"""
+
+import contextlib
 import importlib
+import re
+from collections.abc import Iterator
+from contextvars import ContextVar
 from types import ModuleType
 from typing import Any
 
-from fusion_gym.errors import ConfigurationError
+from fusion_gym.validation import ConfigurationError, nested
+
+TRUST: ContextVar[bool] = ContextVar("trust", default=False)
+_ENVIRONMENTS = ("env", "environment", "id", "error")  # whose texts name code by any colon
+_POLICY = re.compile(r"(?:^|base=)\s*(?!(?:model|zoo):)[^\W\d][\w.]*:\s*[^\W\d]\w*\s*(?::|$)")
+
+
+@contextlib.contextmanager
+def trust_files(trust: bool = True) -> Iterator[None]:
+    """Allow files to name code of the user's, as ``--trust`` does, while this is entered."""
+    token = TRUST.set(trust or TRUST.get())
+    try:
+        yield
+    finally:
+        TRUST.reset(token)
+
+
+def refuse_code(content: Any, source: str) -> None:
+    """Refuse a file's content that names code to import, unless files are trusted.
+
+    Raises:
+        ConfigurationError: an ``error``, an environment or a policy of the form ``module:name``.
+    """
+    for key, part in () if TRUST.get() else nested("file", content):
+        text = part if isinstance(part, str) else ""
+        if ":" in (key + text if key in _ENVIRONMENTS else key) or _POLICY.search(text):
+            why = "it names code that would run; if you trust the file, add --trust"
+            python = "(in Python: fusion_gym.importing.trust_files)"
+            raise ConfigurationError(f"{source}: {key} = {part!r} is not allowed: {why} {python}")
 
 
 def imported(field: str, text: str, module: str) -> ModuleType:

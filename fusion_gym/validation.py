@@ -4,7 +4,9 @@ Every check returns the value in the form the library works with (float64 arrays
 and raises :class:`ConfigurationError` otherwise.
 """
 
-from collections.abc import Iterable
+import copy
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,11 @@ SMALLEST, LARGEST = 1e-15, 1e15
 LONGEST = 100  # entries of an axis of any length; matrices are multiplied entry by entry
 MOST_SENSORS = 1000  # the network serves them in a loop
 MOST_RUNS = 1_000_000  # each has a generator and a block of noise
+MOST_STEPS = 1000  # ahead, of a policy that plans
+MOST_PERIOD = 10**9  # of a policy that requests by the clock
+DEEPEST, MOST_ENTRIES = 32, 100_000  # of nested values
+LONGEST_TEXT, LONGEST_YAML = 100_000_000, 1_000_000  # characters of a file
+CONTROL = r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]"  # in no name, path or word
 LONGEST_HORIZON = 50_000  # scales and tables are worked out step by step
 
 
@@ -95,16 +102,9 @@ def number(
     Raises:
         ConfigurationError: not a number, not finite, or outside the limits.
     """
-    limits = [
-        text
-        for limit, text in (
-            (above, f"> {above}"),
-            (at_least, f">= {at_least}"),
-            (at_most, f"<= {at_most}"),
-        )
-        if limit is not None
-    ]
-    allowed = "a finite number" + (" " + " and ".join(limits) if limits else "")
+    limits = {">": above, ">=": at_least, "<=": at_most}
+    listed = " and ".join(f"{sign} {limit}" for sign, limit in limits.items() if limit is not None)
+    allowed = f"a finite number {listed}".rstrip()
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise refusal(field, value, allowed)
     try:
@@ -138,6 +138,61 @@ def integer(field: str, value: Any, *, at_least: int, at_most: int | None = None
     if value < at_least or (at_most is not None and value > at_most):
         raise refusal(field, value, allowed)
     return int(value)
+
+
+def nested(field: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield a value and all that lists and mappings within it hold, each with the key above it.
+
+    Raises:
+        ConfigurationError: too deep, as what holds itself, or too large.
+    """
+    left, count = [(field, value, 0)], 0
+    while left:
+        key, part, depth = left.pop()
+        count += 1
+        if depth > DEEPEST or count > MOST_ENTRIES:
+            allowed = f"nested at most {DEEPEST} times, with at most {MOST_ENTRIES:,} entries"
+            raise refusal(field, value, allowed)
+        yield key, part
+        if isinstance(part, Mapping):
+            left += [(str(name), entry, depth + 1) for name, entry in part.items()]
+        elif isinstance(part, (list, tuple, set, frozenset)):
+            left += [(key, entry, depth + 1) for entry in part]
+
+
+def limit_options(value: Mapping[str, Any]) -> None:
+    """Check that options are neither deep nor large, and can be copied.
+
+    Raises:
+        ConfigurationError: one is not; names it.
+    """
+    for name, entry in value.items():
+        for _ in nested(name, entry):
+            pass
+        try:
+            copy.deepcopy(entry)
+        except Exception:
+            raise refusal(name, entry, "a value that can be copied") from None
+
+
+def read_text(field: str, path: Path, name: str | None = None) -> str:
+    """Return a file's text; ``name`` is what the user calls it, if that is not its path.
+
+    Raises:
+        ConfigurationError: it cannot be read, or is no text in UTF-8.
+    """
+    label = str(path) if name is None else name
+    try:
+        with path.open(encoding="utf-8") as file:
+            text = file.read(LONGEST_TEXT + 1)
+        if len(text) > LONGEST_TEXT:
+            raise ValueError(f"it has more than {LONGEST_TEXT:,} characters")
+        return text
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(f"{field} = {label!r} is no text in UTF-8: {error}") from None
+    except (OSError, ValueError) as error:  # a ValueError of a path that no system knows
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigurationError(f"{field} = {label!r} cannot be read: {reason}") from None
 
 
 def boolean(field: str, value: Any) -> bool:
@@ -175,6 +230,17 @@ def keys(kind: str, value: Iterable[str], known: Iterable[str]) -> None:
     for key in value:
         if key not in names:
             raise ConfigurationError(f"unknown {kind} {display(key)}: {_known(key, names)}")
+
+
+def reset_options(value: Any, known: Iterable[str]) -> None:
+    """The options of a reset are a mapping, or None, and every key is known.
+
+    Raises:
+        ConfigurationError: anything else.
+    """
+    if value is not None and not isinstance(value, Mapping):
+        raise refusal("options", value, "a dictionary of reset options, or None")
+    keys("reset option", value or {}, known)
 
 
 def arguments(owner: str, value: Iterable[str], known: Iterable[str]) -> None:

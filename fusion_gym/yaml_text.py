@@ -1,4 +1,4 @@
-"""YAML as it is read here: plain values alone, and no key given twice."""
+"""YAML as it is read here: plain values alone, no key given twice, and limits of size."""
 
 import re
 from collections.abc import Hashable
@@ -6,11 +6,35 @@ from typing import Any
 
 import yaml
 
-from fusion_gym.errors import ConfigurationError
+from fusion_gym.errors import ConfigurationError, refusal
+from fusion_gym.importing import refuse_code
+from fusion_gym.validation import CONTROL, LONGEST_YAML, MOST_ENTRIES, nested
+
+_CONTROL = re.compile(rf"(?![\t\n]){CONTROL}")  # texts have lines
+_NUMBERS = {  # without the sexagesimal 1:30 and the octal 010 of YAML 1.1, and with 1e-3
+    "int": r"[-+]?(0|[1-9][\d_]*|0x[\da-fA-F_]+|0b[01_]+)$",
+    "float": r"[-+]?((\d[\d_]*\.[\d_]*|\.\d[\d_]*)([eE][-+]?\d+)?|\d+[eE][-+]?\d+)$"
+    r"|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$",
+}
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML whose keys are given once, and whose ``1e-3`` is a number, as in YAML 1.2."""
+    """YAML with unique keys and the numbers of YAML 1.2."""
+
+    yaml_implicit_resolvers = {  # noqa: RUF012
+        first: [row for row in rows if row[0].rpartition(":")[2] not in _NUMBERS]
+        for first, rows in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Merge what ``<<`` names.
+
+        Raises:
+            ConstructorError: that is too large.
+        """
+        super().flatten_mapping(node)
+        if len(node.value) > MOST_ENTRIES:
+            raise _problem("it merges too many entries", node)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """A mapping.
@@ -24,27 +48,37 @@ class _Loader(yaml.SafeLoader):
                 continue
             key = self.construct_object(key_node, deep=True)
             if isinstance(key, Hashable) and key in visited:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} is given twice", key_node.start_mark
-                )
+                raise _problem(f"the key {key!r} is given twice", key_node)
             visited.add(key)
         return super().construct_mapping(node, deep)
 
 
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), "-+.0123456789"
-)
+def _problem(text: str, node: yaml.Node) -> yaml.YAMLError:
+    return yaml.constructor.ConstructorError(None, None, text, node.start_mark)
+
+
+for _kind, _pattern in _NUMBERS.items():
+    _Loader.add_implicit_resolver(
+        f"tag:yaml.org,2002:{_kind}", re.compile(_pattern), list("-+.0123456789")
+    )
 
 
 def parsed(text: str, source: str) -> Any:
     """What a text in YAML holds; ``source`` says in an error where it is from.
 
     Raises:
-        ConfigurationError: it is no YAML.
+        ConfigurationError: it is no YAML, or names code.
     """
     try:
-        return yaml.load(text, _Loader)  # a safe loader
+        if len(text) > LONGEST_YAML:
+            raise ValueError(f"it has more than {LONGEST_YAML:,} characters")
+        result = yaml.load(text, _Loader)  # a safe loader
     # PyYAML lets through what its types raise: a date of 31 February, tags without a value.
     except (yaml.YAMLError, ValueError, AttributeError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise ConfigurationError(f"{source} is no YAML: {reason}") from None
+    for key, part in nested(source, result):
+        if isinstance(part, str) and _CONTROL.search(key + part):
+            raise refusal(f"{source}: {key}", part, "text without control characters")
+    refuse_code(result, source)
+    return result

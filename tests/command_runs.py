@@ -82,7 +82,8 @@ SAID = {
     "policies": {"policy", "model", "zoo"},
     "policy": {"policy", "model", "zoo"},
     "against": {"policy", "model", "zoo"},
-    "set": {"option", "horizon", "cost_weight", "token_rate", "information", "access"},
+    "set": {"option", "system", "error", "horizon", "cost_weight", "token_rate", "information"}
+    | {"access"},
     "env": {"environment"},
     "seeds": {"seed"},
     "model": {"the command line"},

@@ -70,12 +70,15 @@ POLICIES = [
     "model:", "model:absent.zip", "model:text", "model:folder", "model:latin", "zoo:", "zoo:nobody",
     "zoo:remote_estimation_sensors,price=-1", "innovation_threshold:threshold={[]:1}",
     "innovation_threshold:threshold=" + "(" * 300, "whittle:price=-1", ":", "=",
-    "lookahead:steps=0",
+    "lookahead:steps=0", "value_of_information:steps=1000000000", "periodic:period=" + "9" * 30,
+    "rollout:samples=1000000000,base=never", "lookahead:steps=1000000000", "os:abort",
+    "periodic_optimum:period=1000000000,packets=500000000", "always\0", "nothing\x1b[0m",
 ]  # fmt: skip
 SETTINGS = [
     "horizon", "=", "=3", "horizn=3", "horizon=0", "horizon=-1", "horizon=nan", "horizon=x",
     "horizon=2.5", "horizon=None", "horizon={[]:1}", "horizon=" + "(" * 300, "cost_weight=nan",
     "token_rate=-1", "information=nobody", "access=1", "render_mode=human",
+    "self=1", "env=3", "system=code.yaml", "system=itself.yaml", "horizon=1\n", "error=os:nothing",
 ]  # fmt: skip
 WHOLE = ["-1", "0", "nan", "1.5", "many", "9" * 30]
 REAL = ["-1", "0", "2", "nan", "inf", "much"]

@@ -62,6 +62,19 @@ BROKEN: dict[str, bytes] = {
     "tag": b"!!python/object:os.system x",
     "stamp": b"output: !!timestamp x",
     "digits": b"output: " + b"9" * 5000,
+    "itself": b"output: &a [*a]",
+    "bomb": b"a0: &a0 [1]\n"
+    + b"".join(
+        b"a%d: &a%d [%s]\n" % (n, n, b",".join([b"*a%d" % (n - 1)] * 9)) for n in range(1, 12)
+    ),
+    "merges": b"a0: &a0 {b: 1}\n"
+    + b"".join(
+        b"a%d: &a%d {<<: [%s]}\n" % (n, n, b",".join([b"*a%d" % (n - 1)] * 9)) for n in range(1, 12)
+    ),
+    "code": b"environment: {id: 'os:x', options: {error: 'os:abort'}}\npolicy: 'os:abort'",
+    "sixty": b"training: {num_envs: 1:30}",
+    "escape": b'output: "made\\0\\e[0m"',
+    "twice": b"output: made\noutput: other",
     "other": b'{"something": {"else": 1}}',
 }
 

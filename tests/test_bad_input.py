@@ -152,6 +152,10 @@ def test_number_of_environments(num_envs: Any) -> None:
         (lambda: make_vector(max_episode_steps=0), ("max_episode_steps = 0",)),
         (lambda: make_sb3_vec_env(ENV_ID, 2, stagger=1), ("stagger = 1", "True or False")),
         (lambda: gymnasium.make(ENV_ID).reset(options={"phase": 1}), ("'phase'",)),
+        (lambda: make_vector().reset(options=["reset_mask"]), ("options = ['reset_mask']",)),
+        (lambda: make_vector().reset(seed=[1, "a", 2]), ("seed = [1, 'a', 2]", "whole numbers")),
+        (lambda: gymnasium.make(ENV_ID, self=1), ("unexpected keyword argument 'self'",)),
+        (lambda: make_task(3), ("env = 3", "id")),  # type: ignore[arg-type]
         (
             lambda: make_vector().reset(options={"reset_masks": 1}),
             ("'reset_masks'", "did you mean 'reset_mask'"),

@@ -249,9 +249,13 @@ def test_commands_train_and_evaluate_in_a_variant(own: Path) -> None:
         output: trained
         """
     )
-    command(own, "train", "--config", "training.yaml")
+    refused = call("train", ["--config", "training.yaml"])
+    assert "names code" in refused.err
+    assert "--trust" in refused.err
+    command(own, "train", "--config", "training.yaml", "--trust")
     policies = ["--policies", "always", "model:trained/best_model.zip", "--episodes", "8"]
-    command(own, "evaluate", "--config", "trained/config.yaml", *policies, "--json", "variant.json")
+    given = ["--config", "trained/config.yaml", "--trust", *policies]
+    command(own, "evaluate", *given, "--json", "variant.json")
     base = ["filter=tobit", "token_rate=2", "max_episode_steps=7", "memory=true"]
     ended = call("evaluate", ["--env", TOBIT, "--set", *base, *policies, "--json", "base.json"])
     assert ended.status == 0, ended.err

@@ -215,6 +215,16 @@ LIARS: dict[str, tuple[Liar, str]] = {
     "knows_losses": (Liar("scheduler_memory", lambda s: dug_up(s, "lost")), HIDDEN),
 }
 
+# Those that a signal of another class betrays at once.
+REFUSED = {
+    "tells_time": "age",
+    "sees_measurements": "innovation",
+    "sees_the_centre": "prior_mean",
+    "keeps_what_it_measured": "own_value",
+    "keeps_what_all_measured": "transmission_value",
+    "remembers_with_all": "transmission_value",
+}
+
 
 @pytest.mark.usefixtures("own_table")
 @pytest.mark.parametrize("name", LIARS)
@@ -224,6 +234,10 @@ def test_a_policy_that_lies_is_caught(name: str) -> None:
     task = task_of("remote, losses" if name == "knows_losses" else "tobit")
     if liar.remember is not None:
         task = task_of("tobit, memory")
-    requests = what_matters(make_policy(name, task), task)
-    assert what in requests
     assert what not in may_matter(liar.knowledge)
+    if name in REFUSED:
+        with pytest.raises(ConfigurationError, match=rf"Liar declares.*{liar.knowledge}") as caught:
+            make_policy(name, task)
+        assert f"{REFUSED[name]!r} belongs to the class" in str(caught.value)
+    else:
+        assert what in what_matters(make_policy(name, task), task)

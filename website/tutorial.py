@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 from fusion_gym.agents.output import palette  # the name by which the tutorials import it
 from fusion_gym.agents.output.palette import plt
 
-plt.rcParams.update(palette.LARGE | {"svg.fonttype": "path", "figure.constrained_layout.use": True})
+STYLE = {"svg.fonttype": "path", "figure.constrained_layout.use": True, "text.parse_math": True}
+plt.rcParams.update(palette.LARGE | STYLE)
 
 
 def figure_html(figure: Figure) -> str:

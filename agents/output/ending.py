@@ -6,17 +6,24 @@ import io
 import os
 import signal
 import sys
+import sysconfig
+import traceback
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from fusion_gym.core.system import SignalError
 from fusion_gym.validation import ConfigurationError
+
+# Where Python and packages are, whose frames are not a user's.
+_INSTALLED = ("<", *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))
 
 
 @contextlib.contextmanager
 def report_errors(interrupted: Callable[[], str] = lambda: "interrupted") -> Iterator[None]:
     """Let what a user or the machine did wrong end the program with one line.
 
-    Anything else is an error of the program's own, and keeps its traceback.
+    An error in a user's code ends with its file and line. Anything else is an error of the
+    program's own, and keeps its traceback.
 
     Raises:
         SystemExit: a setting that is not allowed, a file or the memory that the system refuses
@@ -25,7 +32,8 @@ def report_errors(interrupted: Callable[[], str] = lambda: "interrupted") -> Ite
     """
     try:
         _write_anything()
-        yield
+        with name_user_code():
+            yield
         flush()
     except ConfigurationError as error:
         sys.exit(f"error: {_joined(error)}")
@@ -41,6 +49,32 @@ def report_errors(interrupted: Callable[[], str] = lambda: "interrupted") -> Ite
         sys.exit(f"error: {place}{_joined(error.strerror or error)}")
     except MemoryError as error:
         sys.exit(f"error: there is not enough memory. {_joined(error)}".rstrip(". "))
+
+
+@contextlib.contextmanager
+def name_user_code() -> Iterator[None]:
+    """Turn an error in a user's code that the library called into one line with its place.
+
+    Raises:
+        ConfigurationError: names file, line and error. Errors of ours pass.
+    """
+    try:
+        yield
+    except (ConfigurationError, BrokenPipeError):
+        raise
+    except SignalError as error:
+        raise ConfigurationError(str(error)) from None
+    except Exception as error:
+        place, called = "", False
+        for frame, line in traceback.walk_tb(error.__traceback__):
+            name, file = frame.f_globals.get("__name__", ""), frame.f_code.co_filename
+            if name.partition(".")[0] == "fusion_gym":
+                place, called = "", not name.startswith("fusion_gym.agents.")
+            elif called and not file.startswith(_INSTALLED):
+                place = f"{file}, line {line}, in {frame.f_code.co_name}: {type(error).__name__}"
+        if not place:
+            raise
+        raise ConfigurationError(f"{place}: {error}".rstrip(": ")) from None
 
 
 @contextlib.contextmanager

@@ -1,7 +1,9 @@
 """Films of frames that come one by one: GIF and MP4, by imageio."""
 
 import contextlib
+import errno
 import importlib.util
+import io
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -45,12 +47,25 @@ def save_film(frames: Iterable[Frame], path: Path, fps: int) -> None:
         settings = {"duration": 1000 / fps, "loop": 0, "palettesize": 64, "subrectangles": True}
     else:
         settings = {"fps": fps, "macro_block_size": 2}
-    with (
-        replacing(path) as unfinished,
+    with replacing(path) as unfinished:
+        # A GIF in memory, for its writer tries once more where the disk is full.
+        goal: Any = io.BytesIO() if path.suffix.lower() == ".gif" else unfinished
         # Closed after an error too, which the writer's own context leaves to the collector.
-        contextlib.closing(
-            imageio.get_writer(unfinished, format=path.suffix[1:].upper(), **settings)
-        ) as writer,
-    ):
-        for frame in frames:
-            writer.append_data(frame)
+        with contextlib.closing(
+            imageio.get_writer(goal, format=path.suffix[1:].upper(), **settings)
+        ) as writer:
+            count = sum(writer.append_data(frame) is None for frame in frames)
+        if goal is not unfinished:
+            unfinished.write_bytes(goal.getvalue())
+        elif not _complete(unfinished, count):
+            raise OSError(errno.EIO, "the film is not complete, perhaps for want of room")
+
+
+def _complete(film: Path, count: int) -> bool:
+    """Whether a film has so many frames; its codec does not tell of a full disk."""
+    from imageio_ffmpeg import count_frames_and_secs
+
+    try:
+        return bool(count_frames_and_secs(str(film))[0] == count)
+    except RuntimeError:
+        return False

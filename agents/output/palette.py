@@ -28,6 +28,7 @@ plt.rcParams.update(
         "grid.alpha": 0.25,
         "legend.frameon": False,
         "svg.hashsalt": "fusion-gym",
+        "text.parse_math": False,  # labels of users are text
     }
 )
 LARGE: Any = {
@@ -67,8 +68,9 @@ KINDS = {
     "learning": VERMILLION,
 }
 
-# Figures of pages: still read at half their width.
+# Figures of pages: still read at half their width, and their own labels are mathematics.
 READABLE: Any = {
+    "text.parse_math": True,
     "font.size": 11,
     "axes.titlesize": 12,
     "legend.fontsize": 10,

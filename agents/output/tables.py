@@ -12,9 +12,9 @@ from fusion_gym.evaluation.metrics import METRICS, Metric
 
 
 def console() -> Console:
-    """A console that keeps tables whole where the output is no terminal."""
-    result = Console()
-    return result if result.is_terminal else Console(width=150)
+    """Return a console for plain text, wide enough for tables where the output is no terminal."""
+    result = Console(markup=False, emoji=False)
+    return result if result.is_terminal else Console(markup=False, emoji=False, width=150)
 
 
 def table_tables(

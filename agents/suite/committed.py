@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import pydantic
 from pydantic import FiniteFloat
 
+from fusion_gym.importing import refuse_code
 from fusion_gym.validation import ConfigurationError
 
 from ..output.files import write
@@ -129,27 +130,38 @@ class Shelf(NamedTuple):
         return list(result.values())
 
 
+def missing_classes(
+    suite: Suite, setting: Setting, names: Sequence[str], results: Path
+) -> list[Class]:
+    """Return the missing ones of these classes (none: all), whose rules are all made once.
+
+    Raises:
+        ConfigurationError: a family that does not fit, envelopes made from other inputs, or ones
+            that name code.
+    """
+    there = present(suite, setting, results)
+    rules = [content["vertices"] for content in there.values()]
+    refuse_code(rules, str(path_of(results, setting.name)))
+    every = [c for c in classes_of(setting) if not names or c.name in names]
+    missing = [c for c in every if c.name not in there]
+    for search in envelopes.searches_of(suite, setting, missing):
+        search.check()
+    return missing
+
+
 def complete(
     suite: Suite, settings: Sequence[Setting], names: Sequence[str], results: Path, work: Path,
     team: Team,
 ) -> None:  # fmt: skip
     """Tune, choose and measure what is missing of these classes (none: all), setting by setting.
 
-    Everything is made once before anything runs, so that a family that does not fit is told.
-
     Raises:
-        ConfigurationError: a family that does not fit, or envelopes made from other inputs.
+        ConfigurationError: as :func:`missing_classes`, before anything runs.
     """
-    missing = {}
-    for setting in settings:
-        there = present(suite, setting, results)
-        every = [c for c in classes_of(setting) if not names or c.name in names]
-        missing[setting.name] = [c for c in every if c.name not in there]
-        for search in envelopes.searches_of(suite, setting, missing[setting.name]):
-            search.check()
-    for setting in settings:
-        if missing[setting.name]:
-            _complete(suite, setting, missing[setting.name], results, work, team)
+    missing = [(item, missing_classes(suite, item, names, results)) for item in settings]
+    for setting, required in missing:
+        if required:
+            _complete(suite, setting, required, results, work, team)
 
 
 def _complete(

@@ -20,16 +20,10 @@ from .sweep import Sweep
 
 
 def run_all(
-    task: Task,
-    policies: list[str],
-    episodes: int,
-    seed: int,
-    description: str,
-    *,
-    trust: bool = False,
+    task: Task, policies: list[str], episodes: int, seed: int, description: str
 ) -> dict[str, EpisodeResults]:
-    """Every policy on the same seeds, with a bar of progress; ``trust`` as in ``make_policy``."""
-    built = {name: make_policy(name, task, trust=trust) for name in policies}
+    """Run every policy on the same seeds, with a bar of progress."""
+    built = {name: make_policy(name, task) for name in policies}
     total = len(policies) * episodes * task.horizon
     with progress_bar(total, description) as bar:
         result = {}
@@ -41,7 +35,7 @@ def run_all(
 
 def compare(
     env_id: str, task: Task, sweep: Sweep, baselines: dict[str, EpisodeResults],
-    agents: Sequence[str], seed: int, folder: Path, trust: bool = False,
+    agents: Sequence[str], seed: int, folder: Path,
 ) -> None:  # fmt: skip
     """Run the agent, or the agent at each of its prices, on the baselines' episodes.
 
@@ -51,7 +45,7 @@ def compare(
         ConfigurationError: the agent transmits less than every baseline.
     """
     episodes = next(iter(baselines.values())).episodes
-    learned = run_all(task, list(agents), episodes, seed, "agent", trust=trust)
+    learned = run_all(task, list(agents), episodes, seed, "agent")
     result = {name: compare_with_envelope(item, baselines) for name, item in learned.items()}
     envelope = lower_envelope(baselines)
     results = baselines | learned

@@ -15,6 +15,7 @@ from fusion_gym import zoo
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.intervals import mean_interval
+from fusion_gym.importing import refuse_code
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError, refusal
 
@@ -175,6 +176,7 @@ def envelope_of(shelf: Shelf, setting: Setting, of: Class) -> dict[str, Any]:
     if of.name not in result:
         path = str(path_of(shelf.results, setting.name))
         raise ConfigurationError(f"results: {path!r} has no class {of.name!r}: tune it first")
+    refuse_code(result[of.name]["vertices"], str(path_of(shelf.results, setting.name)))
     return result[of.name]
 
 

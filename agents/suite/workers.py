@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from fusion_gym.validation import ConfigurationError
 
+from ..output.ending import name_user_code
 from ..output.progress import progress_bar
 from .team import Team
 
@@ -52,7 +53,8 @@ def _do(parent: int | None, work: Work) -> float:
     """Do a piece of work; returns its weight. A worker of this machine ends with its ``parent``."""
     if parent is not None and os.getpid() != parent:
         end_with(parent)
-    work.function(*work.arguments)
+    with name_user_code():
+        work.function(*work.arguments)
     return work.weight
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import pydantic
 
@@ -48,7 +48,7 @@ class TrainingConfig(Strict):
     timesteps: Positive
     num_envs: Positive = 256
     seed: int = pydantic.Field(default=0, ge=0, lt=2**32)
-    threads: Positive = 1
+    threads: Annotated[int, pydantic.Field(gt=0, le=1024)] = 1
     target_rate: float | None = pydantic.Field(default=None, gt=0, le=1)
     price_exponent: Share = 0.0
     error: Literal["squared", "excess", "mismatch"] = "squared"
@@ -70,7 +70,7 @@ class Experiment(Strict):
     algorithm: AnyAlgorithm
     training: TrainingConfig
     validation: ValidationConfig = ValidationConfig()
-    output: str
+    output: str = pydantic.Field(min_length=1, pattern=r"^[^\n\t]+$")
 
     def inputs(self) -> dict[str, Any]:
         """What the results depend on; a training can be made longer, moved, or given threads."""

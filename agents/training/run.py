@@ -16,6 +16,7 @@ from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.importing import trust_files
 from fusion_gym.validation import ConfigurationError
 
 from ..output.files import replacing, write, write_text
@@ -66,9 +67,9 @@ def earlier(experiment: Experiment, folder: Path, resume: bool) -> Journal | Non
             f"output = {str(folder)!r} holds a finished training without its checkpoint, "
             "latest.zip: nothing to resume"
         )
-    check_inputs(
-        experiment.inputs(), load_checked(Experiment, folder / "config.yaml").inputs(), where
-    )
+    with trust_files():  # a checkpoint there would hold code, too
+        begun = load_checked(Experiment, folder / "config.yaml")
+    check_inputs(experiment.inputs(), begun.inputs(), where)
     return None
 
 
@@ -130,6 +131,7 @@ def train(
     if resume and not holds_training(folder):
         raise ConfigurationError(f"output = {str(folder)!r} holds no training: nothing to resume")
     model, env, scored = check_run(experiment)
+    earlier(experiment, folder, resume)  # refuses before anything is made
     torch.set_num_threads(experiment.training.threads)
     with alone_in(folder, "output"):
         journal = earlier(experiment, folder, resume)

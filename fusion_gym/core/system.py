@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import FunctionType
-from typing import Any, ClassVar, Generic, Literal, TypeVar, cast, get_args
+from typing import Any, ClassVar, Generic, Literal, Self, TypeVar, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -77,13 +77,20 @@ class Signal:
     ``knowledge`` is ``"own"`` for what only the sensor knows before anything is sent (its new
     measurement and all that follows from it), ``"centre"`` for what the fusion centre knows as
     well, ``"clock"`` for what time alone tells. ``axes`` names the axes, as in
-    ``"(sensors, m, N)"``; an array has as many, the batch axis N last.
+    ``"(sensors, m, N)"``; an array has as many, the batch axis N last. ``joint`` marks a row a
+    sensor that no sensor knows, for it depends on the others.
     """
 
     name: str
     knowledge: Knowledge
     axes: str
     meaning: str
+    joint: bool = False
+
+    def known_to(self, knower: Knowledge) -> bool:
+        """Return whether a policy of this class may read it; a sensor reads its own row, too."""
+        node = self.knowledge == "centre" and self.axes.startswith("(sensors") and not self.joint
+        return covers(knower, self.knowledge) or (node and covers(knower, "own"))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "knowledge", deprecation.current("knowledge", self.knowledge))
@@ -117,8 +124,8 @@ def common_signals(axes: str = "(sensors, m, N)", **meanings: str) -> tuple[Sign
     ``axes`` are those of a measurement; ``meanings`` replace the general ones by name.
     """
     return tuple(
-        Signal(name, known, _COMMON_AXES.get(name, axes), meanings.get(name, meaning))
-        for name, known, meaning in _COMMON
+        Signal(n, k, _COMMON_AXES.get(n, axes), meanings.get(n, text), n == "variance_reduction")
+        for n, k, text in _COMMON
     )
 
 
@@ -224,6 +231,12 @@ class Signals(Mapping[str, SignalArray]):
             "it (use information='sensors', or a policy that looks at the centre's signals)"
             for name in hidden
         }
+
+    def limit(self, refused: Mapping[str, str]) -> Self:
+        """Withhold these signals too, for the reasons given; returns the signals themselves."""
+        if refused:
+            self._withheld |= refused
+        return self
 
     def __getitem__(self, name: str) -> SignalArray:
         if name in self._withheld:

@@ -191,7 +191,9 @@ class Film:
             bbox_to_anchor=(0.09, 1.0 - 37 / height), fontsize=7, frameon=False, borderaxespad=0.0,
             borderpad=0.2, columnspacing=1.2, handlelength=1.4,
         )  # fmt: skip
-        self._title = self._figure.text(0.1, 1.0 - 4 / height, "", va="top", fontsize=9)
+        self._title = self._figure.text(
+            0.1, 1.0 - 4 / height, "", va="top", fontsize=9, parse_math=False
+        )
 
 
 class Window:

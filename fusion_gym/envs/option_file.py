@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from fusion_gym.errors import refusal
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, read_text
 
 
 def read_options(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -21,12 +21,7 @@ def read_options(path: str | os.PathLike[str]) -> dict[str, Any]:
         from fusion_gym.yaml_text import parsed
     except ModuleNotFoundError:
         raise ConfigurationError(f"{source} needs PyYAML: pip install pyyaml") from None
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ConfigurationError(f"{source} cannot be read: {reason}") from None
-    content = parsed(text, source)
+    content = parsed(read_text("system", Path(path)), source)
     if not (isinstance(content, dict) and all(isinstance(key, str) for key in content)):
         raise ConfigurationError(f"{source} is not allowed: it must hold a mapping of options")
     return content

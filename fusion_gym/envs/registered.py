@@ -38,7 +38,7 @@ def __getattr__(name: str) -> type:
 
 
 def _single(env_id: str) -> type:
-    def __init__(self: FusionEnv, render_mode: str | None = None, **options: Any) -> None:
+    def __init__(self: FusionEnv, /, render_mode: str | None = None, **options: Any) -> None:
         FusionEnv.__init__(self, make_task(env_id, **options), render_mode)
 
     return _made(env_id, FusionEnv, __init__)
@@ -47,6 +47,7 @@ def _single(env_id: str) -> type:
 def _vector(env_id: str) -> type:
     def __init__(
         self: FusionVectorEnv,
+        /,
         num_envs: int = 1,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,

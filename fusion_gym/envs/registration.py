@@ -11,7 +11,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs.registration import EnvSpec, parse_env_id
 
 from fusion_gym import validation
 from fusion_gym.core.options import CommonOptions, Scenario
@@ -96,12 +96,14 @@ def register(env_id: str | None = None, build: str | Build | None = None) -> Non
 
     Raises:
         ConfigurationError: an id without a build function, or one that is taken.
+        gymnasium.error.Error: an id of another form than Gymnasium's.
     """
     if env_id is not None:
         if build is None:
             raise ConfigurationError(
                 f"build = None is not allowed for {env_id!r}: it must be a function or its name"
             )
+        parse_env_id(str(env_id))
         if ENVIRONMENTS.get(env_id, build) != build:
             raise ConfigurationError(
                 f"env_id = {env_id!r} is not allowed: it is registered already"
@@ -131,6 +133,8 @@ def base_of(env_id: str) -> tuple[str, dict[str, Any]]:
         ConfigurationError: an unknown id, a module that cannot be imported, an entry point that is
             no such class, or additional wrappers.
     """
+    if not isinstance(env_id, str):
+        raise validation.refusal("env", env_id, "the id of an environment")
     module, colon, name = env_id.rpartition(":")
     if colon:
         imported("env", env_id, module)
@@ -185,7 +189,7 @@ def options_of(env_id: str) -> type[CommonOptions]:
     return kind
 
 
-def make_task(env: str | CommonOptions, **options: Any) -> Task:
+def make_task(env: str | CommonOptions, /, **options: Any) -> Task:
     """The task of a registered environment, everything checked before anything runs.
 
     ``env`` is an id, or ``module:id`` of one that a module registers, also by
@@ -199,6 +203,7 @@ def make_task(env: str | CommonOptions, **options: Any) -> Task:
         ConfigurationError: an id that is not registered, an unknown option, or a value that is
             not allowed.
     """
+    validation.limit_options(options)
     if isinstance(env, str):
         env, registered = base_of(env)
         options = registered | options

@@ -84,7 +84,7 @@ class FusionSB3VecEnv(VecEnv):
         """
         began = time.perf_counter()
         for option in self._options:
-            validation.keys("reset option", option, [])
+            validation.reset_options(option, [])
         self.batch.seed(np.arange(self.runs), self._seeds[:: self._rows])
         self._begin()
         self._reset_seeds()
@@ -101,7 +101,9 @@ class FusionSB3VecEnv(VecEnv):
 
         Returns the seed of every row.
         """
-        first = int(np.random.randint(0, 2**32 - 1)) if seed is None else seed  # noqa: NPY002
+        if seed is None:
+            seed = int(np.random.randint(0, 2**32 - 1))  # noqa: NPY002
+        first = validation.integer("seed", seed, at_least=0)
         self._seeds = [first + row // self._rows for row in range(self.num_envs)]
         return self._seeds
 

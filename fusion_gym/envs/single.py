@@ -61,7 +61,7 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
         Raises:
             ConfigurationError: an unknown option.
         """
-        validation.keys("reset option", options or {}, [])
+        validation.reset_options(options, [])
         super().reset(seed=seed)
         self.batch.use_generator(0, self.np_random)
         self.batch.reset()

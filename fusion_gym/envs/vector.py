@@ -118,10 +118,13 @@ class FusionVectorEnv(Specified, Members, VectorEnv[Any, Any, Any]):
                 raise ValueError(
                     f"seed = {seed!r} is not allowed: it must be a whole number or a sequence"
                 )
+            kinds = (int, np.integer, type(None))
+            if any(isinstance(entry, bool) or not isinstance(entry, kinds) for entry in seed):
+                raise validation.refusal("seed", seed, "a whole number, or whole numbers and None")
             seeds = [None if entry is None else int(entry) for entry in seed]
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed has {len(seeds)} entries: it must have {self.num_envs}")
-        mask = self._reset_mask(options or {})
+        mask = self._reset_mask(options)
         runs = np.flatnonzero(mask)
         self.batch.seed(runs, [seeds[run] for run in runs])
         self.batch.reset(None if mask.all() else runs)
@@ -142,9 +145,9 @@ class FusionVectorEnv(Specified, Members, VectorEnv[Any, Any, Any]):
         if self._film is not None:
             self._film.begin(np.flatnonzero(runs))
 
-    def _reset_mask(self, options: dict[str, Any]) -> NDArray[np.bool_]:
-        validation.keys("reset option", options, ["reset_mask"])
-        if "reset_mask" not in options:
+    def _reset_mask(self, options: dict[str, Any] | None) -> NDArray[np.bool_]:
+        validation.reset_options(options, ["reset_mask"])
+        if not options or "reset_mask" not in options:
             return self._everyone
         mask = options["reset_mask"]
         if (

@@ -11,7 +11,7 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Policy, owner_of
+from fusion_gym.policies.base import Policy, owner_of, refused_signals
 
 BATCH = 1024  # episodes side by side; fixed, so that results do not depend on the machine
 
@@ -81,6 +81,7 @@ def _run_batch(
 ) -> EpisodeResults:
     batch = EpisodeBatch.seeded(task, episodes, seed, owner_of(policy))
     policy.reset(episodes, seed)
+    refused = refused_signals(policy, task)
     states, sensors, horizon = len(task.system.state_names), task.sensors, task.horizon
     mse, trace, nees = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
     tokens, denied, returns = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
@@ -88,7 +89,7 @@ def _run_batch(
     diverged = np.zeros(episodes)
     squared_error = np.empty((horizon, states))
     for step in range(horizon):
-        outcome = batch.step(policy(batch.signals()))
+        outcome = batch.step(policy(batch.signals().limit(refused)))
         mean, covariance = task.system.fused(batch.delivered)
         error = task.system.truth(batch.delivered) - mean
         squared_error[step] = outcome.squared_error.mean(-1)
@@ -145,9 +146,10 @@ def record_episode(task: Task, policy: Policy, seed: int) -> Trajectory:
     validation.integer("seed", seed, at_least=0)
     batch = EpisodeBatch.seeded(task, 1, seed, owner_of(policy))
     policy.reset(1, seed)
+    refused = refused_signals(policy, task)
     rows: dict[str, list[NDArray[Any]]] = {field.name: [] for field in fields(Trajectory)}
     for _ in range(task.horizon):
-        outcome = batch.step(policy(batch.signals()))
+        outcome = batch.step(policy(batch.signals().limit(refused)))
         state = batch.delivered
         mean, covariance = task.system.fused(state)
         rows["truth"].append(task.system.truth(state)[:, 0])

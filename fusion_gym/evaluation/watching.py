@@ -10,7 +10,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.envs.drawing import Film, Frame
 from fusion_gym.errors import ConfigurationError
-from fusion_gym.policies.base import Policy, owner_of
+from fusion_gym.policies.base import Policy, owner_of, refused_signals
 
 _LETTERS = 90  # of a policy's name, above its picture
 
@@ -23,12 +23,13 @@ class _Watched:
     policy: Policy
     batch: EpisodeBatch
     film: Film
+    refused: dict[str, str]
     error: float = field(default=0.0)
     packets: int = field(default=0)
     steps: int = field(default=0)
 
     def step(self) -> None:
-        outcome = self.batch.step(self.policy(self.batch.signals()))
+        outcome = self.batch.step(self.policy(self.batch.signals().limit(self.refused)))
         self.film.record(self.batch, outcome)
         self.error += float(outcome.squared_error.sum())
         self.packets += int(outcome.granted.sum())
@@ -66,7 +67,7 @@ def watch(
         policy.reset(1, seed)
         film = Film(task, 1)
         film.begin()
-        watched.append(_Watched(name, policy, batch, film))
+        watched.append(_Watched(name, policy, batch, film, refused_signals(policy, task)))
     return _frames(watched, task.horizon if steps is None else steps)
 
 

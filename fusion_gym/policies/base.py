@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from fusion_gym import deprecation, linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.memory import Owner
-from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.core.signals import MEMORY_SIGNALS
+from fusion_gym.core.system import KNOWLEDGE, Knowledge, Signals, covers, least_covering
+from fusion_gym.core.task import Task
 
 Requests = NDArray[np.bool_]
 PerSensor = float | tuple[float, ...]
@@ -56,6 +58,22 @@ def owner_of(policy: Policy) -> Owner | None:
     validation.choice("remember", result, get_args(Owner))
     owner: Owner = result
     return owner
+
+
+def refused_signals(policy: Policy, task: Task) -> dict[str, str]:
+    """Return the signals outside a policy's declared knowledge, and why each is refused."""
+    knower = deprecation.current("knowledge", getattr(policy, "knowledge", KNOWLEDGE[-1]))
+    least = {signal.name: signal for signal in task.system.signals}
+    if not task.memory and covers(knower, "own"):
+        knower = least_covering((knower, "own_memory"))  # beliefs of the new measurements alone
+    least |= {signal.name: signal for signal in MEMORY_SIGNALS}
+    return {
+        name: f"signal {name!r} belongs to the class {signal.knowledge!r}, and the policy "
+        f"{type(policy).__name__} declares knowledge = {policy.knowledge!r}: declare a class that "
+        "covers it"
+        for name, signal in least.items()
+        if not signal.known_to(knower)
+    }
 
 
 def is_stateless(policy: Policy) -> bool:
@@ -130,7 +148,7 @@ def check_at_most(name: str, value: int | None) -> None:
         ConfigurationError: anything else.
     """
     if value is not None:
-        validation.integer(name, value, at_least=1)
+        validation.integer(name, value, at_least=1, at_most=validation.MOST_SENSORS)
 
 
 def shape_of(signals: Signals) -> tuple[int, int]:

@@ -72,7 +72,7 @@ class Lookahead:
     remember: ClassVar[Owner] = "scheduler"
 
     def __init__(self, task: Task, price: float = 0.01, steps: int = 4) -> None:
-        self.steps = validation.integer("steps", steps, at_least=1)
+        self.steps = validation.integer("steps", steps, at_least=1, at_most=validation.MOST_STEPS)
         self.price = validation.number("price", price, at_least=0.0)
         if task.information != "sensors":
             raise ConfigurationError(

@@ -95,7 +95,7 @@ class PeriodicOptimum:
         cache: str | None = None,
         average: str = "steady",
     ) -> None:
-        validation.integer("period", period, at_least=1)
+        validation.integer("period", period, at_least=1, at_most=validation.MOST_STEPS)
         validation.integer("packets", packets, at_least=1, at_most=period * task.sensors)
         validation.choice("average", average, AVERAGES)
         if cache is not None and not isinstance(cache, str):

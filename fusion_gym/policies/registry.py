@@ -14,13 +14,13 @@ from typing import Any, Literal, NamedTuple, TypedDict, get_args
 import numpy as np
 
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.system import KNOWLEDGE
+from fusion_gym.core.system import KNOWLEDGE, SignalError
 from fusion_gym.core.task import Task
 from fusion_gym.docstrings import plain_marks, read, table
-from fusion_gym.importing import import_named
-from fusion_gym.policies.base import Policy, owner_of
+from fusion_gym.importing import TRUST, import_named
+from fusion_gym.policies.base import Policy, owner_of, refused_signals
 from fusion_gym.policies.settings import parse_settings
-from fusion_gym.validation import ConfigurationError, boolean, choice, keys
+from fusion_gym.validation import ConfigurationError, boolean, choice, keys, refusal
 
 Kind = Literal["rule", "reference", "agent"]
 Maker = Callable[..., Policy]
@@ -155,7 +155,7 @@ def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
             that cannot be read or was trained for another observation layout, or a policy that
             looks at signals which the task withholds.
     """
-    context: Context = {"task": task, "trust": boolean("trust", trust)}
+    context: Context = {"task": task, "trust": boolean("trust", trust) or TRUST.get()}
     policy = _make(spec, task.policy_defaults, context)
     if _kind(_asked(spec)[1]) != "agent":  # loading it has checked all that it sees
         _try_out(spec, policy, task)
@@ -221,6 +221,8 @@ def _asked(spec: str) -> tuple[str, PolicyRow, str]:
     Raises:
         ConfigurationError: an unknown name, or a class that cannot be imported or is no policy.
     """
+    if not isinstance(spec, str):
+        raise refusal("policy", spec, "the text that names a policy")
     name, _, text = spec.partition(":")
     own, _, behind = text.partition(":")
     if name in _ROWS or not own.isidentifier():
@@ -283,8 +285,8 @@ def _try_out(spec: str, policy: Policy, task: Task) -> None:
     batch.reset()
     policy.reset(1)
     try:
-        requests = policy(batch.signals())
-    except (LookupError, ValueError) as error:
+        requests = policy(batch.signals().limit(refused_signals(policy, task)))
+    except (SignalError, ConfigurationError) as error:
         raise ConfigurationError(f"policy {spec!r}: {error.args[0]}") from None
     policy.reset(1)
     shape, kind = np.shape(requests), np.asarray(requests).dtype

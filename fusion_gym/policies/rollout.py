@@ -17,6 +17,7 @@ from fusion_gym.policies.imagination import Imagination
 from fusion_gym.policies.registry import make_policy
 
 _STREAM = 0x726F6C6C6F7574  # keeps what is imagined apart from the noise of the same seed
+_SAMPLES, _STEPS = 1000, 200  # at most
 _LANES = 16384  # simulations side by side, unless those of one run are more
 
 
@@ -85,8 +86,8 @@ class Rollout:
         doubt: float = 1.0,
         trust: bool = False,
     ) -> None:
-        self.samples = validation.integer("samples", samples, at_least=1)
-        self.steps = validation.integer("steps", steps, at_least=1)
+        self.samples = validation.integer("samples", samples, at_least=1, at_most=_SAMPLES)
+        self.steps = validation.integer("steps", steps, at_least=1, at_most=_STEPS)
         if price is not None:
             validation.number("price", price, at_least=0.0)
         self.price = price

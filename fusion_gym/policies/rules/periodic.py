@@ -35,7 +35,7 @@ class Periodic(Rule):
     random_start=True token_rate=2``.
     """
 
-    period: int = parameter(4, validation.integer, at_least=1)
+    period: int = parameter(4, validation.integer, at_least=1, at_most=validation.MOST_PERIOD)
     staggered: bool = parameter(True, validation.boolean)
     knowledge: ClassVar[Knowledge] = "clock"
 
@@ -70,7 +70,7 @@ class RoundRobin(Rule):
     random_start=True token_rate=2``.
     """
 
-    period: int = parameter(1, validation.integer, at_least=1)
+    period: int = parameter(1, validation.integer, at_least=1, at_most=validation.MOST_PERIOD)
     knowledge: ClassVar[Knowledge] = "clock"
 
     def __call__(self, signals: Signals) -> Requests:

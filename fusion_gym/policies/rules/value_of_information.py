@@ -63,7 +63,7 @@ class ValueOfInformation(BeliefRule):
     threshold: float | None = parameter(None, _optional)
     price: float | None = parameter(None, _optional)
     at_most: int | None = parameter(None, check_at_most)
-    steps: int = parameter(1, validation.integer, at_least=1)
+    steps: int = parameter(1, validation.integer, at_least=1, at_most=validation.MOST_STEPS)
     together: ClassVar[tuple[str, ...]] = ("at_most", "steps")
 
     def __post_init__(self) -> None:

@@ -104,6 +104,7 @@ OF_FAMILY = (
         "centre",
         _PER_SENSOR,
         "that trace if only the sensors before this one in the greedy order transmit",
+        joint=True,
     ),
     Signal("sampled", "centre", _PER_SENSOR, "whether the sensor samples at this step"),
 )
