@@ -4,10 +4,10 @@
 
 Envelopes that are missing are tuned first, as ``fusion-gym envelope`` does; every agent keeps
 the hash of the one that it is compared with. Every piece of work (one training seed of one agent,
-say) writes its JSON into
-the results folder as it is finished, and its episodes into the work folder; ``--resume`` skips
-what is there, if it was made from the same inputs, and goes on with trainings in the work folder,
-whose checkpoints hold pickles. ``fusion-gym report`` makes tables and figures of it.
+say) writes what it found and its episodes into the work folder as it is finished; ``--resume``
+skips what is there, if it was made from the same inputs, and goes on with trainings there, whose
+checkpoints hold pickles. The results folder gets a setting's tables once it is judged, and
+``fusion-gym report`` makes a page and figures of them.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from .output.tables import console
 from .suite.agreement import agreement_table
 from .suite.beside_rules import SHIPPED
 from .suite.classes import names_of, trained_classes
-from .suite.committed import FOLDER, Shelf, complete
+from .suite.committed import Shelf, complete
 from .suite.config import Setting, Suite, load_suite
 from .suite.envelopes import envelope_task, run_test
 from .suite.jobs import Folders, job_finished, jobs, rules_of
@@ -83,7 +83,7 @@ class Benchmark(SuiteCommand):
             envelope_task(setting)
         with folders.lock():
             self._check_resumed(folders, settings)
-            writing(("finished pieces", folders.results), ("trainings and episodes", folders.work))
+            writing(("tables", folders.results), ("finished pieces and trainings", folders.work))
             shelf = self._shelf(suite, settings, folders)
             for setting in settings:
                 compared = [of.name for of in trained_classes(suite, setting)]
@@ -118,13 +118,14 @@ class Benchmark(SuiteCommand):
 
     def _check_resumed(self, folders: Folders, values: Sequence[Setting]) -> None:
         """Raises ConfigurationError where there are results and no --resume."""
-        names = [f"{s.name}/*.json" for s in values] + [f"{FOLDER}/{s.name}.json" for s in values]
-        there = [path for name in names for path in folders.results.glob(name)]
-        if there and not self.resume:
-            raise ConfigurationError(
-                f"results = {str(folders.results)!r} holds {len(there)} finished pieces of "
-                "work: go on with --resume, or give another --results and --work"
-            )
+        for option, suffix in (("results", "csv"), ("work", "json")):
+            folder: Path = getattr(folders, option)
+            there = [path for item in values for path in folder.glob(f"{item.name}/*.{suffix}")]
+            if there and not self.resume:
+                raise ConfigurationError(
+                    f"{option} = {str(folder)!r} holds {len(there)} finished tables or pieces of "
+                    "work: go on with --resume, or give another --results and --work"
+                )
 
     def _shelf(self, suite: Suite, settings: Sequence[Setting], folders: Folders) -> Shelf:
         """The quick benchmark takes the envelopes that are shipped, if they are of this config."""

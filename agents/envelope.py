@@ -3,7 +3,7 @@
     fusion-gym envelope [--envs NAME …] [--classes NAME …] [--quick] [--resume]
 
 For each class of knowledge the vertices of the lower envelope are chosen on tuning seeds and then
-measured on the test seeds. ``envelopes/SETTING.json`` in the results folder holds them, each class
+measured on the test seeds. The tables of ``SETTING`` in the results folder hold them, each class
 with a SHA-256 of its content, which ``fusion-gym benchmark`` keeps with every agent that it trains;
 ``envelopes/README.md`` has the table. What was tuned stays in the work folder, so that an
 interrupted run goes on where it was.
@@ -18,7 +18,7 @@ from .input.options import writable_folder
 from .output.files import write_text
 from .output.progress import writing
 from .suite.classes import classes_of
-from .suite.committed import FOLDER, complete, path_of, present
+from .suite.committed import FOLDER, complete, present
 from .suite.config import load_suite
 from .suite.envelope_table import envelope_text
 from .suite.jobs import Folders
@@ -53,7 +53,7 @@ class Envelope(SuiteCommand):
                     "on with --resume, or give another --results"
                 )
             writing(
-                ("finished envelopes", folders.results / FOLDER),
+                ("finished envelopes", folders.results),
                 ("what was tuned and tested", folders.work),
             )
             complete(
@@ -61,4 +61,4 @@ class Envelope(SuiteCommand):
             )
             readme = folders.results / FOLDER / "README.md"
             write_text(readme, envelope_text(folders.results, "fusion-gym envelope"))
-        print(f"envelopes in {path_of(folders.results, '').parent}, the table in {readme}")
+        print(f"envelopes in {folders.results}, the table in {readme}")

@@ -2,8 +2,9 @@
 
     fusion-gym report [--results results] [--pages README.md docs/biased.md …]
 
-Reads the JSON in the results folder and writes ``README.md``, figures of all settings together and
-of each, and ``report.html`` with the figures inside. What the JSON says is text there, no markup.
+Reads the tables in the results folder and writes ``README.md``, figures of all settings together
+and of each, and ``report.html`` with the figures inside. What a table says is text there, no
+markup.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +34,7 @@ class Report(Command):
     """Tables and figures of the benchmark's results, as Markdown and as one HTML page."""
 
     results: Annotated[Path, OutputFolder()] = Path("results")
-    """Folder of the benchmark's JSON, and for what is made of it."""
+    """Folder of the benchmark's tables, and for what is made of them."""
     pages: tuple[Path, ...] = ()
     """Other pages, as README.md, whose marked parts are made anew."""
 
@@ -63,7 +64,7 @@ def text_of(
     lines = [
         f"# {TITLE}",
         "",
-        f"Made by `{command}` and `{second}` from the JSON beside this file.",
+        f"Made by `{command}` and `{second}` from the tables of the settings beside this file.",
         "",
         *how_to_read(value),
         *overview_section(value),

@@ -3,10 +3,11 @@
     fusion-gym robustness [--envs NAME …] [--class local_packets] [--trained] [--resume]
 
 The rules of a committed envelope and the agents of its class run under every case of a config, as
-they were tuned and trained, on the same test episodes. Every piece of work writes its JSON into
-``robustness/`` of the results folder as it is finished, and its episodes into the work folder;
-``--resume`` skips what is there, if it was made from the same inputs. ``robustness/README.md`` has
-the table. With ``--trained`` agents are trained besides over draws of the perturbations.
+they were tuned and trained, on the same test episodes. Every piece of work writes what it found and
+its episodes into the work folder as it is finished; ``--resume`` skips what is there, if it was
+made from the same inputs. The settings' tables in the results folder get the verdicts, which
+``robustness/README.md`` there shows. With ``--trained`` agents are trained besides over draws of
+the perturbations.
 """
 
 from collections.abc import Sequence
@@ -86,14 +87,14 @@ class Robustness(Long):
             there = [
                 path
                 for trial in trials
-                for path in place.glob(f"{trial.setting.name}/{trial.of.name}/*/*.json")
+                for path in self.work.glob(f"{trial.setting.name}/{trial.of.name}/*/*.npz")
             ]
             if there and not self.resume:
                 raise ConfigurationError(
-                    f"results = {str(self.results)!r} holds {len(there)} finished pieces of work: "
+                    f"work = {str(self.work)!r} holds {len(there)} finished pieces of work: "
                     "go on with --resume, or give another --results and --work"
                 )
-            writing(("finished pieces", place), ("trainings and episodes", self.work))
+            writing(("tables", self.results), ("finished pieces and trainings", self.work))
             self._work(trials, ("rules", "agents"), folders)
             trainings = [training for trial in trials for training in trial.trainings]
             if trainings:
@@ -114,7 +115,7 @@ class Robustness(Long):
             every = {setting.name: setting.title for setting in load_suite(config.suite).settings}
             titles = {setting.setting: every[setting.setting] for setting in config.settings}
             table = write_table(self.results, titles, "fusion-gym robustness" + self._how())
-        print(f"results in {place}, the table in {table}")
+        print(f"results in {self.results}, the table in {table}")
 
     def _how(self) -> str:
         """The options that the results depend on."""

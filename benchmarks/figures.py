@@ -32,6 +32,9 @@ from typing import Any
 import torch
 import yaml
 
+from fusion_gym.agents.suite.committed import read_envelopes
+from fusion_gym.agents.suite.tables import read_frame
+
 TIMESTEPS = 100_000
 VALIDATION = {"every": 60_000, "episodes": 64}  # once on the way, and once at the end
 BENCHMARK = "tobit_oscillator"
@@ -105,8 +108,10 @@ def benchmark(setting: str, folder: Path) -> bytes:
     results, work = folder / "results", folder / "work"
     words = ["--quick", "--envs", setting, "--workers", "1"]
     command("benchmark", *words, "--results", str(results), "--work", str(work))
-    files = sorted(results.glob(f"{setting}/*.json"))
-    return json.dumps({file.name: list(numbers(read(file))) for file in files}).encode()
+    files = sorted(work.glob(f"{setting}/*.json"))
+    result: dict[str, Any] = {file.name: list(numbers(read(file))) for file in files}
+    tables = [path for path in sorted(results.glob(f"{setting}/*.csv")) if path.stem != "runs"]
+    return json.dumps(result | {path.name: path.read_text() for path in tables}).encode()
 
 
 def zoo_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
@@ -123,10 +128,10 @@ def zoo_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
 
 def envelope_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
     """Every setting's rules that no other rule beats, in the worlds that they were tuned in."""
-    for path in sorted(Path("results").glob("*/verdict.json")):
-        stored = read(path.parent.parent / "envelopes" / f"{path.parent.name}.json")
+    for path in sorted(Path("results").glob("*/fronts.csv")):
+        stored = read_envelopes(path.parent)
         worlds: dict[str, dict[str, Any]] = {}
-        for name in read(path)["classes"]:
+        for name in read_frame(path.parent, "fronts")["class"]:
             for vertex in stored["classes"][name]["vertices"]:
                 key = ", ".join(f"{k}={v}" for k, v in vertex["options"].items()) or "as it is"
                 world = worlds.setdefault(key, {"options": vertex["options"], "policies": {}})

@@ -6,9 +6,9 @@ In each setting it trains a front with memory and counterfactual credit with eve
 PPO for comparison; measures on the way, over the processor's seconds, when a front is below the
 committed envelope of rules without memory; runs the finished fronts on the test episodes beside the
 envelope of exactly the same information (or the optimum); and measures this machine's steps per
-second. ``OUTPUT/SETTING.json`` is written anew after every training, ``OUTPUT/README.md`` and a
-table at the end. Trainings lie in the work folder, and their checkpoints hold pickles: ``--resume``
-those of your own alone.
+second. The tables in ``OUTPUT/SETTING`` are written anew after every training, ``OUTPUT/README.md``
+and a table at the end. Trainings lie in the work folder, and their checkpoints hold pickles:
+``--resume`` those of your own alone.
 """
 
 import argparse
@@ -22,11 +22,11 @@ from typing import Any
 
 from fusion_gym.agents.output import tables
 from fusion_gym.agents.output.ending import ended_like_by_ctrl_c, report_errors
-from fusion_gym.agents.output.files import read_json, write, write_text
+from fusion_gym.agents.output.files import write, write_text
 from fusion_gym.agents.output.folders import alone_in
 from fusion_gym.agents.output.progress import quietly, writing
 from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.learned import finished_lessons, report
+from fusion_gym.agents.suite.learned import finished_lessons, read_study, report
 from fusion_gym.agents.suite.learning import load_learning
 from fusion_gym.agents.suite.learning_table import learning_text, overview
 from fusion_gym.agents.suite.lessons import run_lesson, run_reference
@@ -49,8 +49,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2, help="processes side by side")
     parser.add_argument("--resume", action="store_true", help="go on with trainings of your own")
     parser.add_argument("--quick", action="store_true", help="less of everything")
-    parser.add_argument("--results", type=Path, default=Path("results"), help="with envelopes/")
-    parser.add_argument("--output", type=Path, help="for JSON and tables: results/learning")
+    parser.add_argument("--results", type=Path, default=Path("results"), help="with envelopes")
+    parser.add_argument("--output", type=Path, help="for tables: results/learning")
     parser.add_argument("--work", type=Path, help="for models and episodes: runs/learning")
     parser.add_argument("--quiet", action="store_true", help="neither progress nor remarks")
     arguments = parser.parse_args()
@@ -84,8 +84,8 @@ def run(args: argparse.Namespace) -> None:
         there = [study.report for study in studies if study.report.exists()]
         if there and not args.resume:
             raise ConfigurationError(
-                f"output = {str(output)!r} holds {there[0].name} already: go on with --resume, or "
-                "give another --output and --work"
+                f"output = {str(output)!r} holds {there[0].parent.name} already: go on with "
+                "--resume, or give another --output and --work"
             )
         writing(("results", output), ("trainings and episodes", work))
         for study in studies:
@@ -93,8 +93,8 @@ def run(args: argparse.Namespace) -> None:
         teach(studies, args.seeds, Team(args.workers))
         for study in studies:
             report(study, args.seeds)
-        files = [output / f"{name}.json" for name in by_name]
-        content = [read_json(path, "output") for path in files if path.exists()]
+        folders = [output / name for name in by_name]
+        content = [read_study(path) for path in folders if (path / "learning.csv").exists()]
         write_text(output / "README.md", learning_text(content, _command(args)))
         tables.console().print(overview(content))
         print(f"results in {output}")

@@ -69,9 +69,12 @@ def benchmark(suite: Path, folder: Path, *words: str) -> list[str]:
 def find(folder: Path) -> dict[str, Any]:
     """All that was found, without the seconds that it took."""
     content = {}
-    for path in sorted((folder / "results").glob("*/*.json")):
+    for path in sorted((folder / "work").glob("*/*.json")):
         content[path.name] = json.loads(path.read_text())
         content[path.name].pop("seconds", None)
+    for path in sorted((folder / "results").glob("*/*.csv")):
+        if path.stem != "runs":  # with seconds
+            content[path.name] = path.read_text()
     return content
 
 
@@ -97,7 +100,7 @@ def test_a_worker_that_ends_in_the_middle_loses_nothing(tmp_path: Path) -> None:
             run.wait()
         assert workers[1].poll() is None
     assert find(many) == find(single)
-    assert {"agent_sensors_0.json", "agent_sensors_1.json", "verdict.json"} <= find(many).keys()
+    assert {"agent_sensors_0.json", "agent_sensors_1.json", "verdict.csv"} <= find(many).keys()
 
 
 @pytest.mark.slow

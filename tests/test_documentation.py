@@ -13,9 +13,9 @@ from page_blocks import blocks_of, imported
 
 import fusion_gym
 from fusion_gym.agents import report
-from fusion_gym.agents.output.files import read_json
 from fusion_gym.agents.suite import envelope_table, learning_table
 from fusion_gym.agents.suite.config import load_suite
+from fusion_gym.agents.suite.learned import read_study
 from fusion_gym.agents.suite.learning import load_learning
 from fusion_gym.agents.suite.report_pages import update_pages
 from fusion_gym.agents.suite.robust_table import write_table
@@ -116,15 +116,17 @@ def test_the_committed_report_says_what_the_results_say() -> None:
 
 
 def test_the_committed_table_of_perturbed_cases_is_that_of_the_verdicts(tmp_path: Path) -> None:
-    folder = ROOT / "results" / "robustness"
-    shutil.copytree(folder, tmp_path / "robustness")
-    written = (folder / "README.md").read_text()
+    results = ROOT / "results"
+    written = (results / "robustness" / "README.md").read_text()
     command = re.search(r"^Made by `(.*?)`", written, re.M)
     assert command is not None
     suite = {setting.name: setting.title for setting in load_suite("benchmark").settings}
     titles = {item.setting: suite[item.setting] for item in load_robustness("robustness").settings}
+    for path in results.glob("*/robustness.csv"):
+        (tmp_path / path.parent.name).mkdir()
+        shutil.copy(path, tmp_path / path.parent.name)
     assert write_table(tmp_path, titles, command[1]).read_text() == written
-    tried = {path.parts[-3] for path in folder.glob("*/*/verdict.json")}
+    tried = {path.parent.name for path in results.glob("*/robustness.csv")}
     assert tried == set(titles)
 
 
@@ -136,7 +138,7 @@ def test_the_committed_envelopes_are_what_the_pages_say() -> None:
 
 def test_the_committed_fronts_are_what_the_pages_say() -> None:
     folder = ROOT / "results" / "learning"
-    files = {path.stem: read_json(path, "results") for path in folder.glob("*.json")}
+    files = {path.parent.name: read_study(path.parent) for path in folder.glob("*/learning.csv")}
     known = [course.setting for course in load_learning("learning").settings]
     reports = [files[name] for name in known if name in files]
     written = (folder / "README.md").read_text()

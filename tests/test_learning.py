@@ -1,9 +1,9 @@
 """How fast agents learn: when a front is below an envelope, and the command that measures it."""
 
 import argparse
-import json
 import math
 import os
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -17,14 +17,14 @@ from small_suite import SMALL, small_suite
 from training_configs import small_config
 
 from benchmarks import learning
-from fusion_gym.agents.output.files import write, write_text
 from fusion_gym.agents.suite.committed import complete
 from fusion_gym.agents.suite.config import load_suite
 from fusion_gym.agents.suite.fronts import excess_over, is_below
-from fusion_gym.agents.suite.learned import closed, judge_fronts, reached
+from fusion_gym.agents.suite.learned import closed, judge_fronts, reached, read_study
 from fusion_gym.agents.suite.learning import load_learning
 from fusion_gym.agents.suite.lessons import beyond, run_lesson
 from fusion_gym.agents.suite.study import Lesson, Study
+from fusion_gym.agents.suite.tables import write_rows
 from fusion_gym.agents.suite.team import Team
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.envs.registration import make_task
@@ -204,7 +204,7 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
     monkeypatch.setattr(learning.measure_throughput, "__defaults__", (0.01,))
     whole = arguments_of(school, tmp_path / "whole")
     learning.run(whole)
-    content = json.loads((whole.output / "small.json").read_text())
+    content = read_study(whole.output / "small")
     assert [front["seed"] for front in content["fronts"]] == [0, 1]
     assert content["fronts"][0]["curve"] != content["fronts"][1]["curve"]
     for front in content["fronts"]:
@@ -219,7 +219,7 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
     assert "`python -m benchmarks.learning --seeds 2" in (whole.output / "README.md").read_text()
     assert "small" in capsys.readouterr().out
 
-    with pytest.raises(ConfigurationError, match=r"holds small.json already: go on with --resume"):
+    with pytest.raises(ConfigurationError, match=r"holds small already: go on with --resume"):
         learning.run(whole)
 
     broken = arguments_of(school, tmp_path / "broken")
@@ -235,12 +235,12 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
     monkeypatch.setattr(PrivilegedVecEnv, "step_alternatives", step_alternatives)
     with pytest.raises(KeyboardInterrupt):
         learning.run(broken)
-    stored = json.loads((broken.output / "small.json").read_text())
+    stored = read_study(broken.output / "small")
     assert [front["seed"] for front in stored["fronts"]] == [0]
     broken.resume = True
     learning.run(broken)
     assert counted == 64, "nothing is trained twice"
-    again = json.loads((broken.output / "small.json").read_text())
+    again = read_study(broken.output / "small")
     assert without_seconds(again) == without_seconds(content)
     learning.run(broken)
     assert counted == 64
@@ -285,7 +285,7 @@ def test_a_front_beside_the_optimum_or_the_best_of_schedules(
     (selection.work / course["setting"]).mkdir()
     (selection.work / course["setting"] / "throughput.json").write_text("{}")
     learning.run(selection)
-    content = json.loads((selection.output / f"{course['setting']}.json").read_text())
+    content = read_study(selection.output / course["setting"])
     assert content["plain"] == []
     assert content["finished"]["compared"] == 3, "all prices"
     suite = load_suite(school / "suite.yaml")
@@ -341,7 +341,8 @@ def test_seeds_and_prices_that_lie_above_are_counted(school: Path) -> None:
         {"seed": 0, "points": [bad, point(0.02, 0.011, 1.8), bad]},
         {"seed": 1, "points": [bad, point(0.03, 0.009, 1.4), bad]},
     ]
-    result = judge_fronts(study_of(school), fronts)
+    study = {"course": study_of(school).course.model_dump(), "inner": [False, True, False]}
+    result = judge_fronts(study | {"fronts": fronts})
     assert result is not None
     assert result["compared"] == 2
     assert [(p["seed"], p["difference"]["low"]) for p in result["above"]] == [(0, 0.011)]
@@ -349,20 +350,24 @@ def test_seeds_and_prices_that_lie_above_are_counted(school: Path) -> None:
     assert result["rates"] == pytest.approx([0.14, 0.18])
     assert result["closed"] == {"rollout": None, "bound": pytest.approx((0.2 + 0.6) / 2.0)}
     assert closed([{"envelope": 1.0, "bound": 1.0, "mse": 1.0}], "bound") is None
-    assert judge_fronts(study_of(school), []) is None
+    assert judge_fronts(study | {"fronts": []}) is None
 
 
 def test_a_rollout_counts_on_its_own_episodes_and_only_where_it_was_run(
     school: Path, tmp_path: Path
 ) -> None:
     """Of 4 episodes the first 2 are twice as hard: there the rollout has 3/4 of the envelope."""
-    rollout = {"setting": "small", "episodes": 2, "points": [{"rate": 0.1, "mse": 1.5}] * 2}
-    rollout["points"][1] = {"rate": 0.3, "mse": 1.5}
-    write(tmp_path / "rollout" / "small.json", rollout)
+    shutil.copytree(school / "results" / "small", tmp_path / "small")
+    none = {"mean": 1.5, "low": 1.5, "high": 1.5}
+    rollout = dict.fromkeys(("mse", "return_gain", "base_mse"), none) | {"episodes": 2, "seed": 0}
+    rollout |= dict.fromkeys(("price", "return", "base_rate"), 0.0)
+    rollout |= dict.fromkeys(("policy", "base_policy", "env", "command"), "x") | {"options": {}}
+    write_rows(tmp_path / "small", "rollout", [rollout | {"rate": rate} for rate in (0.1, 0.3)])
+    bound = dict.fromkeys(("upper", "rate", "step", "points", "gap", "horizon"), 1)
+    bound |= {"sensors": 2, "floor": 0.4, "env": "x", "weights": "mse", "settings": {}}
+    bound |= {"everything_delivered": {}}
     costs = [{"price": 1.0, "lower": 0.9}, {"price": 4.0, "lower": 1.5}]
-    write(tmp_path / "bounds" / "small.json", {"sensors": 2, "floor": 0.4, "costs": costs})
-    envelopes = (school / "results" / "envelopes" / "small.json").read_text()
-    write_text(tmp_path / "envelopes" / "small.json", envelopes)
+    write_rows(tmp_path / "small", "bounds", [bound | cost for cost in costs])
     hard = np.array([2.0, 2.0, 1.0, 1.0])
     envelope = {str(rate): SimpleNamespace(rate=np.array([rate]), mse=hard) for rate in (0.0, 1.0)}
     study = replace(study_of(school), results=tmp_path)

@@ -2,14 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from rich.table import Table
 
-from ..output.files import read_json
 from ..output.markup import share
 from ..output.tables import table_tables
-from .reports import VERDICT
+from .tables import read_rows
 
 
 def agreement_table(quick: Path, full: Path, settings: Sequence[str]) -> Table | None:
@@ -23,7 +21,7 @@ def agreement_table(quick: Path, full: Path, settings: Sequence[str]) -> Table |
     """
     rows = []
     for name in settings:
-        ours, theirs = _middles(quick / name / VERDICT), _middles(full / name / VERDICT)
+        ours, theirs = _middles(quick / name), _middles(full / name)
         for of, our in ours.items():
             if of in theirs:
                 rows.append((name, of, our, theirs[of], _overlap(our, theirs[of])))
@@ -38,12 +36,12 @@ def agreement_table(quick: Path, full: Path, settings: Sequence[str]) -> Table |
     )
 
 
-def _middles(path: Path) -> dict[str, Mapping[str, float]]:
+def _middles(folder: Path) -> dict[str, Mapping[str, float]]:
     """The verdict of every class over the middle of its front."""
-    if not path.exists():
+    if not (folder / "fronts.csv").exists():
         return {}
-    classes: Mapping[str, Any] = read_json(path, "results")["classes"]
-    return {of: value["middle"] for of, value in classes.items() if "middle" in value}
+    rows = read_rows(folder, "fronts")
+    return {row["class"]: row["middle"] for row in rows if "middle" in row}
 
 
 def _overlap(item: Mapping[str, float], other: Mapping[str, float]) -> bool:

@@ -19,7 +19,7 @@ from fusion_gym.policies.base import Policy
 from fusion_gym.policies.saved import saved_agent
 
 from ..output.folders import check_inputs
-from .committed import FOLDER, read_envelopes
+from .committed import path_of, read_envelopes
 from .config import Setting, load_suite
 from .envelope_table import bound_of, measured
 from .envelopes import Test, envelope_inputs, run_test
@@ -73,11 +73,11 @@ class Ground:
         """
         suite = load_suite("benchmark")
         setting = next(setting for setting in suite.settings if setting.name == name)
-        path = SHIPPED / FOLDER / f"{name}.json"
-        envelopes = read_envelopes(path)
+        path = path_of(SHIPPED, name)
+        envelopes = read_envelopes(path.parent)
         check_inputs(envelope_inputs(suite, setting), envelopes["inputs"], repr(str(path)))
-        rollout, simulated = measured(SHIPPED / "rollout" / f"{name}.json", name)
-        bound = bound_of(SHIPPED / "bounds" / f"{name}.json")
+        rollout, simulated = measured(path.parent)
+        bound = bound_of(path.parent)
         return cls(setting, envelopes, bound, rollout, simulated, episodes, suite.seed)
 
     def rules(self, name: str) -> dict[str, Test]:

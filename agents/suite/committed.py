@@ -1,94 +1,94 @@
-"""The file of a setting's envelopes: made piece by piece, read with its hashes checked."""
+"""The tables of a setting's envelopes: made piece by piece, read with its hashes checked."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import pydantic
-from pydantic import FiniteFloat
-
 from fusion_gym.validation import ConfigurationError
 
-from ..output.files import write
 from ..output.folders import check_inputs
 from . import envelopes
 from .classes import Class, classes_of
 from .config import Setting, Suite
-from .reports import IntervalRecord, Known, Shape, read_shape
+from .tables import grouped, read_rows, write_rows
 from .team import Team
 from .workers import Work, side_by_side
 
-FOLDER = "envelopes"  # in that of the results
-
-
-class PlaceRecord(Shape):
-    """A policy's mean rate and its error."""
-
-    rate: FiniteFloat
-    mse: IntervalRecord
-
-
-class Vertex(Shape):
-    """A policy of an envelope, on the tuning and on the test episodes."""
-
-    name: str
-    policy: str
-    options: dict[str, Any]
-    family: str
-    knows: Known
-    tuning: PlaceRecord
-    test: PlaceRecord
-    convex: bool
-
-
-class EnvelopeRecord(Shape):
-    """One class."""
-
-    mode: str
-    memory: bool
-    broadcast: str | None
-    knows: Known
-    options: dict[str, Any]
-    contains: list[str]
-    families: list[str]
-    trials: int
-    vertices: list[Vertex] = pydantic.Field(min_length=1)
-    searches: list[list[list[FiniteFloat]]] = pydantic.Field(min_length=1)
-    sha256: str = pydantic.Field(pattern=r"^[0-9a-f]{64}$")
-
-
-class EnvelopesRecord(Shape):
-    """A setting's ``envelopes/SETTING.json``."""
-
-    setting: str
-    title: str
-    env: str
-    always: FiniteFloat
-    inputs: dict[str, Any]
-    classes: dict[str, EnvelopeRecord]
-    curves: list[dict[str, Any]]
+FOLDER = "envelopes"  # of the table for readers, in that of the results
+TABLES = ("setting", "vertices", "searches", "curves", "classes")  # written in this order
+_POINT = ("name", "rate", "mse")
 
 
 def path_of(results: Path, setting: str) -> Path:
-    """Where a setting's envelopes are."""
-    return results / FOLDER / f"{setting}.json"
+    """Where the index of a setting's envelopes is, which is written last."""
+    return results / setting / f"{TABLES[-1]}.csv"
 
 
-def read_envelopes(path: Path) -> dict[str, Any]:
-    """A setting's envelopes.
+def read_envelopes(folder: Path) -> dict[str, Any]:
+    """Return the envelopes in a setting's folder.
 
     Raises:
-        ConfigurationError: the file cannot be read, is of another shape, or a class is not what
+        ConfigurationError: a table cannot be read, is of another shape, or a class is not what
             its hash says.
     """
-    result = read_shape(EnvelopesRecord, path, "envelopes")
-    for name, content in result["classes"].items():
-        if envelopes.digest(result["inputs"], name, content) != content["sha256"]:
+    result: dict[str, Any] = dict(*read_rows(folder, "setting", "envelopes")[:1])
+    vertices, searches = (
+        grouped(read_rows(folder, table, "envelopes"), "class") for table in TABLES[1:3]
+    )
+    result |= {"setting": folder.name, "classes": {}, "curves": []}
+    for row in read_rows(folder, "classes", "envelopes"):
+        name, sha256 = row.pop("class"), row.pop("sha256")
+        by_seed = grouped(searches.get(name, []), "seed")
+        content = {"broadcast": None} | row | {
+            "vertices": [_nested(vertex) for vertex in vertices.get(name, [])],
+            "searches": [[[p["rate"], p["mse"]] for p in points] for points in by_seed.values()],
+        }  # fmt: skip
+        if envelopes.digest(result.get("inputs", {}), name, content) != sha256:
+            path = str(path_of(folder.parent, folder.name))
             raise ConfigurationError(
-                f"envelopes = {str(path)!r}: classes.{name}.sha256 = {content['sha256'][:12]!r}… "
-                "is not that of what it holds: it was changed after it was written"
+                f"envelopes = {path!r}: sha256 = {sha256[:12]!r}… of the class {name!r} is not "
+                "that of what the tables hold: they were changed after they were written"
             )
-    return result
+        result["classes"][name] = content | {"sha256": sha256}
+    curves: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in read_rows(folder, "curves", "envelopes"):
+        curve = {key: row[key] for key in ("family", "options", "trials")} | {"points": []}
+        curve = curves.setdefault((row["family"], str(row["options"])), curve)
+        curve["points"].append({key: row[key] for key in _POINT})
+    return result | {"curves": list(curves.values())}
+
+
+def _nested(row: dict[str, Any]) -> dict[str, Any]:
+    """Return a vertex as its hash is made of."""
+    for kind in ("tuning", "test"):
+        row[kind] = {"rate": row.pop(f"{kind}_rate"), "mse": row.pop(f"{kind}_mse")}
+    return row
+
+
+def write_envelopes(folder: Path, content: Mapping[str, Any]) -> None:
+    """Write the tables of a setting's envelopes, the index of classes at the end.
+
+    Whoever reads after a kill finds the classes that were there before: their rows stay the same.
+    """
+    classes = content["classes"]
+    tables: dict[str, list[dict[str, Any]]] = {
+        "setting": [dict(content)],
+        "vertices": [
+            {**vertex, "class": name}
+            | {f"{kind}_{key}": vertex[kind][key] for kind in ("tuning", "test")
+               for key in ("rate", "mse")}
+            for name, of in classes.items() for vertex in of["vertices"]
+        ],
+        "searches": [
+            {"class": name, "seed": seed, "rate": rate, "mse": mse}
+            for name, of in classes.items()
+            for seed, points in enumerate(of["searches"]) for rate, mse in points
+        ],
+        "curves": [curve | point for curve in content["curves"] for point in curve["points"]],
+        "classes": [{**of, "class": name} for name, of in classes.items()],
+    }  # fmt: skip
+    for table in TABLES:
+        write_rows(folder, table, tables[table])
 
 
 def present(suite: Suite, setting: Setting, results: Path) -> dict[str, Any]:
@@ -100,7 +100,7 @@ def present(suite: Suite, setting: Setting, results: Path) -> dict[str, Any]:
     path = path_of(results, setting.name)
     if not path.exists():
         return {}
-    content = read_envelopes(path)
+    content = read_envelopes(path.parent)
     check_inputs(envelopes.envelope_inputs(suite, setting), content["inputs"], repr(str(path)))
     return content["classes"]
 
@@ -186,7 +186,7 @@ def _complete(
         content = envelopes.content_of(suite, setting, of, searches, work)
         classes[of.name] = content | {"sha256": envelopes.digest(inputs, of.name, content)}
     task, path = envelopes.envelope_task(setting), path_of(results, setting.name)
-    earlier = read_envelopes(path)["curves"] if path.exists() else []
+    earlier = read_envelopes(path.parent)["curves"] if path.exists() else []
     curves = merged_curves(earlier, list(envelopes.curves_of(searches, work)))
     always = next(curve for curve in curves if curve["family"] == "always")
     order = [c.name for c in classes_of(setting)]
@@ -201,7 +201,7 @@ def _complete(
         "classes": {name: classes[name] for name in order if name in classes},
         "curves": curves,
     }
-    write(path, report)
+    write_envelopes(path.parent, report)
 
 
 def merged_curves(

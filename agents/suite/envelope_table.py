@@ -5,43 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from fusion_gym.evaluation.envelope import EnvelopePoint, height
-from fusion_gym.validation import ConfigurationError
 
-from .committed import FOLDER, read_envelopes
-from .reports import Shape, read_shape
+from .committed import read_envelopes
+from .tables import read_rows
 
 SHARES = (0.05, 0.1, 0.2, 0.4)  # of the rate that transmitting always gets
 HEADLINE = 0.2
-
-
-class Measured(Shape):
-    """A point that was computed elsewhere."""
-
-    rate: float
-    mse: float
-
-
-class Measurements(Shape):
-    """``rollout/SETTING.json``, by the points' rates; ``episodes`` are the first of the test's."""
-
-    setting: str
-    episodes: int
-    points: list[Measured]
-
-
-class PriceErrorRecord(Shape):
-    """No policy costs less than ``lower`` at this price of a packet, error and packets a step."""
-
-    price: float
-    lower: float
-
-
-class BoundRecord(Shape):
-    """``bounds/SETTING.json``, as ``fusion-gym bound`` writes it."""
-
-    sensors: int
-    floor: float
-    costs: list[PriceErrorRecord]
 
 
 def envelope_text(results: Path, command: str) -> str:
@@ -50,8 +19,8 @@ def envelope_text(results: Path, command: str) -> str:
     Raises:
         ConfigurationError: a file that is damaged or of another shape.
     """
-    files = sorted((results / FOLDER).glob("*.json"))
-    content = [read_envelopes(path) for path in files]
+    files = sorted(results.glob("*/classes.csv"))
+    content = [read_envelopes(path.parent) for path in files]
     text = Path(__file__).with_suffix(".md").read_text(encoding="utf-8")
     lines = text.format(command=command).splitlines()
     for envelopes in content:
@@ -66,8 +35,8 @@ def rows_of(envelopes: dict[str, Any], results: Path) -> Iterator[str]:
     """A setting's rows; simulated were packets with a measurement, the bound holds for any."""
     name = envelopes["setting"]
     rates = [round(share * envelopes["always"], 4) for share in SHARES]
-    rollout, episodes = measured(results / "rollout" / f"{name}.json", name)
-    bound = bound_of(results / "bounds" / f"{name}.json")
+    rollout, episodes = measured(results / name)
+    bound = bound_of(results / name)
     grouped: dict[str, dict[bool, list[EnvelopePoint]]] = {}
     for content in envelopes["classes"].values():
         grouped.setdefault(_label(content), {})[content["memory"]] = hull_of(content)
@@ -95,33 +64,29 @@ def hull_of(content: dict[str, Any]) -> list[EnvelopePoint]:
     return sorted(points, key=lambda point: (point.rate, point.mse))
 
 
-def measured(path: Path, setting: str) -> tuple[list[EnvelopePoint], int]:
-    """The points of a file, if it is there, and their number of episodes.
-
-    ``{"setting": …, "episodes": …, "points": [{"rate": …, "mse": …}, …]}``.
+def measured(folder: Path) -> tuple[list[EnvelopePoint], int]:
+    """The rollout of a setting's folder, if it was run, and its number of episodes.
 
     Raises:
-        ConfigurationError: it is of another shape, or of another setting.
+        ConfigurationError: the table is of another shape.
     """
-    if not path.exists():
+    if not (folder / "rollout.csv").exists():
         return [], 0
-    result = read_shape(Measurements, path, "results")
-    if result["setting"] != setting:
-        raise ConfigurationError(
-            f"results = {str(path)!r}: setting = {result['setting']!r} is not allowed: it must be "
-            f"{setting!r}"
-        )
-    points = [EnvelopePoint(f"{p['rate']}", p["rate"], p["mse"]) for p in result["points"]]
-    return sorted(points, key=lambda point: point.rate), result["episodes"]
+    rows = read_rows(folder, "rollout")
+    points = [EnvelopePoint(f"{row['rate']}", row["rate"], row["mse"]["mean"]) for row in rows]
+    return sorted(points, key=lambda point: point.rate), rows[0]["episodes"]
 
 
-def bound_of(path: Path) -> dict[str, Any] | None:
-    """A setting's lower bound, if it was computed.
+def bound_of(folder: Path) -> dict[str, Any] | None:
+    """The lower bound of a setting's folder, if it was computed.
 
     Raises:
-        ConfigurationError: it is of another shape.
+        ConfigurationError: the table is of another shape.
     """
-    return read_shape(BoundRecord, path, "results") if path.exists() else None
+    if not (folder / "bounds.csv").exists():
+        return None
+    rows = read_rows(folder, "bounds")
+    return {"sensors": rows[0]["sensors"], "floor": rows[0]["floor"], "costs": rows}
 
 
 def at_least(bound: dict[str, Any], rate: float) -> float:

@@ -42,12 +42,12 @@ class Job(NamedTuple):
 
     @property
     def place(self) -> str:
-        """Path of its files in the folders, without the suffix."""
+        """Path of its files in the work folder, without the suffix."""
         return f"{self.setting.name}/{self.name}"
 
 
 class Folders(NamedTuple):
-    """``results`` holds JSON for readers, ``work`` models and episodes."""
+    """``results`` holds tables for readers, ``work`` finished pieces, models and episodes."""
 
     results: Path
     work: Path
@@ -62,7 +62,7 @@ class Folders(NamedTuple):
 
     def report(self, job: Job) -> Path:
         """The JSON of a job."""
-        return self.results / f"{job.place}.json"
+        return self.work / f"{job.place}.json"
 
     def episodes(self, job: Job) -> Path:
         """The episodes of a job."""
@@ -191,7 +191,7 @@ def job_finished(job: Job, suite: Suite, folders: Folders) -> bool:
     path = folders.report(job)
     if not folders.hold(job):
         return False
-    report = read_json(path, "results")
+    report = read_json(path, "work")
     check_inputs(job_inputs(job, suite), report.get("inputs"), repr(str(path)))
     load_results(folders.episodes(job), report.get("made_from", ""))
     return True

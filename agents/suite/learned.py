@@ -1,13 +1,15 @@
-"""What a study has found so far: its JSON, made of the finished lessons."""
+"""What a study has found so far: its tables, made of the finished lessons."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from filelock import FileLock
 
-from ..output.files import read_json, write
+from ..output.files import read_json
 from .fronts import range_of
-from .study import Kind, Lesson, Study
+from .study import SOLVED, Kind, Lesson, Study
+from .tables import grouped, read_rows, write_rows
 
 
 def finished_lessons(study: Study, kind: Kind, seeds: int) -> list[dict[str, Any]]:
@@ -21,31 +23,79 @@ def finished_lessons(study: Study, kind: Kind, seeds: int) -> list[dict[str, Any
 
 
 def report(study: Study, seeds: int) -> dict[str, Any]:
-    """Write the study's JSON anew and return what it holds; lessons may end side by side."""
-    study.output.mkdir(parents=True, exist_ok=True)
+    """Write the study's tables anew and return what they hold; lessons may end side by side."""
+    folder = study.report.parent
+    folder.mkdir(parents=True, exist_ok=True)
     with FileLock(study.work / f".{study.setting.name}.lock"):
-        fronts = finished_lessons(study, "front", seeds)
-        plain = finished_lessons(study, "plain", min(seeds, study.learning.plain.seeds))
         speed = study.throughput
-        content: dict[str, Any] = {
-            "setting": study.setting.name,
-            "title": study.setting.title,
-            "env": study.setting.environment.id,
-            "course": study.course.model_dump(mode="json"),
-            "prices": study.prices,
-            "inner": study.inner,
-            "seeds": seeds,
-            "throughput": read_json(speed, "work") if speed.exists() else None,
-            "reached": {
-                "front": [reached(front) for front in fronts],
-                "plain": [reached(item) for item in plain],
-            },
-            "finished": judge_fronts(study, fronts),
-            "fronts": fronts,
-            "plain": plain,
-        }
-        write(study.report, content)
-    return content
+        write_study(
+            folder,
+            {
+                "title": study.setting.title,
+                "env": study.setting.environment.id,
+                "course": study.course.model_dump(mode="json"),
+                "prices": study.prices,
+                "inner": study.inner,
+                "seeds": seeds,
+                "fronts": finished_lessons(study, "front", seeds),
+                "plain": finished_lessons(study, "plain", min(seeds, study.learning.plain.seeds)),
+            }
+            | ({"throughput": read_json(speed, "work")} if speed.exists() else {}),
+        )
+    return read_study(folder)
+
+
+def write_study(folder: Path, content: Mapping[str, Any]) -> None:
+    """Write the tables of a study, that of the study itself at the end."""
+    lessons = [
+        {"kind": kind} | lesson
+        for kind, key in (("front", "fronts"), ("plain", "plain"))
+        for lesson in content[key]
+    ]
+    tables: dict[str, list[dict[str, Any]]] = {
+        "learning_trainings": lessons,
+        "learning_curves": [
+            lesson | point | {"rate": rate, "mse": mse}
+            for lesson in lessons
+            for point in lesson["curve"]
+            for rate, mse in point["front"]
+        ],
+        "learning_points": [
+            {"seed": front["seed"]} | point
+            for front in content["fronts"]
+            for point in front["points"]
+        ],
+        "learning": [dict(content)],
+    }
+    for table, rows in tables.items():
+        write_rows(folder, table, rows)
+
+
+def read_study(folder: Path) -> dict[str, Any]:
+    """Return what a study has found, from its tables.
+
+    Raises:
+        ConfigurationError: a table that cannot be read or is of another shape.
+    """
+    curves: dict[tuple[str, int], dict[int, dict[str, Any]]] = {}
+    for row in read_rows(folder, "learning_curves", "output"):
+        curve = curves.setdefault((row.pop("kind"), row.pop("seed")), {})
+        place = [row.pop("rate"), row.pop("mse")]
+        curve.setdefault(row["timesteps"], {"excess": None} | row | {"front": []})
+        curve[row["timesteps"]]["front"].append(place)
+    points = grouped(read_rows(folder, "learning_points", "output"), "seed")
+    lessons: dict[str, list[dict[str, Any]]] = {"front": [], "plain": []}
+    for row in read_rows(folder, "learning_trainings", "output"):
+        kind = row.pop("kind")
+        row["curve"] = list(curves.get((kind, row["seed"]), {}).values())
+        if kind == "front":
+            row["points"] = points.get(row["seed"], [])
+        lessons[kind].append(row)
+    result: dict[str, Any] = {"setting": folder.name, "throughput": None}
+    result |= dict(*read_rows(folder, "learning", "output")[:1])
+    result |= {"fronts": lessons["front"], "plain": lessons["plain"]}
+    result["reached"] = {kind: [reached(item) for item in every] for kind, every in lessons.items()}
+    return result | {"finished": judge_fronts(result)}
 
 
 def reached(lesson: Mapping[str, Any]) -> dict[str, Any]:
@@ -73,7 +123,7 @@ def reached(lesson: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def judge_fronts(study: Study, fronts: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+def judge_fronts(study: Mapping[str, Any]) -> dict[str, Any] | None:
     """All seeds' finished fronts at the prices that count, beside what they are compared with.
 
     With an optimum all prices count, otherwise the inner ones. ``above`` are seeds and prices
@@ -81,16 +131,17 @@ def judge_fronts(study: Study, fronts: Sequence[Mapping[str, Any]]) -> dict[str,
     difference, ``rates`` are the lowest and the highest, ``closed`` the share of the gaps to
     rollout and bound.
     """
-    counted = [study.solved or inside for inside in study.inner]
+    course = study["course"]
+    counted = [course["against"] in SOLVED or inside for inside in study["inner"]]
     points = [
         point | {"seed": front["seed"]}
-        for front in fronts
+        for front in study["fronts"]
         for point, counts in zip(front["points"], counted, strict=True)
         if counts and "difference" in point
     ]
     if not points:
         return None
-    above = [p for p in points if p["difference"]["low"] > study.course.allowed]
+    above = [p for p in points if p["difference"]["low"] > course["allowed"]]
     worst = max(points, key=lambda point: float(point["difference"]["mean"]))
     return {
         "compared": len(points),

@@ -9,6 +9,7 @@ from rich import box
 from rich.table import Table
 
 from ..output.markup import share
+from .study import SOLVED
 
 Report = Mapping[str, Any]
 _LABELS = {"front": "with credit and memory", "plain": "plain PPO"}
@@ -107,7 +108,7 @@ def details(report: Report) -> Iterator[str]:
     if report["course"]["memoryless"] is not None:
         yield from _firsts(report)
         yield from _curves(report)
-    solved = report["course"]["against"] in ("optimum", "schedules")
+    solved = report["course"]["against"] in SOLVED
     names = ["cost", "optimum"] if solved else ["mse", "envelope"]
     yield _joined(["price", "rate", *names, "difference, mean of seeds", "worst seed", "above"])
     yield _joined(["---"] * (4 + len(names) + 1))

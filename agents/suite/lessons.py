@@ -157,14 +157,14 @@ def beyond(study: Study, rate: float, envelope: Mapping[str, EpisodeResults]) ->
     The rollout was run on the first of the test episodes: it is taken as a share of the envelope
     on these, times the envelope on all.
     """
-    result, name = {}, f"{study.setting.name}.json"
-    rollout, episodes = measured(study.results / "rollout" / name, study.setting.name)
+    result, folder = {}, study.results / study.setting.name
+    rollout, episodes = measured(folder)
     same = replace_value(study.envelope(study.course.against)["knows"]) == "scheduler_memory"
     inside = same and bool(rollout) and rollout[0].rate <= rate <= rollout[-1].rate
     below, own = best_mse(envelope, rate), height(rollout, rate) if inside else None
     if own is not None and below is not None:
         result["rollout"] = own / float(below[:episodes].mean()) * float(below.mean())
-    bound = bound_of(study.results / "bounds" / name)
+    bound = bound_of(folder)
     if bound is not None:
         result["bound"] = at_least(bound, rate)
     return result

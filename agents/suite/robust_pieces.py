@@ -28,7 +28,6 @@ from .config import Setting, Suite
 from .envelopes import envelope_task
 from .fronts import front_prices
 from .jobs import agent_options, experiment_of
-from .robust_summary import FOLDER
 
 RULES = "rules"
 Options = tuple[tuple[str, Any], ...]
@@ -69,7 +68,7 @@ class RobustPiece(NamedTuple):
 
     @property
     def place(self) -> str:
-        """Path of its files in the folders, without the suffix."""
+        """Path of its files in the work folder, without the suffix."""
         return f"{self.setting.name}/{self.of.name}/{self.case}/{self.label}"
 
     @property
@@ -91,14 +90,14 @@ class RobustPiece(NamedTuple):
 
 
 class RobustFolders(NamedTuple):
-    """``results`` holds JSON for readers, ``work`` models and episodes."""
+    """``results`` holds tables for readers, ``work`` finished pieces, models and episodes."""
 
     results: Path
     work: Path
 
     def report(self, piece: RobustPiece) -> Path:
         """The JSON of a piece."""
-        return self.results / FOLDER / f"{piece.place}.json"
+        return self.work / f"{piece.place}.json"
 
     def episodes(self, piece: RobustPiece) -> Path:
         """The episodes of a piece."""
@@ -113,7 +112,7 @@ class RobustFolders(NamedTuple):
         path = self.report(piece)
         if not (path.exists() and self.episodes(piece).exists()):
             return False
-        check_inputs(piece.inputs, read_json(path, "results").get("inputs"), repr(str(path)))
+        check_inputs(piece.inputs, read_json(path, "work").get("inputs"), repr(str(path)))
         self.read(piece)
         return True
 

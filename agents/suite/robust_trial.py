@@ -15,9 +15,8 @@ from .classes import Class
 from .config import Setting, Suite
 from .fronts import front_prices
 from .jobs import agent_task
-from .reports import VERDICT
 from .robust_pieces import RULES, RobustFolders, RobustPiece, agent_piece, rules_piece, training
-from .robust_summary import FOLDER, KINDS
+from .robust_summary import KINDS, write_verdict
 from .robust_table import judge_case, with_shares
 from .robustness import NOMINAL, Case, Perturbed, drawn_world, world
 
@@ -130,7 +129,7 @@ class RobustTrial(NamedTuple):
 
     def conclude(self) -> None:
         """Put all cases, each of which is judged, into the setting's verdict."""
-        cases = {case: read_json(self._verdict(case), "results") for case in self.worlds}
+        cases = {case: read_json(self._verdict(case), "work") for case in self.worlds}
         report = {
             "setting": self.setting.name,
             "class": self.of.name,
@@ -138,7 +137,7 @@ class RobustTrial(NamedTuple):
             "sha256": self.envelope["sha256"],
             "cases": with_shares(cases),
         }
-        write(self.folders.results / FOLDER / self.setting.name / self.of.name / VERDICT, report)
+        write_verdict(self.folders.results / self.setting.name, report)
 
     def _verdict(self, case: str) -> Path:
-        return self.folders.work / self.setting.name / self.of.name / case / VERDICT
+        return self.folders.work / self.setting.name / self.of.name / case / "verdict.json"

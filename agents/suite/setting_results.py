@@ -1,6 +1,5 @@
 """What the results folder holds of a setting, read and checked before anything is made of it."""
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,7 +9,7 @@ from fusion_gym.validation import ConfigurationError
 
 from .committed import path_of, read_envelopes
 from .envelope_table import bound_of, hull_of, measured
-from .reports import VERDICT, Agent, Baselines, TestRecord, Verdict, read_shape
+from .tables import VERDICT, grouped, read_rows
 
 Points = list[tuple[float, float]]  # rate and error
 
@@ -70,14 +69,17 @@ def read_results(results: Path) -> dict[str, SettingResults]:
     """Every setting that is judged, by name.
 
     Raises:
-        ConfigurationError: there are none, or a file that is no such JSON.
+        ConfigurationError: there are none, or a table that cannot be read.
     """
     result = {
-        path.parent.name: read_setting(path.parent) for path in sorted(results.glob(f"*/{VERDICT}"))
+        path.parent.name: read_setting(path.parent)
+        for path in sorted(results.glob(f"*/{VERDICT}.csv"))
     }
     if not result:
+        earlier = ", and not JSON of an earlier version" * any(results.glob(f"*/{VERDICT}.json"))
         raise ConfigurationError(
-            f"results = {str(results)!r} is not allowed: it must hold results of the benchmark"
+            f"results = {str(results)!r} is not allowed: it must hold tables of the "
+            f"benchmark{earlier}"
         )
     return result
 
@@ -86,63 +88,68 @@ def read_setting(folder: Path) -> SettingResults:
     """One setting's results.
 
     Raises:
-        ConfigurationError: a file that cannot be read or is of another shape, or files that do not
-            fit together.
+        ConfigurationError: a table that cannot be read or is of another shape.
     """
     name, results = folder.name, folder.parent
-    verdict = read_shape(Verdict, folder / VERDICT, "results")
-    baselines = read_shape(Baselines, folder / "baselines.json", "results")
-    named = [policy for curve in baselines["curves"].values() for policy in curve["policies"]]
-    named += [place["name"] for of in verdict["classes"].values() for place in of["envelope"]]
-    for item in named:
-        if item not in baselines["policies"]:
-            raise ConfigurationError(
-                f"results = {str(folder)!r} do not fit together: baselines.json has no policy "
-                f"{item!r}, of which it or {VERDICT} speaks"
-            )
-    classes, committed = verdict["classes"], path_of(results, name)
-    agents = _agents(folder, classes)
-    rollout, episodes = measured(results / "rollout" / f"{name}.json", name)
+    verdict = read_verdict(folder)
+    policies = grouped(read_rows(folder, "policies"), "run")
+    baselines = {key: verdict[key] for key in ("env", "episodes", "seed")}
+    for row in policies.get("genie", []):
+        baselines["genie"] = row | {"assumes": row["name"]}
+    seeds: dict[str, list[Points]] = {}
+    validation: dict[str, Any] = {}
+    for run in read_rows(folder, "runs"):
+        if run.get("class") in verdict["classes"]:
+            validation = validation or run["inputs"]["training"]["validation"]
+            points = [(rate_of(p), p["mse"]["mean"]) for p in policies.get(run["run"], [])]
+            if len(points) == len(verdict["classes"][run["class"]]["points"]):
+                seeds.setdefault(run["class"], []).append(points)
+    rollout, episodes = measured(folder)
+    committed = path_of(results, name)
     return SettingResults(
         name,
         verdict,
         baselines,
-        _places(folder / "informed.json"),
-        _places(folder / "references.json"),
-        {name: _columns(own, len(classes[name]["points"])) for name, own in agents.items()},
-        next((a["training"]["validation"] for own in agents.values() for a in own), {}),
-        read_envelopes(committed) if committed.exists() else {},
+        _places(policies.get("informed", [])),
+        _places(policies.get("references", [])),
+        seeds,
+        validation,
+        read_envelopes(folder) if committed.exists() else {},
         rollout,
         episodes,
-        bound_of(results / "bounds" / f"{name}.json"),
+        bound_of(folder),
     )
 
 
-def _places(path: Path) -> list[EnvelopePoint]:
-    """The policies of a file, if it is there, by rising rate."""
-    policies = read_shape(TestRecord, path, "results")["policies"] if path.exists() else {}
-    result = [EnvelopePoint(name, rate_of(p), p["mse"]["mean"]) for name, p in policies.items()]
+def read_verdict(folder: Path) -> dict[str, Any]:
+    """Return the verdict of a setting, with its classes by name.
+
+    Raises:
+        ConfigurationError: a table that cannot be read or is of another shape.
+    """
+    rows = read_rows(folder, VERDICT)
+    if len(rows) != 1 or rows[0]["always"] <= 0.0:
+        path = str(folder / f"{VERDICT}.csv")
+        raise ConfigurationError(
+            f"results = {path!r}: always = {[row['always'] for row in rows]} is not allowed: it "
+            "must be one positive rate"
+        )
+    parts = {
+        part: grouped(read_rows(folder, table), "class")
+        for part, table in (("points", "points"), ("at", "equal_rates"), ("envelope", "tested"))
+    }
+    classes: dict[str, Any] = {}
+    for row in read_rows(folder, "fronts"):
+        name = row.pop("class")
+        classes[name] = {"broadcast": None} | row
+        classes[name] |= {part: every.get(name, []) for part, every in parts.items()}
+    return rows[0] | {"classes": classes, "worth": read_rows(folder, "worth")}
+
+
+def _places(policies: Sequence[Mapping[str, Any]]) -> list[EnvelopePoint]:
+    """The policies by rising rate."""
+    result = [EnvelopePoint(p["name"], rate_of(p), p["mse"]["mean"]) for p in policies]
     return sorted(result, key=lambda point: (point.rate, point.mse))
-
-
-def _agents(folder: Path, classes: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """The agents of the classes that are judged, by training seed."""
-    result: dict[str, list[dict[str, Any]]] = {}
-    for path in sorted(folder.glob("agent_*.json")):
-        # The class is in the file's name; what else lies there is none of these agents.
-        named = re.fullmatch(r"agent_(\w+)_\d+", path.stem)
-        if named and named[1] in classes:
-            result.setdefault(named[1], []).append(read_shape(Agent, path, "results"))
-    return result
-
-
-def _columns(agents: Sequence[Mapping[str, Any]], prices: int) -> list[Points]:
-    """Each training seed's points, of those at as many prices."""
-    return [
-        [(rate_of(point), point["mse"]["mean"]) for point in agent["points"]]
-        for agent in agents
-        if len(agent["points"]) == prices
-    ]
 
 
 def rate_of(policy: Mapping[str, Any]) -> float:

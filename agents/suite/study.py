@@ -18,7 +18,7 @@ from ..output.files import read_json
 from ..output.folders import check_inputs
 from ..training.checked import load_checked, parse
 from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, ValidationConfig
-from .committed import path_of, present, read_envelopes
+from .committed import present, read_envelopes
 from .config import Setting, Suite
 from .envelope_table import hull_of
 from .envelopes import Test, envelope_task
@@ -28,6 +28,7 @@ from .learning import Course, Learning
 from .verdict import MIDDLE
 
 Kind = Literal["front", "plain"]
+SOLVED = ("optimum", "schedules")  # compared by costs
 # Options that change neither the task nor what a policy may know of it: rules see the time anyway.
 _FREE = ("memory_filter", "belief_features", "clock")
 
@@ -74,8 +75,8 @@ class Study:
 
     @property
     def report(self) -> Path:
-        """Its JSON for readers."""
-        return self.output / f"{self.setting.name}.json"
+        """The table for readers that is written last."""
+        return self.output / self.setting.name / "learning.csv"
 
     @property
     def throughput(self) -> Path:
@@ -86,7 +87,7 @@ class Study:
     def envelopes(self) -> dict[str, Any]:
         """The committed file of the setting's envelopes."""
         present(self.suite, self.setting, self.results)  # made from what the suite says now
-        return read_envelopes(path_of(self.results, self.setting.name))
+        return read_envelopes(self.results / self.setting.name)
 
     def envelope(self, name: str) -> dict[str, Any]:
         """A class of the committed envelopes.
@@ -118,7 +119,7 @@ class Study:
     @property
     def solved(self) -> bool:
         """Whether the finished front is compared with an optimum, by costs."""
-        return self.course.against in ("optimum", "schedules")
+        return self.course.against in SOLVED
 
     @property
     def vertices(self) -> list[dict[str, Any]]:

@@ -1,5 +1,6 @@
 """The benchmark's work: the envelopes' rules, references, hindsight, and one training each."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from .jobs import (
     rules_of,
     training_of,
 )
-from .reports import VERDICT
+from .tables import VERDICT, write_rows
 from .verdict import judge
 from .worth import ClassTests, at_rates, worths
 
@@ -57,14 +58,14 @@ def run_job(job: Job, suite: Suite, folders: Folders, shelf: Shelf) -> None:
 def conclude(
     suite: Suite, setting: Setting, folders: Folders, shelf: Shelf
 ) -> dict[str, Any] | None:
-    """The verdict over whatever agents of a setting are finished, written as ``verdict.json``.
+    """The verdict over whatever agents of a setting are finished, written as tables.
 
     Raises:
         ConfigurationError: results that are damaged or were made from other settings.
     """
     every = jobs(suite, [setting], names_of(suite), shelf)
     pieces = [job for job in every if job_finished(job, suite, folders)]
-    reports = {job.name: read_json(folders.report(job), "results") for job in pieces}
+    reports = {job.name: read_json(folders.report(job), "work") for job in pieces}
     result = {
         job.name: load_results(folders.episodes(job), reports[job.name]["made_from"])
         for job in pieces
@@ -103,8 +104,42 @@ def conclude(
         "classes": classes,
         "worth": worths(tested, always),
     }
-    write(folders.results / setting.name / VERDICT, verdict)
+    baselines = reports["baselines"]
+    verdict |= {key: baselines[key] for key in ("env", "episodes", "seed")}
+    write_verdict(folders.results / setting.name, verdict, reports)
     return verdict
+
+
+def write_verdict(
+    folder: Path, verdict: Mapping[str, Any], reports: Mapping[str, Mapping[str, Any]]
+) -> None:
+    """Write the tables of a setting: its pieces of work by name, and its verdict at the end."""
+    policies: list[dict[str, Any]] = []
+    for run, report in reports.items():
+        families: dict[str, dict[str, Any]] = {
+            name: {"family": family, "knows": curve["knows"]}
+            for family, curve in report.get("curves", {}).items()
+            for name in curve["policies"]
+        }
+        for name, policy in report.get("policies", {}).items():
+            policies.append({"run": run, "name": name, **families.get(name, {}), **policy})
+        for price, policy in zip(report.get("prices", []), report.get("points", []), strict=True):
+            policies.append({"run": run, "name": f"price={price!r}", "price": price, **policy})
+        if "genie" in report:
+            policies.append({"run": "genie", "name": report["genie"]["assumes"]} | report["genie"])
+    classes: dict[str, Any] = verdict["classes"]
+    tables: dict[str, list[dict[str, Any]]] = {
+        "runs": [{"run": run} | report for run, report in reports.items()],
+        "policies": policies,
+        "points": [{"class": name} | p for name, of in classes.items() for p in of["points"]],
+        "equal_rates": [{"class": name} | p for name, of in classes.items() for p in of["at"]],
+        "tested": [{"class": name} | p for name, of in classes.items() for p in of["envelope"]],
+        "fronts": [{"class": name} | of for name, of in classes.items()],
+        "worth": verdict["worth"],
+        VERDICT: [dict(verdict)],
+    }
+    for table, rows in tables.items():
+        write_rows(folder, table, rows)
 
 
 def _test(task: Task, policies: list[str], suite: Suite) -> dict[str, EpisodeResults]:
