@@ -22,13 +22,13 @@ from .input.options import Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
 from .output.progress import writing
 from .output.tables import console
-from .suite.agreement import agreement_table
 from .suite.beside_rules import SHIPPED
 from .suite.classes import names_of, trained_classes
 from .suite.committed import Shelf, complete
 from .suite.config import Setting, Suite, load_suite
 from .suite.envelopes import envelope_task, run_test
 from .suite.jobs import Folders, job_finished, jobs, rules_of
+from .suite.report import agreement_table
 from .suite.team import BackendName, Team
 from .suite.work import conclude, run_job
 from .suite.workers import Work, side_by_side

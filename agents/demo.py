@@ -33,7 +33,7 @@ from .output.files import write
 from .output.folders import alone_in
 from .output.progress import writing
 from .suite.beside_rules import Ground, Trials
-from .suite.envelope_table import at_least
+from .suite.committed import at_least
 from .suite.envelopes import envelope_task
 from .suite.team import Team
 from .suite.trainings import train_beside

@@ -20,8 +20,8 @@ from .output.progress import writing
 from .suite.classes import classes_of
 from .suite.committed import FOLDER, complete, present
 from .suite.config import load_suite
-from .suite.envelope_table import envelope_text
 from .suite.jobs import Folders
+from .suite.report import envelopes_text
 from .suite.team import Team
 
 
@@ -60,5 +60,5 @@ class Envelope(SuiteCommand):
                 suite, settings, self.classes, folders.results, folders.work, Team(self.workers)
             )
             readme = folders.results / FOLDER / "README.md"
-            write_text(readme, envelope_text(folders.results, "fusion-gym envelope"))
+            write_text(readme, envelopes_text(folders.results, "fusion-gym envelope"))
         print(f"envelopes in {folders.results}, the table in {readme}")

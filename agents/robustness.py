@@ -22,14 +22,15 @@ from fusion_gym.validation import ConfigurationError
 from .command_line import Long
 from .input.options import Episodes, InputFolder, OutputFolder, Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
+from .output.files import write_text
 from .output.folders import alone_in
 from .output.progress import writing
 from .suite import robust_pieces
 from .suite.classes import trained_classes
 from .suite.committed import Shelf
 from .suite.config import Setting, Suite, load_suite
+from .suite.report import robustness_text
 from .suite.robust_summary import FOLDER
-from .suite.robust_table import write_table
 from .suite.robust_trial import RobustTrial
 from .suite.robustness import Perturbed, load_robustness, select_settings
 from .suite.robustness import RobustnessSettings as Config
@@ -114,7 +115,9 @@ class Robustness(Long):
                 trial.conclude()
             every = {setting.name: setting.title for setting in load_suite(config.suite).settings}
             titles = {setting.setting: every[setting.setting] for setting in config.settings}
-            table = write_table(self.results, titles, "fusion-gym robustness" + self._how())
+            table = place / "README.md"
+            text = robustness_text(self.results, titles, "fusion-gym robustness" + self._how())
+            write_text(table, text)
         print(f"results in {self.results}, the table in {table}")
 
     def _how(self) -> str:

@@ -28,8 +28,8 @@ from fusion_gym.agents.output.progress import quietly, writing
 from fusion_gym.agents.suite.config import load_suite
 from fusion_gym.agents.suite.learned import finished_lessons, read_study, report
 from fusion_gym.agents.suite.learning import load_learning
-from fusion_gym.agents.suite.learning_table import learning_text, overview
 from fusion_gym.agents.suite.lessons import run_lesson, run_reference
+from fusion_gym.agents.suite.report import learning_table, learning_text
 from fusion_gym.agents.suite.study import Kind, Lesson, Study
 from fusion_gym.agents.suite.team import Team
 from fusion_gym.agents.suite.workers import Work, side_by_side
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> None:
         folders = [output / name for name in by_name]
         content = [read_study(path) for path in folders if (path / "learning.csv").exists()]
         write_text(output / "README.md", learning_text(content, _command(args)))
-        tables.console().print(overview(content))
+        tables.console().print(learning_table(content))
         print(f"results in {output}")
 
 

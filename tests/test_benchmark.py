@@ -27,7 +27,7 @@ from fusion_gym.agents.suite.classes import classes_of, trained_classes
 from fusion_gym.agents.suite.committed import read_envelopes
 from fusion_gym.agents.suite.config import load_suite
 from fusion_gym.agents.suite.envelopes import searches_of
-from fusion_gym.agents.suite.setting_results import read_results, read_verdict
+from fusion_gym.agents.suite.report import read_results, read_verdict
 from fusion_gym.agents.suite.tables import read_frame, read_rows, write_rows
 from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
@@ -271,7 +271,7 @@ def test_the_report_shows_what_it_is_reported_as_text(tmp_path: Path) -> None:
     verdict["title"] = title + "\n\n<script>alert(3)</script>"
     verdict["env"] = "a`<script>alert(4)</script>|b"
     write_rows(folder, "verdict", [verdict])
-    text = report.text_of(read_results(tmp_path), "one", "two")
+    text = report.report_text(read_results(tmp_path), "one")
     text += "\n\n<script>alert(5)</script> <b onclick='f'>g</b>\n"
     page = page_of(text, tmp_path, "<script>alert(6)</script>")
     assert "<title>&lt;script&gt;alert(6)&lt;/script&gt;</title>" in page

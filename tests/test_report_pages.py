@@ -8,9 +8,8 @@ import pytest
 from small_results import small_results
 
 from fusion_gym.agents import report
-from fusion_gym.agents.suite.report_pages import update_pages
-from fusion_gym.agents.suite.robust_summary import write_verdict
-from fusion_gym.agents.suite.setting_results import read_results
+from fusion_gym.agents.suite.report import read_results, update_pages
+from fusion_gym.agents.suite.robust_summary import write_cases
 
 PAGE = """# A page
 
@@ -52,7 +51,7 @@ def test_perturbed_cases_are_counted(tmp_path: Path) -> None:
         "none": {"title": "none", "always": 0.5, "agents": {"points": []}},
     }
     report = {"class": "sensors", "cases": cases, "episodes": 2, "sha256": "0"}
-    write_verdict(tmp_path / "tobit_oscillator", report)
+    write_cases(tmp_path / "tobit_oscillator", report)
     text = update_pages(PAGE.format(name="robustness"), {}, tmp_path)
     expected = "| Tobit oscillator | as they are | -20.0% [-30.0%, -10.0%] | 1 | 1 | 1 | "
     assert f"{expected}+2.0% [+1.0%, +3.0%], louder |" in text

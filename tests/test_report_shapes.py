@@ -19,7 +19,7 @@ from fusion_gym.agents.output import pareto_figure
 from fusion_gym.agents.output.palette import AGENTS, RULES
 from fusion_gym.agents.output.pareto_figure import Differences, Limits, Panel, Series
 from fusion_gym.agents.suite.comparison import comparison_table
-from fusion_gym.agents.suite.setting_results import read_setting
+from fusion_gym.agents.suite.report import read_setting
 from fusion_gym.agents.suite.tables import read_rows, write_rows
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import BaselineComparison

@@ -19,9 +19,8 @@ from fusion_gym.policies.base import Policy
 from fusion_gym.policies.saved import saved_agent
 
 from ..output.folders import check_inputs
-from .committed import path_of, read_envelopes
+from .committed import bound_of, measured, path_of, read_envelopes
 from .config import Setting, load_suite
-from .envelope_table import bound_of, measured
 from .envelopes import Test, envelope_inputs, run_test
 from .fronts import front_prices
 from .workers import Work

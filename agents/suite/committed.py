@@ -4,13 +4,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fusion_gym.evaluation.envelope import EnvelopePoint
 from fusion_gym.validation import ConfigurationError
 
 from ..output.folders import check_inputs
 from . import envelopes
 from .classes import Class, classes_of
 from .config import Setting, Suite
-from .tables import grouped, read_rows, write_rows
+from .tables import Row, grouped, read_rows, write_rows
 from .team import Team
 from .workers import Work, side_by_side
 
@@ -89,6 +90,44 @@ def write_envelopes(folder: Path, content: Mapping[str, Any]) -> None:
     }  # fmt: skip
     for table in TABLES:
         write_rows(folder, table, tables[table])
+
+
+def hull_of(content: Mapping[str, Any]) -> list[EnvelopePoint]:
+    """Return a committed class's envelope on the test seeds."""
+    points = [
+        EnvelopePoint(v["name"], v["test"]["rate"], v["test"]["mse"]["mean"])
+        for v in content["vertices"]
+    ]
+    return sorted(points, key=lambda point: (point.rate, point.mse))
+
+
+def measured(folder: Path) -> tuple[list[EnvelopePoint], int]:
+    """Return the rollout in a setting's folder, if it was run, and its number of episodes.
+
+    Raises:
+        ConfigurationError: the table is of another shape.
+    """
+    rows = read_rows(folder, "rollout") if (folder / "rollout.csv").exists() else []
+    points = [EnvelopePoint(f"{row['rate']}", row["rate"], row["mse"]["mean"]) for row in rows]
+    episodes = rows[0]["episodes"] if rows else 0
+    return sorted(points, key=lambda point: point.rate), episodes
+
+
+def bound_of(folder: Path) -> Row | None:
+    """Return the lower bound in a setting's folder, if it was computed.
+
+    Raises:
+        ConfigurationError: the table is of another shape.
+    """
+    rows = read_rows(folder, "bounds") if (folder / "bounds.csv").exists() else []
+    return rows[0] | {"costs": rows} if rows else None
+
+
+def at_least(bound: Row, rate: float) -> float:
+    """Return the least error at a rate that the prices' lines leave, between two rates as well."""
+    packets = bound["sensors"] * rate
+    lines = [cost["lower"] - cost["price"] * packets for cost in bound["costs"]]
+    return float(max([bound["floor"], *lines]))
 
 
 def present(suite: Suite, setting: Setting, results: Path) -> dict[str, Any]:

@@ -23,7 +23,7 @@ def finished_lessons(study: Study, kind: Kind, seeds: int) -> list[dict[str, Any
 
 
 def report(study: Study, seeds: int) -> dict[str, Any]:
-    """Write the study's tables anew and return what they hold; lessons may end side by side."""
+    """Write the study's tables again and return what they hold; lessons may end side by side."""
     folder = study.report.parent
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(study.work / f".{study.setting.name}.lock"):
@@ -46,7 +46,7 @@ def report(study: Study, seeds: int) -> dict[str, Any]:
 
 
 def write_study(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write the tables of a study, that of the study itself at the end."""
+    """Write the tables of a study, the study itself at the end."""
     lessons = [
         {"kind": kind} | lesson
         for kind, key in (("front", "fronts"), ("plain", "plain"))

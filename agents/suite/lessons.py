@@ -17,7 +17,7 @@ from fusion_gym.policies.registry import make_policy
 from ..output.files import write
 from ..training.monitor import Measure
 from ..training.run import holds_training, train
-from .envelope_table import at_least, bound_of, measured
+from .committed import at_least, bound_of, measured
 from .envelopes import Test, run_test
 from .fronts import excess_over, meter
 from .learned import report

@@ -1,23 +1,17 @@
-"""All perturbed cases of a setting in a line: in how many of them agents are ahead of the rules."""
+"""The tables of the perturbed cases of a setting, written and read."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fusion_gym.validation import choice
-
-from ..output.markup import NONE, plain_text, share, table_markup
-from .robustness import NOMINAL
 from .tables import grouped, read_rows, write_rows
 
 FOLDER = "robustness"  # of the page for readers in that of the results, and a table's name
 KINDS = {"agents": "agent_", "trained": "trained_"}  # what their labels begin with
-_HEAD = ["setting", "agents", "as assumed", "better", "undecided", "worse", "at worst"]
-_NAMES = {"agents": "as they are", "trained": "trained over draws"}
 Report = Mapping[str, Any]
 
 
-def write_verdict(folder: Path, report: Report) -> None:
+def write_cases(folder: Path, report: Report) -> None:
     """Write what was found of a class into the tables of its setting, beside the other classes."""
     own, points = [], []
     for case, row in report["cases"].items():
@@ -54,39 +48,6 @@ def read_reports(results: Path, settings: Sequence[str]) -> list[dict[str, Any]]
             report = {key: own[0][key] for key in ("episodes", "sha256")}
             result.append({"setting": name, "class": of, "cases": cases} | report)
     return result
-
-
-def robustness_summary(reports: Sequence[Report], titles: Mapping[str, str]) -> list[str]:
-    """A table: each setting's agents as they are, and those trained over draws.
-
-    ``titles`` of the settings by name; what stands before their first comma is shown.
-
-    Raises:
-        ConfigurationError: a setting without a title.
-    """
-    rows = []
-    for report in reports:
-        choice("setting", report["setting"], titles)
-        title = titles[report["setting"]].partition(",")[0]
-        for kind, name in _NAMES.items():
-            if kind in report["cases"][NOMINAL]:
-                rows.append([plain_text(title), name, *_cells(report["cases"], kind)])
-    return table_markup(_HEAD, rows)
-
-
-def _cells(cases: Mapping[str, Report], kind: str) -> Iterator[str]:
-    nominal = cases[NOMINAL][kind].get("middle")
-    result = {
-        row["title"]: row[kind]["middle"]
-        for name, row in cases.items()
-        if name != NOMINAL and "middle" in row.get(kind, {})
-    }
-    better = sum(is_gain(middle) for middle in result.values())
-    worse = sum(middle["low"] > 0.0 for middle in result.values())
-    yield share(nominal)
-    yield from map(str, (better, len(result) - better - worse, worse))
-    worst = max(result, key=lambda title: float(result[title]["mean"]), default=None)
-    yield NONE if worst is None else f"{share(result[worst])}, {plain_text(worst)}"
 
 
 def is_gain(middle: Mapping[str, float]) -> bool:

@@ -1,8 +1,7 @@
-"""What perturbed cases leave of the rules and of the agents' gain, judged and as a table."""
+"""What perturbed cases leave of the rules and of the agents' gain, judged."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,23 +10,12 @@ from fusion_gym.evaluation.envelope import best_mse
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import mean_interval
 
-from ..output.files import write_text
-from ..output.markup import NONE, share
 from .robust_pieces import RULES, RobustFolders, RobustPiece
-from .robust_summary import FOLDER, KINDS, is_gain, read_reports, robustness_summary
+from .robust_summary import KINDS, is_gain
 from .robustness import NOMINAL
 from .verdict import MIDDLE, Searches, judge
 
 Rules = Mapping[str, EpisodeResults]
-
-_HEAD = """
-## {of}
-
-{episodes} test episodes of every policy in every case.
-
-| setting | case | rules' error | agents | left of the gain | trained over draws |
-|---|---|---|---|---|---|
-"""
 
 
 def judge_case(
@@ -96,41 +84,3 @@ def _left(row: Mapping[str, Any] | None, nominal: Mapping[str, Any] | None) -> f
         return None
     before = nominal["middle"]
     return float(row["middle"]["mean"] / before["mean"]) if is_gain(before) else None
-
-
-def write_table(results: Path, titles: Mapping[str, str], command: str) -> Path:
-    """The tables of all settings that have a verdict, in their order, by class; returns their file.
-
-    ``titles`` of the settings, by name.
-
-    Raises:
-        ConfigurationError: a verdict that is damaged.
-    """
-    folder = results / FOLDER
-    reports = read_reports(results, list(titles))
-    result: dict[str, list[dict[str, Any]]] = {}
-    for report in reports:
-        result.setdefault(report["class"], []).append(report)
-    text = Path(__file__).with_suffix(".md").read_text(encoding="utf-8")
-    parts = [text.format(command=command), "\n".join(robustness_summary(reports, titles))]
-    for of, reports in sorted(result.items()):
-        counts = {report["episodes"] for report in reports}
-        option_text = " or ".join(str(count) for count in sorted(counts))
-        parts.append(_HEAD.format(of=of, episodes=option_text))
-        parts.append("\n".join(line for report in reports for line in _lines(report)) + "\n")
-    path = folder / "README.md"
-    write_text(path, "".join(parts))
-    return path
-
-
-def _lines(report: Mapping[str, Any]) -> Iterator[str]:
-    for row in report["cases"].values():
-        left = row.get("agents", {}).get("left")
-        cells = (
-            report["setting"],
-            row["title"],
-            share(row["rules"]),
-            *(share(row.get(kind, {}).get("middle")) for kind in KINDS),
-        )
-        stored = NONE if left is None else f"{left:.0%}"
-        yield f"| {' | '.join((*cells[:4], stored, cells[4]))} |"

@@ -16,7 +16,7 @@ from .config import Setting, Suite
 from .fronts import front_prices
 from .jobs import agent_task
 from .robust_pieces import RULES, RobustFolders, RobustPiece, agent_piece, rules_piece, training
-from .robust_summary import KINDS, write_verdict
+from .robust_summary import KINDS, write_cases
 from .robust_table import judge_case, with_shares
 from .robustness import NOMINAL, Case, Perturbed, drawn_world, world
 
@@ -137,7 +137,7 @@ class RobustTrial(NamedTuple):
             "sha256": self.envelope["sha256"],
             "cases": with_shares(cases),
         }
-        write_verdict(self.folders.results / self.setting.name, report)
+        write_cases(self.folders.results / self.setting.name, report)
 
     def _verdict(self, case: str) -> Path:
         return self.folders.work / self.setting.name / self.of.name / case / "verdict.json"

@@ -18,9 +18,8 @@ from ..output.files import read_json
 from ..output.folders import check_inputs
 from ..training.checked import load_checked, parse
 from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, ValidationConfig
-from .committed import present, read_envelopes
+from .committed import hull_of, present, read_envelopes
 from .config import Setting, Suite
-from .envelope_table import hull_of
 from .envelopes import Test, envelope_task
 from .fronts import Points, front_prices, is_below
 from .jobs import training_of

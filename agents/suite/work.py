@@ -126,10 +126,11 @@ def write_verdict(
         for price, policy in zip(report.get("prices", []), report.get("points", []), strict=True):
             policies.append({"run": run, "name": f"price={price!r}", "price": price, **policy})
         if "genie" in report:
-            policies.append({"run": "genie", "name": report["genie"]["assumes"]} | report["genie"])
+            genie = report["genie"]
+            policies.append({"run": "genie", "name": genie["assumes"], **genie})
     classes: dict[str, Any] = verdict["classes"]
     tables: dict[str, list[dict[str, Any]]] = {
-        "runs": [{"run": run} | report for run, report in reports.items()],
+        "runs": [{"run": run, **report} for run, report in reports.items()],
         "policies": policies,
         "points": [{"class": name} | p for name, of in classes.items() for p in of["points"]],
         "equal_rates": [{"class": name} | p for name, of in classes.items() for p in of["at"]],

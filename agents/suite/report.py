@@ -1,0 +1,784 @@
+"""The pages of the results: data frames made of the tables, rendered by the templates.
+
+A new column of a page is a new entry in the rows of one of these frames.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import pandas as pd
+from rich import box
+from rich.table import Table
+
+from fusion_gym.evaluation.envelope import EnvelopePoint, height
+from fusion_gym.validation import ConfigurationError, choice
+
+from ..output.markup import NONE, code, markup_number, plain_text, ranged, share
+from ..output.tables import table_tables
+from .committed import at_least, bound_of, hull_of, measured, path_of, read_envelopes
+from .config import load_suite
+from .robust_summary import KINDS, is_gain, read_reports
+from .robustness import NOMINAL
+from .study import SOLVED
+from .tables import VERDICT, Row, grouped, read_rows
+from .verdict import MIDDLE, RATES
+from .worth import SHARES
+
+ABOVE = 0.01  # a point lies above the envelope where its whole interval is further up than this
+HEADLINE = 0.2  # of the rate that always transmitting gets: where single errors are named
+LEAST_ROOM = 0.05  # below that the share of it that an agent closes says nothing
+ESTIMATE = "packets that hold the estimate"
+KNOWING = {
+    "memory": "memory, of a scheduler",
+    "hearing": "hearing, of sensors alone",
+    "deciding together": "deciding together",
+    ESTIMATE: "a packet with the estimate",
+}
+# Where a kind of knowledge is nothing of its own, and why.
+_REASONS = {
+    ("memory", "fusion_gym/MarkovJumpTracking-v0"): "nodes remember by themselves",
+    ("memory", "fusion_gym/RemoteEstimation-v0"): "nothing to remember",
+    (ESTIMATE, "fusion_gym/MarkovJumpTracking-v0"): "packets hold the node's estimate",
+    (ESTIMATE, "fusion_gym/UnknownInput-v0"): "the centre begins anew from what was sent",
+    (ESTIMATE, "fusion_gym/RemoteEstimation-v0"): "a packet is the value itself",
+}
+_MARKED = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def _percent(value: float) -> str:
+    """Return a share, with a digit behind the point where it is small."""
+    return f"{100.0 * value:.1f} %" if abs(value) < 0.0995 else f"{100.0 * value:.0f} %"
+
+
+TEMPLATES = jinja2.Environment(
+    loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates")),
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+    undefined=jinja2.StrictUndefined,
+)
+TEMPLATES.filters |= {
+    "share": share, "percent": _percent, "text": plain_text, "code": code, "ranged": ranged,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SettingResults:
+    """A setting's tables as pages and figures need them.
+
+    ``seeds[class]`` has rate and error at each price, by training seed; ``ahead`` are the
+    scheduler's references and ``known`` the centre's. What is not there is empty.
+    """
+
+    name: str
+    verdict: Row
+    classes: dict[str, Row]
+    worths: list[Row]
+    envelopes: Row
+    ahead: list[EnvelopePoint]
+    known: list[EnvelopePoint]
+    genie: Row | None
+    seeds: dict[str, list[list[tuple[float, float]]]]
+    validation: Row
+    rollout: list[EnvelopePoint]
+    rollout_episodes: int
+    bound: Row | None
+
+    @property
+    def label(self) -> str:
+        """The setting's name for readers: its title up to the first comma."""
+        return str(self.verdict["title"].split(",")[0])
+
+    @property
+    def always(self) -> float:
+        """The rate of always transmitting."""
+        return float(self.verdict["always"])
+
+    @property
+    def optimal(self) -> bool:
+        """Whether the scheduler's reference is the optimum."""
+        names = [point.name for point in self.ahead]
+        return bool(names) and all(name.startswith("optimal:") for name in names)
+
+    @property
+    def broadcast(self) -> str:
+        """What a sensor alone receives in the environment as it is."""
+        inputs = self.envelopes.get("inputs", {})
+        every = [front["broadcast"] for front in self.classes.values() if front["broadcast"]]
+        return str(next(iter([*inputs.get("broadcasts", ()), *every]), "none"))
+
+    @property
+    def known_classes(self) -> dict[str, Row]:
+        """The classes with agents, and committed ones where no class of the kind has any."""
+        committed = self.envelopes.get("classes", {})
+        there = {kind_of(front) for front in self.classes.values()}
+        others = {name: of for name, of in committed.items() if kind_of(of) not in there}
+        every = others | self.classes
+        return {name: every[name] for name in dict.fromkeys([*committed, *every]) if name in every}
+
+    def hull(self, name: str) -> list[EnvelopePoint]:
+        """Return the envelope of a class on the test seeds; empty without one."""
+        if name in self.classes:
+            return [
+                EnvelopePoint(p["name"], p["rate"], p["mse"])
+                for p in self.classes[name]["envelope"]
+            ]
+        committed = self.envelopes.get("classes", {})
+        return hull_of(committed[name]) if name in committed else []
+
+    def rules_at(self, name: str, rate: float) -> float | None:
+        """Return the error of a class's rules at a rate."""
+        hull = self.hull(name)
+        return height(hull, rate) if hull else None
+
+    def bound_at(self, rate: float) -> float:
+        """Return the proven bound at a rate."""
+        assert self.bound is not None
+        return at_least(self.bound, rate)
+
+    def worth(self, kind: str) -> Row:
+        """Return the row that stands for a kind: with memory if there is, of the farthest apart."""
+        rows = [row for row in self.worths if row["kind"] == kind]
+        if kind == "memory":
+            rows = [row for row in rows if row["knows"] == "sensors_memory"]
+        if kind == "hearing":
+            rows = [
+                row
+                for row in rows
+                if row["knows"].startswith("local_packets")
+                and row["less"].startswith(f"local_{self.broadcast}")
+            ]
+        return min(rows, key=lambda row: "memory" not in row["knows"], default={})
+
+    def reason(self, kind: str) -> str:
+        """Return why there is nothing of a kind, in a word."""
+        absent = f"fewer than half of {RATES} rates in common" if self.worth(kind) else ""
+        return _REASONS.get((kind, self.verdict["env"]), absent or "not compared")
+
+    def middle(self, name: str) -> str:
+        """Return a class's agents against its rules over the middle, or why there is nothing."""
+        if name in self.classes:
+            middle = self.classes[name].get("middle")
+            return share(middle) if middle else "no price in the middle"
+        return _REASONS.get(("memory", self.verdict["env"]), "no agents")
+
+    def sides(self) -> dict[str, list[Row]]:
+        """Return the fronts whose middle lies below, above or on both sides of the rules."""
+        sides: dict[str, list[Row]] = {"below": [], "above": [], "apart": []}
+        for front in self.classes.values():
+            if "middle" in front:
+                low, high = front["middle"]["low"], front["middle"]["high"]
+                sides["below" if high < 0.0 else "above" if low > 0.0 else "apart"].append(front)
+        return {side: fronts for side, fronts in sides.items() if fronts}
+
+    def gap(self, name: str) -> tuple[float, float] | None:
+        """Return how far rules and agents lie above a class's reference, over the middle."""
+        low, high = (end * self.always for end in MIDDLE)
+        points = self.classes[name]["points"] if name in self.classes else []
+        inside = [p for p in points if "reference" in p and low <= p["rate"] <= high]
+        below = sum(point["reference"] for point in inside)
+        if not inside or below <= 0.0:
+            return None
+        rules, agents = (sum(point[key] for point in inside) / below for key in ("envelope", "mse"))
+        return rules - 1.0, agents - 1.0
+
+    @property
+    def referred(self) -> list[str]:
+        """The classes with a reference of which something is said."""
+        scheduler = "sensors" if "sensors" in self.classes else "sensors_memory"
+        return [name for name in (scheduler, "centre") if self.gap(name)]
+
+    def reference(self, front: Mapping[str, Any]) -> str:
+        """Return what a class is referred to, in words."""
+        if front["mode"] == "centre":
+            return "the best periodic schedules"
+        return "the optimum" if self.optimal else "a lookahead with the model"
+
+
+def kind_of(content: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Return who decides, what a sensor alone receives, and what a packet holds."""
+    packet = content.get("packet") or content["options"].get("packet", "measurement")
+    return content["mode"], content["broadcast"] or "", str(packet)
+
+
+def read_results(results: Path) -> dict[str, SettingResults]:
+    """Return every setting that is judged, by name.
+
+    Raises:
+        ConfigurationError: there are none, or a table that cannot be read.
+    """
+    found = sorted(results.glob(f"*/{VERDICT}.csv"))
+    if not found:
+        earlier = ", and not JSON of an earlier version" * any(results.glob(f"*/{VERDICT}.json"))
+        raise ConfigurationError(
+            f"results = {str(results)!r} is not allowed: it must hold tables of the "
+            f"benchmark{earlier}"
+        )
+    return {path.parent.name: read_setting(path.parent) for path in found}
+
+
+def read_setting(folder: Path) -> SettingResults:
+    """Return one setting's results.
+
+    Raises:
+        ConfigurationError: a table that cannot be read or is of another shape.
+    """
+    verdict = read_verdict(folder)
+    classes = verdict.pop("classes")
+    policies = grouped(read_rows(folder, "policies"), "run")
+    seeds: dict[str, list[list[tuple[float, float]]]] = {}
+    validation: Row = {}
+    for run in read_rows(folder, "runs"):
+        if run.get("class") in classes:
+            validation = validation or run["inputs"]["training"]["validation"]
+            points = [(rate_of(p), p["mse"]["mean"]) for p in policies.get(run["run"], [])]
+            if len(points) == len(classes[run["class"]]["points"]):
+                seeds.setdefault(run["class"], []).append(points)
+    rollout, episodes = measured(folder)
+    committed = path_of(folder.parent, folder.name)
+    return SettingResults(
+        name=folder.name,
+        verdict=verdict,
+        classes=classes,
+        worths=verdict.pop("worth"),
+        envelopes=read_envelopes(folder) if committed.exists() else {},
+        ahead=_places(policies.get("informed", [])),
+        known=_places(policies.get("references", [])),
+        genie=next(iter(policies.get("genie", [])), None),
+        seeds=seeds,
+        validation=validation,
+        rollout=rollout,
+        rollout_episodes=episodes,
+        bound=bound_of(folder),
+    )
+
+
+def read_verdict(folder: Path) -> Row:
+    """Return the verdict of a setting, with its classes by name.
+
+    Raises:
+        ConfigurationError: a table that cannot be read or is of another shape.
+    """
+    rows = read_rows(folder, VERDICT)
+    if len(rows) != 1 or rows[0]["always"] <= 0.0:
+        path = str(folder / f"{VERDICT}.csv")
+        raise ConfigurationError(
+            f"results = {path!r}: always = {[row['always'] for row in rows]} is not allowed: it "
+            "must be one positive rate"
+        )
+    parts = {
+        part: grouped(read_rows(folder, table), "class")
+        for part, table in (("points", "points"), ("at", "equal_rates"), ("envelope", "tested"))
+    }
+    classes: dict[str, Row] = {}
+    for row in read_rows(folder, "fronts"):
+        name = row.pop("class")
+        classes[name] = {"broadcast": None} | row
+        classes[name] |= {part: every.get(name, []) for part, every in parts.items()}
+    return rows[0] | {"classes": classes, "worth": read_rows(folder, "worth")}
+
+
+def _places(policies: Sequence[Row]) -> list[EnvelopePoint]:
+    result = [EnvelopePoint(p["name"], rate_of(p), p["mse"]["mean"]) for p in policies]
+    return sorted(result, key=lambda point: (point.rate, point.mse))
+
+
+def rate_of(policy: Row) -> float:
+    """Return a tested policy's mean rate per sensor and step."""
+    return float(sum(policy["rate"]) / len(policy["rate"]))
+
+
+def cell(points: Sequence[EnvelopePoint], rate: float) -> str:
+    """Return the error at a rate between the points, or a dash."""
+    computed = bool(points) and points[0].rate > 0.0  # point by point: it ends with the last one
+    if not points or (computed and rate > points[-1].rate):
+        return NONE
+    result = height(points, rate)
+    return NONE if result is None else f"{result:.4g}"
+
+
+def above_of(front: Row) -> tuple[list[Row], int]:
+    """Return the points whose whole interval is above the envelope, and of how many."""
+    compared = [point for point in front["points"] if "difference" in point]
+    return [point for point in compared if point["difference"]["low"] > ABOVE], len(compared)
+
+
+def count_above(settings: Sequence[SettingResults]) -> tuple[int, int]:
+    """Return how many points of all classes lie above the envelope, and of how many."""
+    pairs = [above_of(front) for item in settings for front in item.classes.values()]
+    return sum(len(points) for points, _ in pairs), sum(count for _, count in pairs)
+
+
+# The frames of the report.
+
+
+def knowing_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
+    """Return what knowing more is worth to rules and to agents."""
+    return pd.DataFrame(
+        {"setting": plain_text(item.label), "of": who}
+        | {
+            head: share(item.worth(kind)[who]) if who in item.worth(kind) else item.reason(kind)
+            for kind, head in KNOWING.items()
+        }
+        for item in settings
+        for who in ("rules", "agents")
+    )
+
+
+def learning_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
+    """Return what learning is worth: agents against the rules of the same class."""
+    return pd.DataFrame(
+        {
+            "setting": plain_text(item.label),
+            "centre": item.middle("centre"),
+            "alone": item.middle(f"local_{item.broadcast}"),
+            "alone, memory": item.middle(f"local_{item.broadcast}_memory"),
+            "scheduler": item.middle("sensors"),
+            "scheduler, memory": item.middle("sensors_memory"),
+        }
+        for item in settings
+    )
+
+
+def headline_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
+    """Return the front page's table: what memory is worth to rules, and what learning is."""
+    frame, knowing = learning_frame(settings), knowing_frame(settings)
+    memory = knowing[knowing["of"] == "rules"][KNOWING["memory"]].to_numpy()
+    frame.insert(1, "rules of a scheduler: memory", memory)
+    return frame
+
+
+def above_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
+    """Return each point at which agents are worse than rules."""
+    return pd.DataFrame(
+        {
+            "setting": plain_text(item.label),
+            "class": plain_text(name),
+            "price": f"{point['price']:.3g}",
+            "rate": f"{point['rate']:.4f}",
+            "difference": share(point["difference"]),
+        }
+        for item in settings
+        for name, front in item.classes.items()
+        for point in above_of(front)[0]
+    )
+
+
+def classes_frame(results: SettingResults) -> pd.DataFrame:
+    """Return how the agents of each class did."""
+    rows = []
+    for name, front in results.classes.items():
+        above, count = above_of(front)
+        hindsight = front.get("hindsight_room")
+        rows.append(
+            {
+                "class": plain_text(name),
+                "seeds": front["seeds"],
+                "agents against rules, middle": share(front["middle"])
+                if "middle" in front
+                else "no price there",
+                "rates there": f"{len(front.get('rates', []))} of {RATES}",
+                "points above +1 %": f"{len(above)} of {count}",
+                "share of the gap to the reference closed": _closed(results, front),
+                "in hindsight": NONE if hindsight is None else f"{-hindsight:+.0%}",
+                "rules at a fifth of the rate": _strongest(results, name),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _closed(results: SettingResults, front: Row) -> str:
+    """Return how much of the room between rules and reference the agents close."""
+    if not any("reference" in point for point in front["points"]):
+        return "no reference"
+    what = results.reference(front).removeprefix("the ").removeprefix("a ")
+    room = front.get("room")
+    if room is None:
+        return f"none is left to {what}"
+    if room < LEAST_ROOM:
+        return f"room {room:.1%} only ({what})"
+    return f"{front['closed']:.0%} of {room:.1%} ({what})"
+
+
+def _strongest(results: SettingResults, name: str) -> str:
+    """Return the rules that are mixed at a typical rate, without their parameters."""
+    hull, rate = results.hull(name), HEADLINE * results.always
+    left = [point for point in hull if point.rate <= rate][-1:]
+    right = [point for point in hull if point.rate > rate][:1]
+    rules = dict.fromkeys(point.name.split(":")[0].split(" [")[0] for point in (*left, *right))
+    return ", ".join(code(rule) for rule in rules) or NONE
+
+
+def rates_frame(results: SettingResults) -> pd.DataFrame:
+    """Return rules and agents of each class at a few rates."""
+    simulated = "simulated"
+    if results.rollout:
+        simulated += f" ({results.rollout_episodes} episodes)"
+    classes = results.known_classes
+    rows = []
+    for name, front in classes.items():
+        last = "sensors_memory" if "sensors_memory" in classes else "sensors"
+        for row in front.get("at") or [{"rate": part * results.always} for part in SHARES]:
+            rate = row["rate"]
+            rules = markup_number(row.get("rules"))
+            if "at" not in front:  # without agents
+                error = results.rules_at(name, rate)
+                rules = NONE if error is None else f"{error:.4g}"
+            rows.append(
+                {
+                    "class": plain_text(name),
+                    "rate": f"{rate:.4g}",
+                    "rules": rules,
+                    "agents": markup_number(row.get("agents")),
+                    "difference": share(row.get("difference")),
+                    simulated: cell(results.rollout, rate) if name == last else NONE,
+                    "proven bound": f"{results.bound_at(rate):.4g}" if results.bound else NONE,
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def worth_frame(results: SettingResults) -> pd.DataFrame:
+    """Return what each class is worth beside one that knows less."""
+    return pd.DataFrame(
+        {
+            "what is known more": plain_text(row["kind"]),
+            "class": plain_text(row["knows"]),
+            "beside": plain_text(row["less"]),
+            "rules": share(row.get("rules")),
+            "agents": share(row.get("agents")),
+        }
+        for row in results.worths
+        if "rules" in row or "agents" in row
+    )
+
+
+def text_of(
+    results: Mapping[str, SettingResults], command: str, panels: Mapping[str, Sequence[str]]
+) -> str:
+    """Return the report in Markdown; ``panels`` has the small panels of each setting's figure."""
+    settings = list(results.values())
+    fronts = [front for item in settings for front in item.classes.values()]
+    return _render(
+        "report.md",
+        settings=settings,
+        command=command,
+        panels=panels,
+        trained=[front["seeds"] for front in fronts],
+        tuned=[item.envelopes["inputs"]["tuning"] for item in settings if item.envelopes],
+        validated=[item.validation for item in settings if item.validation],
+    )
+
+
+def _render(template: str, **values: Any) -> str:
+    """Return a template's text; it may call every function of this module."""
+    text = TEMPLATES.get_template(template).render(globals() | values)
+    return text.rstrip("\n") + "\n"
+
+
+# Parts of other pages.
+
+
+def update_pages(text: str, settings: Mapping[str, SettingResults], results: Path) -> str:
+    """Return the text with all its marked parts made again.
+
+    ``<!-- results: SETTING -->`` to ``<!-- end -->`` holds what was found in a setting, with
+    ``headline`` in its place the table of all settings and how many points lie above envelopes,
+    and with ``robustness`` what the folder ``results`` has of perturbed cases.
+
+    Raises:
+        ConfigurationError: a setting that neither the results nor the benchmark has.
+    """
+    titles = {setting.name: setting.title for setting in load_suite("benchmark").settings}
+
+    def part(match: re.Match[str]) -> str:
+        choice("results", match[2], dict.fromkeys(["headline", "robustness", *settings, *titles]))
+        content = _render(
+            "part.md",
+            name=match[2],
+            settings=list(settings.values()),
+            trained=[f["seeds"] for item in settings.values() for f in item.classes.values()],
+            results=settings.get(match[2]),
+            reports=read_reports(results, list(titles)),
+            titles=titles,
+        )
+        return f"{match[1]}\n{content}\n{match[3]}"
+
+    return _MARKED.sub(part, text)
+
+
+# Perturbed cases.
+
+
+def robustness_frame(reports: Sequence[Row], titles: Mapping[str, str]) -> pd.DataFrame:
+    """Return in how many cases agents are ahead of the rules; ``titles`` of settings by name."""
+    rows = []
+    for report in reports:
+        choice("setting", report["setting"], titles)
+        cases = report["cases"]
+        for kind, name in (("agents", "as they are"), ("trained", "trained over draws")):
+            if kind not in cases[NOMINAL]:
+                continue
+            result = {
+                row["title"]: row[kind]["middle"]
+                for case, row in cases.items()
+                if case != NOMINAL and "middle" in row.get(kind, {})
+            }
+            better = sum(is_gain(middle) for middle in result.values())
+            worse = sum(middle["low"] > 0.0 for middle in result.values())
+            worst = max(result, key=lambda title: float(result[title]["mean"]), default="")
+            rows.append(
+                {
+                    "setting": plain_text(titles[report["setting"]].partition(",")[0]),
+                    "agents": name,
+                    "as assumed": share(cases[NOMINAL][kind].get("middle")),
+                    "better": better,
+                    "undecided": len(result) - better - worse,
+                    "worse": worse,
+                    "at worst": f"{share(result[worst])}, {plain_text(worst)}" if worst else NONE,
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def cases_frame(reports: Sequence[Row]) -> pd.DataFrame:
+    """Return what each case leaves of the rules and of the agents' gain."""
+    rows = []
+    for report in reports:
+        for row in report["cases"].values():
+            middles = {kind: row.get(kind, {}).get("middle") for kind in KINDS}
+            left = row.get("agents", {}).get("left")
+            rows.append(
+                {
+                    "setting": report["setting"],
+                    "case": row["title"],
+                    "rules' error": share(row.get("rules")),
+                    "agents": share(middles["agents"]),
+                    "left of the gain": NONE if left is None else f"{left:.0%}",
+                    "trained over draws": share(middles["trained"]),
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def robustness_text(results: Path, titles: Mapping[str, str], command: str) -> str:
+    """Return the page of perturbed cases of the settings with these titles.
+
+    Raises:
+        ConfigurationError: a table that cannot be read or is of another shape.
+    """
+    reports = read_reports(results, list(titles))
+    of = {name: [r for r in reports if r["class"] == name] for name in
+          sorted({report["class"] for report in reports})}  # fmt: skip
+    return _render("robustness.md", reports=reports, by_class=of, titles=titles, command=command)
+
+
+# Committed envelopes.
+
+
+def envelopes_text(results: Path, command: str) -> str:
+    """Return the page of the committed rules.
+
+    Raises:
+        ConfigurationError: a table that cannot be read or is of another shape.
+    """
+    folders = [path.parent for path in sorted(results.glob("*/classes.csv"))]
+    content = {folder.name: read_envelopes(folder) for folder in folders}
+    rows = pd.concat([envelopes_frame(results / name, item) for name, item in content.items()])
+    return _render("envelopes.md", command=command, rows=rows, settings=content)
+
+
+def envelopes_frame(folder: Path, envelopes: Row) -> pd.DataFrame:
+    """Return rules at a few rates; simulated were packets with a measurement."""
+    rates = [round(part * envelopes["always"], 4) for part in SHARES]
+    (rollout, episodes), bound = measured(folder), bound_of(folder)
+    hulls: dict[str, dict[bool, list[EnvelopePoint]]] = {}
+    for content in envelopes["classes"].values():
+        mode, broadcast, packet = kind_of(content)
+        held = ESTIMATE if packet == "estimate" else ""
+        name = ", ".join(part for part in (mode, broadcast, held) if part)
+        hulls.setdefault(name, {})[content["memory"]] = hull_of(content)
+    rows = []
+    for name, by_memory in sorted(hulls.items()):
+        for rate in rates:
+            simulated = cell(rollout if name == "sensors" else [], rate)
+            rows.append(
+                {
+                    "setting": folder.name,
+                    "class": name,
+                    "rate": f"{rate:.4g}",
+                    "without memory": cell(by_memory.get(False, []), rate),
+                    "with memory": cell(by_memory.get(True, []), rate),
+                    "rollout": simulated if simulated == NONE else f"{simulated} ({episodes})",
+                    "bound": NONE if bound is None else f"{at_least(bound, rate):.4g}",
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+# How fast agents learn.
+
+
+def studies_frame(studies: Sequence[Row]) -> pd.DataFrame:
+    """Return one row a setting, of how fast agents learn."""
+    rows = []
+    for study in studies:
+        speed, course = study["throughput"] or {}, study["course"]
+        fronts, plain = (
+            _moments(study["reached"][kind]) if course["memoryless"] else NONE
+            for kind in ("front", "plain")
+        )
+        result = study["finished"]
+        rows.append(
+            {
+                "setting": study["setting"],
+                "steps/s": f"{speed['without']:,.0f}" if "without" in speed else NONE,
+                "with values": f"{speed['values']:,.0f}" if "values" in speed else NONE,
+                "below the rules without memory": fronts,
+                "plain PPO": plain,
+                "finished against": course["against"],
+                "above": NONE,
+                "worst": NONE,
+                "gap closed": NONE,
+            }
+        )
+        if result:
+            worst, (low, high) = result["worst"], result["rates"]
+            parts = {name: part for name, part in result["closed"].items() if part is not None}
+            rows[-1] |= {
+                "above": f"{len(result['above'])} of {result['compared']} above "
+                f"{course['allowed']:+.1%} (rates {low:.3f} to {high:.3f})",
+                "worst": f"{share(worst['difference'])} (seed {worst['seed']}, price "
+                f"{worst['price']:.3g})",
+                "gap closed": ", ".join(f"{part:.0%} to {name}" for name, part in parts.items())
+                or NONE,
+            }
+    return pd.DataFrame(rows)
+
+
+def _moments(reached: Sequence[Row]) -> str:
+    """Return when the seeds' fronts first were below the envelope."""
+    if not reached:
+        return NONE
+    firsts = [item["first"] for item in reached if "first" in item]
+    parts = [f"{len(firsts)} of {len(reached)} seeds"]
+    if firsts:
+        for form, name in (("{:.0f} s", "cpu_seconds"), ("{:,} steps", "timesteps")):
+            ends = [form.format(choose(item[name] for item in firsts)) for choose in (min, max)]
+            parts.append(" to ".join(dict.fromkeys(ends)))
+    late = [item["cpu_seconds"] for item in reached if "first" not in item]
+    return ", ".join(parts + ([f"not within {min(late):.0f} s"] if late else []))
+
+
+def curves_frame(study: Row) -> pd.DataFrame:
+    """Return the most by which fronts are above the rules without memory, over steps."""
+    rows = []
+    for label, key in (("with credit and memory", "fronts"), ("plain PPO", "plain")):
+        points = [point for item in study[key] for point in item["curve"]]
+        for steps in sorted({point["timesteps"] for point in points}):
+            own = [point for point in points if point["timesteps"] == steps]
+            known = [point["excess"] for point in own if point["excess"] is not None]
+            ends = [f"{choose(known):+.0%}" for choose in (min, max)] if known else [NONE]
+            rows.append(
+                {
+                    "training": label,
+                    "steps": f"{steps:,}",
+                    "seconds": f"{np.mean([point['cpu_seconds'] for point in own]):.1f}",
+                    "above the rules without memory by at most": " to ".join(dict.fromkeys(ends)),
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def finished_frame(study: Row) -> pd.DataFrame:
+    """Return the finished fronts of all seeds, price by price."""
+    names = ["cost", "optimum"] if study["course"]["against"] in SOLVED else ["mse", "envelope"]
+    rows = []
+    for place, price in enumerate(study["prices"]):
+        points = [front["points"][place] for front in study["fronts"]]
+        points = [point for point in points if "difference" in point]
+        if not points:
+            continue
+        worst = max((p["difference"] for p in points), key=lambda ends: float(ends["mean"]))
+        above = sum(p["difference"]["low"] > study["course"]["allowed"] for p in points)
+        mean = float(np.mean([p["difference"]["mean"] for p in points]))
+        rows.append(
+            {"price": f"{price:.3g}{'' if study['inner'][place] else ' (outer)'}"}
+            | {name: f"{np.mean([p[name] for p in points]):.4g}" for name in ("rate", *names)}
+            | {
+                "difference, mean of seeds": f"{mean:+.1%}",
+                "worst seed": share(worst),
+                "above": f"{above} of {len(points)}",
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def learning_text(studies: Sequence[Row], command: str) -> str:
+    """Return the page of how fast agents learn."""
+    return _render("learning.md", studies=studies, command=command)
+
+
+def learning_table(studies: Sequence[Row]) -> Table:
+    """Return its first table for the terminal."""
+    frame = studies_frame(studies)
+    table = Table(title="what agents learn, and how fast", box=box.SIMPLE_HEAD, show_lines=True)
+    for column in frame:
+        table.add_column(str(column), overflow="fold", no_wrap=column == "setting")
+    for row in frame.to_numpy():
+        table.add_row(*row)
+    return table
+
+
+# The quick benchmark beside the full one.
+
+
+def agreement_table(quick: Path, full: Path, settings: Sequence[str]) -> Table | None:
+    """Return each class of agents over the middle of its front, by both, and whether they agree.
+
+    They agree where their 95 % intervals have a value in common. ``None`` where the folder
+    ``full`` has no verdict of any class that the folder ``quick`` has.
+
+    Raises:
+        ConfigurationError: a verdict that is damaged.
+    """
+    pairs = list(_middles(quick, full, settings))
+    if not pairs:
+        return None
+    agree = [
+        our["low"] <= their["high"] and their["low"] <= our["high"] for *_, our, their in pairs
+    ]
+    frame = pd.DataFrame(
+        {
+            "setting": name,
+            "class": of,
+            "quick": share(our),
+            "full": share(their),
+            "agree": "yes" if same else "no",
+        }
+        for (name, of, our, their), same in zip(pairs, agree, strict=True)
+    )
+    return table_tables(
+        "agents against the rules of their class: the quick benchmark and the full one",
+        list(frame.columns),
+        frame.to_numpy().tolist(),
+        f"{sum(agree)} of {len(agree)} verdicts agree: their 95 % intervals overlap",
+    )
+
+
+def _middles(
+    quick: Path, full: Path, settings: Sequence[str]
+) -> Iterator[tuple[str, str, Row, Row]]:
+    """Return the middles of the classes that both have."""
+    for name in settings:
+        ours, theirs = (
+            {row["class"]: row["middle"] for row in read_rows(folder / name, "fronts")
+             if "middle" in row} if (folder / name / "fronts.csv").exists() else {}
+            for folder in (quick, full)
+        )  # fmt: skip
+        yield from ((name, of, our, theirs[of]) for of, our in ours.items() if of in theirs)
