@@ -18,20 +18,22 @@ from typing import Annotated
 from fusion_gym.validation import ConfigurationError, choice
 
 from .command_line import SuiteCommand
+from .experiments.classes import names_of, trained_classes
+from .experiments.config import Setting, Suite, load_suite
+from .experiments.references import (
+    SHIPPED,
+    EnvelopeStore,
+    complete_envelopes,
+    envelope_task,
+    run_test,
+)
+from .experiments.report import agreement_table
+from .experiments.training import Folders, job_finished, jobs, judge_setting, rules_of, run_job
+from .experiments.workers import BackendName, Call, Pool, side_by_side
 from .input.options import Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
 from .output.progress import writing
 from .output.tables import console
-from .suite.beside_rules import SHIPPED
-from .suite.classes import names_of, trained_classes
-from .suite.committed import Shelf, complete
-from .suite.config import Setting, Suite, load_suite
-from .suite.envelopes import envelope_task, run_test
-from .suite.jobs import Folders, job_finished, jobs, rules_of
-from .suite.report import agreement_table
-from .suite.team import BackendName, Team
-from .suite.work import conclude, run_job
-from .suite.workers import Work, side_by_side
 from .training.checked import parse
 
 USUAL = Path("results")  # of the full benchmark
@@ -68,7 +70,7 @@ class Benchmark(SuiteCommand):
 
     def _run(self) -> None:
         suite = self.suite()
-        team = Team(self.workers, self.backend, self.address)
+        team = Pool(self.workers, self.backend, self.address)
         folders = Folders.create(self.results, self.work, self.quick)
         if not team.here:  # whoever works has another working directory
             folders = Folders(folders.results.absolute(), folders.work.absolute())
@@ -87,9 +89,11 @@ class Benchmark(SuiteCommand):
             shelf = self._shelf(suite, settings, folders)
             for setting in settings:
                 compared = [of.name for of in trained_classes(suite, setting)]
-                complete(shelf.suite, [setting], compared, shelf.results, folders.work, team)
+                complete_envelopes(
+                    shelf.suite, [setting], compared, shelf.results, folders.work, team
+                )
             rules = [
-                Work(4.0, run_test, (test, folders.work))
+                Call(4.0, run_test, (test, folders.work))
                 for setting in settings
                 for test in rules_of(suite, setting, shelf)
                 if not test.path(folders.work).exists()
@@ -100,14 +104,14 @@ class Benchmark(SuiteCommand):
             done = [job.place for job in every if job_finished(job, suite, folders)]
             side_by_side(
                 [
-                    Work(job.weight, run_job, (job, suite, folders, shelf))
+                    Call(job.weight, run_job, (job, suite, folders, shelf))
                     for job in jobs(suite, settings, classes, shelf)
                     if job.place not in done
                 ],
                 team,
                 "benchmark",
             )
-            judged = [Work(30.0, conclude, (suite, item, folders, shelf)) for item in settings]
+            judged = [Call(30.0, judge_setting, (suite, item, folders, shelf)) for item in settings]
             side_by_side(judged, team, "verdicts")
         if self.quick:
             beside = agreement_table(folders.results, USUAL, [setting.name for setting in settings])
@@ -127,12 +131,12 @@ class Benchmark(SuiteCommand):
                     "work: go on with --resume, or give another --results and --work"
                 )
 
-    def _shelf(self, suite: Suite, settings: Sequence[Setting], folders: Folders) -> Shelf:
+    def _shelf(self, suite: Suite, settings: Sequence[Setting], folders: Folders) -> EnvelopeStore:
         """The quick benchmark takes the envelopes that are shipped, if they are of this config."""
-        shipped = Shelf(load_suite(self.config), SHIPPED)
+        shipped = EnvelopeStore(load_suite(self.config), SHIPPED)
         if self.quick and all(
             {of.name for of in trained_classes(suite, setting)} <= shipped.envelopes(setting).keys()
             for setting in settings
         ):
             return shipped
-        return Shelf(suite, folders.results)
+        return EnvelopeStore(suite, folders.results)

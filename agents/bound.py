@@ -22,11 +22,11 @@ from fusion_gym.solvers.silence import SilenceBound, silence_bound, silence_mode
 from fusion_gym.validation import choice
 
 from .command_line import Long, SetOptions
+from .experiments.tables import write_rows
 from .input.options import Between, Episodes, OutputFile, OutputFolder, Seed, Whole
 from .output import tables as terminal
 from .output.files import write
 from .output.progress import progress_bar, writing
-from .suite.tables import write_rows
 
 _WEIGHTS = ("mse", "reward")
 

@@ -14,15 +14,15 @@ from dataclasses import dataclass
 from fusion_gym.validation import ConfigurationError, choice
 
 from .command_line import SuiteCommand
+from .experiments.classes import classes_of
+from .experiments.config import load_suite
+from .experiments.references import ENVELOPES, committed_classes, complete_envelopes
+from .experiments.report import envelopes_text
+from .experiments.training import Folders
+from .experiments.workers import Pool
 from .input.options import writable_folder
 from .output.files import write_text
 from .output.progress import writing
-from .suite.classes import classes_of
-from .suite.committed import FOLDER, complete, present
-from .suite.config import load_suite
-from .suite.jobs import Folders
-from .suite.report import envelopes_text
-from .suite.team import Team
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Envelope(SuiteCommand):
             there = [
                 name
                 for setting in settings
-                for name in present(suite, setting, folders.results)
+                for name in committed_classes(suite, setting, folders.results)
                 if not self.classes or name in self.classes
             ]
             if there and not self.resume:
@@ -56,9 +56,9 @@ class Envelope(SuiteCommand):
                 ("finished envelopes", folders.results),
                 ("what was tuned and tested", folders.work),
             )
-            complete(
-                suite, settings, self.classes, folders.results, folders.work, Team(self.workers)
+            complete_envelopes(
+                suite, settings, self.classes, folders.results, folders.work, Pool(self.workers)
             )
-            readme = folders.results / FOLDER / "README.md"
+            readme = folders.results / ENVELOPES / "README.md"
             write_text(readme, envelopes_text(folders.results, "fusion-gym envelope"))
         print(f"envelopes in {folders.results}, the table in {readme}")

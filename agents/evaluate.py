@@ -22,12 +22,12 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import Long, PolicyNames, SetOptions
-from .input.environment import environment_of
 from .input.files import checked
 from .input.options import Episodes, OutputFile, Seed
 from .output import tables
 from .output.files import read_json, write
 from .output.progress import progress_bar, remark, writing
+from .training.environment import environment_of
 
 
 class Ends(pydantic.BaseModel):

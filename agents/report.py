@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Annotated
 
 from .command_line import Command
+from .experiments.figures import draw_overview, draw_setting, report_text
+from .experiments.report import read_results, update_pages
 from .input.files import read_text
 from .input.options import OutputFolder
 from .output.files import write_text
 from .output.markup import page_of
-from .suite.figures import draw_overview, draw_setting, report_text
-from .suite.report import read_results, update_pages
 
 TITLE = "Results of the benchmark"
 

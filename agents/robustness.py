@@ -20,22 +20,27 @@ import tyro
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import Long
+from .experiments import robustness as robust_pieces
+from .experiments.classes import trained_classes
+from .experiments.config import (
+    Perturbed,
+    Setting,
+    Suite,
+    load_robustness,
+    load_suite,
+    select_settings,
+)
+from .experiments.config import RobustnessSettings as Config
+from .experiments.references import EnvelopeStore
+from .experiments.report import robustness_text
+from .experiments.robustness import RobustTrial
+from .experiments.verdict import ROBUSTNESS
+from .experiments.workers import Call, Pool, side_by_side
 from .input.options import Episodes, InputFolder, OutputFolder, Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
 from .output.files import write_text
 from .output.folders import alone_in
 from .output.progress import writing
-from .suite import robust_pieces
-from .suite.classes import trained_classes
-from .suite.committed import Shelf
-from .suite.config import Setting, Suite, load_suite
-from .suite.report import robustness_text
-from .suite.robust_summary import FOLDER
-from .suite.robust_trial import RobustTrial
-from .suite.robustness import Perturbed, load_robustness, select_settings
-from .suite.robustness import RobustnessSettings as Config
-from .suite.team import Team
-from .suite.workers import Work, side_by_side
 from .training.checked import parse
 
 USUAL = Path("runs/benchmark/full")
@@ -82,7 +87,7 @@ class Robustness(Long):
         config = load_robustness(self.config)
         folders = robust_pieces.RobustFolders(self.results, self.work)
         trials = [self._trial(config, item, folders) for item in select_settings(config, self.envs)]
-        place = self.results / FOLDER
+        place = self.results / ROBUSTNESS
         writable_folder("results", place)
         with alone_in(place, "results"), alone_in(self.work, "work"):
             there = [
@@ -100,19 +105,19 @@ class Robustness(Long):
             trainings = [training for trial in trials for training in trial.trainings]
             if trainings:
                 work = [
-                    Work(
+                    Call(
                         30.0 + training.training.timesteps / 10_000,
                         robust_pieces.run_training,
                         (training,),
                     )
                     for training in trainings
                 ]
-                side_by_side(work, Team(self.workers), "trainings over draws")
+                side_by_side(work, Pool(self.workers), "trainings over draws")
                 self._work(trials, ("trained",), folders)
-            rows = [Work(20.0, trial.judge, (case,)) for trial in trials for case in trial.worlds]
-            side_by_side(rows, Team(self.workers), "verdicts")
+            rows = [Call(20.0, trial.judge, (case,)) for trial in trials for case in trial.worlds]
+            side_by_side(rows, Pool(self.workers), "verdicts")
             for trial in trials:
-                trial.conclude()
+                trial.write_verdict()
             every = {setting.name: setting.title for setting in load_suite(config.suite).settings}
             titles = {setting.setting: every[setting.setting] for setting in config.settings}
             table = place / "README.md"
@@ -132,7 +137,7 @@ class Robustness(Long):
     ) -> RobustTrial:
         """A setting with its agents, everything checked."""
         suite = load_suite(config.suite)
-        shelf = Shelf(suite, self.results)
+        shelf = EnvelopeStore(suite, self.results)
         changed = {"training_seeds": self.seeds, "timesteps": self.timesteps}
         changed = {key: value for key, value in changed.items() if value is not None}
         suite = parse(Suite, suite.model_dump() | changed, "command line")
@@ -155,8 +160,8 @@ class Robustness(Long):
         pieces = [piece for trial in trials for piece in trial.pieces(kinds)]
         left = [piece for piece in pieces if not folders.finished(piece)]
         side_by_side(
-            [Work(piece.weight, robust_pieces.run_piece, (piece, folders)) for piece in left],
-            Team(self.workers),
+            [Call(piece.weight, robust_pieces.run_piece, (piece, folders)) for piece in left],
+            Pool(self.workers),
             " and ".join(kinds),
         )
 

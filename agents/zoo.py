@@ -19,13 +19,13 @@ from fusion_gym import zoo
 from fusion_gym.validation import ConfigurationError, choice
 
 from .command_line import Long
+from .experiments.classes import HEARD, KNOWS
+from .experiments.config import Mode
+from .experiments.tables import grouped, read_rows
 from .input.options import InputFolder, OutputFolder
 from .output.files import read_json, replacing, write
 from .output.progress import writing
 from .output.small_model import small_model
-from .suite.classes import HEARD, KNOWS
-from .suite.config import Mode
-from .suite.tables import grouped, read_rows
 
 LARGEST = 300_000  # bytes of a model
 MOST = 4_000_000  # bytes of all of them

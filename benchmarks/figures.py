@@ -32,14 +32,14 @@ from typing import Any
 import torch
 import yaml
 
-from fusion_gym.agents.suite.committed import read_envelopes
-from fusion_gym.agents.suite.tables import read_frame
+from fusion_gym.agents.experiments.references import read_envelopes
+from fusion_gym.agents.experiments.tables import read_frame
 
 TIMESTEPS = 100_000
 VALIDATION = {"every": 60_000, "episodes": 64}  # once on the way, and once at the end
 BENCHMARK = "tobit_oscillator"
 # Takes a temporary folder and returns what is to be hashed.
-Work = Callable[[Path], bytes]
+Piece = Callable[[Path], bytes]
 Content = dict[str, Any]
 
 
@@ -114,7 +114,7 @@ def benchmark(setting: str, folder: Path) -> bytes:
     return json.dumps(result | {path.name: path.read_text() for path in tables}).encode()
 
 
-def zoo_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
+def zoo_pieces(episodes: int) -> Iterator[tuple[str, Piece]]:
     """Every agent of the zoo at its prices, in its environment."""
     for path in sorted(Path("fusion_gym/zoo").glob("*.json")):
         card = read(path)
@@ -126,7 +126,7 @@ def zoo_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
         yield f"zoo {path.stem}, {episodes} episodes", work
 
 
-def envelope_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
+def envelope_pieces(episodes: int) -> Iterator[tuple[str, Piece]]:
     """Every setting's rules that no other rule beats, in the worlds that they were tuned in."""
     for path in sorted(Path("results").glob("*/fronts.csv")):
         stored = read_envelopes(path.parent)
@@ -142,13 +142,13 @@ def envelope_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
             yield f"envelopes {path.parent.name}, {key}, {episodes} episodes", work
 
 
-def reproduce_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
+def reproduce_pieces(episodes: int) -> Iterator[tuple[str, Piece]]:
     """Every table of the documentation."""
     for path in sorted(Path("configs").glob("*_reproduce.yaml")):
         yield f"reproduce {path.stem}, {episodes} episodes", partial(reproduce, path, episodes)
 
 
-def training_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
+def training_pieces(episodes: int) -> Iterator[tuple[str, Piece]]:
     """Every config of a training; its episodes are ``VALIDATION``'s."""
     for path in sorted(Path("configs").glob("*.yaml")):
         plain = yaml.safe_load(path.read_text())
@@ -156,12 +156,12 @@ def training_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
             yield f"trainings {path.stem}", partial(train, plain)
 
 
-def benchmark_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
+def benchmark_pieces(episodes: int) -> Iterator[tuple[str, Piece]]:
     """The quick benchmark of one setting; its episodes are those of ``--quick``."""
     yield f"benchmark {BENCHMARK}", partial(benchmark, BENCHMARK)
 
 
-KINDS: dict[str, Callable[[int], Iterator[tuple[str, Work]]]] = {
+KINDS: dict[str, Callable[[int], Iterator[tuple[str, Piece]]]] = {
     "zoo": zoo_pieces,
     "envelopes": envelope_pieces,
     "reproduce": reproduce_pieces,
@@ -170,7 +170,7 @@ KINDS: dict[str, Callable[[int], Iterator[tuple[str, Work]]]] = {
 }
 
 
-def fingerprint(work: Work) -> tuple[str, float]:
+def fingerprint(work: Piece) -> tuple[str, float]:
     """The SHA-256 of what the work gave, and the seconds that it took."""
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:

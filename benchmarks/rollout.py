@@ -16,8 +16,8 @@ from typing import Any
 import yaml
 
 import fusion_gym
+from fusion_gym.agents.experiments.tables import write_rows
 from fusion_gym.agents.output.progress import progress_bar, quietly, remark, writing
-from fusion_gym.agents.suite.tables import write_rows
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.metrics import mean_interval

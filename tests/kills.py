@@ -26,7 +26,7 @@ from stable_baselines3 import PPO
 from training_configs import small_config
 
 from fusion_gym.agents.__main__ import load
-from fusion_gym.agents.suite import verdict
+from fusion_gym.agents.experiments import verdict
 
 Outcome = dict[str, Any]
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fusion_gym.agents.suite.work import write_verdict
+from fusion_gym.agents.experiments.training import write_verdict
 
 ENV = "fusion_gym/RemoteEstimation-v0"
 SETTING = "remote_estimation"
@@ -26,7 +26,7 @@ def interval(mean: float, half: float = 0.01) -> dict[str, float]:
     return {"mean": mean, "low": mean - half, "high": mean + half}
 
 
-def tested(rate: float, mse: float) -> dict[str, Any]:
+def outcome(rate: float, mse: float) -> dict[str, Any]:
     others = {name: interval(0.0) for name in ("return", "denied", "tokens", "nees")}
     return {"rate": [rate, rate], "mse": interval(mse), "median": mse} | others
 
@@ -102,7 +102,7 @@ def agent(name: str, seed: int) -> dict[str, Any]:
         "training_seed": seed,
         "best_validation": {"return": -1.0 - seed},
         "prices": list(PRICES),
-        "points": [tested(rate, (1.0 + 0.1 * seed) * error(scale, rate)) for rate in RATES],
+        "points": [outcome(rate, (1.0 + 0.1 * seed) * error(scale, rate)) for rate in RATES],
     }
 
 
@@ -123,17 +123,17 @@ def small_results(
         "worth": [worth | {"rules": interval(-0.2), "agents": interval(0.0)}],
     }
     places = [place for item in fronts.values() for place in item["envelope"]]
-    policies = {place["name"]: tested(place["rate"], place["mse"]) for place in places}
+    policies = {place["name"]: outcome(place["rate"], place["mse"]) for place in places}
     baselines: dict[str, Any] = run() | {
         "curves": {
             "always": {"knows": "centre", "policies": ["always"]},
         },
-        "policies": policies | {"always": tested(ALWAYS, 1.0)},
-        "genie": tested(0.5, 0.5) | {"assumes": "everything arrives"},
+        "policies": policies | {"always": outcome(ALWAYS, 1.0)},
+        "genie": outcome(0.5, 0.5) | {"assumes": "everything arrives"},
     }
     if policies:
         baselines["curves"]["paced"] = {"knows": "centre", "policies": list(policies)}
-    ahead = {f"lookahead:steps=1,price={rate}": tested(rate, error(0.7, rate)) for rate in RATES}
+    ahead = {f"lookahead:steps=1,price={rate}": outcome(rate, error(0.7, rate)) for rate in RATES}
     reports = {"baselines": baselines, "informed": run() | {"policies": ahead}}
     for name in classes:
         for seed in range(seeds):

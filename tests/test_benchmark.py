@@ -20,15 +20,14 @@ from training_configs import small_config
 import fusion_gym
 from fusion_gym.agents import __main__ as everything
 from fusion_gym.agents import benchmark, report, solved, tune, zoo
+from fusion_gym.agents.experiments import training as jobs
+from fusion_gym.agents.experiments.classes import classes_of, trained_classes
+from fusion_gym.agents.experiments.config import load_suite
+from fusion_gym.agents.experiments.references import read_envelopes, searches_of
+from fusion_gym.agents.experiments.report import read_results, read_verdict
+from fusion_gym.agents.experiments.tables import read_frame, read_rows, write_rows
 from fusion_gym.agents.output.files import load_results, save_results
 from fusion_gym.agents.output.markup import code, page_of
-from fusion_gym.agents.suite import jobs
-from fusion_gym.agents.suite.classes import classes_of, trained_classes
-from fusion_gym.agents.suite.committed import read_envelopes
-from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.envelopes import searches_of
-from fusion_gym.agents.suite.report import read_results, read_verdict
-from fusion_gym.agents.suite.tables import read_frame, read_rows, write_rows
 from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.core.system import covers
@@ -49,7 +48,7 @@ def run_main(monkeypatch: pytest.MonkeyPatch, module: Any, *arguments: str) -> N
 def test_from_tuning_to_report_and_zoo(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("fusion_gym.agents.suite.verdict.RESAMPLES", 50)
+    monkeypatch.setattr("fusion_gym.agents.experiments.verdict.RESAMPLES", 50)
     results, work = tmp_path / "results", tmp_path / "work"
     arguments = [
         "--config", str(small_suite(tmp_path)), "--results", str(results), "--work", str(work),
@@ -150,7 +149,7 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
         tasks[name] = tasks.get(name) or jobs.envelope_task(setting, options)
         return tasks[name]
 
-    monkeypatch.setattr("fusion_gym.agents.suite.envelopes.envelope_task", task_of)
+    monkeypatch.setattr("fusion_gym.agents.experiments.references.envelope_task", task_of)
     suite = load_suite(ROOT / "configs" / "benchmark.yaml")
     assert load_suite(ROOT / "configs" / "benchmark.yaml", quick=True).settings == suite.settings
     for setting in suite.settings:

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from small_suite import small_suite
 
-from fusion_gym.agents.suite.team import Team
+from fusion_gym.agents.experiments.workers import Pool
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -118,7 +118,7 @@ def test_ray_gives_the_work_of_a_lost_worker_to_another(tmp_path: Path) -> None:
     def is_wrong(_: Any) -> float:
         raise ConfigurationError("filter = 'x' is not allowed")
 
-    team = Team(2, "ray")
+    team = Pool(2, "ray")
     with team.gathered():
         done = list(team.done(ends_its_first_worker, [tmp_path / str(n) for n in range(3)]))
         assert sorted(done) == [0.0, 1.0, 2.0]
@@ -128,9 +128,9 @@ def test_ray_gives_the_work_of_a_lost_worker_to_another(tmp_path: Path) -> None:
 
 def test_a_team_that_is_not_there_is_refused() -> None:
     with pytest.raises(ConfigurationError, match=r"address = 'tcp://x' .*backend='loky'"):
-        Team(2, "loky", "tcp://x")
+        Pool(2, "loky", "tcp://x")
     with (
         pytest.raises(ConfigurationError, match=r"address = 'nowhere' .*backend='dask'"),
-        Team(2, "dask", "nowhere").gathered(),
+        Pool(2, "dask", "nowhere").gathered(),
     ):
         pass

@@ -12,7 +12,7 @@ from small_suite import ENV, small_suite
 from training_configs import small_config
 
 from fusion_gym.agents.__main__ import load
-from fusion_gym.agents.suite import verdict
+from fusion_gym.agents.experiments import verdict
 
 DAMAGES: dict[str, Callable[[bytes, bytes], bytes]] = {
     "cut short": lambda content, other: content[: len(content) * 2 // 3],

@@ -11,18 +11,16 @@ import pytest
 from page_blocks import blocks_of, imported
 
 import fusion_gym
-from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.figures import report_text
-from fusion_gym.agents.suite.learned import read_study
-from fusion_gym.agents.suite.learning import load_learning
-from fusion_gym.agents.suite.report import (
+from fusion_gym.agents.experiments.config import load_learning, load_robustness, load_suite
+from fusion_gym.agents.experiments.figures import report_text
+from fusion_gym.agents.experiments.learning import read_learning
+from fusion_gym.agents.experiments.report import (
     envelopes_text,
     learning_text,
     read_results,
     robustness_text,
     update_pages,
 )
-from fusion_gym.agents.suite.robustness import load_robustness
 from fusion_gym.envs import pages
 from fusion_gym.envs.option_text import options_in
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
@@ -137,7 +135,7 @@ def test_the_committed_envelopes_are_what_the_pages_say() -> None:
 
 def test_the_committed_fronts_are_what_the_pages_say() -> None:
     folder = ROOT / "results" / "learning"
-    files = {path.parent.name: read_study(path.parent) for path in folder.glob("*/learning.csv")}
+    files = {path.parent.name: read_learning(path.parent) for path in folder.glob("*/learning.csv")}
     known = [course.setting for course in load_learning("learning").settings]
     reports = [files[name] for name in known if name in files]
     written = (folder / "README.md").read_text()

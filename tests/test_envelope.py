@@ -11,11 +11,11 @@ from small_suite import ENV, small_suite
 
 import fusion_gym
 from fusion_gym.agents import envelope
-from fusion_gym.agents.suite.classes import Class, classes_of
-from fusion_gym.agents.suite.committed import merged_curves, read_envelopes, write_envelopes
-from fusion_gym.agents.suite.config import Choices, Family, Range, Tuning, load_suite
-from fusion_gym.agents.suite.tables import read_rows, write_rows
-from fusion_gym.agents.suite.tuning import (
+from fusion_gym.agents.experiments.classes import Class, classes_of
+from fusion_gym.agents.experiments.config import Choices, Family, Range, Tuning, load_suite
+from fusion_gym.agents.experiments.references import merge_curves, read_envelopes, write_envelopes
+from fusion_gym.agents.experiments.tables import read_rows, write_rows
+from fusion_gym.agents.experiments.tuning import (
     TuningTrial,
     first_values,
     near_hull,
@@ -226,5 +226,5 @@ def test_classes_that_are_added_take_no_curves_away() -> None:
         {"family": "a", "options": {}, "trials": 2},
         {"family": "b", "options": {"memory": True}},
     ]
-    result = merged_curves(first, new)
+    result = merge_curves(first, new)
     assert result == [new[0], first[1], new[1]]

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from small_suite import small_suite
 
+from fusion_gym.agents.experiments import references as envelopes
+from fusion_gym.agents.experiments.classes import classes_of
+from fusion_gym.agents.experiments.config import load_suite
+from fusion_gym.agents.experiments.report import robustness_frame
 from fusion_gym.agents.reproduction.judging import below
 from fusion_gym.agents.reproduction.round_robin_tobit.judging import always_below
-from fusion_gym.agents.suite import envelopes
-from fusion_gym.agents.suite.classes import classes_of
-from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.report import robustness_frame
 from fusion_gym.evaluation.envelope import best_mse
 
 NOISE = np.array([-3.0, 1.0, -2.0, 3.5])

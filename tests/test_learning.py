@@ -17,15 +17,22 @@ from small_suite import SMALL, small_suite
 from training_configs import small_config
 
 from benchmarks import learning
-from fusion_gym.agents.suite.committed import complete
-from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.fronts import excess_over, is_below
-from fusion_gym.agents.suite.learned import closed, judge_fronts, reached, read_study
-from fusion_gym.agents.suite.learning import load_learning
-from fusion_gym.agents.suite.lessons import beyond, run_lesson
-from fusion_gym.agents.suite.study import Lesson, Study
-from fusion_gym.agents.suite.tables import write_rows
-from fusion_gym.agents.suite.team import Team
+from fusion_gym.agents.experiments.config import load_learning, load_suite
+from fusion_gym.agents.experiments.learning import (
+    LearningRun,
+    LearningSetup,
+    best_known,
+    excess_over,
+    first_below,
+    gap_share,
+    is_below,
+    judge_fronts,
+    read_learning,
+    run_course,
+)
+from fusion_gym.agents.experiments.references import complete_envelopes
+from fusion_gym.agents.experiments.tables import write_rows
+from fusion_gym.agents.experiments.workers import Pool
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import EnvelopePoint
@@ -94,17 +101,17 @@ def test_the_first_moment_below_and_what_came_after() -> None:
         }
         for place, (excess, below) in enumerate(states)
     ]
-    result = reached({"seed": 3, "curve": curve})["first"]
+    result = first_below({"seed": 3, "curve": curve})["first"]
     assert (result["timesteps"], result["excess"], result["above_later"]) == (100, -0.1, 1)
-    assert "first" not in reached({"seed": 3, "curve": curve[:1]})
+    assert "first" not in first_below({"seed": 3, "curve": curve[:1]})
 
 
-def study_of(folder: Path, **course: Any) -> Study:
+def study_of(folder: Path, **course: Any) -> LearningSetup:
     """The only course of the config that :func:`school` writes, with changes."""
     taught = load_learning(folder / "learning.yaml")
     plain = taught.settings[0].model_dump() | course
     suite = load_suite(taught.suite)
-    return Study(
+    return LearningSetup(
         taught, suite, type(taught.settings[0])(**plain), folder / "results", folder, folder
     )
 
@@ -123,7 +130,9 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
     suite = small_suite(folder, settings=[*SMALL["settings"], source], families=gain)
     choice = load_suite(suite)
     classes = ["sensors", "sensors_memory"]
-    complete(choice, choice.settings[:1], classes, folder / "results", folder / "tuning", Team(1))
+    complete_envelopes(
+        choice, choice.settings[:1], classes, folder / "results", folder / "tuning", Pool(1)
+    )
     options = {
         "small": {"filter": "tobit", "horizon": 10, "memory": True},
         "centre": {"filter": "tobit", "horizon": 10, "information": "centre"},
@@ -169,7 +178,7 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def fewer_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fusion_gym.agents.suite.verdict.RESAMPLES", 20)
+    monkeypatch.setattr("fusion_gym.agents.experiments.verdict.RESAMPLES", 20)
 
 
 def arguments_of(school: Path, folder: Path, **changes: Any) -> argparse.Namespace:
@@ -204,7 +213,7 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
     monkeypatch.setattr(learning.measure_throughput, "__defaults__", (0.01,))
     whole = arguments_of(school, tmp_path / "whole")
     learning.run(whole)
-    content = read_study(whole.output / "small")
+    content = read_learning(whole.output / "small")
     assert [front["seed"] for front in content["fronts"]] == [0, 1]
     assert content["fronts"][0]["curve"] != content["fronts"][1]["curve"]
     for front in content["fronts"]:
@@ -235,12 +244,12 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
     monkeypatch.setattr(PrivilegedVecEnv, "step_alternatives", step_alternatives)
     with pytest.raises(KeyboardInterrupt):
         learning.run(broken)
-    stored = read_study(broken.output / "small")
+    stored = read_learning(broken.output / "small")
     assert [front["seed"] for front in stored["fronts"]] == [0]
     broken.resume = True
     learning.run(broken)
     assert counted == 64, "nothing is trained twice"
-    again = read_study(broken.output / "small")
+    again = read_learning(broken.output / "small")
     assert without_seconds(again) == without_seconds(content)
     learning.run(broken)
     assert counted == 64
@@ -250,16 +259,16 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
 def test_plain_ppo_ends_with_its_budget_or_below_the_rules(
     school: Path, tmp_path: Path, budget: float, below: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fusion_gym.agents.suite.study.is_below", lambda *_: below)
+    monkeypatch.setattr("fusion_gym.agents.experiments.learning.is_below", lambda *_: below)
     study = replace(study_of(school), work=tmp_path, output=tmp_path)
-    lesson = Lesson(study, "plain", 0, budget)
-    run_lesson(lesson, 1)
+    lesson = LearningRun(study, "plain", 0, budget)
+    run_course(lesson, 1)
     result = lesson.result()
     assert result is not None
     assert [point["timesteps"] for point in result["curve"]] == [128], "not the whole 256"
     changed = study.learning.model_copy(update={"episodes": 5})
     with pytest.raises(ConfigurationError, match=r"^episodes = 5 differs from that of .*: 4$"):
-        Lesson(replace(study, learning=changed), "plain", 0).result()
+        LearningRun(replace(study, learning=changed), "plain", 0).result()
 
 
 @pytest.mark.parametrize(
@@ -285,7 +294,7 @@ def test_a_front_beside_the_optimum_or_the_best_of_schedules(
     (selection.work / course["setting"]).mkdir()
     (selection.work / course["setting"] / "throughput.json").write_text("{}")
     learning.run(selection)
-    content = read_study(selection.output / course["setting"])
+    content = read_learning(selection.output / course["setting"])
     assert content["plain"] == []
     assert content["finished"]["compared"] == 3, "all prices"
     suite = load_suite(school / "suite.yaml")
@@ -349,7 +358,7 @@ def test_seeds_and_prices_that_lie_above_are_counted(school: Path) -> None:
     assert (result["worst"]["seed"], result["mean"]) == (1, pytest.approx(0.025))
     assert result["rates"] == pytest.approx([0.14, 0.18])
     assert result["closed"] == {"rollout": None, "bound": pytest.approx((0.2 + 0.6) / 2.0)}
-    assert closed([{"envelope": 1.0, "bound": 1.0, "mse": 1.0}], "bound") is None
+    assert gap_share([{"envelope": 1.0, "bound": 1.0, "mse": 1.0}], "bound") is None
     assert judge_fronts(study | {"fronts": []}) is None
 
 
@@ -371,18 +380,18 @@ def test_a_rollout_counts_on_its_own_episodes_and_only_where_it_was_run(
     hard = np.array([2.0, 2.0, 1.0, 1.0])
     envelope = {str(rate): SimpleNamespace(rate=np.array([rate]), mse=hard) for rate in (0.0, 1.0)}
     study = replace(study_of(school), results=tmp_path)
-    assert beyond(study, 0.2, envelope) == {"rollout": 0.75 * 1.5, "bound": pytest.approx(0.5)}
-    assert beyond(study, 0.05, envelope) == {"bound": pytest.approx(1.1)}
-    assert beyond(study, 0.31, envelope) == {"bound": 0.4}
+    assert best_known(study, 0.2, envelope) == {"rollout": 0.75 * 1.5, "bound": pytest.approx(0.5)}
+    assert best_known(study, 0.05, envelope) == {"bound": pytest.approx(1.1)}
+    assert best_known(study, 0.31, envelope) == {"bound": 0.4}
     course = study.course.model_copy(update={"against": "sensors"})
-    assert "rollout" not in beyond(replace(study, course=course), 0.2, envelope), "it remembers"
+    assert "rollout" not in best_known(replace(study, course=course), 0.2, envelope), "it remembers"
 
 
 def test_every_shipped_front_knows_what_it_is_compared_with(tmp_path: Path) -> None:
     taught = load_learning("learning")
     suite = load_suite(taught.suite)
     for course in taught.settings:
-        study = Study(taught, suite, course, ROOT / "results", tmp_path, tmp_path)
+        study = LearningSetup(taught, suite, course, ROOT / "results", tmp_path, tmp_path)
         study.check()
         assert study.inner == [False, *[True] * (taught.prices - 2), False], course.setting
         assert len(study.tests) == len({test.name for test in study.tests}) > 5

@@ -8,8 +8,8 @@ import pytest
 from small_results import small_results
 
 from fusion_gym.agents import report
-from fusion_gym.agents.suite.report import read_results, update_pages
-from fusion_gym.agents.suite.robust_summary import write_cases
+from fusion_gym.agents.experiments.report import read_results, update_pages
+from fusion_gym.agents.experiments.verdict import write_cases
 
 PAGE = """# A page
 

@@ -15,12 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_results import CLASSES, ENV, SETTING, small_model, small_results
 
+from fusion_gym.agents.compare import comparison_table
+from fusion_gym.agents.experiments.report import read_setting
+from fusion_gym.agents.experiments.tables import read_rows, write_rows
 from fusion_gym.agents.output import pareto_figure
 from fusion_gym.agents.output.palette import AGENTS, RULES
 from fusion_gym.agents.output.pareto_figure import Differences, Limits, Panel, Series
-from fusion_gym.agents.suite.comparison import comparison_table
-from fusion_gym.agents.suite.report import read_setting
-from fusion_gym.agents.suite.tables import read_rows, write_rows
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import BaselineComparison
 from fusion_gym.evaluation.episodes import run_episodes
@@ -87,8 +87,9 @@ def test_json_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
 @given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1))
 def test_numbers_are_read_back_bit_for_bit(tmp_path_factory: Any, values: list[float]) -> None:
     folder = tmp_path_factory.mktemp("table")
-    write_rows(folder, "tested", [{"class": "a", "name": "b", "rate": x, "mse": x} for x in values])
-    again = [row["mse"] for row in read_rows(folder, "tested")]
+    rows = [{"class": "a", "name": "b", "rate": value, "mse": value} for value in values]
+    write_rows(folder, "envelope", rows)
+    again = [row["mse"] for row in read_rows(folder, "envelope")]
     assert struct.pack(f"{len(values)}d", *again) == struct.pack(f"{len(values)}d", *values)
 
 

@@ -12,14 +12,13 @@ import yaml
 from command_runs import call
 from small_suite import small_suite
 
+from fusion_gym.agents.experiments import verdict
+from fusion_gym.agents.experiments.classes import classes_of
+from fusion_gym.agents.experiments.config import Case, load_robustness, load_suite, world
+from fusion_gym.agents.experiments.robustness import error_change
+from fusion_gym.agents.experiments.training import experiment_of
+from fusion_gym.agents.experiments.verdict import read_reports
 from fusion_gym.agents.robustness import _usual_class
-from fusion_gym.agents.suite import verdict
-from fusion_gym.agents.suite.classes import classes_of
-from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.jobs import experiment_of
-from fusion_gym.agents.suite.robust_summary import read_reports
-from fusion_gym.agents.suite.robust_table import error_change
-from fusion_gym.agents.suite.robustness import Case, load_robustness, world
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.agents.training.run import train
 from fusion_gym.envs.registration import make_task

@@ -4,10 +4,16 @@ import numpy as np
 import pytest
 from test_verdict import made_up
 
-from fusion_gym.agents.suite.classes import Class, classes_of, trained_classes
-from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.verdict import middles
-from fusion_gym.agents.suite.worth import SHARES, ClassTests, at_rates, pairs, worths
+from fusion_gym.agents.experiments.classes import Class, classes_of, trained_classes
+from fusion_gym.agents.experiments.config import load_suite
+from fusion_gym.agents.experiments.verdict import (
+    SHARES,
+    ClassTests,
+    at_rates,
+    middles,
+    pairs,
+    worths,
+)
 from fusion_gym.core.system import covers
 
 NOISE = np.random.default_rng(0).uniform(0.5, 1.5, 300)

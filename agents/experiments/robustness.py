@@ -1,18 +1,20 @@
-"""Pieces of work under perturbed cases: some policies of one class, run on the test episodes.
+"""Rules and agents of a class under perturbed cases: pieces of work and their verdict."""
 
-All that is taken from the benchmark's own work is taken here: its tasks, trainings and envelopes.
-"""
+from __future__ import annotations
 
 import glob
 import hashlib
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 from fusion_gym import zoo
 from fusion_gym.core.task import Task
+from fusion_gym.evaluation.envelope import best_mse
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.registry import make_policy
@@ -23,11 +25,10 @@ from ..output.folders import check_inputs, fingerprint
 from ..training.config import Experiment
 from ..training.run import holds_training, train
 from .classes import Class, classes_of
-from .committed import Shelf, path_of
-from .config import Setting, Suite
-from .envelopes import envelope_task
-from .fronts import front_prices
-from .jobs import agent_options, experiment_of
+from .config import NOMINAL, Case, Perturbed, Setting, Suite, drawn_world, front_prices, world
+from .references import EnvelopeStore, envelope_task, path_of
+from .training import agent_options, agent_task, experiment_of
+from .verdict import KINDS, MIDDLE, Searches, is_gain, judge, write_cases
 
 RULES = "rules"
 Options = tuple[tuple[str, Any], ...]
@@ -164,7 +165,7 @@ def class_named(setting: Setting, name: str) -> Class:
     return every[name]
 
 
-def envelope_of(shelf: Shelf, setting: Setting, of: Class) -> dict[str, Any]:
+def envelope_of(shelf: EnvelopeStore, setting: Setting, of: Class) -> dict[str, Any]:
     """The committed envelope of a class.
 
     Raises:
@@ -266,3 +267,196 @@ def run_training(experiment: Experiment) -> None:
     folder = Path(experiment.output)
     if not train(experiment, resume=holds_training(folder), quiet=True)["finished"]:
         raise KeyboardInterrupt
+
+
+Rules = Mapping[str, EpisodeResults]
+
+
+def judge_case(
+    pieces: Mapping[str, RobustPiece],
+    nominal: RobustPiece,
+    prices: Sequence[float],
+    searches: Searches,
+    folders: RobustFolders,
+) -> dict[str, Any]:
+    """A case: what it does to the rules, and every kind of agent beside them.
+
+    ``pieces`` are its finished pieces by label, ``nominal`` that of the rules as assumed, and
+    ``searches`` what each tuning seed alone would have made of the envelope.
+    """
+    before = folders.read(nominal)
+    middle = math.sqrt(MIDDLE[0] * MIDDLE[1]) * float(before["always"].rate.mean())
+    every = folders.read(pieces[RULES])
+    always = float(every["always"].rate.mean())
+    envelope = _without_added(every, pieces[RULES])
+    row: dict[str, Any] = {
+        "always": always,
+        "rules": error_change(_without_added(before, nominal), envelope, middle),
+    }
+    for kind, prefix in KINDS.items():
+        tested = [
+            list(folders.read(piece).values())
+            for label, piece in pieces.items()
+            if label.startswith(prefix)
+        ]
+        if tested:
+            row[kind] = judge(tested, prices, envelope, {}, always, searches=searches)
+    return row
+
+
+def with_shares(cases: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The cases, with what each leaves of the nominal gain of every kind of agent."""
+    for kind in KINDS:
+        for row in cases.values():
+            left = _left(row.get(kind), cases[NOMINAL].get(kind))
+            if left is not None:
+                row[kind]["left"] = left
+    return cases
+
+
+def _without_added(rules: Rules, piece: RobustPiece) -> Rules:
+    added = {entry.name for entry in piece.entries if entry.added}
+    return {name: rule for name, rule in rules.items() if name not in added}
+
+
+def error_change(nominal: Rules, case: Rules, rate: float) -> dict[str, float] | None:
+    """The relative change of the rules' error at a rate, with its interval over paired episodes.
+
+    That of a ratio of means, by its linear part; ``None`` left of either's first rule.
+    """
+    before, after = best_mse(nominal, rate), best_mse(case, rate)
+    if before is None or after is None:
+        return None
+    ratio = float(after.mean() / before.mean())
+    linear = ratio - 1.0 + (after - ratio * before) / before.mean()
+    return mean_interval(np.asarray(linear))._asdict()
+
+
+def _left(row: Mapping[str, Any] | None, nominal: Mapping[str, Any] | None) -> float | None:
+    """The gain of a case as a share of the nominal one, where that is no accident."""
+    if row is None or nominal is None or "middle" not in row or "middle" not in nominal:
+        return None
+    before = nominal["middle"]
+    return float(row["middle"]["mean"] / before["mean"]) if is_gain(before) else None
+
+
+class RobustTrial(NamedTuple):
+    """What is to be tried in a setting.
+
+    ``worlds`` are the setting as it is in each case, by name and the nominal one first, with
+    ``titles``; ``agents`` the texts of agents, and ``seeds`` those of trainings over draws.
+    """
+
+    suite: Suite
+    setting: Setting
+    of: Class
+    envelope: dict[str, Any]
+    worlds: dict[str, Setting]
+    titles: dict[str, str]
+    drawn: Setting
+    agents: tuple[str, ...]
+    seeds: tuple[int, ...]
+    episodes: int
+    folders: RobustFolders
+
+    @classmethod
+    def create(
+        cls, suite: Suite, setting: Setting, perturbed: Perturbed, cases: Sequence[Case], of: Class,
+        envelope: dict[str, Any], agents: Sequence[str], trained: bool, episodes: int,
+        folders: RobustFolders,
+    ) -> RobustTrial:  # fmt: skip
+        """Every case is made once before anything runs.
+
+        Raises:
+            ConfigurationError: a case that the setting cannot have, an agent that does not fit, or
+                no draws to train over; says which.
+        """
+        worlds = {case.name: world(setting, case) for case in cases}
+        drawn = drawn_world(setting, perturbed)
+        for name, item in [*worlds.items(), ("drawn", drawn)]:
+            try:
+                agent_task(item, of)
+            except ConfigurationError as error:
+                raise ConfigurationError(f"{name} of {setting.name}: {error}") from None
+        for agent in agents:
+            make_policy(agent, agent_task(setting, of))
+        if trained and not perturbed.drawn:
+            raise ConfigurationError(
+                f"trained = True is not allowed with {setting.name}: the config has no 'drawn' "
+                "options for it"
+            )
+        return cls(
+            suite=suite,
+            setting=setting,
+            of=of,
+            envelope=envelope,
+            worlds=worlds,
+            titles={case.name: case.title for case in cases},
+            drawn=drawn,
+            agents=tuple(agents),
+            seeds=tuple(range(suite.training_seeds)) if trained else (),
+            episodes=episodes,
+            folders=folders,
+        )
+
+    @property
+    def trainings(self) -> list[Experiment]:
+        """The trainings over draws."""
+        return [
+            training(self.suite, self.drawn, self.of, seed, self.folders.work)
+            for seed in self.seeds
+        ]
+
+    @property
+    def labels(self) -> dict[str, dict[str, str]]:
+        """The text of every agent, by its kind and label."""
+        outputs = [Path(experiment.output) for experiment in self.trainings]
+        return {
+            "agents": {f"agent_{place}": text for place, text in enumerate(self.agents)},
+            "trained": {
+                f"trained_{seed}": f"model:{output / 'best_model.zip'}"
+                for seed, output in zip(self.seeds, outputs, strict=True)
+            },
+        }
+
+    def pieces(self, kinds: Sequence[str], cases: Sequence[str] = ()) -> Iterator[RobustPiece]:
+        """The work of some kinds of agents, and with ``"rules"`` theirs, in some cases (none: all).
+
+        Raises:
+            OSError: an agent's file cannot be read.
+        """
+        requested = (self.episodes, self.suite.seed)
+        for case in cases or self.worlds:
+            single = self.worlds[case]
+            if RULES in kinds:
+                yield rules_piece(single, self.of, case, self.envelope["vertices"], *requested)
+            for kind in kinds:
+                for label, agent in self.labels.get(kind, {}).items():
+                    yield agent_piece(self.suite, single, self.of, case, label, agent, *requested)
+
+    def judge(self, case: str) -> None:
+        """Judge a case, all of whose pieces are finished, and keep that."""
+        (nominal,) = self.pieces((RULES,), (NOMINAL,))
+        row = judge_case(
+            {piece.label: piece for piece in self.pieces((RULES, *KINDS), (case,))},
+            nominal,
+            front_prices(self.setting.price_range, self.suite.prices),
+            self.envelope["searches"],
+            self.folders,
+        )
+        write(self._verdict(case), {"title": self.titles[case]} | row)
+
+    def write_verdict(self) -> None:
+        """Put all cases, each of which is judged, into the setting's verdict."""
+        cases = {case: read_json(self._verdict(case), "work") for case in self.worlds}
+        report = {
+            "setting": self.setting.name,
+            "class": self.of.name,
+            "episodes": self.episodes,
+            "sha256": self.envelope["sha256"],
+            "cases": with_shares(cases),
+        }
+        write_cases(self.folders.results / self.setting.name, report)
+
+    def _verdict(self, case: str) -> Path:
+        return self.folders.work / self.setting.name / self.of.name / case / "verdict.json"

@@ -20,14 +20,10 @@ from fusion_gym.validation import ConfigurationError, choice
 
 from ..output.markup import NONE, code, markup_number, plain_text, ranged, share
 from ..output.tables import table_tables
-from .committed import at_least, bound_of, hull_of, measured, path_of, read_envelopes
-from .config import load_suite
-from .robust_summary import KINDS, is_gain, read_reports
-from .robustness import NOMINAL
-from .study import SOLVED
+from .config import NOMINAL, SOLVED, load_suite
+from .references import at_least, bound_of, hull_of, path_of, read_envelopes, rollout_of
 from .tables import VERDICT, Row, grouped, read_rows
-from .verdict import MIDDLE, RATES
-from .worth import SHARES
+from .verdict import KINDS, MIDDLE, RATES, SHARES, is_gain, read_cases
 
 ABOVE = 0.01  # a point lies above the envelope where its whole interval is further up than this
 HEADLINE = 0.2  # of the rate that always transmitting gets: where single errors are named
@@ -239,7 +235,7 @@ def read_setting(folder: Path) -> SettingResults:
             points = [(rate_of(p), p["mse"]["mean"]) for p in policies.get(run["run"], [])]
             if len(points) == len(classes[run["class"]]["points"]):
                 seeds.setdefault(run["class"], []).append(points)
-    rollout, episodes = measured(folder)
+    rollout, episodes = rollout_of(folder)
     committed = path_of(folder.parent, folder.name)
     return SettingResults(
         name=folder.name,
@@ -273,7 +269,7 @@ def read_verdict(folder: Path) -> Row:
         )
     parts = {
         part: grouped(read_rows(folder, table), "class")
-        for part, table in (("points", "points"), ("at", "equal_rates"), ("envelope", "tested"))
+        for part, table in (("points", "points"), ("at", "equal_rates"), ("envelope", "envelope"))
     }
     classes: dict[str, Row] = {}
     for row in read_rows(folder, "fronts"):
@@ -504,7 +500,7 @@ def update_pages(text: str, settings: Mapping[str, SettingResults], results: Pat
             settings=list(settings.values()),
             trained=[f["seeds"] for item in settings.values() for f in item.classes.values()],
             results=settings.get(match[2]),
-            reports=read_reports(results, list(titles)),
+            reports=read_cases(results, list(titles)),
             titles=titles,
         )
         return f"{match[1]}\n{content}\n{match[3]}"
@@ -572,7 +568,7 @@ def robustness_text(results: Path, titles: Mapping[str, str], command: str) -> s
     Raises:
         ConfigurationError: a table that cannot be read or is of another shape.
     """
-    reports = read_reports(results, list(titles))
+    reports = read_cases(results, list(titles))
     of = {name: [r for r in reports if r["class"] == name] for name in
           sorted({report["class"] for report in reports})}  # fmt: skip
     return _render("robustness.md", reports=reports, by_class=of, titles=titles, command=command)
@@ -596,7 +592,7 @@ def envelopes_text(results: Path, command: str) -> str:
 def envelopes_frame(folder: Path, envelopes: Row) -> pd.DataFrame:
     """Return rules at a few rates; simulated were packets with a measurement."""
     rates = [round(part * envelopes["always"], 4) for part in SHARES]
-    (rollout, episodes), bound = measured(folder), bound_of(folder)
+    (rollout, episodes), bound = rollout_of(folder), bound_of(folder)
     hulls: dict[str, dict[bool, list[EnvelopePoint]]] = {}
     for content in envelopes["classes"].values():
         mode, broadcast, packet = kind_of(content)

@@ -9,7 +9,7 @@ from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError
 
 if TYPE_CHECKING:
-    from ..training.config import Experiment
+    from .config import Experiment
 
 
 def environment_of(
@@ -26,8 +26,8 @@ def environment_of(
             raise ConfigurationError("env = None is not allowed: give --env ID or --config FILE")
         return env, options, None
     # Here, for it needs Stable-Baselines3, which takes seconds to load.
-    from ..training.checked import load_checked
-    from ..training.config import Experiment
+    from .checked import load_checked
+    from .config import Experiment
 
     experiment = load_checked(Experiment, config)
     environment = experiment.environment
