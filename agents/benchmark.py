@@ -28,7 +28,7 @@ from .experiments.references import (
     run_test,
 )
 from .experiments.report import agreement_table
-from .experiments.training import Folders, job_finished, jobs, judge_setting, rules_of, run_job
+from .experiments.training import Folders, job_inputs, jobs, judge_setting, rules_of, run_job
 from .experiments.workers import BackendName, Call, Pool, side_by_side
 from .input.options import Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
@@ -70,9 +70,9 @@ class Benchmark(SuiteCommand):
 
     def _run(self) -> None:
         suite = self.suite()
-        team = Pool(self.workers, self.backend, self.address)
+        pool = Pool(self.workers, self.backend, self.address)
         folders = Folders.create(self.results, self.work, self.quick)
-        if not team.here:  # whoever works has another working directory
+        if not pool.local:  # whoever works has another working directory
             folders = Folders(folders.results.absolute(), folders.work.absolute())
         writable_folder("results", folders.results)
         writable_folder("work", folders.work)
@@ -86,33 +86,35 @@ class Benchmark(SuiteCommand):
         with folders.lock():
             self._check_resumed(folders, settings)
             writing(("tables", folders.results), ("finished pieces and trainings", folders.work))
-            shelf = self._shelf(suite, settings, folders)
+            store = self._store(suite, settings, folders)
             for setting in settings:
                 compared = [of.name for of in trained_classes(suite, setting)]
                 complete_envelopes(
-                    shelf.suite, [setting], compared, shelf.results, folders.work, team
+                    store.suite, [setting], compared, store.results, folders.work, pool
                 )
             rules = [
                 Call(4.0, run_test, (test, folders.work))
                 for setting in settings
-                for test in rules_of(suite, setting, shelf)
+                for test in rules_of(suite, setting, store)
                 if not test.path(folders.work).exists()
             ]
-            side_by_side(rules, team, "rules")
+            side_by_side(rules, pool, "rules")
             # All of the settings' pieces, for the verdict is over all of them.
-            every = jobs(suite, settings, names_of(suite), shelf)
-            done = [job.place for job in every if job_finished(job, suite, folders)]
+            every = jobs(suite, settings, names_of(suite), store)
+            done = [
+                job.place for job in every if folders.finished(job.place, job_inputs(job, suite))
+            ]
             side_by_side(
                 [
-                    Call(job.weight, run_job, (job, suite, folders, shelf))
-                    for job in jobs(suite, settings, classes, shelf)
+                    Call(job.weight, run_job, (job, suite, folders, store))
+                    for job in jobs(suite, settings, classes, store)
                     if job.place not in done
                 ],
-                team,
+                pool,
                 "benchmark",
             )
-            judged = [Call(30.0, judge_setting, (suite, item, folders, shelf)) for item in settings]
-            side_by_side(judged, team, "verdicts")
+            judged = [Call(30.0, judge_setting, (suite, item, folders, store)) for item in settings]
+            side_by_side(judged, pool, "verdicts")
         if self.quick:
             beside = agreement_table(folders.results, USUAL, [setting.name for setting in settings])
             if beside is not None:
@@ -131,7 +133,7 @@ class Benchmark(SuiteCommand):
                     "work: go on with --resume, or give another --results and --work"
                 )
 
-    def _shelf(self, suite: Suite, settings: Sequence[Setting], folders: Folders) -> EnvelopeStore:
+    def _store(self, suite: Suite, settings: Sequence[Setting], folders: Folders) -> EnvelopeStore:
         """The quick benchmark takes the envelopes that are shipped, if they are of this config."""
         shipped = EnvelopeStore(load_suite(self.config), SHIPPED)
         if self.quick and all(

@@ -17,11 +17,10 @@ from typing import Annotated
 
 import tyro
 
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, choice
 
 from .command_line import Long
-from .experiments import robustness as robust_pieces
-from .experiments.classes import trained_classes
+from .experiments.classes import classes_of, trained_classes
 from .experiments.config import (
     Perturbed,
     Setting,
@@ -33,7 +32,8 @@ from .experiments.config import (
 from .experiments.config import RobustnessSettings as Config
 from .experiments.references import EnvelopeStore
 from .experiments.report import robustness_text
-from .experiments.robustness import RobustTrial
+from .experiments.robustness import RobustTrial, agents_of, run_piece, run_training
+from .experiments.training import Folders
 from .experiments.verdict import ROBUSTNESS
 from .experiments.workers import Call, Pool, side_by_side
 from .input.options import Episodes, InputFolder, OutputFolder, Steps, Whole, writable_folder
@@ -85,11 +85,11 @@ class Robustness(Long):
 
     def _run(self) -> None:
         config = load_robustness(self.config)
-        folders = robust_pieces.RobustFolders(self.results, self.work)
+        folders = Folders(self.results, self.work)
         trials = [self._trial(config, item, folders) for item in select_settings(config, self.envs)]
         place = self.results / ROBUSTNESS
         writable_folder("results", place)
-        with alone_in(place, "results"), alone_in(self.work, "work"):
+        with alone_in(self.results, "results"), alone_in(self.work, "work"):
             there = [
                 path
                 for trial in trials
@@ -104,15 +104,11 @@ class Robustness(Long):
             self._work(trials, ("rules", "agents"), folders)
             trainings = [training for trial in trials for training in trial.trainings]
             if trainings:
-                work = [
-                    Call(
-                        30.0 + training.training.timesteps / 10_000,
-                        robust_pieces.run_training,
-                        (training,),
-                    )
+                calls = [
+                    Call(30.0 + training.training.timesteps / 10_000, run_training, (training,))
                     for training in trainings
                 ]
-                side_by_side(work, Pool(self.workers), "trainings over draws")
+                side_by_side(calls, Pool(self.workers), "trainings over draws")
                 self._work(trials, ("trained",), folders)
             rows = [Call(20.0, trial.judge, (case,)) for trial in trials for case in trial.worlds]
             side_by_side(rows, Pool(self.workers), "verdicts")
@@ -132,19 +128,18 @@ class Robustness(Long):
         episodes = "" if self.episodes == Robustness.episodes else f" --episodes {self.episodes}"
         return trained + episodes
 
-    def _trial(
-        self, config: Config, entry: Perturbed, folders: robust_pieces.RobustFolders
-    ) -> RobustTrial:
+    def _trial(self, config: Config, entry: Perturbed, folders: Folders) -> RobustTrial:
         """A setting with its agents, everything checked."""
         suite = load_suite(config.suite)
-        shelf = EnvelopeStore(suite, self.results)
+        store = EnvelopeStore(suite, self.results)
         changed = {"training_seeds": self.seeds, "timesteps": self.timesteps}
         changed = {key: value for key, value in changed.items() if value is not None}
         suite = parse(Suite, suite.model_dump() | changed, "command line")
         setting = next(setting for setting in suite.settings if setting.name == entry.setting)
-        of = robust_pieces.class_named(setting, self.of or _usual_class(suite, setting))
-        agents = robust_pieces.agents_of(setting, of, self.agents, self.models, USUAL)
-        envelope = robust_pieces.envelope_of(shelf, setting, of)
+        classes = {of.name: of for of in classes_of(setting)}
+        of = classes[choice("class", self.of or _usual_class(suite, setting), classes)]
+        agents = agents_of(setting, of, self.agents, self.models, USUAL)
+        envelope = store.envelope(setting, of.name)
         return RobustTrial.create(
             suite, setting, entry, config.cases_of(entry), of, envelope, agents,
             self.trained, self.episodes, folders,
@@ -154,13 +149,13 @@ class Robustness(Long):
         self,
         trials: Sequence[RobustTrial],
         kinds: tuple[str, ...],
-        folders: robust_pieces.RobustFolders,
+        folders: Folders,
     ) -> None:
         """Do what is not finished of some kinds."""
         pieces = [piece for trial in trials for piece in trial.pieces(kinds)]
-        left = [piece for piece in pieces if not folders.finished(piece)]
+        left = [piece for piece in pieces if not folders.finished(piece.place, piece.inputs)]
         side_by_side(
-            [Call(piece.weight, robust_pieces.run_piece, (piece, folders)) for piece in left],
+            [Call(piece.weight, run_piece, (piece, folders)) for piece in left],
             Pool(self.workers),
             " and ".join(kinds),
         )

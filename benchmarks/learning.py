@@ -115,16 +115,16 @@ def _command(arguments: argparse.Namespace) -> str:
     return shlex.join(words)
 
 
-def teach(studies: Sequence[LearningSetup], seeds: int, team: Pool) -> None:
+def teach(studies: Sequence[LearningSetup], seeds: int, pool: Pool) -> None:
     """References, then fronts, then plain PPO for a multiple of the seconds that they took."""
     tests = {test.path(study.work): (test, study.work) for study in studies for test in study.tests}
     side_by_side(
         [Call(2.0, run_reference, pair) for path, pair in tests.items() if not path.exists()],
-        team,
+        pool,
         "references",
     )
     fronts = [LearningRun(study, "front", seed) for seed in range(seeds) for study in studies]
-    _side_by_side(fronts, seeds, team, "front")
+    _side_by_side(fronts, seeds, pool, "front")
     plain = []
     for study in studies:
         if study.memoryless is None:
@@ -134,17 +134,17 @@ def teach(studies: Sequence[LearningSetup], seeds: int, team: Pool) -> None:
         budget = study.learning.plain.budget * taken
         count = min(seeds, study.learning.plain.seeds)
         plain += [LearningRun(study, "plain", seed, budget) for seed in range(count)]
-    _side_by_side(plain, seeds, team, "plain")
+    _side_by_side(plain, seeds, pool, "plain")
 
 
-def _side_by_side(lessons: Sequence[LearningRun], seeds: int, team: Pool, kind: Kind) -> None:
+def _side_by_side(lessons: Sequence[LearningRun], seeds: int, pool: Pool, kind: Kind) -> None:
     left = [lesson for lesson in lessons if lesson.result() is None]
     side_by_side(
         [
             Call(lesson.experiment.training.timesteps / _SPEED, run_course, (lesson, seeds))
             for lesson in left
         ],
-        team,
+        pool,
         f"{kind} trainings",
     )
 

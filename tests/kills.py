@@ -72,15 +72,8 @@ def benchmark(folder: Path) -> tuple[list[str], Callable[[], Outcome]]:
     results, work = folder / "results", folder / "work"
 
     def outcome() -> Outcome:
-        result = {}
-        for path in sorted(results.rglob("*.csv")):
-            if path.stem != "runs":  # with seconds of wall time
-                result[path.name] = path.read_text()
-        for path in sorted(work.glob("small/*.json")):
-            report = json.loads(path.read_text())
-            report.pop("seconds", None)  # of wall time
-            text = json.dumps(report).replace(str(folder), "")
-            result[path.name] = text
+        tables = (path for path in results.rglob("*.csv") if path.stem != "runs")  # with seconds
+        result: Outcome = {path.name: path.read_text() for path in tables}
         return result | {"episodes": sorted(path.name for path in work.rglob("*.npz"))}
 
     config = small_suite(folder, timesteps=4096)

@@ -317,7 +317,7 @@ def test_demo_from_training_to_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ground, learner = thinned(CommittedRules.read(demo.SETTING, 2)), demo.LEARNERS[1]
-    monkeypatch.setattr(demo.Ground, "read", lambda *_: ground)
+    monkeypatch.setattr(demo.CommittedRules, "read", lambda *_: ground)
     monkeypatch.setattr(demo, "LEARNERS", (learner,))
     monkeypatch.setattr(demo, "TEAM", Pool(1))
     words = ["--output", str(tmp_path), "--episodes", "2", "--timesteps", "4096"]

@@ -46,10 +46,7 @@ WRITTEN = {
         )
     ),
     "tune": ("study/best.yaml", "study/trial_0/latest.zip", "study/trial_0/config.yaml"),
-    "benchmark": (
-        *("results/small/verdict.csv", "results/small/policies.csv"),
-        "work/small/sensors_0/latest.zip",
-    ),
+    "benchmark": ("results/small/verdict.csv", "work/small/sensors_0/latest.zip"),
     "evaluate": (),
 }
 

@@ -17,7 +17,7 @@ from fusion_gym.agents.experiments.classes import classes_of
 from fusion_gym.agents.experiments.config import Case, load_robustness, load_suite, world
 from fusion_gym.agents.experiments.robustness import error_change
 from fusion_gym.agents.experiments.training import experiment_of
-from fusion_gym.agents.experiments.verdict import read_reports
+from fusion_gym.agents.experiments.verdict import read_cases
 from fusion_gym.agents.robustness import _usual_class
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.agents.training.run import train
@@ -92,7 +92,7 @@ def test_all_of_it(folder: Path, tmp_path: Path) -> None:
     pieces = sorted(str(path.relative_to(place)) for path in files)
     labels = ("agent_0", "rules", "trained_0")
     assert pieces == [f"{c}/{p}.json" for c in ("as_assumed", "loud", "poor") for p in labels]
-    (content,) = read_reports(results, ["small"])
+    (content,) = read_cases(results, ["small"])
     assert list(content["cases"]) == ["as_assumed", "loud", "poor"]
     nominal, loud, poor = content["cases"].values()
     assert nominal["rules"]["mean"] == 0.0
@@ -117,7 +117,7 @@ def test_all_of_it(folder: Path, tmp_path: Path) -> None:
     assert (ended.status, ended.trace) == (0, ""), ended.err
     changed = [path for path, time in before.items() if path.stat().st_mtime_ns != time]
     assert changed == [lost]
-    assert read_reports(results, ["small"]) == [content]
+    assert read_cases(results, ["small"]) == [content]
     assert (results / "robustness" / "README.md").read_text() == table
 
     other = [word if word != "8" else "9" for word in line]

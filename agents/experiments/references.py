@@ -486,8 +486,22 @@ class EnvelopeStore(NamedTuple):
     results: Path
 
     def classes(self, setting: Setting) -> dict[str, Any]:
-        """What is there of a setting, as :func:`present`."""
+        """Return the classes of a setting by name, as :func:`committed_classes`."""
         return committed_classes(self.suite, setting, self.results)
+
+    def envelope(self, setting: Setting, name: str) -> dict[str, Any]:
+        """Return a class of a setting.
+
+        Raises:
+            ConfigurationError: there is none of that name.
+        """
+        classes = self.classes(setting)
+        if name not in classes:
+            path = str(path_of(self.results, setting.name))
+            raise ConfigurationError(
+                f"envelopes = {path!r} is not allowed: it has no class {name!r}: tune it first"
+            )
+        return classes[name]
 
     def envelopes(self, setting: Setting) -> dict[str, Any]:
         """What is there of a setting; nothing, if that was made from another suite."""
@@ -505,7 +519,7 @@ class EnvelopeStore(NamedTuple):
 
 def complete_envelopes(
     suite: Suite, settings: Sequence[Setting], names: Sequence[str], results: Path, work: Path,
-    team: Pool,
+    pool: Pool,
 ) -> None:  # fmt: skip
     """Tune, choose and measure what is missing of these classes (none: all), setting by setting.
 
@@ -523,19 +537,17 @@ def complete_envelopes(
             search.check()
     for setting in settings:
         if missing[setting.name]:
-            _complete(suite, setting, missing[setting.name], results, work, team)
+            _complete(suite, setting, missing[setting.name], results, work, pool)
 
 
 def _complete(
-    suite: Suite, setting: Setting, required: Sequence[Class], results: Path, work: Path, team: Pool
+    suite: Suite, setting: Setting, required: Sequence[Class], results: Path, work: Path, pool: Pool
 ) -> None:
     searches = searches_of(suite, setting, required)
     left = [search for search in searches if not search.path(work).exists()]
     left.sort(key=lambda search: -len(search.family.parameters))  # the long ones first
     side_by_side(
-        [Call(10.0, run_search, (item, work)) for item in left],
-        team,
-        f"{setting.name}: tuning",
+        [Call(10.0, run_search, (item, work)) for item in left], pool, f"{setting.name}: tuning"
     )
     vertices = [
         vertex
@@ -545,7 +557,7 @@ def _complete(
     tests = {item.path(work): item for item in tests_of(suite, setting, vertices)}
     side_by_side(
         [Call(2.0, run_test, (test, work)) for path, test in tests.items() if not path.exists()],
-        team,
+        pool,
         f"{setting.name}: testing",
     )
     classes = committed_classes(suite, setting, results)

@@ -4,7 +4,7 @@ A new column of a page is a new entry in the rows of one of these frames.
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -743,38 +743,30 @@ def agreement_table(quick: Path, full: Path, settings: Sequence[str]) -> Table |
     Raises:
         ConfigurationError: a verdict that is damaged.
     """
-    pairs = list(_middles(quick, full, settings))
-    if not pairs:
-        return None
-    agree = [
-        our["low"] <= their["high"] and their["low"] <= our["high"] for *_, our, their in pairs
-    ]
-    frame = pd.DataFrame(
-        {
-            "setting": name,
-            "class": of,
-            "quick": share(our),
-            "full": share(their),
-            "agree": "yes" if same else "no",
-        }
-        for (name, of, our, their), same in zip(pairs, agree, strict=True)
+    ours, theirs = (
+        pd.DataFrame(
+            [
+                (name, row["class"], row["middle"])
+                for name in settings
+                if (folder / name / "fronts.csv").exists()
+                for row in read_rows(folder / name, "fronts")
+                if "middle" in row
+            ],
+            columns=["setting", "class", "middle"],
+        )
+        for folder in (quick, full)
     )
+    both = ours.merge(theirs, on=["setting", "class"], suffixes=("_quick", "_full"))
+    if both.empty:
+        return None
+    rows = []
+    for *names, our, their in both.itertuples(index=False):
+        agree = our["low"] <= their["high"] and their["low"] <= our["high"]
+        rows.append((*names, share(our), share(their), "yes" if agree else "no"))
+    agreeing = sum(row[-1] == "yes" for row in rows)
     return table_tables(
         "agents against the rules of their class: the quick benchmark and the full one",
-        list(frame.columns),
-        frame.to_numpy().tolist(),
-        f"{sum(agree)} of {len(agree)} verdicts agree: their 95 % intervals overlap",
+        ("setting", "class", "quick", "full", "agree"),
+        rows,
+        f"{agreeing} of {len(rows)} verdicts agree: their 95 % intervals overlap",
     )
-
-
-def _middles(
-    quick: Path, full: Path, settings: Sequence[str]
-) -> Iterator[tuple[str, str, Row, Row]]:
-    """Return the middles of the classes that both have."""
-    for name in settings:
-        ours, theirs = (
-            {row["class"]: row["middle"] for row in read_rows(folder / name, "fronts")
-             if "middle" in row} if (folder / name / "fronts.csv").exists() else {}
-            for folder in (quick, full)
-        )  # fmt: skip
-        yield from ((name, of, our, theirs[of]) for of, our in ours.items() if of in theirs)

@@ -20,14 +20,14 @@ from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError, refusal
 
-from ..output.files import load_results, read_json, save_results, write
-from ..output.folders import check_inputs, fingerprint
+from ..output.files import read_json, write
+from ..output.folders import fingerprint
 from ..training.config import Experiment
 from ..training.run import holds_training, train
-from .classes import Class, classes_of
+from .classes import Class
 from .config import NOMINAL, Case, Perturbed, Setting, Suite, drawn_world, front_prices, world
-from .references import EnvelopeStore, envelope_task, path_of
-from .training import agent_options, agent_task, experiment_of
+from .references import envelope_task
+from .training import Folders, agent_options, agent_task, experiment_of
 from .verdict import KINDS, MIDDLE, Searches, is_gain, judge, write_cases
 
 RULES = "rules"
@@ -90,43 +90,7 @@ class RobustPiece(NamedTuple):
         return envelope_task(self.setting, entry.options)
 
 
-class RobustFolders(NamedTuple):
-    """``results`` holds tables for readers, ``work`` finished pieces, models and episodes."""
-
-    results: Path
-    work: Path
-
-    def report(self, piece: RobustPiece) -> Path:
-        """The JSON of a piece."""
-        return self.work / f"{piece.place}.json"
-
-    def episodes(self, piece: RobustPiece) -> Path:
-        """The episodes of a piece."""
-        return self.work / f"{piece.place}.npz"
-
-    def finished(self, piece: RobustPiece) -> bool:
-        """Whether a piece's results are there.
-
-        Raises:
-            ConfigurationError: they are damaged, or were made from other inputs; says which.
-        """
-        path = self.report(piece)
-        if not (path.exists() and self.episodes(piece).exists()):
-            return False
-        check_inputs(piece.inputs, read_json(path, "work").get("inputs"), repr(str(path)))
-        self.read(piece)
-        return True
-
-    def read(self, piece: RobustPiece) -> dict[str, EpisodeResults]:
-        """The episodes of a finished piece, by the names of its policies.
-
-        Raises:
-            ConfigurationError: they are damaged.
-        """
-        return load_results(self.episodes(piece), fingerprint(piece.inputs))
-
-
-def run_piece(piece: RobustPiece, folders: RobustFolders) -> None:
+def run_piece(piece: RobustPiece, folders: Folders) -> None:
     """Run the policies of a piece and keep what they did."""
     torch.set_num_threads(1)
     result = {}
@@ -136,8 +100,8 @@ def run_piece(piece: RobustPiece, folders: RobustFolders) -> None:
         task = tasks[same] = tasks[same] if same in tasks else piece.task(entry)
         policy = make_policy(entry.policy, task)
         result[entry.name] = run_episodes(task, policy, piece.episodes, piece.seed)
-    save_results(folders.episodes(piece), result, fingerprint(piece.inputs))
     report = {
+        "made_from": fingerprint(piece.inputs),
         "setting": piece.setting.name,
         "case": piece.case,
         "inputs": piece.inputs,
@@ -150,32 +114,7 @@ def run_piece(piece: RobustPiece, folders: RobustFolders) -> None:
             for name, item in result.items()
         },
     }
-    write(folders.report(piece), report)
-
-
-def class_named(setting: Setting, name: str) -> Class:
-    """A setting's class.
-
-    Raises:
-        ConfigurationError: it has none of that name.
-    """
-    every = {item.name: item for item in classes_of(setting)}
-    if name not in every:
-        raise refusal("class", name, f"one of those of {setting.name}: {', '.join(every)}")
-    return every[name]
-
-
-def envelope_of(shelf: EnvelopeStore, setting: Setting, of: Class) -> dict[str, Any]:
-    """The committed envelope of a class.
-
-    Raises:
-        ConfigurationError: there is none.
-    """
-    result = shelf.classes(setting)
-    if of.name not in result:
-        path = str(path_of(shelf.results, setting.name))
-        raise ConfigurationError(f"results: {path!r} has no class {of.name!r}: tune it first")
-    return result[of.name]
+    folders.write(piece.place, report, result)
 
 
 def rules_piece(
@@ -277,16 +216,16 @@ def judge_case(
     nominal: RobustPiece,
     prices: Sequence[float],
     searches: Searches,
-    folders: RobustFolders,
+    folders: Folders,
 ) -> dict[str, Any]:
     """A case: what it does to the rules, and every kind of agent beside them.
 
     ``pieces`` are its finished pieces by label, ``nominal`` that of the rules as assumed, and
     ``searches`` what each tuning seed alone would have made of the envelope.
     """
-    before = folders.read(nominal)
+    before = folders.read(nominal.place)[1]
     middle = math.sqrt(MIDDLE[0] * MIDDLE[1]) * float(before["always"].rate.mean())
-    every = folders.read(pieces[RULES])
+    every = folders.read(pieces[RULES].place)[1]
     always = float(every["always"].rate.mean())
     envelope = _without_added(every, pieces[RULES])
     row: dict[str, Any] = {
@@ -295,7 +234,7 @@ def judge_case(
     }
     for kind, prefix in KINDS.items():
         tested = [
-            list(folders.read(piece).values())
+            list(folders.read(piece.place)[1].values())
             for label, piece in pieces.items()
             if label.startswith(prefix)
         ]
@@ -357,13 +296,13 @@ class RobustTrial(NamedTuple):
     agents: tuple[str, ...]
     seeds: tuple[int, ...]
     episodes: int
-    folders: RobustFolders
+    folders: Folders
 
     @classmethod
     def create(
         cls, suite: Suite, setting: Setting, perturbed: Perturbed, cases: Sequence[Case], of: Class,
         envelope: dict[str, Any], agents: Sequence[str], trained: bool, episodes: int,
-        folders: RobustFolders,
+        folders: Folders,
     ) -> RobustTrial:  # fmt: skip
         """Every case is made once before anything runs.
 

@@ -27,7 +27,7 @@ from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, Val
 from ..training.run import holds_training, train
 from .classes import Class, classes_of, names_of, trained_classes
 from .config import Setting, Suite, front_prices
-from .references import EnvelopeStore, Test, envelope_task, path_of, run_test
+from .references import EnvelopeStore, Test, envelope_task, run_test
 from .tables import VERDICT, write_rows
 from .verdict import ClassTests, at_rates, judge, worths
 
@@ -72,17 +72,34 @@ class Folders(NamedTuple):
             work or Path("runs/benchmark/quick" if quick else "runs/benchmark/full"),
         )
 
-    def report(self, job: Job) -> Path:
-        """The JSON of a job."""
-        return self.work / f"{job.place}.json"
+    def finished(self, place: str, inputs: Mapping[str, Any]) -> bool:
+        """Return whether the results of a piece of work are there.
 
-    def episodes(self, job: Job) -> Path:
-        """The episodes of a job."""
-        return self.work / f"{job.place}.npz"
+        Raises:
+            ConfigurationError: they are damaged, or were made from other inputs; says which.
+        """
+        report = self.work / f"{place}.json"
+        if not (report.exists() and report.with_suffix(".npz").exists()):
+            return False
+        check_inputs(inputs, read_json(report, "work").get("inputs"), repr(str(report)))
+        self.read(place)
+        return True
 
-    def hold(self, job: Job) -> bool:
-        """Whether results of a job are there."""
-        return self.report(job).exists() and self.episodes(job).exists()
+    def read(self, place: str) -> tuple[dict[str, Any], dict[str, EpisodeResults]]:
+        """Return the report of a finished piece of work, and its episodes by policy.
+
+        Raises:
+            ConfigurationError: they are damaged.
+        """
+        report = read_json(self.work / f"{place}.json", "work")
+        return report, load_results(self.work / f"{place}.npz", report.get("made_from", ""))
+
+    def write(
+        self, place: str, report: Mapping[str, Any], episodes: Mapping[str, EpisodeResults]
+    ) -> None:
+        """Write the episodes of a piece of work, then its report."""
+        save_results(self.work / f"{place}.npz", episodes, report["made_from"])
+        write(self.work / f"{place}.json", report)
 
     @contextmanager
     def lock(self) -> Iterator[None]:
@@ -99,7 +116,7 @@ class Folders(NamedTuple):
 
 
 def jobs(
-    suite: Suite, settings: Sequence[Setting], classes: Sequence[str], shelf: EnvelopeStore
+    suite: Suite, settings: Sequence[Setting], classes: Sequence[str], store: EnvelopeStore
 ) -> Iterator[Job]:
     """All work, what everything else needs first; agents of some classes, by name.
 
@@ -107,7 +124,7 @@ def jobs(
         ConfigurationError: a class that an agent would be compared with is not there.
     """
     required = {setting.name: trained_classes(suite, setting) for setting in settings}
-    hashes = {setting.name: _hashes(shelf, setting, required[setting.name]) for setting in settings}
+    hashes = {setting.name: _hashes(store, setting, required[setting.name]) for setting in settings}
     for setting in settings:
         yield Job(setting, "baselines", weight=5.0, envelopes=tuple(hashes[setting.name].items()))
     for setting in settings:
@@ -125,25 +142,22 @@ def jobs(
                     yield Job(setting, "agent", of, seed, weight, stored)
 
 
-def _hashes(shelf: EnvelopeStore, setting: Setting, classes: Sequence[Class]) -> dict[str, str]:
+def _hashes(store: EnvelopeStore, setting: Setting, classes: Sequence[Class]) -> dict[str, str]:
     """The hash of each class of agents, and of those without agents that are there as well."""
-    there = shelf.classes(setting)
-    for of in classes:
-        if of.name not in there:
-            path = str(path_of(shelf.results, setting.name))
-            raise ConfigurationError(
-                f"envelopes = {path!r} is not allowed: it has no class {of.name!r}"
-            )
     names = {of.name for of in classes}
-    return {c.name: there[c.name]["sha256"] for c in classes_of(setting) if c.name in names}
+    return {
+        of.name: store.envelope(setting, of.name)["sha256"]
+        for of in classes_of(setting)
+        if of.name in names
+    }
 
 
-def rules_of(suite: Suite, setting: Setting, shelf: EnvelopeStore) -> list[Test]:
+def rules_of(suite: Suite, setting: Setting, store: EnvelopeStore) -> list[Test]:
     """The rules of the envelopes that agents are compared with, to be run on the test episodes."""
     names = [of.name for of in trained_classes(suite, setting)]
     return [
         Test(setting, tuple(v["options"].items()), v["policy"], suite.episodes, suite.seed)
-        for v in shelf.vertices(setting, names)
+        for v in store.vertices(setting, names)
     ]
 
 
@@ -194,21 +208,6 @@ def job_inputs(job: Job, suite: Suite) -> dict[str, Any]:
     return result | {"training": training_of(experiment), "envelope": envelope} | tested
 
 
-def job_finished(job: Job, suite: Suite, folders: Folders) -> bool:
-    """Whether a job's results are there.
-
-    Raises:
-        ConfigurationError: they are damaged, or were made from other settings; says which.
-    """
-    path = folders.report(job)
-    if not folders.hold(job):
-        return False
-    report = read_json(path, "work")
-    check_inputs(job_inputs(job, suite), report.get("inputs"), repr(str(path)))
-    load_results(folders.episodes(job), report.get("made_from", ""))
-    return True
-
-
 def experiment_of(suite: Suite, setting: Setting, of: Class, seed: int, work: Path) -> Experiment:
     """The training of one agent: the price drawn for each episode and seen."""
     options = agent_options(setting, of) | {
@@ -234,11 +233,11 @@ def experiment_of(suite: Suite, setting: Setting, of: Class, seed: int, work: Pa
     )
 
 
-def run_job(job: Job, suite: Suite, folders: Folders, shelf: EnvelopeStore) -> None:
+def run_job(job: Job, suite: Suite, folders: Folders, store: EnvelopeStore) -> None:
     """Do a job and write its results."""
     torch.set_num_threads(1)
     if job.kind == "baselines":
-        _run_baselines(job, suite, folders, shelf)
+        _run_baselines(job, suite, folders, store)
     elif job.kind in ("informed", "references"):
         _run_references(job, suite, folders)
     elif job.kind == "hindsight":
@@ -248,26 +247,24 @@ def run_job(job: Job, suite: Suite, folders: Folders, shelf: EnvelopeStore) -> N
 
 
 def judge_setting(
-    suite: Suite, setting: Setting, folders: Folders, shelf: EnvelopeStore
+    suite: Suite, setting: Setting, folders: Folders, store: EnvelopeStore
 ) -> dict[str, Any] | None:
     """The verdict over whatever agents of a setting are finished, written as tables.
 
     Raises:
         ConfigurationError: results that are damaged or were made from other settings.
     """
-    every = jobs(suite, [setting], names_of(suite), shelf)
-    pieces = [job for job in every if job_finished(job, suite, folders)]
-    reports = {job.name: read_json(folders.report(job), "work") for job in pieces}
-    result = {
-        job.name: load_results(folders.episodes(job), reports[job.name]["made_from"])
-        for job in pieces
-    }
+    every = jobs(suite, [setting], names_of(suite), store)
+    pieces = [job for job in every if folders.finished(job.place, job_inputs(job, suite))]
+    read = {job.name: folders.read(job.place) for job in pieces}
+    reports = {name: report for name, (report, _) in read.items()}
+    result = {name: episodes for name, (_, episodes) in read.items()}
     if "baselines" not in result:
         return None
     rules, known = result["baselines"], result.get("references", {})
     references = {"sensors": result.get("informed", {}) | known, "centre": known, "local": {}}
     always = float(rules["always"].rate.mean())
-    committed, tested, classes = shelf.classes(setting), {}, {}
+    committed, tested, classes = store.classes(setting), {}, {}
     for of in trained_classes(suite, setting):
         own = committed[of.name]
         envelope = {vertex["name"]: rules[vertex["name"]] for vertex in own["vertices"]}
@@ -342,7 +339,7 @@ def _test(task: Task, policies: list[str], suite: Suite) -> dict[str, EpisodeRes
     }
 
 
-def _run_baselines(job: Job, suite: Suite, folders: Folders, shelf: EnvelopeStore) -> None:
+def _run_baselines(job: Job, suite: Suite, folders: Folders, store: EnvelopeStore) -> None:
     """Gather the tested rules of the committed envelopes, test the single policies and the genie.
 
     Raises:
@@ -351,12 +348,12 @@ def _run_baselines(job: Job, suite: Suite, folders: Folders, shelf: EnvelopeStor
     setting = job.setting
     curves: dict[str, dict[str, Any]] = {}
     result: dict[str, EpisodeResults] = {}
-    vertices = shelf.vertices(setting, [name for name, _ in job.envelopes])
-    for vertex, test in zip(vertices, rules_of(suite, setting, shelf), strict=True):
+    vertices = store.vertices(setting, [name for name, _ in job.envelopes])
+    for vertex, test in zip(vertices, rules_of(suite, setting, store), strict=True):
         if not test.path(folders.work).exists():
             run_test(test, folders.work)
         results = test.read(folders.work)
-        if suite.episodes == shelf.suite.episodes and suite.seed == shelf.suite.seed:
+        if suite.episodes == store.suite.episodes and suite.seed == store.suite.seed:
             check_vertex(vertex, results)
         policy = make_policy(vertex["policy"], envelope_task(setting, vertex["options"].items()))
         result[vertex["name"]] = results
@@ -437,17 +434,15 @@ def _run_agent(job: Job, suite: Suite, folders: Folders) -> None:
         "prices": prices,
         "points": [_summary(result[name]) for name in names],
     }
-    save_results(folders.episodes(job), result, report["made_from"])
-    write(folders.report(job), report)
+    folders.write(job.place, report, result)
 
 
 def _keep(
     job: Job, folders: Folders, content: dict[str, EpisodeResults], report: dict[str, Any]
 ) -> None:
     """Write the episodes, then the report with a summary of every policy."""
-    save_results(folders.episodes(job), content, report["made_from"])
     policies = {name: _summary(results) for name, results in content.items()}
-    write(folders.report(job), report | {"policies": policies})
+    folders.write(job.place, report | {"policies": policies}, content)
 
 
 def _header(job: Job, suite: Suite, task: Task) -> dict[str, Any]:

@@ -58,19 +58,21 @@ class Pool:
             )
 
     @property
-    def here(self) -> bool:
+    def local(self) -> bool:
         """Whether the workers are processes of this one."""
         return self.backend == "loky"
 
-    def done(self, function: Callable[[Any], float], pieces: Sequence[Any]) -> Iterator[float]:
-        """Let the team do the pieces; what the function returns, as it comes. While gathered."""
+    def map_unordered(
+        self, function: Callable[[Any], float], pieces: Sequence[Any]
+    ) -> Iterator[float]:
+        """Let the pool do the pieces; what the function returns, as it comes. While connected."""
         if self.backend == "ray":
-            yield from self._done_by_ray(function, pieces)
+            yield from self._map_by_ray(function, pieces)
         else:
             calls = (joblib.delayed(function)(piece) for piece in pieces)
             yield from joblib.Parallel(return_as="generator_unordered", batch_size=1)(calls)
 
-    def _done_by_ray(
+    def _map_by_ray(
         self, function: Callable[[Any], float], pieces: Sequence[Any]
     ) -> Iterator[float]:
         ray = self._package()
@@ -84,49 +86,34 @@ class Pool:
                 raise error.cause from None
 
     @contextlib.contextmanager
-    def gathered(self) -> Iterator[None]:
-        """Work goes to the team while this is entered.
+    def connect(self) -> Iterator[None]:
+        """Hand work to the pool while this is entered.
 
         Raises:
             ConfigurationError: the backend's package is not installed, or nobody is at the address.
         """
         with contextlib.ExitStack() as stack:
-            if self.backend == "dask":
-                stack.enter_context(self._dask())
-            if self.backend == "ray":
-                stack.enter_context(self._ray())
-            else:
-                jobs = self.workers if self.here else -1
+            try:
+                if self.backend == "dask":
+                    stack.enter_context(self._package().Client(**self._cluster()))
+                elif self.backend == "ray":
+                    self._package().init(**self._cluster())
+                    stack.callback(self._package().shutdown)
+            except (OSError, ValueError) as error:
+                raise self._nobody(error) from None
+            if self.backend != "ray":
+                jobs = self.workers if self.local else -1
                 stack.enter_context(joblib.parallel_config(self.backend, n_jobs=jobs))
             yield
 
-    @contextlib.contextmanager
-    def _dask(self) -> Iterator[None]:
-        distributed = self._package()
-        try:
-            if self.address is None:
-                client = distributed.Client(n_workers=self.workers, threads_per_worker=1)
-            else:
-                client = distributed.Client(self.address, timeout=_PATIENCE)
-        except (OSError, ValueError) as error:
-            raise self._nobody(error) from None
-        with client:
-            yield
-
-    @contextlib.contextmanager
-    def _ray(self) -> Iterator[None]:
-        ray = self._package()
-        try:
-            if self.address is None:
-                ray.init(num_cpus=self.workers, include_dashboard=False)
-            else:
-                ray.init(address=self.address)
-        except (OSError, ValueError) as error:
-            raise self._nobody(error) from None
-        try:
-            yield
-        finally:
-            ray.shutdown()
+    def _cluster(self) -> dict[str, Any]:
+        """Return what the backend needs to find a cluster, or to begin one here."""
+        if self.address is not None:
+            patience = {"timeout": _PATIENCE} if self.backend == "dask" else {}
+            return {"address": self.address} | patience
+        if self.backend == "dask":
+            return {"n_workers": self.workers, "threads_per_worker": 1}
+        return {"num_cpus": self.workers, "include_dashboard": False}
 
     def _package(self) -> Any:
         name = _PACKAGES[self.backend]
@@ -156,26 +143,26 @@ class Call(NamedTuple):
     arguments: tuple[Any, ...]
 
 
-def side_by_side(work: Sequence[Call], team: Pool, description: str) -> None:
-    """Let the team do the work, and show how far it is.
+def side_by_side(work: Sequence[Call], pool: Pool, description: str) -> None:
+    """Let the pool do the work, and show how far it is.
 
     Raises:
-        ConfigurationError: some of it does not fit, there is no such team, or the system ended a
+        ConfigurationError: some of it does not fit, there is no such pool, or the system ended a
             worker of this machine. A cluster gives the work of a worker that is gone to another.
     """
     if not work:
         return
     total, done = sum(item.weight for item in work), 0.0
-    parent = os.getpid() if team.here else None
-    with progress_bar(len(work), description, unit="pieces") as bar, team.gathered():
-        weights = team.done(functools.partial(_do, parent), work)
+    parent = os.getpid() if pool.local else None
+    with progress_bar(len(work), description, unit="pieces") as bar, pool.connect():
+        weights = pool.map_unordered(functools.partial(_do, parent), work)
         try:
             for place, weight in enumerate(weights, 1):
                 done += weight
                 bar.reach(place, done / total)
         except BrokenProcessPool:
             raise ConfigurationError(
-                f"workers = {team.workers}: the system ended one of them, perhaps for want of "
+                f"workers = {pool.workers}: the system ended one of them, perhaps for want of "
                 "memory; finished pieces of work are kept: go on as after an interrupt"
             ) from None
 
