@@ -530,7 +530,7 @@ def run_course(run: LearningRun, seeds: int) -> None:
         "curve": curve(setup, folder),
     }
     if run.kind == "front":
-        result["points"] = test_front(setup, folder / "best_model.zip")
+        result["points"] = evaluate_front(setup, folder / "best_model.zip")
     write(run.path, result)
     report(setup, seeds)
 
@@ -552,7 +552,7 @@ def curve(setup: LearningSetup, folder: Path) -> list[dict[str, Any]]:
     return result
 
 
-def test_front(setup: LearningSetup, model: Path) -> list[dict[str, Any]]:
+def evaluate_front(setup: LearningSetup, model: Path) -> list[dict[str, Any]]:
     """A finished front on the test episodes, price by price, beside what it is compared with.
 
     Raises:

@@ -12,7 +12,7 @@ from typing import Any
 import jinja2
 import numpy as np
 import pandas as pd
-from rich import box
+from rich.markdown import Markdown
 from rich.table import Table
 
 from fusion_gym.evaluation.envelope import EnvelopePoint, height
@@ -23,7 +23,7 @@ from ..output.tables import table_tables
 from .config import NOMINAL, SOLVED, load_suite
 from .references import at_least, bound_of, hull_of, path_of, read_envelopes, rollout_of
 from .tables import VERDICT, Row, grouped, read_rows
-from .verdict import KINDS, MIDDLE, RATES, SHARES, is_gain, read_cases
+from .verdict import MIDDLE, RATES, SHARES, is_gain, read_cases
 
 ABOVE = 0.01  # a point lies above the envelope where its whole interval is further up than this
 HEADLINE = 0.2  # of the rate that always transmitting gets: where single errors are named
@@ -60,6 +60,7 @@ TEMPLATES = jinja2.Environment(
 )
 TEMPLATES.filters |= {
     "share": share, "percent": _percent, "text": plain_text, "code": code, "ranged": ranged,
+    "mean": lambda values: float(np.mean(values)),
 }  # fmt: skip
 
 
@@ -349,22 +350,6 @@ def headline_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
     return frame
 
 
-def above_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
-    """Return each point at which agents are worse than rules."""
-    return pd.DataFrame(
-        {
-            "setting": plain_text(item.label),
-            "class": plain_text(name),
-            "price": f"{point['price']:.3g}",
-            "rate": f"{point['rate']:.4f}",
-            "difference": share(point["difference"]),
-        }
-        for item in settings
-        for name, front in item.classes.items()
-        for point in above_of(front)[0]
-    )
-
-
 def classes_frame(results: SettingResults) -> pd.DataFrame:
     """Return how the agents of each class did."""
     rows = []
@@ -437,21 +422,6 @@ def rates_frame(results: SettingResults) -> pd.DataFrame:
                 }
             )
     return pd.DataFrame(rows)
-
-
-def worth_frame(results: SettingResults) -> pd.DataFrame:
-    """Return what each class is worth beside one that knows less."""
-    return pd.DataFrame(
-        {
-            "what is known more": plain_text(row["kind"]),
-            "class": plain_text(row["knows"]),
-            "beside": plain_text(row["less"]),
-            "rules": share(row.get("rules")),
-            "agents": share(row.get("agents")),
-        }
-        for row in results.worths
-        if "rules" in row or "agents" in row
-    )
 
 
 def text_of(
@@ -542,26 +512,6 @@ def robustness_frame(reports: Sequence[Row], titles: Mapping[str, str]) -> pd.Da
     return pd.DataFrame(rows)
 
 
-def cases_frame(reports: Sequence[Row]) -> pd.DataFrame:
-    """Return what each case leaves of the rules and of the agents' gain."""
-    rows = []
-    for report in reports:
-        for row in report["cases"].values():
-            middles = {kind: row.get(kind, {}).get("middle") for kind in KINDS}
-            left = row.get("agents", {}).get("left")
-            rows.append(
-                {
-                    "setting": report["setting"],
-                    "case": row["title"],
-                    "rules' error": share(row.get("rules")),
-                    "agents": share(middles["agents"]),
-                    "left of the gain": NONE if left is None else f"{left:.0%}",
-                    "trained over draws": share(middles["trained"]),
-                }
-            )
-    return pd.DataFrame(rows)
-
-
 def robustness_text(results: Path, titles: Mapping[str, str], command: str) -> str:
     """Return the page of perturbed cases of the settings with these titles.
 
@@ -620,115 +570,15 @@ def envelopes_frame(folder: Path, envelopes: Row) -> pd.DataFrame:
 # How fast agents learn.
 
 
-def studies_frame(studies: Sequence[Row]) -> pd.DataFrame:
-    """Return one row a setting, of how fast agents learn."""
-    rows = []
-    for study in studies:
-        speed, course = study["throughput"] or {}, study["course"]
-        fronts, plain = (
-            _moments(study["reached"][kind]) if course["memoryless"] else NONE
-            for kind in ("front", "plain")
-        )
-        result = study["finished"]
-        rows.append(
-            {
-                "setting": study["setting"],
-                "steps/s": f"{speed['without']:,.0f}" if "without" in speed else NONE,
-                "with values": f"{speed['values']:,.0f}" if "values" in speed else NONE,
-                "below the rules without memory": fronts,
-                "plain PPO": plain,
-                "finished against": course["against"],
-                "above": NONE,
-                "worst": NONE,
-                "gap closed": NONE,
-            }
-        )
-        if result:
-            worst, (low, high) = result["worst"], result["rates"]
-            parts = {name: part for name, part in result["closed"].items() if part is not None}
-            rows[-1] |= {
-                "above": f"{len(result['above'])} of {result['compared']} above "
-                f"{course['allowed']:+.1%} (rates {low:.3f} to {high:.3f})",
-                "worst": f"{share(worst['difference'])} (seed {worst['seed']}, price "
-                f"{worst['price']:.3g})",
-                "gap closed": ", ".join(f"{part:.0%} to {name}" for name, part in parts.items())
-                or NONE,
-            }
-    return pd.DataFrame(rows)
-
-
-def _moments(reached: Sequence[Row]) -> str:
-    """Return when the seeds' fronts first were below the envelope."""
-    if not reached:
-        return NONE
-    firsts = [item["first"] for item in reached if "first" in item]
-    parts = [f"{len(firsts)} of {len(reached)} seeds"]
-    if firsts:
-        for form, name in (("{:.0f} s", "cpu_seconds"), ("{:,} steps", "timesteps")):
-            ends = [form.format(choose(item[name] for item in firsts)) for choose in (min, max)]
-            parts.append(" to ".join(dict.fromkeys(ends)))
-    late = [item["cpu_seconds"] for item in reached if "first" not in item]
-    return ", ".join(parts + ([f"not within {min(late):.0f} s"] if late else []))
-
-
-def curves_frame(study: Row) -> pd.DataFrame:
-    """Return the most by which fronts are above the rules without memory, over steps."""
-    rows = []
-    for label, key in (("with credit and memory", "fronts"), ("plain PPO", "plain")):
-        points = [point for item in study[key] for point in item["curve"]]
-        for steps in sorted({point["timesteps"] for point in points}):
-            own = [point for point in points if point["timesteps"] == steps]
-            known = [point["excess"] for point in own if point["excess"] is not None]
-            ends = [f"{choose(known):+.0%}" for choose in (min, max)] if known else [NONE]
-            rows.append(
-                {
-                    "training": label,
-                    "steps": f"{steps:,}",
-                    "seconds": f"{np.mean([point['cpu_seconds'] for point in own]):.1f}",
-                    "above the rules without memory by at most": " to ".join(dict.fromkeys(ends)),
-                }
-            )
-    return pd.DataFrame(rows)
-
-
-def finished_frame(study: Row) -> pd.DataFrame:
-    """Return the finished fronts of all seeds, price by price."""
-    names = ["cost", "optimum"] if study["course"]["against"] in SOLVED else ["mse", "envelope"]
-    rows = []
-    for place, price in enumerate(study["prices"]):
-        points = [front["points"][place] for front in study["fronts"]]
-        points = [point for point in points if "difference" in point]
-        if not points:
-            continue
-        worst = max((p["difference"] for p in points), key=lambda ends: float(ends["mean"]))
-        above = sum(p["difference"]["low"] > study["course"]["allowed"] for p in points)
-        mean = float(np.mean([p["difference"]["mean"] for p in points]))
-        rows.append(
-            {"price": f"{price:.3g}{'' if study['inner'][place] else ' (outer)'}"}
-            | {name: f"{np.mean([p[name] for p in points]):.4g}" for name in ("rate", *names)}
-            | {
-                "difference, mean of seeds": f"{mean:+.1%}",
-                "worst seed": share(worst),
-                "above": f"{above} of {len(points)}",
-            }
-        )
-    return pd.DataFrame(rows)
-
-
 def learning_text(studies: Sequence[Row], command: str) -> str:
     """Return the page of how fast agents learn."""
-    return _render("learning.md", studies=studies, command=command)
+    return _render("learning.md", studies=studies, command=command, SOLVED=SOLVED)
 
 
-def learning_table(studies: Sequence[Row]) -> Table:
+def learning_table(studies: Sequence[Row]) -> Markdown:
     """Return its first table for the terminal."""
-    frame = studies_frame(studies)
-    table = Table(title="what agents learn, and how fast", box=box.SIMPLE_HEAD, show_lines=True)
-    for column in frame:
-        table.add_column(str(column), overflow="fold", no_wrap=column == "setting")
-    for row in frame.to_numpy():
-        table.add_row(*row)
-    return table
+    rows = TEMPLATES.get_template("learning_rows.md").make_module(globals())
+    return Markdown(str(rows.overview(studies)))  # type: ignore[attr-defined]
 
 
 # The quick benchmark beside the full one.

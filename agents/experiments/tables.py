@@ -32,7 +32,7 @@ class Column(NamedTuple):
     allowed: tuple[str, ...] = ()
 
 
-def _declared() -> dict[str, dict[str, Column]]:
+def _read_columns() -> dict[str, dict[str, Column]]:
     """Return the columns of every table, from the list beside this module."""
     result: dict[str, dict[str, Column]] = {}
     rows = pd.read_csv(Path(__file__).with_name("columns.csv"), dtype=str, keep_default_na=False)
@@ -42,7 +42,7 @@ def _declared() -> dict[str, dict[str, Column]]:
     return result
 
 
-TABLES = _declared()
+TABLES = _read_columns()
 
 
 def columns_of(table: str) -> dict[str, Column]:
