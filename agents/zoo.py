@@ -21,7 +21,7 @@ from fusion_gym.validation import ConfigurationError, choice
 from .command_line import Long
 from .experiments.classes import HEARD, KNOWS
 from .experiments.config import Mode
-from .experiments.tables import grouped, read_rows
+from .experiments.tables import group_by, read_rows
 from .input.options import InputFolder, OutputFolder
 from .output.files import read_json, replacing, write
 from .output.progress import writing
@@ -73,7 +73,7 @@ def best_agents(results: Path) -> dict[tuple[str, str], dict[str, Any]]:
     """Return the best training seed by setting and class, with what it did at its prices."""
     result: dict[tuple[str, str], dict[str, Any]] = {}
     for path in sorted(results.glob("*/runs.csv")):
-        policies = grouped(read_rows(path.parent, "policies"), "run")
+        policies = group_by(read_rows(path.parent, "policies"), "run")
         for run in read_rows(path.parent, "runs"):
             if "class" in run:
                 run |= {"setting": path.parent.name, "policies": policies.get(run["run"], [])}

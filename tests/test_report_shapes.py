@@ -47,7 +47,7 @@ def change(file: Path, column: str, value: str) -> None:
         ("fronts", "mode", "nobody", "mode = 'nobody' is not allowed: it must be 'centre' or"),
         ("fronts", "rates", "[1", "rates = '[1' is not allowed: it must be JSON"),
         ("fronts", "seeds", "1.5", "seeds = 1.5 is not allowed: it must be a whole number"),
-        ("worth", "rules_low", "x", "rules_low = 'x' is not allowed: it must be a finite number"),
+        ("worth", "rules_low", "", "rules_low = an empty cell is not allowed: it must be a finite"),
         ("points", "mse", "", "mse = an empty cell is not allowed"),
     ],
 )

@@ -43,7 +43,7 @@ from .references import (
     rollout_of,
     run_test,
 )
-from .tables import grouped, read_rows, write_rows
+from .tables import group_by, read_rows, write_rows
 from .training import check_vertex, training_of
 from .verdict import MIDDLE, AgentFront, excess, interval
 
@@ -409,7 +409,7 @@ def read_learning(folder: Path) -> dict[str, Any]:
         place = [row.pop("rate"), row.pop("mse")]
         curve.setdefault(row["timesteps"], {"excess": None} | row | {"front": []})
         curve[row["timesteps"]]["front"].append(place)
-    points = grouped(read_rows(folder, "learning_points", "output"), "seed")
+    points = group_by(read_rows(folder, "learning_points", "output"), "seed")
     runs: dict[str, list[dict[str, Any]]] = {"front": [], "plain": []}
     for row in read_rows(folder, "learning_trainings", "output"):
         kind = row.pop("kind")

@@ -32,7 +32,7 @@ from ..output.files import load_results, read_json, save_results, write
 from ..output.folders import check_inputs, fingerprint
 from .classes import Class, classes_of
 from .config import Family, Setting, Suite, Tuning, front_prices, load_suite
-from .tables import Row, grouped, read_rows, write_rows
+from .tables import Row, group_by, read_rows, write_rows
 from .tuning import as_they_are, first_values, policy_text, tune_families
 from .workers import Call, Pool, side_by_side
 
@@ -369,12 +369,12 @@ def read_envelopes(folder: Path) -> dict[str, Any]:
     """
     result: dict[str, Any] = dict(*read_rows(folder, "setting", "envelopes")[:1])
     vertices, searches = (
-        grouped(read_rows(folder, table, "envelopes"), "class") for table in _TABLES[1:3]
+        group_by(read_rows(folder, table, "envelopes"), "class") for table in _TABLES[1:3]
     )
     result |= {"setting": folder.name, "classes": {}, "curves": []}
     for row in read_rows(folder, "classes", "envelopes"):
         name, sha256 = row.pop("class"), row.pop("sha256")
-        by_seed = grouped(searches.get(name, []), "seed")
+        by_seed = group_by(searches.get(name, []), "seed")
         content = {"broadcast": None} | row | {
             "vertices": [_nested(vertex) for vertex in vertices.get(name, [])],
             "searches": [[[p["rate"], p["mse"]] for p in points] for points in by_seed.values()],

@@ -22,7 +22,7 @@ from ..output.markup import NONE, code, markup_number, plain_text, ranged, share
 from ..output.tables import table_tables
 from .config import NOMINAL, SOLVED, load_suite
 from .references import at_least, bound_of, hull_of, path_of, read_envelopes, rollout_of
-from .tables import VERDICT, Row, grouped, read_rows
+from .tables import VERDICT, Row, group_by, read_rows
 from .verdict import MIDDLE, RATES, SHARES, is_gain, read_cases
 
 ABOVE = 0.01  # a point lies above the envelope where its whole interval is further up than this
@@ -227,7 +227,7 @@ def read_setting(folder: Path) -> SettingResults:
     """
     verdict = read_verdict(folder)
     classes = verdict.pop("classes")
-    policies = grouped(read_rows(folder, "policies"), "run")
+    policies = group_by(read_rows(folder, "policies"), "run")
     seeds: dict[str, list[list[tuple[float, float]]]] = {}
     validation: Row = {}
     for run in read_rows(folder, "runs"):
@@ -269,7 +269,7 @@ def read_verdict(folder: Path) -> Row:
             "must be one positive rate"
         )
     parts = {
-        part: grouped(read_rows(folder, table), "class")
+        part: group_by(read_rows(folder, table), "class")
         for part, table in (("points", "points"), ("at", "equal_rates"), ("envelope", "envelope"))
     }
     classes: dict[str, Row] = {}

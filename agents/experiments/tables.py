@@ -98,7 +98,10 @@ def read_frame(folder: Path, table: str, option: str = "results") -> pd.DataFram
             f"{display(differing[0])}"
         )
     for name, column in columns.items():
-        frame[name], wrong = _checked(frame[name], column)
+        frame[name], wrong = _check(frame[name], column)
+        if column.kind == "interval":  # all of it is there, or nothing
+            mean = name.removesuffix("_low").removesuffix("_high")
+            wrong |= frame[name].isna() & frame[mean].notna()
         if wrong.any():
             value = frame[name][wrong].tolist()[0]
             cell = "an empty cell" if pd.isna(value) else display(value)
@@ -115,7 +118,7 @@ _KINDS = {
 }  # fmt: skip
 
 
-def _checked(values: "pd.Series[Any]", column: Column) -> "tuple[pd.Series[Any], pd.Series[bool]]":
+def _check(values: "pd.Series[Any]", column: Column) -> "tuple[pd.Series[Any], pd.Series[bool]]":
     """Return the column as its kind has it, and which of its cells are not allowed."""
     absent = values.isna()
     wrong = absent & (not column.empty)
@@ -167,7 +170,7 @@ def read_rows(folder: Path, table: str, option: str = "results") -> list[Row]:
     return result
 
 
-def grouped(rows: Iterable[Row], name: str) -> dict[str, list[Row]]:
+def group_by(rows: Iterable[Row], name: str) -> dict[str, list[Row]]:
     """Return the rows by one of their columns, without it."""
     result: dict[str, list[Row]] = {}
     for row in rows:

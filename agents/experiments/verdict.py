@@ -15,7 +15,7 @@ from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import mean_interval
 
 from .classes import HEARD, Class
-from .tables import grouped, read_rows, write_rows
+from .tables import group_by, read_rows, write_rows
 
 RESAMPLES = 2000
 MIDDLE = (0.05, 0.5)  # of the rate that transmitting always gets: the middle of the front
@@ -371,7 +371,7 @@ def read_cases(results: Path, settings: Sequence[str]) -> list[dict[str, Any]]:
     for name in settings:
         folder = results / name
         rows = read_rows(folder, ROBUSTNESS) if (folder / f"{ROBUSTNESS}.csv").exists() else []
-        for of, own in sorted(grouped(rows, "class").items()):
+        for of, own in sorted(group_by(rows, "class").items()):
             cases: dict[str, Any] = {}
             for row in own:
                 case = cases.setdefault(
