@@ -4,10 +4,10 @@
 
 Envelopes that are missing are tuned first, as ``fusion-gym envelope`` does; every agent keeps
 the hash of the one that it is compared with. Every piece of work (one training seed of one agent,
-say) writes its JSON into
-the results folder as it is finished, and its episodes into the work folder; ``--resume`` skips
-what is there, if it was made from the same inputs, and goes on with trainings in the work folder,
-whose checkpoints hold pickles. ``fusion-gym report`` makes tables and figures of it.
+say) writes what it found and its episodes into the work folder as it is finished; ``--resume``
+skips what is there, if it was made from the same inputs, and goes on with trainings there, whose
+checkpoints hold pickles. The results folder gets a setting's tables once it is judged, and
+``fusion-gym report`` makes a page and figures of them.
 """
 
 from collections.abc import Sequence
@@ -18,21 +18,24 @@ from typing import Annotated
 from fusion_gym.validation import choice
 
 from .command_line import SuiteCommand
+from .experiments.classes import names_of, trained_classes
+from .experiments.config import Setting, Suite, load_suite
+from .experiments.references import (
+    SHIPPED,
+    EnvelopeStore,
+    complete_envelopes,
+    envelope_task,
+    missing_classes,
+    run_test,
+)
+from .experiments.report import agreement_table
+from .experiments.training import Folders, job_inputs, jobs, judge_setting, rules_of, run_job
+from .experiments.workers import BackendName, Call, Pool, side_by_side
 from .input.options import Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
 from .output.folders import refuse_earlier
 from .output.progress import writing
 from .output.tables import console
-from .suite.agreement import agreement_table
-from .suite.beside_rules import SHIPPED
-from .suite.classes import names_of, trained_classes
-from .suite.committed import FOLDER, Shelf, complete, missing_classes
-from .suite.config import Setting, Suite, load_suite
-from .suite.envelopes import envelope_task, run_test
-from .suite.jobs import Folders, job_finished, jobs, rules_of
-from .suite.team import BackendName, Team
-from .suite.work import conclude, run_job
-from .suite.workers import Work, side_by_side
 from .training.checked import parse
 
 USUAL = Path("results")  # of the full benchmark
@@ -69,9 +72,9 @@ class Benchmark(SuiteCommand):
 
     def _run(self) -> None:
         suite = self.suite()
-        team = Team(self.workers, self.backend, self.address)
+        pool = Pool(self.workers, self.backend, self.address)
         folders = Folders.create(self.results, self.work, self.quick)
-        if not team.here:  # whoever works has another working directory
+        if not pool.local:  # whoever works has another working directory
             folders = Folders(folders.results.absolute(), folders.work.absolute())
         writable_folder("results", folders.results)
         writable_folder("work", folders.work)
@@ -82,42 +85,44 @@ class Benchmark(SuiteCommand):
         classes = self.classes or names_of(suite)
         for setting in settings:
             envelope_task(setting)
-        files = [f"{item.name}/*.json" for item in settings]
-        files += [f"{FOLDER}/{item.name}.json" for item in settings]
-        there = [path for name in files for path in folders.results.glob(name)]
-        refuse_earlier(folders.results, len(there), self.resume)
-        shelf = self._shelf(suite, settings, folders)
+        for option, suffix in (("results", "csv"), ("work", "json")):
+            folder: Path = getattr(folders, option)
+            there = [path for item in settings for path in folder.glob(f"{item.name}/*.{suffix}")]
+            refuse_earlier(option, folder, len(there), self.resume)
+        store = self._store(suite, settings, folders)
         compared = [[of.name for of in trained_classes(suite, setting)] for setting in settings]
         for setting, names in zip(settings, compared, strict=True):
-            missing_classes(shelf.suite, setting, names, shelf.results)
-        if not team.here:
-            with team.gathered():  # nobody is there, or a package is absent
+            missing_classes(store.suite, setting, names, store.results)
+        if not pool.local:
+            with pool.connect():  # nobody is there, or a package is absent
                 pass
         with folders.lock():
-            writing(("finished pieces", folders.results), ("trainings and episodes", folders.work))
+            writing(("tables", folders.results), ("finished pieces and trainings", folders.work))
             for setting, names in zip(settings, compared, strict=True):
-                complete(shelf.suite, [setting], names, shelf.results, folders.work, team)
+                complete_envelopes(store.suite, [setting], names, store.results, folders.work, pool)
             rules = [
-                Work(4.0, run_test, (test, folders.work))
+                Call(4.0, run_test, (test, folders.work))
                 for setting in settings
-                for test in rules_of(suite, setting, shelf)
+                for test in rules_of(suite, setting, store)
                 if not test.path(folders.work).exists()
             ]
-            side_by_side(rules, team, "rules")
+            side_by_side(rules, pool, "rules")
             # All of the settings' pieces, for the verdict is over all of them.
-            every = jobs(suite, settings, names_of(suite), shelf)
-            done = [job.place for job in every if job_finished(job, suite, folders)]
+            every = jobs(suite, settings, names_of(suite), store)
+            done = [
+                job.place for job in every if folders.finished(job.place, job_inputs(job, suite))
+            ]
             side_by_side(
                 [
-                    Work(job.weight, run_job, (job, suite, folders, shelf))
-                    for job in jobs(suite, settings, classes, shelf)
+                    Call(job.weight, run_job, (job, suite, folders, store))
+                    for job in jobs(suite, settings, classes, store)
                     if job.place not in done
                 ],
-                team,
+                pool,
                 "benchmark",
             )
-            judged = [Work(30.0, conclude, (suite, item, folders, shelf)) for item in settings]
-            side_by_side(judged, team, "verdicts")
+            judged = [Call(30.0, judge_setting, (suite, item, folders, store)) for item in settings]
+            side_by_side(judged, pool, "verdicts")
         if self.quick:
             beside = agreement_table(folders.results, USUAL, [setting.name for setting in settings])
             if beside is not None:
@@ -125,12 +130,12 @@ class Benchmark(SuiteCommand):
         report = f"fusion-gym report --results {folders.results}"
         print(f"results in {folders.results}: {report}")
 
-    def _shelf(self, suite: Suite, settings: Sequence[Setting], folders: Folders) -> Shelf:
+    def _store(self, suite: Suite, settings: Sequence[Setting], folders: Folders) -> EnvelopeStore:
         """The quick benchmark takes the envelopes that are shipped, if they are of this config."""
-        shipped = Shelf(load_suite(self.config), SHIPPED)
+        shipped = EnvelopeStore(load_suite(self.config), SHIPPED)
         if self.quick and all(
             {of.name for of in trained_classes(suite, setting)} <= shipped.envelopes(setting).keys()
             for setting in settings
         ):
             return shipped
-        return Shelf(suite, folders.results)
+        return EnvelopeStore(suite, folders.results)

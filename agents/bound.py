@@ -22,8 +22,9 @@ from fusion_gym.solvers.silence import SilenceBound, silence_bound, silence_mode
 from fusion_gym.validation import choice
 
 from .command_line import Long, SetOptions
-from .input.options import Between, Episodes, OutputFile, Seed, Whole
-from .output import tables
+from .experiments.tables import write_rows
+from .input.options import Between, Episodes, OutputFile, OutputFolder, Seed, Whole
+from .output import tables as terminal
 from .output.files import write
 from .output.progress import progress_bar, writing
 
@@ -54,6 +55,8 @@ class Bound(Long):
     """Seed of the first episode."""
     json: Annotated[Path | None, OutputFile()] = None
     """Write the results to this file."""
+    tables: Annotated[Path | None, OutputFolder()] = None
+    """Write the bound at the rates as bounds.csv and bounds_at.csv into this setting's folder."""
 
     keeps = False
 
@@ -88,7 +91,10 @@ class Bound(Long):
             name: value._asdict() for name, value in delivered.items()
         }
         write(self.json, report)
-        console = tables.console()
+        if self.tables is not None and self.rates:
+            write_rows(self.tables, "bounds", [report | cost for cost in report["costs"]])
+            write_rows(self.tables, "bounds_at", report["bounds"])
+        console = terminal.console()
         console.print(_floors(report))
         if self.rates:
             console.print(_table(report))
@@ -123,11 +129,11 @@ def _reward_weights(task: Task) -> Any:
 
 def _floors(report: dict[str, Any]) -> Table:
     delivered = report["everything_delivered"].items()
-    rows = [(f"filter {name}", tables.table_number(value)) for name, value in delivered]
+    rows = [(f"filter {name}", terminal.table_number(value)) for name, value in delivered]
     if "floor" in report:
         rows.append(("uncensored, Kalman filter: unavoidable", f"{report['floor']:.4g}"))
     heads = ("everything delivered", "MSE, every state with 1")
-    return tables.table_tables(f"{report['env']}: floors", heads, rows)
+    return terminal.table_tables(f"{report['env']}: floors", heads, rows)
 
 
 def _table(report: dict[str, Any]) -> Table:
@@ -136,4 +142,4 @@ def _table(report: dict[str, Any]) -> Table:
         for row in report["bounds"]
     ]
     heads = ("rate", "error at least", "price of a packet", "gap at this price")
-    return tables.table_tables("no policy has less", heads, rows)
+    return terminal.table_tables("no policy has less", heads, rows)

@@ -26,24 +26,20 @@ from fusion_gym.evaluation.intervals import Interval
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import Long
+from .experiments.references import CommittedRules, Trials, at_least, envelope_task
+from .experiments.workers import Pool, side_by_side, train_beside
 from .input.options import Episodes, OutputFolder, Steps
 from .output import figures, front_figure, tables
 from .output.ending import ended_like_by_ctrl_c
 from .output.files import write
 from .output.folders import alone_in
 from .output.progress import writing
-from .suite.beside_rules import Ground, Trials
-from .suite.envelope_table import at_least
-from .suite.envelopes import envelope_task
-from .suite.team import Team
-from .suite.trainings import train_beside
-from .suite.workers import side_by_side
 from .training.checked import load_checked
 from .training.config import Experiment
 from .training.run import earlier, holds_training
 
 SETTING = "tobit_oscillator"
-TEAM = Team(2)
+TEAM = Pool(2)
 
 
 class Learner(NamedTuple):
@@ -95,7 +91,7 @@ class Demo(Long):
 
     def run(self) -> None:
         """From trainings to figures."""
-        ground = Ground.read(SETTING, self.episodes)
+        ground = CommittedRules.read(SETTING, self.episodes)
         folders = {learner.name: self.output / learner.name for learner in LEARNERS}
         experiments = {
             learner.name: load_checked(Experiment, learner.config).changed(
@@ -157,7 +153,7 @@ def _conclude(learner: Learner, tests: Trials, folder: Path) -> None:
     draw_episodes(folder, learner, tests)
 
 
-def front_table(learner: Learner, ground: Ground, report: Mapping[str, Any]) -> Table:
+def front_table(learner: Learner, ground: CommittedRules, report: Mapping[str, Any]) -> Table:
     """A row a price: the agent, and the rules of both classes at its rate."""
     bucket = envelope_task(ground.setting).bucket
     caption = (

@@ -3,7 +3,7 @@
     fusion-gym envelope [--envs NAME …] [--classes NAME …] [--quick] [--resume]
 
 For each class of knowledge the vertices of the lower envelope are chosen on tuning seeds and then
-measured on the test seeds. ``envelopes/SETTING.json`` in the results folder holds them, each class
+measured on the test seeds. The tables of ``SETTING`` in the results folder hold them, each class
 with a SHA-256 of its content, which ``fusion-gym benchmark`` keeps with every agent that it trains;
 ``envelopes/README.md`` has the table. What was tuned stays in the work folder, so that an
 interrupted run goes on where it was.
@@ -14,16 +14,21 @@ from dataclasses import dataclass
 from fusion_gym.validation import choice
 
 from .command_line import SuiteCommand
+from .experiments.classes import classes_of
+from .experiments.config import load_suite
+from .experiments.references import (
+    ENVELOPES,
+    committed_classes,
+    complete_envelopes,
+    missing_classes,
+)
+from .experiments.report import envelopes_text
+from .experiments.training import Folders
+from .experiments.workers import Pool
 from .input.options import writable_folder
 from .output.files import write_text
 from .output.folders import refuse_earlier
 from .output.progress import writing
-from .suite.classes import classes_of
-from .suite.committed import FOLDER, complete, missing_classes, path_of, present
-from .suite.config import load_suite
-from .suite.envelope_table import envelope_text
-from .suite.jobs import Folders
-from .suite.team import Team
 
 
 @dataclass(frozen=True)
@@ -44,20 +49,20 @@ class Envelope(SuiteCommand):
         there = [
             name
             for setting in settings
-            for name in present(suite, setting, folders.results)
+            for name in committed_classes(suite, setting, folders.results)
             if not self.classes or name in self.classes
         ]
-        refuse_earlier(folders.results, len(there), self.resume)
+        refuse_earlier("results", folders.results, len(there), self.resume)
         for setting in settings:
             missing_classes(suite, setting, self.classes, folders.results)
         with folders.lock():
             writing(
-                ("finished envelopes", folders.results / FOLDER),
+                ("finished envelopes", folders.results),
                 ("what was tuned and tested", folders.work),
             )
-            complete(
-                suite, settings, self.classes, folders.results, folders.work, Team(self.workers)
+            complete_envelopes(
+                suite, settings, self.classes, folders.results, folders.work, Pool(self.workers)
             )
-            readme = folders.results / FOLDER / "README.md"
-            write_text(readme, envelope_text(folders.results, "fusion-gym envelope"))
-        print(f"envelopes in {path_of(folders.results, '').parent}, the table in {readme}")
+            readme = folders.results / ENVELOPES / "README.md"
+            write_text(readme, envelopes_text(folders.results, "fusion-gym envelope"))
+        print(f"envelopes in {folders.results}, the table in {readme}")

@@ -13,20 +13,56 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
+import pydantic
+
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.evaluation.metrics import paired_difference, robust_summary, summarise
+from fusion_gym.evaluation.metrics import METRICS, paired_difference, robust_summary, summarise
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import Long, PolicyNames, SetOptions
-from .input.environment import environment_of
 from .input.files import checked
 from .input.options import Episodes, OutputFile, Seed
 from .output import tables
 from .output.files import read_json, write
 from .output.progress import progress_bar, remark, writing
-from .suite.reports import Evaluation
+from .training.environment import environment_of
+
+
+class Ends(pydantic.BaseModel):
+    """A mean with its interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+class Quantiles(pydantic.BaseModel):
+    """Quantiles of the episodes' error."""
+
+    median: float
+
+
+# A policy in the JSON of an evaluation: an interval for a metric, or a list.
+_Row = Annotated[list[float], pydantic.Field(min_length=1)]
+_FIELDS: dict[str, Any] = {
+    name: (_Row if metric.axis else Ends, ...) for name, metric in METRICS.items()
+}
+EVALUATED = pydantic.create_model("EVALUATED", **_FIELDS)
+
+
+class Evaluation(pydantic.BaseModel):
+    """The JSON of an evaluation."""
+
+    policies: dict[str, EVALUATED]  # type: ignore[valid-type]
+    quantiles: dict[str, Quantiles]
+
+    @pydantic.model_validator(mode="after")
+    def _paired(self) -> "Evaluation":
+        if missing := sorted(self.policies.keys() - self.quantiles.keys()):
+            raise ValueError(f"quantiles of {missing} are missing")
+        return self
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import Command, SetOptions
-from .input.environment import environment_of
 from .input.options import OutputFile
 from .output.files import replacing
+from .training.environment import environment_of
 
 _KINDS = ("zoo", "model")
 

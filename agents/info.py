@@ -15,8 +15,8 @@ from rich.markdown import Markdown
 from fusion_gym.validation import ConfigurationError, nearest
 
 from .command_line import Command
-from .input.catalogue import catalogue
 from .output.tables import console
+from .training.catalogue import catalogue
 
 
 @dataclass(frozen=True)

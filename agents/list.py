@@ -16,8 +16,8 @@ from rich.table import Table
 from fusion_gym.validation import keys
 
 from .command_line import Command
-from .input.catalogue import catalogue
 from .output.tables import console
+from .training.catalogue import catalogue
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,11 @@ from fusion_gym.evaluation.cross_term import CrossTerm, cross_terms, usual_polic
 from fusion_gym.policies.registry import make_policy
 
 from .command_line import Long, PolicyNames, SetOptions
-from .input.environment import environment_of
 from .input.options import OutputFile, Seed, Whole
 from .output import tables
 from .output.files import write
 from .output.progress import progress_bar, writing
+from .training.environment import environment_of
 
 
 @dataclass(frozen=True)

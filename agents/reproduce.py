@@ -17,6 +17,9 @@ from typing import Annotated
 import tyro
 
 from .command_line import Command
+from .experiments.workers import Call as Work
+from .experiments.workers import Pool as Team
+from .experiments.workers import side_by_side
 from .input.options import OutputFolder, Seed, Whole
 from .output.ending import ended_like_by_ctrl_c
 from .output.files import remove_partials
@@ -25,8 +28,6 @@ from .reproduction.making import PieceJob, compute_jobs, results_of
 from .reproduction.page import write_overview, write_page
 from .reproduction.paper import Paper, Piece
 from .reproduction.papers import NAMES, papers
-from .suite.team import Team
-from .suite.workers import Work, side_by_side
 
 
 @dataclass(frozen=True)

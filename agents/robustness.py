@@ -3,10 +3,11 @@
     fusion-gym robustness [--envs NAME …] [--class local_packets] [--trained] [--resume]
 
 The rules of a committed envelope and the agents of its class run under every case of a config, as
-they were tuned and trained, on the same test episodes. Every piece of work writes its JSON into
-``robustness/`` of the results folder as it is finished, and its episodes into the work folder;
-``--resume`` skips what is there, if it was made from the same inputs. ``robustness/README.md`` has
-the table. With ``--trained`` agents are trained besides over draws of the perturbations.
+they were tuned and trained, on the same test episodes. Every piece of work writes what it found and
+its episodes into the work folder as it is finished; ``--resume`` skips what is there, if it was
+made from the same inputs. The settings' tables in the results folder get the verdicts, which
+``robustness/README.md`` there shows. With ``--trained`` agents are trained besides over draws of
+the perturbations.
 """
 
 from collections.abc import Sequence
@@ -16,22 +17,30 @@ from typing import Annotated
 
 import tyro
 
+from fusion_gym.validation import choice
+
 from .command_line import Long
+from .experiments.classes import classes_of, trained_classes
+from .experiments.config import (
+    Perturbed,
+    Setting,
+    Suite,
+    load_robustness,
+    load_suite,
+    select_settings,
+)
+from .experiments.config import RobustnessSettings as Config
+from .experiments.references import EnvelopeStore
+from .experiments.report import robustness_text
+from .experiments.robustness import RobustTrial, agents_of, run_piece, run_training
+from .experiments.training import Folders
+from .experiments.verdict import ROBUSTNESS
+from .experiments.workers import Call, Pool, side_by_side
 from .input.options import Episodes, InputFolder, OutputFolder, Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
+from .output.files import write_text
 from .output.folders import alone_in, refuse_earlier
 from .output.progress import writing
-from .suite import robust_pieces
-from .suite.classes import trained_classes
-from .suite.committed import Shelf
-from .suite.config import Setting, Suite, load_suite
-from .suite.robust_summary import FOLDER
-from .suite.robust_table import write_table
-from .suite.robust_trial import RobustTrial
-from .suite.robustness import Perturbed, load_robustness, select_settings
-from .suite.robustness import RobustnessSettings as Config
-from .suite.team import Team
-from .suite.workers import Work, side_by_side
 from .training.checked import parse
 
 USUAL = Path("runs/benchmark/full")
@@ -76,42 +85,40 @@ class Robustness(Long):
 
     def _run(self) -> None:
         config = load_robustness(self.config)
-        folders = robust_pieces.RobustFolders(self.results, self.work)
+        folders = Folders(self.results, self.work)
         trials = [self._trial(config, item, folders) for item in select_settings(config, self.envs)]
-        place = self.results / FOLDER
+        place = self.results / ROBUSTNESS
         writable_folder("results", place)
         there = [
             path
             for trial in trials
-            for path in place.glob(f"{trial.setting.name}/{trial.of.name}/*/*.json")
+            for path in self.work.glob(f"{trial.setting.name}/{trial.of.name}/*/*.npz")
         ]
-        refuse_earlier(self.results, len(there), self.resume)
+        refuse_earlier("work", self.work, len(there), self.resume)
         for trial in trials:
             for piece in trial.pieces(("rules", "agents")):
-                folders.finished(piece)
-        with alone_in(place, "results"), alone_in(self.work, "work"):
-            writing(("finished pieces", place), ("trainings and episodes", self.work))
+                folders.finished(piece.place, piece.inputs)
+        with alone_in(self.results, "results"), alone_in(self.work, "work"):
+            writing(("tables", self.results), ("finished pieces and trainings", self.work))
             self._work(trials, ("rules", "agents"), folders)
             trainings = [training for trial in trials for training in trial.trainings]
             if trainings:
-                work = [
-                    Work(
-                        30.0 + training.training.timesteps / 10_000,
-                        robust_pieces.run_training,
-                        (training,),
-                    )
+                calls = [
+                    Call(30.0 + training.training.timesteps / 10_000, run_training, (training,))
                     for training in trainings
                 ]
-                side_by_side(work, Team(self.workers), "trainings over draws")
+                side_by_side(calls, Pool(self.workers), "trainings over draws")
                 self._work(trials, ("trained",), folders)
-            rows = [Work(20.0, trial.judge, (case,)) for trial in trials for case in trial.worlds]
-            side_by_side(rows, Team(self.workers), "verdicts")
+            rows = [Call(20.0, trial.judge, (case,)) for trial in trials for case in trial.worlds]
+            side_by_side(rows, Pool(self.workers), "verdicts")
             for trial in trials:
-                trial.conclude()
+                trial.write_verdict()
             every = {setting.name: setting.title for setting in load_suite(config.suite).settings}
             titles = {setting.setting: every[setting.setting] for setting in config.settings}
-            table = write_table(self.results, titles, "fusion-gym robustness" + self._how())
-        print(f"results in {place}, the table in {table}")
+            table = place / "README.md"
+            text = robustness_text(self.results, titles, "fusion-gym robustness" + self._how())
+            write_text(table, text)
+        print(f"results in {self.results}, the table in {table}")
 
     def _how(self) -> str:
         """The options that the results depend on."""
@@ -120,19 +127,18 @@ class Robustness(Long):
         episodes = "" if self.episodes == Robustness.episodes else f" --episodes {self.episodes}"
         return trained + episodes
 
-    def _trial(
-        self, config: Config, entry: Perturbed, folders: robust_pieces.RobustFolders
-    ) -> RobustTrial:
+    def _trial(self, config: Config, entry: Perturbed, folders: Folders) -> RobustTrial:
         """A setting with its agents, everything checked."""
         suite = load_suite(config.suite)
-        shelf = Shelf(suite, self.results)
+        store = EnvelopeStore(suite, self.results)
         changed = {"training_seeds": self.seeds, "timesteps": self.timesteps}
         changed = {key: value for key, value in changed.items() if value is not None}
         suite = parse(Suite, suite.model_dump() | changed, "command line")
         setting = next(setting for setting in suite.settings if setting.name == entry.setting)
-        of = robust_pieces.class_named(setting, self.of or _usual_class(suite, setting))
-        agents = robust_pieces.agents_of(setting, of, self.agents, self.models, USUAL)
-        envelope = robust_pieces.envelope_of(shelf, setting, of)
+        classes = {of.name: of for of in classes_of(setting)}
+        of = classes[choice("class", self.of or _usual_class(suite, setting), classes)]
+        agents = agents_of(setting, of, self.agents, self.models, USUAL)
+        envelope = store.envelope(setting, of.name)
         return RobustTrial.create(
             suite, setting, entry, config.cases_of(entry), of, envelope, agents,
             self.trained, self.episodes, folders,
@@ -142,14 +148,14 @@ class Robustness(Long):
         self,
         trials: Sequence[RobustTrial],
         kinds: tuple[str, ...],
-        folders: robust_pieces.RobustFolders,
+        folders: Folders,
     ) -> None:
         """Do what is not finished of some kinds."""
         pieces = [piece for trial in trials for piece in trial.pieces(kinds)]
-        left = [piece for piece in pieces if not folders.finished(piece)]
+        left = [piece for piece in pieces if not folders.finished(piece.place, piece.inputs)]
         side_by_side(
-            [Work(piece.weight, robust_pieces.run_piece, (piece, folders)) for piece in left],
-            Team(self.workers),
+            [Call(piece.weight, run_piece, (piece, folders)) for piece in left],
+            Pool(self.workers),
             " and ".join(kinds),
         )
 

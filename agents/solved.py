@@ -17,12 +17,12 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import Long
+from .experiments.verdict import excess
 from .input.options import Episodes, OutputFolder, Seed, TrainingSeeds
 from .output import tables
 from .output.files import read_json, write
 from .output.folders import fingerprint
 from .output.progress import progress_bar, writing
-from .suite.verdict import excess
 from .training.checked import load_checked
 from .training.config import Experiment
 from .training.run import holds_training, train

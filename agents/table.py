@@ -15,10 +15,10 @@ from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.registry import make_policy
 
 from .command_line import Long
+from .experiments.config import SweepSettings
 from .input.options import Episodes, Seed
 from .output import tables
 from .output.progress import progress_bar
-from .suite.sweep import SweepSettings
 from .training.checked import load_checked
 
 COLUMNS = ("setting", "requests", "rate", "MSE", "median", "ARMSE", "trace P", "NEES")

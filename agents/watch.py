@@ -22,10 +22,10 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import Long, SetOptions
-from .input.environment import environment_of
 from .input.options import OutputFile, Seed, Whole
 from .output.films import checked_film, save_film
 from .output.progress import progress_bar, writing
+from .training.environment import environment_of
 
 
 @dataclass(frozen=True)

@@ -19,12 +19,13 @@ from fusion_gym import zoo
 from fusion_gym.validation import ConfigurationError, choice
 
 from .command_line import Long
+from .experiments.classes import HEARD, KNOWS
+from .experiments.config import Mode
+from .experiments.tables import group_by, read_rows
 from .input.options import InputFolder, OutputFolder
 from .output.files import read_json, replacing, write
 from .output.progress import writing
 from .output.small_model import small_model
-from .suite.classes import HEARD, KNOWS
-from .suite.reports import Agent, read_shape
 
 LARGEST = 300_000  # bytes of a model
 MOST = 4_000_000  # bytes of all of them
@@ -39,7 +40,7 @@ class Zoo(Long):
     classes: tuple[str, ...] = ()
     """Classes by name, as sensors_memory; none stands for five of each setting at most."""
     results: Annotated[Path, InputFolder()] = Path("results")
-    """Folder of the benchmark's JSON."""
+    """Folder of the benchmark's tables."""
     work: Annotated[Path, InputFolder()] = Path("runs/benchmark/full")
     """Folder of its models."""
     zoo: Annotated[Path, OutputFolder()] = Path(zoo.__file__).parent
@@ -69,15 +70,21 @@ class Zoo(Long):
 
 
 def best_agents(results: Path) -> dict[tuple[str, str], dict[str, Any]]:
-    """The report of the best training seed, by setting and class."""
+    """Return the best training seed by setting and class, with what it did at its prices."""
     result: dict[tuple[str, str], dict[str, Any]] = {}
-    for path in sorted(results.glob("*/agent_*.json")):
-        report = read_shape(Agent, path, "results")
-        place = (report["setting"], report["class"])
-        value = report["best_validation"]["return"]
-        if place not in result or value > result[place]["best_validation"]["return"]:
-            result[place] = report
+    for path in sorted(results.glob("*/runs.csv")):
+        policies = group_by(read_rows(path.parent, "policies"), "run")
+        for run in read_rows(path.parent, "runs"):
+            if "class" in run:
+                run |= {"setting": path.parent.name, "policies": policies.get(run["run"], [])}
+                earlier = result.setdefault((run["setting"], run["class"]), run)
+                if _validation(run) > _validation(earlier):
+                    result[run["setting"], run["class"]] = run
     return result
+
+
+def _validation(run: Mapping[str, Any]) -> float:
+    return float(run["best_validation"]["return"])
 
 
 def select(
@@ -138,22 +145,29 @@ def model_of(report: dict[str, Any], work: Path) -> bytes:
 
 def add(name: str, report: dict[str, Any], model: bytes, folder: Path) -> None:
     """Write a model's card, then the model: a model that is there has a card."""
-    options = report["options"] | report["class_options"]
+    training = report["inputs"]["training"]
+    environment = report["inputs"]["environment"]
+    options = environment["options"] | report["class_options"]
+    mode: Mode = report["class"].split("_")[0]
+    points = [dict(policy) for policy in report["policies"]]
+    prices = [point.pop("price") for point in points]
+    for point in points:
+        point.pop("name")
     card = {
         "sha256": hashlib.sha256(model).hexdigest(),
-        "env": report["env"],
+        "env": environment["id"],
         "options": options,
         "class": report["class"],
-        "mode": report["mode"],
-        "knows": KNOWS[report["mode"], bool(options.get("memory", False))],
-        "training": report["training"] | {"output": f"runs/{name}"},
+        "mode": mode,
+        "knows": KNOWS[mode, bool(options.get("memory", False))],
+        "training": training | {"output": f"runs/{name}"},
         "command": f"fusion-gym benchmark --envs {report['setting']} --classes "
         f"{report['class']}, training seed {report['training_seed']}",
         "test": {
             "episodes": report["episodes"],
-            "seed": report["seed"],
-            "prices": report["prices"],
-            "points": report["points"],
+            "seed": report["inputs"]["seed"],
+            "prices": prices,
+            "points": points,
         },
     }
     write(folder / f"{name}.json", card)

@@ -32,11 +32,14 @@ from typing import Any
 import torch
 import yaml
 
+from fusion_gym.agents.experiments.references import read_envelopes
+from fusion_gym.agents.experiments.tables import read_frame
+
 TIMESTEPS = 100_000
 VALIDATION = {"every": 60_000, "episodes": 64}  # once on the way, and once at the end
 BENCHMARK = "tobit_oscillator"
 # Takes a temporary folder and returns what is to be hashed.
-Work = Callable[[Path], bytes]
+Piece = Callable[[Path], bytes]
 Content = dict[str, Any]
 
 
@@ -105,11 +108,13 @@ def benchmark(setting: str, folder: Path) -> bytes:
     results, work = folder / "results", folder / "work"
     words = ["--quick", "--envs", setting, "--workers", "1"]
     command("benchmark", *words, "--results", str(results), "--work", str(work))
-    files = sorted(results.glob(f"{setting}/*.json"))
-    return json.dumps({file.name: list(numbers(read(file))) for file in files}).encode()
+    files = sorted(work.glob(f"{setting}/*.json"))
+    result: dict[str, Any] = {file.name: list(numbers(read(file))) for file in files}
+    tables = [path for path in sorted(results.glob(f"{setting}/*.csv")) if path.stem != "runs"]
+    return json.dumps(result | {path.name: path.read_text() for path in tables}).encode()
 
 
-def zoo_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
+def zoo_pieces(episodes: int) -> Iterator[tuple[str, Piece]]:
     """Every agent of the zoo at its prices, in its environment."""
     for path in sorted(Path("fusion_gym/zoo").glob("*.json")):
         card = read(path)
@@ -121,12 +126,12 @@ def zoo_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
         yield f"zoo {path.stem}, {episodes} episodes", work
 
 
-def envelope_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
+def envelope_pieces(episodes: int) -> Iterator[tuple[str, Piece]]:
     """Every setting's rules that no other rule beats, in the worlds that they were tuned in."""
-    for path in sorted(Path("results").glob("*/verdict.json")):
-        stored = read(path.parent.parent / "envelopes" / f"{path.parent.name}.json")
+    for path in sorted(Path("results").glob("*/fronts.csv")):
+        stored = read_envelopes(path.parent)
         worlds: dict[str, dict[str, Any]] = {}
-        for name in read(path)["classes"]:
+        for name in read_frame(path.parent, "fronts")["class"]:
             for vertex in stored["classes"][name]["vertices"]:
                 key = ", ".join(f"{k}={v}" for k, v in vertex["options"].items()) or "as it is"
                 world = worlds.setdefault(key, {"options": vertex["options"], "policies": {}})
@@ -137,13 +142,13 @@ def envelope_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
             yield f"envelopes {path.parent.name}, {key}, {episodes} episodes", work
 
 
-def reproduce_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
+def reproduce_pieces(episodes: int) -> Iterator[tuple[str, Piece]]:
     """Every table of the documentation."""
     for path in sorted(Path("configs").glob("*_reproduce.yaml")):
         yield f"reproduce {path.stem}, {episodes} episodes", partial(reproduce, path, episodes)
 
 
-def training_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
+def training_pieces(episodes: int) -> Iterator[tuple[str, Piece]]:
     """Every config of a training; its episodes are ``VALIDATION``'s."""
     for path in sorted(Path("configs").glob("*.yaml")):
         plain = yaml.safe_load(path.read_text())
@@ -151,12 +156,12 @@ def training_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
             yield f"trainings {path.stem}", partial(train, plain)
 
 
-def benchmark_pieces(episodes: int) -> Iterator[tuple[str, Work]]:
+def benchmark_pieces(episodes: int) -> Iterator[tuple[str, Piece]]:
     """The quick benchmark of one setting; its episodes are those of ``--quick``."""
     yield f"benchmark {BENCHMARK}", partial(benchmark, BENCHMARK)
 
 
-KINDS: dict[str, Callable[[int], Iterator[tuple[str, Work]]]] = {
+KINDS: dict[str, Callable[[int], Iterator[tuple[str, Piece]]]] = {
     "zoo": zoo_pieces,
     "envelopes": envelope_pieces,
     "reproduce": reproduce_pieces,
@@ -165,7 +170,7 @@ KINDS: dict[str, Callable[[int], Iterator[tuple[str, Work]]]] = {
 }
 
 
-def fingerprint(work: Work) -> tuple[str, float]:
+def fingerprint(work: Piece) -> tuple[str, float]:
     """The SHA-256 of what the work gave, and the seconds that it took."""
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:

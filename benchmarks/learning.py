@@ -6,9 +6,9 @@ In each setting it trains a front with memory and counterfactual credit with eve
 PPO for comparison; measures on the way, over the processor's seconds, when a front is below the
 committed envelope of rules without memory; runs the finished fronts on the test episodes beside the
 envelope of exactly the same information (or the optimum); and measures this machine's steps per
-second. ``OUTPUT/SETTING.json`` is written anew after every training, ``OUTPUT/README.md`` and a
-table at the end. Trainings lie in the work folder, and their checkpoints hold pickles: ``--resume``
-those of your own alone.
+second. The tables in ``OUTPUT/SETTING`` are written anew after every training, ``OUTPUT/README.md``
+and a table at the end. Trainings lie in the work folder, and their checkpoints hold pickles:
+``--resume`` those of your own alone.
 """
 
 import argparse
@@ -20,19 +20,24 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from fusion_gym.agents.experiments.config import load_learning, load_suite
+from fusion_gym.agents.experiments.learning import (
+    Kind,
+    LearningRun,
+    LearningSetup,
+    finished_runs,
+    read_learning,
+    report,
+    run_course,
+    run_reference,
+)
+from fusion_gym.agents.experiments.report import learning_table, learning_text
+from fusion_gym.agents.experiments.workers import Call, Pool, side_by_side
 from fusion_gym.agents.output import tables
 from fusion_gym.agents.output.ending import ended_like_by_ctrl_c, report_errors
-from fusion_gym.agents.output.files import read_json, write, write_text
+from fusion_gym.agents.output.files import write, write_text
 from fusion_gym.agents.output.folders import alone_in
 from fusion_gym.agents.output.progress import quietly, writing
-from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.learned import finished_lessons, report
-from fusion_gym.agents.suite.learning import load_learning
-from fusion_gym.agents.suite.learning_table import learning_text, overview
-from fusion_gym.agents.suite.lessons import run_lesson, run_reference
-from fusion_gym.agents.suite.study import Kind, Lesson, Study
-from fusion_gym.agents.suite.team import Team
-from fusion_gym.agents.suite.workers import Work, side_by_side
 from fusion_gym.validation import ConfigurationError, choice, integer
 
 from .throughput import measured, remembering, vector
@@ -49,8 +54,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2, help="processes side by side")
     parser.add_argument("--resume", action="store_true", help="go on with trainings of your own")
     parser.add_argument("--quick", action="store_true", help="less of everything")
-    parser.add_argument("--results", type=Path, default=Path("results"), help="with envelopes/")
-    parser.add_argument("--output", type=Path, help="for JSON and tables: results/learning")
+    parser.add_argument("--results", type=Path, default=Path("results"), help="with envelopes")
+    parser.add_argument("--output", type=Path, help="for tables: results/learning")
     parser.add_argument("--work", type=Path, help="for models and episodes: runs/learning")
     parser.add_argument("--quiet", action="store_true", help="neither progress nor remarks")
     arguments = parser.parse_args()
@@ -75,7 +80,9 @@ def run(args: argparse.Namespace) -> None:
     work = args.work or Path("runs/learning/quick" if args.quick else "runs/learning/full")
     by_name = {course.setting: course for course in learning.settings}
     settings = [by_name[choice("setting", name, by_name)] for name in args.settings or by_name]
-    studies = [Study(learning, suite, setting, args.results, output, work) for setting in settings]
+    studies = [
+        LearningSetup(learning, suite, setting, args.results, output, work) for setting in settings
+    ]
     for study in studies:
         study.check()
         study.experiment("front", 0)
@@ -84,19 +91,19 @@ def run(args: argparse.Namespace) -> None:
         there = [study.report for study in studies if study.report.exists()]
         if there and not args.resume:
             raise ConfigurationError(
-                f"output = {str(output)!r} holds {there[0].name} already: go on with --resume, or "
-                "give another --output and --work"
+                f"output = {str(output)!r} holds {there[0].parent.name} already: go on with "
+                "--resume, or give another --output and --work"
             )
         writing(("results", output), ("trainings and episodes", work))
         for study in studies:
             measure_throughput(study)
-        teach(studies, args.seeds, Team(args.workers))
+        teach(studies, args.seeds, Pool(args.workers))
         for study in studies:
             report(study, args.seeds)
-        files = [output / f"{name}.json" for name in by_name]
-        content = [read_json(path, "output") for path in files if path.exists()]
+        folders = [output / name for name in by_name]
+        content = [read_learning(path) for path in folders if (path / "learning.csv").exists()]
         write_text(output / "README.md", learning_text(content, _command(args)))
-        tables.console().print(overview(content))
+        tables.console().print(learning_table(content))
         print(f"results in {output}")
 
 
@@ -108,41 +115,41 @@ def _command(arguments: argparse.Namespace) -> str:
     return shlex.join(words)
 
 
-def teach(studies: Sequence[Study], seeds: int, team: Team) -> None:
+def teach(studies: Sequence[LearningSetup], seeds: int, pool: Pool) -> None:
     """References, then fronts, then plain PPO for a multiple of the seconds that they took."""
     tests = {test.path(study.work): (test, study.work) for study in studies for test in study.tests}
     side_by_side(
-        [Work(2.0, run_reference, pair) for path, pair in tests.items() if not path.exists()],
-        team,
+        [Call(2.0, run_reference, pair) for path, pair in tests.items() if not path.exists()],
+        pool,
         "references",
     )
-    fronts = [Lesson(study, "front", seed) for seed in range(seeds) for study in studies]
-    _side_by_side(fronts, seeds, team, "front")
+    fronts = [LearningRun(study, "front", seed) for seed in range(seeds) for study in studies]
+    _side_by_side(fronts, seeds, pool, "front")
     plain = []
     for study in studies:
         if study.memoryless is None:
             continue
-        trained = finished_lessons(study, "front", seeds)
+        trained = finished_runs(study, "front", seeds)
         taken = statistics.fmean(item["curve"][-1]["cpu_seconds"] for item in trained)
         budget = study.learning.plain.budget * taken
         count = min(seeds, study.learning.plain.seeds)
-        plain += [Lesson(study, "plain", seed, budget) for seed in range(count)]
-    _side_by_side(plain, seeds, team, "plain")
+        plain += [LearningRun(study, "plain", seed, budget) for seed in range(count)]
+    _side_by_side(plain, seeds, pool, "plain")
 
 
-def _side_by_side(lessons: Sequence[Lesson], seeds: int, team: Team, kind: Kind) -> None:
+def _side_by_side(lessons: Sequence[LearningRun], seeds: int, pool: Pool, kind: Kind) -> None:
     left = [lesson for lesson in lessons if lesson.result() is None]
     side_by_side(
         [
-            Work(lesson.experiment.training.timesteps / _SPEED, run_lesson, (lesson, seeds))
+            Call(lesson.experiment.training.timesteps / _SPEED, run_course, (lesson, seeds))
             for lesson in left
         ],
-        team,
+        pool,
         f"{kind} trainings",
     )
 
 
-def measure_throughput(study: Study, seconds: float = 0.3) -> None:
+def measure_throughput(study: LearningSetup, seconds: float = 0.3) -> None:
     """Keep the steps per second of the processor in the study's setting, if that was not done."""
     if study.throughput.exists():
         return

@@ -1,15 +1,14 @@
 """What one improvement by simulation brings over the value rule, in the benchmark's settings.
 
-    python -m benchmarks.rollout tobit_oscillator --output results/rollout
+    python -m benchmarks.rollout tobit_oscillator --output results
 
 For each price of a token it plays `rollout` on `value_of_information`, and that base by itself, on
 the same episodes of the setting with memory, and writes both points and the paired difference of
-the returns at that price to `OUTPUT/SETTING.json`. The base's own price is the token's over
+the returns at that price to `OUTPUT/SETTING/rollout.csv`. The base's own price is the token's over
 `--ratio`: a packet keeps its worth over several steps, and the rule counts one.
 """
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from typing import Any
 import yaml
 
 import fusion_gym
+from fusion_gym.agents.experiments.tables import write_rows
 from fusion_gym.agents.output.progress import progress_bar, quietly, remark, writing
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
@@ -31,8 +31,7 @@ def point(policy: str, results: EpisodeResults) -> dict[str, Any]:
     return {
         "policy": policy,
         "rate": float(results.rate.mean()),
-        "mse": float(results.mse.mean()),
-        "mse_interval": mean_interval(results.mse)[1:],
+        "mse": mean_interval(results.mse)._asdict(),
     }
 
 
@@ -47,9 +46,8 @@ def improve(task: Task, price: float, value: Any, progress: Any) -> dict[str, An
     gain = mean_interval(results.returns - plain.returns)
     return point(policy, results) | {
         "price": price,
-        "base": point(base, plain),
-        "return_gain": gain.mean,
-        "return_gain_interval": gain[1:],
+        **{f"base_{key}": value for key, value in point(base, plain).items()},
+        "return_gain": gain._asdict(),
         "return": float(results.returns.mean()),
     }
 
@@ -83,19 +81,15 @@ def main() -> None:
         for price, task in tasks.items():
             points.append(improve(task, price, arguments, bar.update))
             last = points[-1]
-            remark(f"price {price}: rate {last['rate']:.4f}, MSE {last['mse']:.4g}")
-    report = {
-        "setting": arguments.setting,
+            remark(f"price {price}: rate {last['rate']:.4f}, MSE {last['mse']['mean']:.4g}")
+    shared = {
         "env": environment["id"],
         "options": options,
         "episodes": arguments.episodes,
         "seed": arguments.seed,
         "command": " ".join(["python -m benchmarks.rollout", *sys.argv[1:]]),
-        "points": points,
     }
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    path = arguments.output / f"{arguments.setting}.json"
-    path.write_text(json.dumps(report, indent=1) + "\n")
+    write_rows(arguments.output / arguments.setting, "rollout", [shared | item for item in points])
 
 
 if __name__ == "__main__":

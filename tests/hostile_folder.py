@@ -91,10 +91,9 @@ def scratch(folder: Path) -> None:
         for suffix in ("", ".yaml", ".json"):
             (folder / f"{name}{suffix}").write_bytes(raw)
         broken = folder / "bad_results" / name / SETTING
-        broken.mkdir(parents=True)
-        shutil.copy(whole / "baselines.json", broken)
-        (broken / "verdict.json").write_bytes(raw)
-        (broken / "agent_sensors_0.json").write_bytes(raw)
+        shutil.copytree(whole, broken)
+        (broken / "verdict.csv").write_bytes(raw)
+        (broken / "runs.csv").write_bytes(raw)
     small_model(folder / "work" / SETTING / "sensors_0" / "best_model.zip")
     (folder / "folder").mkdir()
     (folder / "folder" / "file").write_text("kept")

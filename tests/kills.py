@@ -26,7 +26,7 @@ from stable_baselines3 import PPO
 from training_configs import small_config
 
 from fusion_gym.agents.__main__ import load
-from fusion_gym.agents.suite import verdict
+from fusion_gym.agents.experiments import verdict
 
 Outcome = dict[str, Any]
 
@@ -72,12 +72,8 @@ def benchmark(folder: Path) -> tuple[list[str], Callable[[], Outcome]]:
     results, work = folder / "results", folder / "work"
 
     def outcome() -> Outcome:
-        result = {}
-        for path in sorted(results.rglob("*.json")):
-            report = json.loads(path.read_text())
-            report.pop("seconds", None)  # of wall time
-            text = json.dumps(report).replace(str(folder), "")
-            result[path.name] = text
+        tables = (path for path in results.rglob("*.csv") if path.stem != "runs")  # with seconds
+        result: Outcome = {path.name: path.read_text() for path in tables}
         return result | {"episodes": sorted(path.name for path in work.rglob("*.npz"))}
 
     config = small_suite(folder, timesteps=4096)

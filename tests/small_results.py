@@ -1,10 +1,11 @@
-"""Results of a tiny benchmark as its commands write them, made up: what readers of them need."""
+"""Results of a tiny benchmark as its commands write them, made up."""
 
-import json
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from fusion_gym.agents.experiments.training import write_verdict
 
 ENV = "fusion_gym/RemoteEstimation-v0"
 SETTING = "remote_estimation"
@@ -25,8 +26,9 @@ def interval(mean: float, half: float = 0.01) -> dict[str, float]:
     return {"mean": mean, "low": mean - half, "high": mean + half}
 
 
-def tested(rate: float, mse: float) -> dict[str, Any]:
-    return {"rate": [rate, rate], "mse": interval(mse)}
+def outcome(rate: float, mse: float) -> dict[str, Any]:
+    others = {name: interval(0.0) for name in ("return", "denied", "tokens", "nees")}
+    return {"rate": [rate, rate], "mse": interval(mse), "median": mse} | others
 
 
 def error(scale: float, rate: float) -> float:
@@ -81,26 +83,26 @@ def front(name: str, seeds: int) -> dict[str, Any]:
     }
 
 
-def agent(setting: str, name: str, seed: int) -> dict[str, Any]:
+def run() -> dict[str, Any]:
+    """What every piece of work says of itself."""
+    inputs = {"environment": {"id": ENV, "options": {"horizon": 4}}, "seed": 0}
+    inputs |= {"training": {"validation": {"episodes": 1000, "seed": 500_000_000}}}
+    return {"horizon": 4, "episodes": 20, "made_from": "0", "inputs": inputs}
+
+
+def agent(name: str, seed: int) -> dict[str, Any]:
     """The report of one training."""
     mode, memory, broadcast, _, scale = CLASSES[name]
     options: dict[str, Any] = {"memory": True} if memory else {}
     if broadcast not in (None, "none"):
         options["broadcast"] = broadcast
-    return {
-        "setting": setting,
-        "mode": mode,
+    return run() | {
         "class": name,
         "class_options": options | ({"information": "centre"} if mode == "centre" else {}),
         "training_seed": seed,
-        "training": {"validation": {"episodes": 1000, "seed": 500_000_000}},
         "best_validation": {"return": -1.0 - seed},
-        "env": ENV,
-        "options": {"horizon": 4},
-        "episodes": 20,
-        "seed": 0,
         "prices": list(PRICES),
-        "points": [tested(rate, (1.0 + 0.1 * seed) * error(scale, rate)) for rate in RATES],
+        "points": [outcome(rate, (1.0 + 0.1 * seed) * error(scale, rate)) for rate in RATES],
     }
 
 
@@ -109,39 +111,34 @@ def small_results(
 ) -> Path:
     """The folder of a setting, with all that the report reads there."""
     folder = results / setting
-    folder.mkdir(parents=True)
     fronts = {name: front(name, seeds) for name in classes}
     worth = {"kind": "memory", "knows": "sensors_memory", "less": "sensors"}
     verdict = {
-        "setting": setting,
         "title": "A small setting, made up",
+        "env": ENV,
+        "episodes": 20,
+        "seed": 0,
         "always": ALWAYS,
         "classes": fronts,
         "worth": [worth | {"rules": interval(-0.2), "agents": interval(0.0)}],
     }
     places = [place for item in fronts.values() for place in item["envelope"]]
-    policies = {place["name"]: tested(place["rate"], place["mse"]) for place in places}
-    baselines: dict[str, Any] = {
-        "setting": setting,
-        "env": ENV,
-        "options": {"horizon": 4},
-        "episodes": 20,
-        "seed": 0,
+    policies = {place["name"]: outcome(place["rate"], place["mse"]) for place in places}
+    baselines: dict[str, Any] = run() | {
         "curves": {
             "always": {"knows": "centre", "policies": ["always"]},
         },
-        "policies": policies | {"always": tested(ALWAYS, 1.0)},
-        "genie": {"mse": {"mean": 0.5}, "assumes": "everything arrives"},
+        "policies": policies | {"always": outcome(ALWAYS, 1.0)},
+        "genie": outcome(0.5, 0.5) | {"assumes": "everything arrives"},
     }
     if policies:
         baselines["curves"]["paced"] = {"knows": "centre", "policies": list(policies)}
-    ahead = {f"lookahead:steps=1,price={rate}": tested(rate, error(0.7, rate)) for rate in RATES}
-    files = {"verdict": verdict, "baselines": baselines, "informed": {"policies": ahead}}
+    ahead = {f"lookahead:steps=1,price={rate}": outcome(rate, error(0.7, rate)) for rate in RATES}
+    reports = {"baselines": baselines, "informed": run() | {"policies": ahead}}
     for name in classes:
         for seed in range(seeds):
-            files[f"agent_{name}_{seed}"] = agent(setting, name, seed)
-    for name, content in files.items():
-        (folder / f"{name}.json").write_text(json.dumps(content), encoding="utf-8")
+            reports[f"agent_{name}_{seed}"] = agent(name, seed)
+    write_verdict(folder, verdict, reports)
     return folder
 
 

@@ -22,10 +22,9 @@ from training_configs import ENV, SMALL, read_records, small_config
 import fusion_gym
 from fusion_gym.agents import demo, evaluate
 from fusion_gym.agents.command_line import read_command
-from fusion_gym.agents.suite.beside_rules import Ground, Trials
-from fusion_gym.agents.suite.config import Suite
-from fusion_gym.agents.suite.sweep import Sweep, SweepSettings
-from fusion_gym.agents.suite.team import Team
+from fusion_gym.agents.experiments.config import Suite, Sweep, SweepSettings
+from fusion_gym.agents.experiments.references import CommittedRules, Trials
+from fusion_gym.agents.experiments.workers import Pool
 from fusion_gym.agents.training import run as train
 from fusion_gym.agents.training.algorithms import TABLE
 from fusion_gym.agents.training.checked import load_checked
@@ -304,7 +303,7 @@ def test_evaluation_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         run_evaluation(monkeypatch, *common, "--seed", "1", "--resume", "--policies", "always")
 
 
-def thinned(ground: Ground, every: int = 30) -> Ground:
+def thinned(ground: CommittedRules, every: int = 30) -> CommittedRules:
     """With fewer rules, for speed."""
     envelopes = copy.deepcopy(dict(ground.envelopes))
     for content in envelopes["classes"].values():
@@ -315,10 +314,10 @@ def thinned(ground: Ground, every: int = 30) -> Ground:
 def test_demo_from_training_to_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ground, learner = thinned(Ground.read(demo.SETTING, 2)), demo.LEARNERS[1]
-    monkeypatch.setattr(demo.Ground, "read", lambda *_: ground)
+    ground, learner = thinned(CommittedRules.read(demo.SETTING, 2)), demo.LEARNERS[1]
+    monkeypatch.setattr(demo.CommittedRules, "read", lambda *_: ground)
     monkeypatch.setattr(demo, "LEARNERS", (learner,))
-    monkeypatch.setattr(demo, "TEAM", Team(1))
+    monkeypatch.setattr(demo, "TEAM", Pool(1))
     words = ["--output", str(tmp_path), "--episodes", "2", "--timesteps", "4096"]
     monkeypatch.setattr(sys, "argv", ["demo", *words])
     demo.Demo.main()
@@ -355,7 +354,7 @@ def test_demo_from_training_to_figures(
 
 def test_the_demo_trains_in_the_setting_of_its_rules() -> None:
     """What differs from the environment of the rules with memory is the price, which is drawn."""
-    ground = Ground.read(demo.SETTING, 1)
+    ground = CommittedRules.read(demo.SETTING, 1)
     for learner in demo.LEARNERS:
         plain, remembering = (
             ground.envelopes["classes"][name] for name in (learner.plain, learner.with_memory)

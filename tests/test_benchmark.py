@@ -20,14 +20,14 @@ from training_configs import small_config
 import fusion_gym
 from fusion_gym.agents import __main__ as everything
 from fusion_gym.agents import benchmark, report, solved, tune, zoo
+from fusion_gym.agents.experiments import training as jobs
+from fusion_gym.agents.experiments.classes import classes_of, trained_classes
+from fusion_gym.agents.experiments.config import load_suite
+from fusion_gym.agents.experiments.references import read_envelopes, searches_of
+from fusion_gym.agents.experiments.report import read_results, read_verdict
+from fusion_gym.agents.experiments.tables import read_frame, read_rows, write_rows
 from fusion_gym.agents.output.files import load_results, save_results
 from fusion_gym.agents.output.markup import code, page_of
-from fusion_gym.agents.suite import jobs
-from fusion_gym.agents.suite.classes import classes_of, trained_classes
-from fusion_gym.agents.suite.committed import read_envelopes
-from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.envelopes import searches_of
-from fusion_gym.agents.suite.setting_results import read_results
 from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.core.system import covers
@@ -48,15 +48,15 @@ def run_main(monkeypatch: pytest.MonkeyPatch, module: Any, *arguments: str) -> N
 def test_from_tuning_to_report_and_zoo(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("fusion_gym.agents.suite.verdict.RESAMPLES", 50)
+    monkeypatch.setattr("fusion_gym.agents.experiments.verdict.RESAMPLES", 50)
     results, work = tmp_path / "results", tmp_path / "work"
     arguments = [
         "--config", str(small_suite(tmp_path)), "--results", str(results), "--work", str(work),
         "--workers", "1",
     ]  # fmt: skip
     run_main(monkeypatch, benchmark, *arguments, "--seeds", "1", "--classes", "sensors")
-    folder = results / "small"
-    first = json.loads((folder / "verdict.json").read_text())
+    folder = work / "small"
+    first = read_verdict(results / "small")
     assert first["classes"]["sensors"]["seeds"] == 1
     stamp = (folder / "agent_sensors_0.json").stat().st_mtime_ns
     with pytest.raises(SystemExit, match="--resume"):
@@ -72,23 +72,22 @@ def test_from_tuning_to_report_and_zoo(
         with pytest.raises(SystemExit, match=message) as caught:
             run_main(monkeypatch, benchmark, *arguments, "--resume", option, value)
         assert "\n" not in str(caught.value)
-    verdict = json.loads((folder / "verdict.json").read_text())
+    verdict = read_verdict(results / "small")
     assert {name: front["seeds"] for name, front in verdict["classes"].items()} == {
         "centre": 2, "local_estimate": 2, "local_packets_memory": 2, "sensors": 2,
     }  # fmt: skip
-    baselines = json.loads((folder / "baselines.json").read_text())
-    assert baselines["curves"]["gain"]["knows"] == "centre"
-    assert baselines["genie"]["assumes"] == "everything arrives"
-    assert (folder / "references.json").exists()
-    hindsight = json.loads((folder / "hindsight.json").read_text())
-    assert (hindsight["episodes"], hindsight["width"]) == (5, 4)
-    dear = hindsight["policies"]["hindsight at price 0.1"]["tokens"]["mean"]
-    assert dear < hindsight["policies"]["hindsight at price 0.001"]["tokens"]["mean"]
+    policies = read_frame(results / "small", "policies")
+    assert set(policies[policies["family"] == "gain"]["knows"]) == {"centre"}
+    assert list(policies[policies["run"] == "genie"]["name"]) == ["everything arrives"]
+    runs = read_frame(results / "small", "runs").set_index("run")
+    assert runs["episodes"]["hindsight"] == 5
+    dear = policies[policies["run"] == "hindsight"].set_index("name")["tokens"]
+    assert dear["hindsight at price 0.1"] < dear["hindsight at price 0.001"]
     # The envelope that an agent was compared with, and that it is one of the agent's inputs.
-    committed = json.loads((results / "envelopes" / "small.json").read_text())["classes"]
+    committed = read_envelopes(results / "small")["classes"]
     front = verdict["classes"]["local_estimate"]
     assert front["sha256"] == committed["local_estimate"]["sha256"]
-    stored = json.loads((folder / "agent_local_estimate_1.json").read_text())["inputs"]["envelope"]
+    stored = json.loads(runs["inputs"]["agent_local_estimate_1"])["envelope"]
     assert stored == {"class": "local_estimate", "sha256": front["sha256"]}
     in_local = {point["name"] for point in verdict["classes"]["local_estimate"]["envelope"]}
     assert not any(name.startswith("information_gain") for name in in_local)
@@ -149,7 +148,7 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
         tasks[name] = tasks.get(name) or jobs.envelope_task(setting, options)
         return tasks[name]
 
-    monkeypatch.setattr("fusion_gym.agents.suite.envelopes.envelope_task", task_of)
+    monkeypatch.setattr("fusion_gym.agents.experiments.references.envelope_task", task_of)
     suite = load_suite(ROOT / "configs" / "benchmark.yaml")
     assert load_suite(ROOT / "configs" / "benchmark.yaml", quick=True).settings == suite.settings
     for setting in suite.settings:
@@ -167,11 +166,11 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(
-    "path", sorted((ROOT / "results" / "envelopes").glob("*.json")), ids=lambda path: path.stem
+    "path", sorted((ROOT / "results").glob("*/classes.csv")), ids=lambda path: path.parent.name
 )
 def test_envelopes_hold_rules_that_know_no_more_than_their_class(path: Path) -> None:
     """What the committed envelopes say of a rule's knowledge is the rule's own word."""
-    stored, tasks = read_envelopes(path), {}
+    stored, tasks = read_envelopes(path.parent), {}
     for content in stored["classes"].values():
         for vertex in content["vertices"]:
             key = json.dumps(vertex["options"], sort_keys=True)
@@ -265,16 +264,12 @@ def test_a_suite_that_is_not_allowed(tmp_path: Path, changes: Any, message: str)
 def test_the_report_shows_what_it_is_reported_as_text(tmp_path: Path) -> None:
     """Titles, policies and folders in HTML, Markdown and with a table's bars stay what they are."""
     folder = small_results(tmp_path, "a<b>_[c](javascript:d)")
-    for path in folder.glob("agent_*.json"):  # where no such name is allowed
-        path.write_text(json.dumps(json.loads(path.read_text()) | {"setting": "strange"}))
     title = 'x <script>alert(1)</script> | *y* [z](javascript:alert(2)) `<img src=x onerror="e">`'
-    verdict = json.loads((folder / "verdict.json").read_text())
-    baselines = json.loads((folder / "baselines.json").read_text())
+    (verdict,) = read_rows(folder, "verdict")
     verdict["title"] = title + "\n\n<script>alert(3)</script>"
-    baselines["env"] = "a`<script>alert(4)</script>|b"
-    for name, content in (("verdict", verdict), ("baselines", baselines)):
-        (folder / f"{name}.json").write_text(json.dumps(content))
-    text = report.text_of(read_results(tmp_path), "one", "two")
+    verdict["env"] = "a`<script>alert(4)</script>|b"
+    write_rows(folder, "verdict", [verdict])
+    text = report.report_text(read_results(tmp_path), "one")
     text += "\n\n<script>alert(5)</script> <b onclick='f'>g</b>\n"
     page = page_of(text, tmp_path, "<script>alert(6)</script>")
     assert "<title>&lt;script&gt;alert(6)&lt;/script&gt;</title>" in page

@@ -8,12 +8,11 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from small_suite import small_suite
 
-from fusion_gym.agents.suite.team import Team
+from fusion_gym.agents.experiments.workers import Pool
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -66,13 +65,10 @@ def benchmark(suite: Path, folder: Path, *words: str) -> list[str]:
     ]
 
 
-def find(folder: Path) -> dict[str, Any]:
-    """All that was found, without the seconds that it took."""
-    content = {}
-    for path in sorted((folder / "results").glob("*/*.json")):
-        content[path.name] = json.loads(path.read_text())
-        content[path.name].pop("seconds", None)
-    return content
+def find(folder: Path) -> dict[str, str]:
+    """Return all tables but the one with the seconds that it took."""
+    paths = (folder / "results").glob("*/*.csv")
+    return {path.name: path.read_text() for path in paths if path.stem != "runs"}
 
 
 @pytest.mark.slow
@@ -97,7 +93,7 @@ def test_a_worker_that_ends_in_the_middle_loses_nothing(tmp_path: Path) -> None:
             run.wait()
         assert workers[1].poll() is None
     assert find(many) == find(single)
-    assert {"agent_sensors_0.json", "agent_sensors_1.json", "verdict.json"} <= find(many).keys()
+    assert {"policies.csv", "points.csv", "verdict.csv"} <= find(many).keys()
 
 
 @pytest.mark.slow
@@ -112,22 +108,23 @@ def test_ray_gives_the_work_of_a_lost_worker_to_another(tmp_path: Path) -> None:
             return float(folder.name)
         os._exit(1)
 
-    def is_wrong(_: Any) -> float:
+    def is_wrong(_: object) -> float:
         raise ConfigurationError("filter = 'x' is not allowed")
 
-    team = Team(2, "ray")
-    with team.gathered():
-        done = list(team.done(ends_its_first_worker, [tmp_path / str(n) for n in range(3)]))
+    pool = Pool(2, "ray")
+    with pool.connect():
+        folders = [tmp_path / str(n) for n in range(3)]
+        done = list(pool.map_unordered(ends_its_first_worker, folders))
         assert sorted(done) == [0.0, 1.0, 2.0]
         with pytest.raises(ConfigurationError, match=r"^filter = 'x' is not allowed$"):
-            list(team.done(is_wrong, [0]))
+            list(pool.map_unordered(is_wrong, [0]))
 
 
 def test_a_team_that_is_not_there_is_refused() -> None:
     with pytest.raises(ConfigurationError, match=r"address = 'tcp://x' .*backend='loky'"):
-        Team(2, "loky", "tcp://x")
+        Pool(2, "loky", "tcp://x")
     with (
         pytest.raises(ConfigurationError, match=r"address = 'nowhere' .*backend='dask'"),
-        Team(2, "dask", "nowhere").gathered(),
+        Pool(2, "dask", "nowhere").connect(),
     ):
         pass

@@ -18,8 +18,8 @@ from hostile_folder import ROOT, contents, scratch
 from fusion_gym.agents import __main__ as everything
 from fusion_gym.agents.command_line import Command
 from fusion_gym.agents.demo import remove
+from fusion_gym.agents.experiments.config import SweepCurve
 from fusion_gym.agents.output.ending import report_errors
-from fusion_gym.agents.suite.sweep import SweepCurve
 from fusion_gym.policies.settings import parse_value
 from fusion_gym.validation import ConfigurationError
 

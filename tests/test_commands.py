@@ -15,9 +15,9 @@ import fusion_gym
 from fusion_gym.agents import __main__ as everything
 from fusion_gym.agents import command_line
 from fusion_gym.agents.benchmark import Benchmark
-from fusion_gym.agents.input.catalogue import catalogue
 from fusion_gym.agents.train import Train
 from fusion_gym.agents.training.algorithms import TABLE
+from fusion_gym.agents.training.catalogue import catalogue
 from fusion_gym.agents.training.checked import config_path, load_checked, parse
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.policies.model import ALGORITHMS

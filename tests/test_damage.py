@@ -12,7 +12,7 @@ from small_suite import ENV, small_suite
 from training_configs import small_config
 
 from fusion_gym.agents.__main__ import load
-from fusion_gym.agents.suite import verdict
+from fusion_gym.agents.experiments import verdict
 
 DAMAGES: dict[str, Callable[[bytes, bytes], bytes]] = {
     "cut short": lambda content, other: content[: len(content) * 2 // 3],
@@ -30,8 +30,8 @@ READ: dict[str, tuple[str, ...]] = {
     "train": ("run/latest.zip",),
     "tune": ("study/study.db",),
     "benchmark": tuple(
-        f"{folder}/small/{name}.{suffix}"
-        for folder, suffix in (("results", "json"), ("work", "npz"))
+        f"work/small/{name}.{suffix}"
+        for suffix in ("json", "npz")
         for name in ("baselines", "informed", "references", "hindsight", "agent_sensors_0")
     ),
     "evaluate": ("result.json",),
@@ -46,7 +46,7 @@ WRITTEN = {
         )
     ),
     "tune": ("study/best.yaml", "study/trial_0/latest.zip", "study/trial_0/config.yaml"),
-    "benchmark": ("results/small/verdict.json", "work/small/sensors_0/latest.zip"),
+    "benchmark": ("results/small/verdict.csv", "work/small/sensors_0/latest.zip"),
     "evaluate": (),
 }
 
@@ -145,4 +145,7 @@ def meaning(folder: Path) -> dict[str, Any]:
             for key in ("seconds", "steps_per_second"):
                 line.pop(key, None)
         result[str(path.relative_to(folder))] = json.dumps(lines).replace(str(folder), "")
+    for path in sorted(folder.rglob("*.csv")):
+        if path.stem != "runs":  # with seconds
+            result[str(path.relative_to(folder))] = path.read_text()
     return result

@@ -3,7 +3,6 @@
 import importlib.util
 import pydoc
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,15 +11,16 @@ import pytest
 from page_blocks import blocks_of, imported
 
 import fusion_gym
-from fusion_gym.agents import report
-from fusion_gym.agents.output.files import read_json
-from fusion_gym.agents.suite import envelope_table, learning_table
-from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.learning import load_learning
-from fusion_gym.agents.suite.report_pages import update_pages
-from fusion_gym.agents.suite.robust_table import write_table
-from fusion_gym.agents.suite.robustness import load_robustness
-from fusion_gym.agents.suite.setting_results import read_results
+from fusion_gym.agents.experiments.config import load_learning, load_robustness, load_suite
+from fusion_gym.agents.experiments.figures import report_text
+from fusion_gym.agents.experiments.learning import read_learning
+from fusion_gym.agents.experiments.report import (
+    envelopes_text,
+    learning_text,
+    read_results,
+    robustness_text,
+    update_pages,
+)
 from fusion_gym.envs import pages
 from fusion_gym.envs.option_text import options_in
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
@@ -109,40 +109,39 @@ def test_files_and_names_of_the_library_that_the_texts_name_exist() -> None:
 def test_the_committed_report_says_what_the_results_say() -> None:
     settings = read_results(ROOT / "results")
     written = (ROOT / "results" / "README.md").read_text()
-    assert written == report.text_of(settings, "fusion-gym benchmark")
+    assert written == report_text(settings, "fusion-gym benchmark")
     for path in (ROOT / "README.md", *DOCS):
         text = path.read_text()
         assert update_pages(text, settings, ROOT / "results") == text, path.name
 
 
-def test_the_committed_table_of_perturbed_cases_is_that_of_the_verdicts(tmp_path: Path) -> None:
-    folder = ROOT / "results" / "robustness"
-    shutil.copytree(folder, tmp_path / "robustness")
-    written = (folder / "README.md").read_text()
+def test_the_committed_table_of_perturbed_cases_is_that_of_the_verdicts() -> None:
+    results = ROOT / "results"
+    written = (results / "robustness" / "README.md").read_text()
     command = re.search(r"^Made by `(.*?)`", written, re.M)
     assert command is not None
     suite = {setting.name: setting.title for setting in load_suite("benchmark").settings}
     titles = {item.setting: suite[item.setting] for item in load_robustness("robustness").settings}
-    assert write_table(tmp_path, titles, command[1]).read_text() == written
-    tried = {path.parts[-3] for path in folder.glob("*/*/verdict.json")}
+    assert robustness_text(results, titles, command[1]) == written
+    tried = {path.parent.name for path in results.glob("*/robustness.csv")}
     assert tried == set(titles)
 
 
 def test_the_committed_envelopes_are_what_the_pages_say() -> None:
     results = ROOT / "results"
     written = (results / "envelopes" / "README.md").read_text()
-    assert written == envelope_table.envelope_text(results, "fusion-gym envelope")
+    assert written == envelopes_text(results, "fusion-gym envelope")
 
 
 def test_the_committed_fronts_are_what_the_pages_say() -> None:
     folder = ROOT / "results" / "learning"
-    files = {path.stem: read_json(path, "results") for path in folder.glob("*.json")}
+    files = {path.parent.name: read_learning(path.parent) for path in folder.glob("*/learning.csv")}
     known = [course.setting for course in load_learning("learning").settings]
     reports = [files[name] for name in known if name in files]
     written = (folder / "README.md").read_text()
     command = re.search("Made by `(.*)`;", written)
     assert command
-    assert written == learning_table.learning_text(reports, command.group(1))
+    assert written == learning_text(reports, command.group(1))
 
 
 def doc_of(env_id: str) -> str:

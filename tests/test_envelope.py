@@ -11,10 +11,11 @@ from small_suite import ENV, small_suite
 
 import fusion_gym
 from fusion_gym.agents import envelope
-from fusion_gym.agents.suite.classes import Class, classes_of
-from fusion_gym.agents.suite.committed import merged_curves, read_envelopes
-from fusion_gym.agents.suite.config import Choices, Family, Range, Tuning, load_suite
-from fusion_gym.agents.suite.tuning import (
+from fusion_gym.agents.experiments.classes import Class, classes_of
+from fusion_gym.agents.experiments.config import Choices, Family, Range, Tuning, load_suite
+from fusion_gym.agents.experiments.references import merge_curves, read_envelopes, write_envelopes
+from fusion_gym.agents.experiments.tables import read_rows, write_rows
+from fusion_gym.agents.experiments.tuning import (
     TuningTrial,
     first_values,
     near_hull,
@@ -148,7 +149,7 @@ def test_envelopes_are_committed_and_kept(
     words = ["--config", config, "--results", str(results), "--work", str(tmp_path / "work")]
     words += ["--workers", "1"]
     run(monkeypatch, *words, "--classes", "centre", "local_packets")
-    path = results / "envelopes" / "small.json"
+    path = results / "small"
     first = read_envelopes(path)
     assert list(first["classes"]) == ["centre", "local_packets"]
     with pytest.raises(SystemExit, match="--resume"):
@@ -185,12 +186,12 @@ def test_envelopes_are_committed_and_kept(
     assert "| small | sensors |" in text
     assert "| small | local, packets |" in text
     # What was changed by hand is noticed, and what was made from other inputs refused.
-    content = json.loads(path.read_text())
-    content["classes"]["centre"]["vertices"][0]["test"]["mse"]["mean"] *= 0.9
-    path.write_text(json.dumps(content))
-    with pytest.raises(SystemExit, match=r"classes.centre.sha256 = .* it was changed"):
+    vertices = read_rows(path, "vertices")
+    vertices[0]["test_mse"]["mean"] *= 0.9
+    write_rows(path, "vertices", vertices)
+    with pytest.raises(SystemExit, match=r"sha256 = .* of the class 'centre' .* were changed"):
         run(monkeypatch, *words, "--resume")
-    path.write_text(json.dumps(envelopes))
+    write_envelopes(path, envelopes)
     other = tmp_path / "other"
     other.mkdir()
     words[1] = str(small_suite(other, families=families, episodes=13))
@@ -225,5 +226,5 @@ def test_classes_that_are_added_take_no_curves_away() -> None:
         {"family": "a", "options": {}, "trials": 2},
         {"family": "b", "options": {"memory": True}},
     ]
-    result = merged_curves(first, new)
+    result = merge_curves(first, new)
     assert result == [new[0], first[1], new[1]]

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from small_suite import small_suite
 
+from fusion_gym.agents.experiments import references as envelopes
+from fusion_gym.agents.experiments.classes import classes_of
+from fusion_gym.agents.experiments.config import load_suite
+from fusion_gym.agents.experiments.report import robustness_frame
 from fusion_gym.agents.reproduction.judging import below
 from fusion_gym.agents.reproduction.round_robin_tobit.judging import always_below
-from fusion_gym.agents.suite import envelopes
-from fusion_gym.agents.suite.classes import classes_of
-from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.robust_summary import robustness_summary
 from fusion_gym.evaluation.envelope import best_mse
 
 NOISE = np.array([-3.0, 1.0, -2.0, 3.5])
@@ -40,11 +40,11 @@ def test_cases_are_counted_by_their_intervals_and_the_worst_is_named() -> None:
         "worse": interval(0.2, 0.1, 0.3),
     }
     cases = {name: {"title": name, "agents": {"middle": item}} for name, item in result.items()}
-    lines = robustness_summary([{"setting": "small", "cases": cases}], {"small": "a setting"})
-    (row,) = (line for line in lines if "as they are" in line)
-    assert [cell.strip() for cell in row.split("|")][4:7] == ["1", "1", "1"]
-    assert row.rstrip(" |").endswith("worse")
-    assert "+20" in row
+    frame = robustness_frame([{"setting": "small", "cases": cases}], {"small": "a setting"})
+    (row,) = frame.to_dict("records")
+    assert [row[name] for name in ("better", "undecided", "worse")] == [1, 1, 1]
+    assert row["at worst"].endswith("worse")
+    assert "+20" in row["at worst"]
 
 
 # The middle policy lies below the line through its neighbours where it is tuned, above it after.

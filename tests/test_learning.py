@@ -1,9 +1,9 @@
 """How fast agents learn: when a front is below an envelope, and the command that measures it."""
 
 import argparse
-import json
 import math
 import os
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -17,15 +17,11 @@ from small_suite import SMALL, small_suite
 from training_configs import small_config
 
 from benchmarks import learning
-from fusion_gym.agents.output.files import write, write_text
-from fusion_gym.agents.suite.committed import complete
-from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.fronts import excess_over, is_below
-from fusion_gym.agents.suite.learned import closed, judge_fronts, reached
-from fusion_gym.agents.suite.learning import load_learning
-from fusion_gym.agents.suite.lessons import beyond, run_lesson
-from fusion_gym.agents.suite.study import Lesson, Study
-from fusion_gym.agents.suite.team import Team
+from fusion_gym.agents.experiments import learning as fronts
+from fusion_gym.agents.experiments.config import load_learning, load_suite
+from fusion_gym.agents.experiments.references import complete_envelopes
+from fusion_gym.agents.experiments.tables import write_rows
+from fusion_gym.agents.experiments.workers import Pool
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import EnvelopePoint
@@ -58,8 +54,10 @@ ENVELOPE = [
 def test_the_excess_of_a_front_is_the_worst_of_points_and_vertices(
     front: list[tuple[float, float]], excess: float
 ) -> None:
-    assert excess_over(front, ENVELOPE) == pytest.approx(excess)
-    assert excess_over(front, [*ENVELOPE, EnvelopePoint("bad", 0.2, 1.9)]) == pytest.approx(excess)
+    assert fronts.excess_over(front, ENVELOPE) == pytest.approx(excess)
+    assert fronts.excess_over(front, [*ENVELOPE, EnvelopePoint("bad", 0.2, 1.9)]) == pytest.approx(
+        excess
+    )
 
 
 @pytest.mark.parametrize(
@@ -69,9 +67,11 @@ def test_the_excess_of_a_front_is_the_worst_of_points_and_vertices(
 def test_a_front_is_more_than_a_point_and_than_silence(
     low: float, high: float, below: bool
 ) -> None:
-    assert is_below([(low, 1.0), (high, 0.5)], ENVELOPE, least=0.05) == below
-    assert not is_below([(0.1, 2.0), (0.3, 0.5)], ENVELOPE, least=0.05), "as good is not below"
-    assert not is_below([(0.0, 3.9)] * 7, ENVELOPE, least=0.05)
+    assert fronts.is_below([(low, 1.0), (high, 0.5)], ENVELOPE, least=0.05) == below
+    assert not fronts.is_below([(0.1, 2.0), (0.3, 0.5)], ENVELOPE, least=0.05), (
+        "as good is not below"
+    )
+    assert not fronts.is_below([(0.0, 3.9)] * 7, ENVELOPE, least=0.05)
 
 
 def test_a_range_counts_from_a_twentieth_of_always_transmitting(school: Path) -> None:
@@ -94,17 +94,17 @@ def test_the_first_moment_below_and_what_came_after() -> None:
         }
         for place, (excess, below) in enumerate(states)
     ]
-    result = reached({"seed": 3, "curve": curve})["first"]
+    result = fronts.first_below({"seed": 3, "curve": curve})["first"]
     assert (result["timesteps"], result["excess"], result["above_later"]) == (100, -0.1, 1)
-    assert "first" not in reached({"seed": 3, "curve": curve[:1]})
+    assert "first" not in fronts.first_below({"seed": 3, "curve": curve[:1]})
 
 
-def study_of(folder: Path, **course: Any) -> Study:
+def study_of(folder: Path, **course: Any) -> fronts.LearningSetup:
     """The only course of the config that :func:`school` writes, with changes."""
     taught = load_learning(folder / "learning.yaml")
     plain = taught.settings[0].model_dump() | course
     suite = load_suite(taught.suite)
-    return Study(
+    return fronts.LearningSetup(
         taught, suite, type(taught.settings[0])(**plain), folder / "results", folder, folder
     )
 
@@ -123,7 +123,9 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
     suite = small_suite(folder, settings=[*SMALL["settings"], source], families=gain)
     choice = load_suite(suite)
     classes = ["sensors", "sensors_memory"]
-    complete(choice, choice.settings[:1], classes, folder / "results", folder / "tuning", Team(1))
+    complete_envelopes(
+        choice, choice.settings[:1], classes, folder / "results", folder / "tuning", Pool(1)
+    )
     options = {
         "small": {"filter": "tobit", "horizon": 10, "memory": True},
         "centre": {"filter": "tobit", "horizon": 10, "information": "centre"},
@@ -169,7 +171,7 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def fewer_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fusion_gym.agents.suite.verdict.RESAMPLES", 20)
+    monkeypatch.setattr("fusion_gym.agents.experiments.verdict.RESAMPLES", 20)
 
 
 def arguments_of(school: Path, folder: Path, **changes: Any) -> argparse.Namespace:
@@ -204,7 +206,7 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
     monkeypatch.setattr(learning.measure_throughput, "__defaults__", (0.01,))
     whole = arguments_of(school, tmp_path / "whole")
     learning.run(whole)
-    content = json.loads((whole.output / "small.json").read_text())
+    content = fronts.read_learning(whole.output / "small")
     assert [front["seed"] for front in content["fronts"]] == [0, 1]
     assert content["fronts"][0]["curve"] != content["fronts"][1]["curve"]
     for front in content["fronts"]:
@@ -219,7 +221,7 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
     assert "`python -m benchmarks.learning --seeds 2" in (whole.output / "README.md").read_text()
     assert "small" in capsys.readouterr().out
 
-    with pytest.raises(ConfigurationError, match=r"holds small.json already: go on with --resume"):
+    with pytest.raises(ConfigurationError, match=r"holds small already: go on with --resume"):
         learning.run(whole)
 
     broken = arguments_of(school, tmp_path / "broken")
@@ -235,12 +237,12 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
     monkeypatch.setattr(PrivilegedVecEnv, "step_alternatives", step_alternatives)
     with pytest.raises(KeyboardInterrupt):
         learning.run(broken)
-    stored = json.loads((broken.output / "small.json").read_text())
+    stored = fronts.read_learning(broken.output / "small")
     assert [front["seed"] for front in stored["fronts"]] == [0]
     broken.resume = True
     learning.run(broken)
     assert counted == 64, "nothing is trained twice"
-    again = json.loads((broken.output / "small.json").read_text())
+    again = fronts.read_learning(broken.output / "small")
     assert without_seconds(again) == without_seconds(content)
     learning.run(broken)
     assert counted == 64
@@ -250,16 +252,16 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
 def test_plain_ppo_ends_with_its_budget_or_below_the_rules(
     school: Path, tmp_path: Path, budget: float, below: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fusion_gym.agents.suite.study.is_below", lambda *_: below)
+    monkeypatch.setattr("fusion_gym.agents.experiments.learning.is_below", lambda *_: below)
     study = replace(study_of(school), work=tmp_path, output=tmp_path)
-    lesson = Lesson(study, "plain", 0, budget)
-    run_lesson(lesson, 1)
+    lesson = fronts.LearningRun(study, "plain", 0, budget)
+    fronts.run_course(lesson, 1)
     result = lesson.result()
     assert result is not None
     assert [point["timesteps"] for point in result["curve"]] == [128], "not the whole 256"
     changed = study.learning.model_copy(update={"episodes": 5})
     with pytest.raises(ConfigurationError, match=r"^episodes = 5 differs from that of .*: 4$"):
-        Lesson(replace(study, learning=changed), "plain", 0).result()
+        fronts.LearningRun(replace(study, learning=changed), "plain", 0).result()
 
 
 @pytest.mark.parametrize(
@@ -285,7 +287,7 @@ def test_a_front_beside_the_optimum_or_the_best_of_schedules(
     (selection.work / course["setting"]).mkdir()
     (selection.work / course["setting"] / "throughput.json").write_text("{}")
     learning.run(selection)
-    content = json.loads((selection.output / f"{course['setting']}.json").read_text())
+    content = fronts.read_learning(selection.output / course["setting"])
     assert content["plain"] == []
     assert content["finished"]["compared"] == 3, "all prices"
     suite = load_suite(school / "suite.yaml")
@@ -337,47 +339,57 @@ def test_seeds_and_prices_that_lie_above_are_counted(school: Path) -> None:
         }
 
     bad = point(9.0, 8.0, 9.0)  # outside the inner part
-    fronts = [
+    seeds = [
         {"seed": 0, "points": [bad, point(0.02, 0.011, 1.8), bad]},
         {"seed": 1, "points": [bad, point(0.03, 0.009, 1.4), bad]},
     ]
-    result = judge_fronts(study_of(school), fronts)
+    study = {"course": study_of(school).course.model_dump(), "inner": [False, True, False]}
+    result = fronts.judge_fronts(study | {"fronts": seeds})
     assert result is not None
     assert result["compared"] == 2
     assert [(p["seed"], p["difference"]["low"]) for p in result["above"]] == [(0, 0.011)]
     assert (result["worst"]["seed"], result["mean"]) == (1, pytest.approx(0.025))
     assert result["rates"] == pytest.approx([0.14, 0.18])
     assert result["closed"] == {"rollout": None, "bound": pytest.approx((0.2 + 0.6) / 2.0)}
-    assert closed([{"envelope": 1.0, "bound": 1.0, "mse": 1.0}], "bound") is None
-    assert judge_fronts(study_of(school), []) is None
+    assert fronts.gap_share([{"envelope": 1.0, "bound": 1.0, "mse": 1.0}], "bound") is None
+    assert fronts.judge_fronts(study | {"fronts": []}) is None
 
 
 def test_a_rollout_counts_on_its_own_episodes_and_only_where_it_was_run(
     school: Path, tmp_path: Path
 ) -> None:
     """Of 4 episodes the first 2 are twice as hard: there the rollout has 3/4 of the envelope."""
-    rollout = {"setting": "small", "episodes": 2, "points": [{"rate": 0.1, "mse": 1.5}] * 2}
-    rollout["points"][1] = {"rate": 0.3, "mse": 1.5}
-    write(tmp_path / "rollout" / "small.json", rollout)
+    shutil.copytree(school / "results" / "small", tmp_path / "small")
+    none = {"mean": 1.5, "low": 1.5, "high": 1.5}
+    rollout = dict.fromkeys(("mse", "return_gain", "base_mse"), none) | {"episodes": 2, "seed": 0}
+    rollout |= dict.fromkeys(("price", "return", "base_rate"), 0.0)
+    rollout |= dict.fromkeys(("policy", "base_policy", "env", "command"), "x") | {"options": {}}
+    write_rows(tmp_path / "small", "rollout", [rollout | {"rate": rate} for rate in (0.1, 0.3)])
+    bound = dict.fromkeys(("upper", "rate", "step", "points", "gap", "horizon"), 1)
+    bound |= {"sensors": 2, "floor": 0.4, "env": "x", "weights": "mse", "settings": {}}
+    bound |= {"everything_delivered": {}}
     costs = [{"price": 1.0, "lower": 0.9}, {"price": 4.0, "lower": 1.5}]
-    write(tmp_path / "bounds" / "small.json", {"sensors": 2, "floor": 0.4, "costs": costs})
-    envelopes = (school / "results" / "envelopes" / "small.json").read_text()
-    write_text(tmp_path / "envelopes" / "small.json", envelopes)
+    write_rows(tmp_path / "small", "bounds", [bound | cost for cost in costs])
     hard = np.array([2.0, 2.0, 1.0, 1.0])
     envelope = {str(rate): SimpleNamespace(rate=np.array([rate]), mse=hard) for rate in (0.0, 1.0)}
     study = replace(study_of(school), results=tmp_path)
-    assert beyond(study, 0.2, envelope) == {"rollout": 0.75 * 1.5, "bound": pytest.approx(0.5)}
-    assert beyond(study, 0.05, envelope) == {"bound": pytest.approx(1.1)}
-    assert beyond(study, 0.31, envelope) == {"bound": 0.4}
+    assert fronts.best_known(study, 0.2, envelope) == {
+        "rollout": 0.75 * 1.5,
+        "bound": pytest.approx(0.5),
+    }
+    assert fronts.best_known(study, 0.05, envelope) == {"bound": pytest.approx(1.1)}
+    assert fronts.best_known(study, 0.31, envelope) == {"bound": 0.4}
     course = study.course.model_copy(update={"against": "sensors"})
-    assert "rollout" not in beyond(replace(study, course=course), 0.2, envelope), "it remembers"
+    assert "rollout" not in fronts.best_known(replace(study, course=course), 0.2, envelope), (
+        "it remembers"
+    )
 
 
 def test_every_shipped_front_knows_what_it_is_compared_with(tmp_path: Path) -> None:
     taught = load_learning("learning")
     suite = load_suite(taught.suite)
     for course in taught.settings:
-        study = Study(taught, suite, course, ROOT / "results", tmp_path, tmp_path)
+        study = fronts.LearningSetup(taught, suite, course, ROOT / "results", tmp_path, tmp_path)
         study.check()
         assert study.inner == [False, *[True] * (taught.prices - 2), False], course.setting
         assert len(study.tests) == len({test.name for test in study.tests}) > 5

@@ -1,6 +1,5 @@
 """The parts of pages that say who wins: made of results, and only where a page asks for them."""
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -9,8 +8,8 @@ import pytest
 from small_results import small_results
 
 from fusion_gym.agents import report
-from fusion_gym.agents.suite.report_pages import update_pages
-from fusion_gym.agents.suite.setting_results import read_results
+from fusion_gym.agents.experiments.report import read_results, update_pages
+from fusion_gym.agents.experiments.verdict import write_cases
 
 PAGE = """# A page
 
@@ -42,19 +41,17 @@ def test_the_command_writes_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_perturbed_cases_are_counted(tmp_path: Path) -> None:
     def row(title: str, low: float, high: float) -> dict[str, Any]:
         middle = {"mean": (low + high) / 2, "low": low, "high": high}
-        return {"title": title, "agents": {"middle": middle}}
+        return {"title": title, "always": 0.5, "agents": {"middle": middle, "points": []}}
 
     cases = {
         "as_assumed": row("as assumed", -0.3, -0.1),
         "loud": row("loud", -0.2, -0.1),
         "louder": row("louder", 0.01, 0.03),
         "still": row("still", -0.1, 0.1),
-        "none": {"title": "none", "agents": {}},
+        "none": {"title": "none", "always": 0.5, "agents": {"points": []}},
     }
-    folder = tmp_path / "robustness" / "tobit_oscillator" / "sensors"
-    folder.mkdir(parents=True)
-    report = {"setting": "tobit_oscillator", "class": "sensors", "cases": cases}
-    (folder / "verdict.json").write_text(json.dumps(report))
+    report = {"class": "sensors", "cases": cases, "episodes": 2, "sha256": "0"}
+    write_cases(tmp_path / "tobit_oscillator", report)
     text = update_pages(PAGE.format(name="robustness"), {}, tmp_path)
     expected = "| Tobit oscillator | as they are | -20.0% [-30.0%, -10.0%] | 1 | 1 | 1 | "
     assert f"{expected}+2.0% [+1.0%, +3.0%], louder |" in text

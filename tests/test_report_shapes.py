@@ -1,101 +1,97 @@
-"""JSON of another shape than its reader needs is refused by its field, before anything is drawn."""
+"""Tables of another shape than theirs are refused by their column, before anything is drawn."""
 
 import copy
 import json
 import shutil
+import struct
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 from command_runs import call
 from hostile_folder import contents
+from hypothesis import given
+from hypothesis import strategies as st
 from small_results import CLASSES, ENV, SETTING, small_model, small_results
 
+from fusion_gym.agents.compare import comparison_table
+from fusion_gym.agents.experiments.tables import read_rows, write_rows
 from fusion_gym.agents.output import pareto_figure
 from fusion_gym.agents.output.palette import AGENTS, RULES
 from fusion_gym.agents.output.pareto_figure import Differences, Limits, Panel, Series
-from fusion_gym.agents.suite.comparison import comparison_table
-from fusion_gym.agents.suite.setting_results import read_setting
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import BaselineComparison
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.intervals import Interval
 from fusion_gym.policies.registry import make_policy
 
-ABSENT = object()
+ABSENT = "ABSENT"
 
 
-def changed(content: dict[str, Any], place: str, value: Any) -> dict[str, Any]:
-    """The content with another value in a place, or without it."""
-    result = copy.deepcopy(content)
-    *above, last = place.split("/")
-    inner: Any = result
-    for key in above:
-        inner = inner[int(key) if key.isdigit() else key]
-    if value is ABSENT:
-        del inner[last]
+def change(file: Path, column: str, value: str) -> None:
+    """Write another value into the first cell of a column, or take the column away."""
+    frame = pd.read_csv(file, dtype=str, keep_default_na=False)
+    if value == ABSENT:
+        frame = frame.drop(columns=column)
     else:
-        inner[last] = value
-    return result
-
-
-@pytest.fixture
-def setting(tmp_path: Path) -> Path:
-    """A folder with one setting's results."""
-    folder = small_results(tmp_path / "results")
-    read_setting(folder)
-    return folder
+        frame.loc[0, column] = value
+    frame.to_csv(file, index=False)
 
 
 @pytest.mark.parametrize(
-    ("name", "place", "value", "message"),
+    ("table", "column", "value", "message"),
     [
-        ("verdict", "title", ABSENT, "title is not allowed: Field required"),
-        ("verdict", "always", 0.0, "always = 0.0 is not allowed"),
-        ("verdict", "classes/sensors/mode", "nobody", "classes.sensors.mode = 'nobody'"),
-        ("verdict", "worth/0/rules/low", "x", "worth.0.rules.low = 'x'"),
-        ("agent_sensors_1", "class", ABSENT, "class is not allowed: Field required"),
-        ("verdict", "classes/sensors/points", [], "classes.sensors.points = []"),
-        ("verdict", "classes/sensors/points/0/mse", float("nan"), "points.0.mse = nan"),
-        ("verdict", "classes/sensors/points/0/rate", "0.5", "points.0.rate = '0.5'"),
-        ("verdict", "classes/sensors/closed", ABSENT, "room stands without closed"),
-        ("verdict", "classes/sensors/envelope/0/name", "ghost", "no policy 'ghost'"),
-        ("baselines", "curves/always/policies", ["ghost"], "no policy 'ghost'"),
-        ("baselines", "policies/always/mse", 3, "policies.always.mse = 3"),
-        ("informed", "policies", [], "policies = []"),
+        ("verdict", "title", ABSENT, "has other columns than the table 'verdict': 'title'"),
+        ("verdict", "always", "0.0", "always = [0.0] is not allowed"),
+        ("fronts", "mode", "nobody", "mode = 'nobody' is not allowed: it must be 'centre' or"),
+        ("fronts", "rates", "[1", "rates = '[1' is not allowed: it must be JSON"),
+        ("fronts", "seeds", "1.5", "seeds = 1.5 is not allowed: it must be a whole number"),
+        ("worth", "rules_low", "", "rules_low = an empty cell is not allowed: it must be a finite"),
+        ("points", "mse", "", "mse = an empty cell is not allowed"),
     ],
 )
 def test_results_of_another_shape(
-    setting: Path, name: str, place: str, value: Any, message: str
+    tmp_path: Path, table: str, column: str, value: str, message: str
 ) -> None:
-    file = setting / f"{name}.json"
-    content = changed(json.loads(file.read_text(encoding="utf-8")), place, value)
-    file.write_text(json.dumps(content), encoding="utf-8")
+    setting = small_results(tmp_path / "results")
+    change(setting / f"{table}.csv", column, value)
     before = contents(setting)
     ended = call("report", ["--results", str(setting.parent)])
-    assert (ended.status, ended.trace, contents(setting)) == (1, "", before)
+    assert (ended.status, ended.trace, ended.err.count("\n")) == (1, "", 1)
+    assert contents(setting) == before
     assert ended.err.startswith("error: results = ")
     assert message in ended.err
-    assert len(ended.err.splitlines()) == 1
+
+
+def test_json_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
+    (tmp_path / SETTING).mkdir()
+    (tmp_path / SETTING / "verdict.json").write_text("{}")
+    ended = call("report", ["--results", str(tmp_path)])
+    assert (ended.status, "and not JSON of an earlier version" in ended.err) == (1, True)
+
+
+@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1))
+def test_numbers_are_read_back_bit_for_bit(tmp_path_factory: Any, values: list[float]) -> None:
+    folder = tmp_path_factory.mktemp("table")
+    rows = [{"class": "a", "name": "b", "rate": value, "mse": value} for value in values]
+    write_rows(folder, "envelope", rows)
+    again = [row["mse"] for row in read_rows(folder, "envelope")]
+    assert struct.pack(f"{len(values)}d", *again) == struct.pack(f"{len(values)}d", *values)
 
 
 def test_the_zoo_takes_all_agents_or_none(tmp_path: Path) -> None:
-    """The second of two has no model; a setting's name is no path; then both are there."""
+    """The second of two has no model; then both are there."""
     results, work = tmp_path / "results", tmp_path / "work"
     for name in (SETTING, "zz"):  # the other stands first, in the order in which they are copied
         small_results(results, name, classes=["sensors"], seeds=1)
-    file = results / "zz" / "agent_sensors_0.json"
-    agent = json.loads(file.read_text(encoding="utf-8"))
     small_model(work / SETTING / "sensors_0" / "best_model.zip")
     words = ["--results", str(results), "--work", str(work), "--zoo", str(tmp_path / "zoo")]
-    for value, message in (("second", "best_model.zip is missing"), ("../../x", "setting = ")):
-        file.write_text(json.dumps(agent | {"setting": value}), encoding="utf-8")
-        ended = call("zoo", words)
-        assert (ended.status, ended.trace) == (1, "")
-        assert message in ended.err
-        assert not (tmp_path / "zoo").exists()
-    file.write_text(json.dumps(agent | {"setting": "second"}), encoding="utf-8")
-    shutil.copytree(work / SETTING, work / "second")
+    ended = call("zoo", words)
+    assert (ended.status, ended.trace) == (1, "")
+    assert "best_model.zip is missing" in ended.err
+    assert not (tmp_path / "zoo").exists()
+    shutil.copytree(work / SETTING, work / "zz")
     assert call("zoo", words).status == 0
     assert len(list((tmp_path / "zoo").iterdir())) == 4
 
@@ -135,7 +131,8 @@ def test_the_zoo_takes_a_choice_and_removes_what_is_not_in_it(
 def test_what_is_not_there_yet_is_said(tmp_path: Path) -> None:
     """No agents, no references, no envelopes: a report all the same, which says so."""
     folder = small_results(tmp_path, classes=[])
-    (folder / "informed.json").unlink()
+    policies = read_rows(folder, "policies")
+    write_rows(folder, "policies", [row for row in policies if row["run"] != "informed"])
     assert call("report", ["--results", str(tmp_path)]).status == 0
     text = (tmp_path / "README.md").read_text()
     assert "Agents of a class: none so far." in text
@@ -153,7 +150,10 @@ def test_an_evaluation_goes_on_with_whole_policies_alone(tmp_path: Path) -> None
         ("quantiles/always", "quantiles of ['always'] are missing"),
         ("policies/always/return", "policies.always.return is not allowed"),
     ):
-        file.write_text(json.dumps(changed(whole, place, ABSENT)), encoding="utf-8")
+        content = copy.deepcopy(whole)
+        above, name, *inner = place.split("/")
+        del (content[above][name] if inner else content[above])[inner[0] if inner else name]
+        file.write_text(json.dumps(content), encoding="utf-8")
         ended = call("evaluate", [*words, "--resume"])
         assert (ended.status, ended.trace) == (1, "")
         assert message in ended.err

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,13 @@ import yaml
 from command_runs import call
 from small_suite import small_suite
 
+from fusion_gym.agents.experiments import verdict
+from fusion_gym.agents.experiments.classes import classes_of
+from fusion_gym.agents.experiments.config import Case, load_robustness, load_suite, world
+from fusion_gym.agents.experiments.robustness import error_change
+from fusion_gym.agents.experiments.training import experiment_of
+from fusion_gym.agents.experiments.verdict import read_cases
 from fusion_gym.agents.robustness import _usual_class
-from fusion_gym.agents.suite import verdict
-from fusion_gym.agents.suite.classes import classes_of
-from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.jobs import experiment_of
-from fusion_gym.agents.suite.robust_table import error_change
-from fusion_gym.agents.suite.robustness import Case, load_robustness, world
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.agents.training.run import train
 from fusion_gym.envs.registration import make_task
@@ -76,10 +77,7 @@ def words_of(path: Path, results: Path, *more: str) -> list[str]:
 
 
 def with_envelopes(result: Path, folder: Path) -> Path:
-    target = folder / "envelopes"
-    target.mkdir()
-    for path in (result / "results" / "envelopes").glob("*.json"):
-        (target / path.name).write_bytes(path.read_bytes())
+    shutil.copytree(result / "results" / "small", folder / "small")
     return folder
 
 
@@ -89,11 +87,12 @@ def test_all_of_it(folder: Path, tmp_path: Path) -> None:
     line = words_of(folder, results, "--trained", "--seeds", "1")
     ended = call("robustness", line, seconds=300.0)
     assert (ended.status, ended.trace) == (0, ""), ended.err
-    place = results / "robustness" / "small" / "sensors"
-    pieces = sorted(str(path.relative_to(place)) for path in place.glob("*/*.json"))
+    place = results / "work" / "small" / "sensors"
+    files = [path for path in place.glob("*/*.json") if path.stem != "verdict"]
+    pieces = sorted(str(path.relative_to(place)) for path in files)
     labels = ("agent_0", "rules", "trained_0")
     assert pieces == [f"{c}/{p}.json" for c in ("as_assumed", "loud", "poor") for p in labels]
-    content = json.loads((place / "verdict.json").read_text())
+    (content,) = read_cases(results, ["small"])
     assert list(content["cases"]) == ["as_assumed", "loud", "poor"]
     nominal, loud, poor = content["cases"].values()
     assert nominal["rules"]["mean"] == 0.0
@@ -111,14 +110,14 @@ def test_all_of_it(folder: Path, tmp_path: Path) -> None:
     again = call("robustness", line)
     assert again.status == 1
     assert "holds 9 finished pieces of work: go on with --resume" in again.err
-    before = {path: path.stat().st_mtime_ns for path in place.glob("*/*.json")}
+    before = {path: path.stat().st_mtime_ns for path in files}
     lost = place / "loud" / "rules.json"
     lost.unlink()
     ended = call("robustness", [*line, "--resume"], seconds=120.0)
     assert (ended.status, ended.trace) == (0, ""), ended.err
     changed = [path for path, time in before.items() if path.stat().st_mtime_ns != time]
     assert changed == [lost]
-    assert json.loads((place / "verdict.json").read_text()) == content
+    assert read_cases(results, ["small"]) == [content]
     assert (results / "robustness" / "README.md").read_text() == table
 
     other = [word if word != "8" else "9" for word in line]
@@ -131,7 +130,7 @@ def test_a_piece_holds_what_a_rule_does_in_its_case(folder: Path, tmp_path: Path
     results = with_envelopes(folder, tmp_path)
     ended = call("robustness", words_of(folder, results), seconds=120.0)
     assert (ended.status, ended.trace) == (0, ""), ended.err
-    place = results / "robustness" / "small" / "sensors"
+    place = results / "work" / "small" / "sensors"
     report = json.loads((place / "loud" / "rules.json").read_text())
     suite = load_suite(folder / "suite.yaml")
     environment = suite.settings[0].environment
@@ -189,7 +188,7 @@ def test_what_is_not_allowed_is_reported_before_anything_runs(
     ended = call("robustness", line)
     assert (ended.status, ended.trace) == (1, "")
     assert text in ended.err.splitlines()[-1]
-    assert not list((results / "robustness").glob("*/*/*"))
+    assert not list((results / "work").glob("*/*/*"))
 
 
 def test_shipped_cases_fit_the_shipped_suite() -> None:

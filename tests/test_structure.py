@@ -90,3 +90,20 @@ def test_there_are_no_circles() -> None:
     for module in modules():
         for other in imports(module):
             assert module not in reached(other), f"{module} and {other} import each other"
+
+
+# Each part of the agents may import from the parts before its own, and from itself.
+PARTS = ("input", "output", "training", "experiments", "reproduction", "commands")
+
+
+def part_of(path: Path) -> int:
+    names = [*path.relative_to(ROOT / "agents").parts, "commands"]
+    return PARTS.index(names[0] if names[0] in PARTS else "commands")
+
+
+def test_imports_of_the_agents_run_downwards() -> None:
+    for path in (ROOT / "agents").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.level:
+                target = path.parents[node.level - 1] / (node.module or "").replace(".", "/")
+                assert part_of(target) <= part_of(path), f"{path} imports {target}"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rliable import library, metrics
 
-from fusion_gym.agents.suite.verdict import AgentFront, interval, judge
+from fusion_gym.agents.experiments.verdict import AgentFront, interval, judge
 from fusion_gym.evaluation.episodes import EpisodeResults
 
 
@@ -62,7 +62,7 @@ def test_the_middle_of_the_front_is_from_a_twentieth_to_half_of_always(
     always: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Rates just outside and just inside, each with a difference of its own."""
-    monkeypatch.setattr("fusion_gym.agents.suite.verdict.RESAMPLES", 20)
+    monkeypatch.setattr("fusion_gym.agents.experiments.verdict.RESAMPLES", 20)
     noise = np.random.default_rng(0).uniform(0.5, 1.5, 50)
     baselines = {"never": made_up(0.0, 2 * noise), "always": made_up(1.0, noise)}
 

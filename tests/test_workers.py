@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 # A parent that waits for its worker, which says its number and would work for a minute.
 PARENT = """
 import subprocess, sys
-worker = "import os, sys, time; from fusion_gym.agents.suite.workers import end_with; "
+worker = "import os, sys, time; from fusion_gym.agents.experiments.workers import end_with; "
 worker += "end_with(os.getppid()); print(os.getpid(), flush=True); time.sleep(60)"
 subprocess.run([sys.executable, "-c", worker])
 """

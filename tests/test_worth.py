@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from test_verdict import made_up
 
-from fusion_gym.agents.suite.classes import Class, classes_of, trained_classes
-from fusion_gym.agents.suite.config import load_suite
-from fusion_gym.agents.suite.verdict import middles
-from fusion_gym.agents.suite.worth import SHARES, ClassTests, at_rates, pairs, worths
+from fusion_gym.agents.experiments import verdict
+from fusion_gym.agents.experiments.classes import Class, classes_of, trained_classes
+from fusion_gym.agents.experiments.config import load_suite
+from fusion_gym.agents.experiments.verdict import ClassTests, at_rates, middles, worths
 from fusion_gym.core.system import covers
 
 NOISE = np.random.default_rng(0).uniform(0.5, 1.5, 300)
@@ -34,7 +34,7 @@ def test_rules_and_agents_at_a_grid_of_rates() -> None:
     result = at_rates(
         build_parts(Class("sensors"), 1.0, [[0.08, 0.3], [0.06, 0.25]], 0.9), always=1.0
     )
-    assert [row["rate"] for row in result] == pytest.approx(SHARES)
+    assert [row["rate"] for row in result] == pytest.approx(verdict.SHARES)
     for row in result:
         assert row["rules"]["mean"] == pytest.approx((2 - row["rate"]) * NOISE.mean())
         assert row["rules"]["low"] < row["rules"]["mean"] < row["rules"]["high"]
@@ -88,7 +88,7 @@ def test_only_one_thing_differs_between_two_classes() -> None:
     kinds = set()
     for setting in suite.settings:
         every = {c.name: c for c in classes_of(setting)}
-        for kind, more, less in pairs(trained_classes(suite, setting)):
+        for kind, more, less in verdict.pairs(trained_classes(suite, setting)):
             kinds.add(kind)
             know, other = every[more], every[less]
             assert covers(know.knows, other.knows)

@@ -56,8 +56,11 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def remove_partials(folder: Path) -> None:
-    """Remove what killed processes left half-written; nobody else may be writing there."""
-    for partial in folder.glob("*"):
+    """Remove what killed processes left half-written; nobody else may be writing there.
+
+    In the folders within, too, but there only tables, JSON and episodes.
+    """
+    for partial in (*folder.glob("*"), *folder.glob("*/*.part.[cjn]*")):
         if _PARTIAL.search(partial.name):
             partial.unlink(missing_ok=True)
 

@@ -44,7 +44,7 @@ def alone_in(folder: Path, name: str) -> Iterator[None]:
         lock.release()
 
 
-def refuse_earlier(folder: Path, count: int, resume: bool) -> None:
+def refuse_earlier(option: str, folder: Path, count: int, resume: bool) -> None:
     """Refuse to begin where so many results are already, unless they are resumed.
 
     Raises:
@@ -52,7 +52,7 @@ def refuse_earlier(folder: Path, count: int, resume: bool) -> None:
     """
     if count and not resume:
         raise ConfigurationError(
-            f"results = {str(folder)!r} holds {count} finished pieces of work: go on with "
+            f"{option} = {str(folder)!r} holds {count} finished pieces of work: go on with "
             "--resume, or give another --results and --work"
         )
 

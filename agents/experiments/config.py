@@ -1,0 +1,475 @@
+"""The configs of the experiments: settings, rules, agents, perturbed cases and trainings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import numpy as np
+import pydantic
+
+from fusion_gym.envs.registration import make_task
+from fusion_gym.validation import ConfigurationError, choice
+
+from ..training.algorithms import AlgorithmConfig, AnyAlgorithm, PPOConfig, settings
+from ..training.checked import Positive, Rate, Share, Strict, load_changed, load_checked
+from ..training.config import EnvironmentConfig
+
+Mode = Literal["sensors", "centre", "local"]
+Broadcast = Literal["none", "estimate", "packets"]
+Packet = Literal["measurement", "estimate"]
+Error = Literal["squared", "excess", "mismatch"]
+Longer = Annotated[float, pydantic.Field(gt=0)]
+
+
+class Range(Strict):
+    """A parameter between ``low`` and ``high``, in the logarithm, of one value or one a sensor."""
+
+    low: Rate
+    high: Rate
+    whole: bool = False
+    per_sensor: bool = False
+
+    @pydantic.model_validator(mode="after")
+    def _ordered(self) -> Range:
+        if self.low >= self.high:
+            raise ValueError(f"low = {self.low} must be below high = {self.high}")
+        return self
+
+
+class Choices(Strict):
+    """A parameter with few values."""
+
+    values: tuple[Any, ...] = pydantic.Field(min_length=1)
+
+
+class Family(Strict):
+    """A rule with parameters to tune; ``policy`` may fix others (``paced:rate=0.1``).
+
+    ``tuned_in`` says where: ``"setting"`` once in each setting, for what the rule looks at depends
+    neither on memory nor on what is broadcast; ``"sensors"`` or ``"local"`` anew in each class of
+    the scheduler or of sensors that decide by themselves, for it does.
+    """
+
+    label: str
+    policy: str
+    parameters: dict[str, Range | Choices]
+    tuned_in: Literal["setting", "sensors", "local"] = "setting"
+
+
+class Tuning(Strict):
+    """One budget of trials for every rule, on seeds that no test uses.
+
+    Each of ``seeds`` searches runs by itself, on ``episodes`` episodes of its own from ``seed`` on:
+    ``trials`` policies over the whole range, then ``refined`` at each of ``prices`` prices of the
+    setting's range, for the least error plus price times tokens, both times the number of
+    parameters, 3 at most (one for each sensor counts as many). The policies on a search's lower
+    envelope, and those within ``near`` (a share of the error) of it up to ``finalists`` in all, are
+    run again on the episodes of all searches.
+    """
+
+    trials: Positive = 12
+    prices: Positive = 8
+    refined: Positive = 1
+    episodes: Positive = 80
+    seeds: Positive = 3
+    seed: int = pydantic.Field(default=600_000_000, ge=0)
+    near: Share = 0.02
+    finalists: Positive = 8
+
+
+class Genie(Strict):
+    """A system that always receives, with these options changed: a lower bound of the error."""
+
+    options: dict[str, Any]
+    assumes: str
+
+
+class Hindsight(Strict):
+    """What a clairvoyant would do at some prices; ``width`` is that of its beam search."""
+
+    prices: tuple[Rate, ...] = pydantic.Field(min_length=1)
+    width: Positive = 32
+
+
+class Setting(Strict):
+    """One environment in one setting; ``families`` are labels, all of them by default.
+
+    ``informed`` are policies that know the model and all new signals, ``references`` computed
+    ones that know no more than the centre. ``broadcasts`` are what a sensor by itself may hear, by
+    rising knowledge, the environment's default first; with ``estimates`` there is a class of
+    schedulers whose packets hold the estimate. ``known`` are policies that earlier searches
+    found: they compete with what the search finds, as if every tuning seed had found them.
+
+    ``agents`` are the classes in which agents are trained, by name (all by default), and
+    ``agent_options`` tell them what rules know anyway. ``longer`` multiplies the length of their
+    trainings, ``lengths`` those of one mode or class; ``price_exponent``, ``num_envs``, ``error``
+    and ``tuning`` replace the suite's, ``envs`` the number of environments of one mode or class;
+    ``algorithm`` changes entries of the suite's, ``algorithms`` those of one mode; ``pace`` is
+    about how many steps a second they train, for the time that is told to remain.
+    """
+
+    name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
+    title: str
+    environment: EnvironmentConfig
+    price_range: tuple[Rate, Rate]
+    families: tuple[str, ...] | None = None
+    points: tuple[str, ...] = ("always", "never")
+    known: tuple[str, ...] = ()
+    informed: tuple[str, ...] = ()
+    references: tuple[str, ...] = ()
+    longer: Longer = 1.0
+    lengths: dict[str, Longer] = pydantic.Field(default_factory=dict)
+    price_exponent: Share | None = None
+    num_envs: Positive | None = None
+    envs: dict[str, Positive] = pydantic.Field(default_factory=dict)
+    error: Error | None = None
+    agents: tuple[str, ...] | None = None
+    agent_options: dict[str, Any] = pydantic.Field(default_factory=dict)
+    algorithm: dict[str, Any] = pydantic.Field(default_factory=dict)
+    algorithms: dict[Mode, dict[str, Any]] = pydantic.Field(default_factory=dict)
+    pace: Positive = 10_000
+    tuning: dict[str, Any] = pydantic.Field(default_factory=dict)
+    broadcasts: tuple[Broadcast, ...] = pydantic.Field(default=("none",), min_length=1)
+    estimates: bool = False
+    genie: Genie | None = None
+    hindsight: Hindsight | None = None
+
+
+class Suite(Strict):
+    """The whole benchmark; ``classes`` are those in which agents are trained, by name (all)."""
+
+    episodes: Positive = 1000
+    seed: int = pydantic.Field(default=0, ge=0)
+    training_seeds: Positive = 5
+    timesteps: Positive = 4_000_000
+    num_envs: Positive = 256
+    prices: Positive = 7
+    price_exponent: Share = 0.5
+    hindsight_episodes: Positive = 100
+    error: Error = "squared"
+    classes: tuple[str, ...] | None = None
+    tuning: Tuning = Tuning()
+    algorithm: AnyAlgorithm
+    algorithms: dict[Mode, dict[str, Any]] = pydantic.Field(default_factory=dict)
+    families: tuple[Family, ...]
+    settings: tuple[Setting, ...]
+
+    def algorithm_of(self, setting: Setting, mode: Mode) -> AlgorithmConfig:
+        """The algorithm of a setting's agents of a mode, checked again.
+
+        Raises:
+            ValueError: a hyper-parameter that is unknown or not allowed.
+        """
+        of_mode = self.algorithms.get(mode, {}) | setting.algorithms.get(mode, {})
+        return settings(self.algorithm.model_dump() | setting.algorithm | of_mode)
+
+    def num_envs_of(self, setting: Setting, name: str, mode: Mode) -> int:
+        """Environments side by side in a training of a class."""
+        own = setting.envs.get(name, setting.envs.get(mode))
+        return own or setting.num_envs or self.num_envs
+
+    def timesteps_of(self, setting: Setting, name: str, mode: Mode) -> int:
+        """Steps of a training of a class; where sensors decide by themselves, of all their rows."""
+        length = setting.lengths.get(name, setting.lengths.get(mode, 1.0))
+        return round(self.timesteps * setting.longer * length)
+
+    def tuning_of(self, setting: Setting) -> Tuning:
+        """The setting's budget of tuning, checked again.
+
+        Raises:
+            ValueError: an entry that is unknown or not allowed.
+        """
+        return Tuning(**(self.tuning.model_dump() | setting.tuning))
+
+    def families_of(self, setting: Setting) -> list[Family]:
+        """The setting's baselines."""
+        names = setting.families
+        return [f for f in self.families if names is None or f.label in names]
+
+    @pydantic.model_validator(mode="after")
+    def _named(self) -> Suite:
+        labels = [family.label for family in self.families]
+        if len(set(labels)) < len(labels):
+            raise ValueError(f"labels of families must differ: {labels}")
+        for setting in self.settings:
+            for mode in get_args(Mode):
+                self.algorithm_of(setting, mode)
+            self.tuning_of(setting)
+            for name in setting.families or ():
+                if name not in labels:
+                    raise ValueError(f"families of {setting.name}: {name!r} is none of {labels}")
+        return self
+
+
+# What --quick changes: the same work, less of it. Trainings are as long as in the full one, for
+# agents of shorter ones are others.
+QUICK: dict[str, Any] = {
+    "episodes": 200,
+    "training_seeds": 1,
+    "prices": 5,
+    "hindsight_episodes": 10,
+    "classes": ["local_estimate_memory", "sensors", "sensors_memory"],
+    "tuning": {"trials": 4, "prices": 4, "refined": 1, "episodes": 32, "seeds": 2},
+}
+
+
+def load_suite(path: str | Path, quick: bool = False) -> Suite:
+    """The benchmark's config, or its quick version.
+
+    Raises:
+        ConfigurationError: unreadable, an unknown key, or a value that is not allowed.
+    """
+    return load_changed(Suite, path, QUICK if quick else {})
+
+
+class SweepCurve(Strict):
+    """A baseline swept over one parameter: ``policy`` holds ``{value}`` in its place."""
+
+    label: str
+    policy: str
+    values: tuple[float | int, ...] = pydantic.Field(min_length=1)
+
+    @property
+    def policies(self) -> list[str]:
+        """One policy text a value."""
+        return [self.policy.replace("{value}", f"{value:g}") for value in self.values]
+
+    @pydantic.field_validator("policy")
+    @classmethod
+    def _has_place(cls, policy: str) -> str:
+        if "{value}" not in policy:
+            raise ValueError("must hold {value} where the swept parameter stands")
+        return policy
+
+
+class Sweep(Strict):
+    """Baselines over their thresholds, and the single policies that stand beside them."""
+
+    curves: tuple[SweepCurve, ...]
+    points: tuple[str, ...] = ()
+
+    @property
+    def policies(self) -> list[str]:
+        """Every policy text of the sweep, each once, in order."""
+        texts = [text for curve in self.curves for text in curve.policies]
+        return list(dict.fromkeys([*self.points, *texts]))
+
+
+class ComparisonRow(Strict):
+    """One policy in one setting of the comparison's environment, or of another."""
+
+    label: str
+    policy: str
+    environment: str | None = None
+    options: dict[str, Any] = pydantic.Field(default_factory=dict)
+
+
+class SweepSettings(Strict):
+    """Settings and policies of one environment, row by row."""
+
+    environment: str
+    rows: tuple[ComparisonRow, ...] = pydantic.Field(min_length=1)
+
+
+class Plain(Strict):
+    """Plain PPO without memory in the suite's settings, for comparison.
+
+    It ends below the memoryless envelope, or after ``budget`` times the processor seconds that the
+    fronts' trainings took.
+    """
+
+    every: Positive = 100_000
+    seeds: Positive = 2
+    budget: Rate = 3.0
+    timesteps: Positive = 3_200_000
+    num_envs: Positive = 256
+    algorithm: AnyAlgorithm = PPOConfig(name="ppo")
+
+
+class PlainChanges(Strict):
+    """What is other in a setting; ``longer`` multiplies the length."""
+
+    longer: float = pydantic.Field(default=1.0, gt=0)
+    algorithm: dict[str, Any] = pydantic.Field(default_factory=dict)
+
+
+SOLVED = ("optimum", "schedules")  # what fronts are compared with by costs
+
+
+class Course(Strict):
+    """What is trained in one setting of the suite, and what it is compared with.
+
+    ``front`` is the training's config, ``memoryless`` the class of the committed envelope to get
+    below while learning. The finished front is compared with ``against``: a class of the committed
+    envelope, the ``optimum`` at each price, or the best of ``schedules`` there; a share of
+    ``allowed`` above it is still good.
+    """
+
+    setting: str
+    front: str
+    memoryless: str | None = None
+    against: str
+    schedules: tuple[str, ...] = ()
+    allowed: Rate = 0.01
+    plain: PlainChanges = PlainChanges()
+
+    @pydantic.model_validator(mode="after")
+    def _scheduled(self) -> Course:
+        if (self.against == "schedules") != bool(self.schedules):
+            raise ValueError("schedules and against: schedules stand together")
+        return self
+
+
+class Learning(Strict):
+    """All settings; ``timesteps`` and ``test_episodes`` stand for those of configs and suite."""
+
+    suite: str = "benchmark"
+    prices: Positive = 7
+    inner: tuple[Share, Share] = (0.05, 0.95)
+    every: Positive = 50_000
+    episodes: Positive = 128
+    timesteps: Positive | None = None
+    test_episodes: Positive | None = None
+    plain: Plain = Plain()
+    settings: tuple[Course, ...] = pydantic.Field(min_length=1)
+
+    def algorithm_of(self, course: Course) -> AlgorithmConfig:
+        """Plain PPO's hyper-parameters in a setting, checked again.
+
+        Raises:
+            ValueError: a hyper-parameter that is unknown or not allowed.
+        """
+        return settings(self.plain.algorithm.model_dump() | course.plain.algorithm)
+
+    @pydantic.model_validator(mode="after")
+    def _trainable(self) -> Learning:
+        for course in self.settings:
+            self.algorithm_of(course)
+        return self
+
+
+# What --quick changes: the same work, less of it.
+LEARNING_QUICK: dict[str, Any] = {
+    "timesteps": 50_000,
+    "every": 25_000,
+    "test_episodes": 100,
+    "episodes": 32,
+    "plain": {"every": 25_000, "seeds": 1, "budget": 1.0},
+}
+
+
+def load_learning(path: str | Path, quick: bool = False) -> Learning:
+    """The config, or its quick version.
+
+    Raises:
+        ConfigurationError: unreadable, an unknown key, or a value that is not allowed.
+    """
+    return load_changed(Learning, path, LEARNING_QUICK if quick else {})
+
+
+NOMINAL = "as_assumed"  # the case without a perturbation
+
+
+class Case(Strict):
+    """Other options of a setting: ``options`` as they are, ``scaled`` ones by a factor."""
+
+    name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
+    title: str
+    options: dict[str, Any] = pydantic.Field(default_factory=dict)
+    scaled: dict[str, Rate] = pydantic.Field(default_factory=dict)
+
+
+class Perturbed(Strict):
+    """The cases of a setting: ``shared`` ones by name, then its ``own``.
+
+    ``drawn`` are options that agents trained over draws have: pairs, drawn anew in every episode.
+    """
+
+    setting: str
+    shared: tuple[str, ...] = ()
+    own: tuple[Case, ...] = ()
+    drawn: dict[str, Any] = pydantic.Field(default_factory=dict)
+
+
+class RobustnessSettings(Strict):
+    """Which settings of a suite are tried, and under which cases; the nominal one goes before."""
+
+    suite: str = "benchmark"
+    cases: tuple[Case, ...]
+    settings: tuple[Perturbed, ...] = pydantic.Field(min_length=1)
+
+    @pydantic.model_validator(mode="after")
+    def _named(self) -> RobustnessSettings:
+        known = [case.name for case in self.cases]
+        for setting in self.settings:
+            unknown = [name for name in setting.shared if name not in known]
+            if unknown:
+                raise ValueError(f"shared of {setting.setting}: {unknown[0]!r} is none of {known}")
+            names = [NOMINAL, *setting.shared, *(case.name for case in setting.own)]
+            if len(set(names)) < len(names):
+                raise ValueError(f"cases of {setting.setting} must differ: {names}")
+        return self
+
+    def cases_of(self, setting: Perturbed) -> list[Case]:
+        """A setting's cases, the nominal one first."""
+        shared = {case.name: case for case in self.cases}
+        nominal = Case(name=NOMINAL, title="as assumed")
+        return [nominal, *(shared[name] for name in setting.shared), *setting.own]
+
+
+def load_robustness(path: str | Path) -> RobustnessSettings:
+    """The config.
+
+    Raises:
+        ConfigurationError: unreadable, an unknown key, or a value that is not allowed.
+    """
+    return load_checked(RobustnessSettings, path)
+
+
+def select_settings(config: RobustnessSettings, names: tuple[str, ...]) -> list[Perturbed]:
+    """The settings of these names (none: all), each of which the suite has.
+
+    Raises:
+        ConfigurationError: one that the config or the suite does not have.
+    """
+    by_name = {setting.setting: setting for setting in config.settings}
+    known = [setting.name for setting in load_suite(config.suite).settings]
+    for name in by_name:
+        choice("setting", name, known)
+    return [by_name[choice("envs", name, by_name)] for name in names or by_name]
+
+
+def world(setting: Setting, case: Case) -> Setting:
+    """The setting as it is in a case.
+
+    Raises:
+        ConfigurationError: an option that is scaled and is no number.
+    """
+    environment, options = setting.environment, dict(setting.environment.options)
+    defaults = make_task(environment.id).settings
+    for name, factor in case.scaled.items():
+        value = options.get(name, defaults.get(name))
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ConfigurationError(
+                f"scaled = {{{name!r}: {factor:g}}} of the case {case.name!r} is not allowed: "
+                f"{name} of {setting.name} must be a number, and is {value!r}"
+            )
+        options[name] = value * factor
+    return _with_options(setting, options | case.options)
+
+
+def drawn_world(setting: Setting, perturbed: Perturbed) -> Setting:
+    """The setting in which agents are trained over draws."""
+    return _with_options(setting, setting.environment.options | perturbed.drawn)
+
+
+def _with_options(setting: Setting, options: dict[str, Any]) -> Setting:
+    environment = setting.environment.model_copy(update={"options": options})
+    return setting.model_copy(update={"environment": environment})
+
+
+def front_prices(price_range: tuple[float, float], count: int) -> list[float]:
+    """Prices over the whole range, evenly in the logarithm, both ends exactly."""
+    low, high = price_range
+    return [min(max(float(price), low), high) for price in np.geomspace(low, high, count)]

@@ -1,0 +1,637 @@
+"""How fast agents learn: their fronts while they train, and beside the rules when finished."""
+
+import functools
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from filelock import FileLock
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from fusion_gym.arrays import Array
+from fusion_gym.core.reward import Price
+from fusion_gym.core.task import Task
+from fusion_gym.deprecation import replace_value
+from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation.beside import run_beside
+from fusion_gym.evaluation.envelope import EnvelopePoint, best_mse, height, lower_hull
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.policies.model import ModelPolicy
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError, choice
+
+from ..output.files import read_json, write
+from ..output.folders import check_inputs
+from ..training.checked import load_checked, parse
+from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, ValidationConfig
+from ..training.monitor import Measure
+from ..training.run import holds_training, train
+from .config import SOLVED, Course, Learning, Setting, Suite, front_prices
+from .references import (
+    Test,
+    at_least,
+    bound_of,
+    committed_classes,
+    envelope_task,
+    hull_of,
+    read_envelopes,
+    rollout_of,
+    run_test,
+)
+from .tables import group_by, read_rows, write_rows
+from .training import check_vertex, training_of
+from .verdict import MIDDLE, AgentFront, excess, interval
+
+Points = Sequence[Sequence[float]]  # (rate, MSE) at each price
+WIDTH = 3.0  # the least factor between the rates of a front: less is hardly more than a point
+
+
+def meter(experiment: Experiment, prices: Sequence[float], episodes: int) -> Measure:
+    """What measures a training's ``front`` on its validation seeds, beside its ``cpu_seconds``."""
+    task = make_task(experiment.environment.id, **experiment.environment.options)
+    local, seed = experiment.environment.local, experiment.validation.seed
+
+    def measure(model: BaseAlgorithm, seconds: float) -> dict[str, Any]:
+        policies = [ModelPolicy(model, task, price=price, local=local) for price in prices]
+        result = run_beside(task, policies, episodes, seed)
+        points = [[float(brief.rate.mean()), float(brief.mse.mean())] for brief in result]
+        return {"cpu_seconds": seconds, "front": points}
+
+    return measure
+
+
+def excess_over(front: Points, envelope: Sequence[EnvelopePoint]) -> float:
+    """The most by which a front lies above an envelope over the front's range, as a share of it.
+
+    Every point of the front counts at its own rate, and between its lowest and its highest rate
+    the front's lower hull (mixtures of two prices) at each vertex of the envelope. Both are
+    straight between these rates, so a share below zero says that the front is below the envelope
+    everywhere in its range. Infinite where a rate is left of the envelope or an error not finite.
+    """
+    own = lower_hull(EnvelopePoint(str(place), *point) for place, point in enumerate(front))
+    hull = lower_hull(envelope)
+    low, high = range_of(front)
+    pairs: list[tuple[float | None, float | None]]
+    pairs = [(mse, height(hull, rate)) for rate, mse in front]
+    pairs += [(height(own, v.rate), v.mse) for v in hull if low < v.rate < high]
+    shares = [mse / above - 1.0 if mse is not None and above else np.inf for mse, above in pairs]
+    result = float(np.max(shares))
+    return result if np.isfinite(result) else np.inf
+
+
+def is_below(front: Points, envelope: Sequence[EnvelopePoint], least: float) -> bool:
+    """Whether a front is below an envelope over its whole range, and has one.
+
+    A policy that does the same at every price would have no range to be above in, and one that
+    sends next to nothing is as good as any rule there: the highest rate is at least three times
+    the lowest, and three times the rate ``least``, below which the lowest is taken for it.
+    """
+    low, high = range_of(front)
+    return excess_over(front, envelope) < 0.0 and high >= WIDTH * max(low, least)
+
+
+def range_of(front: Points) -> tuple[float, float]:
+    """The lowest and the highest rate."""
+    rates = [rate for rate, _ in front]
+    return min(rates), max(rates)
+
+
+Kind = Literal["front", "plain"]
+# Options that change neither the task nor what a policy may know of it: rules see the time anyway.
+_FREE = ("memory_filter", "belief_features", "clock")
+
+
+@dataclass(frozen=True)
+class LearningSetup:
+    """A course and where its files are: ``results`` holds the committed ones."""
+
+    learning: Learning
+    suite: Suite
+    course: Course
+    results: Path
+    output: Path
+    work: Path
+
+    @property
+    def setting(self) -> Setting:
+        """The suite's setting.
+
+        Raises:
+            ConfigurationError: there is none of that name.
+        """
+        by_name = {setting.name: setting for setting in self.suite.settings}
+        return by_name[choice("setting", self.course.setting, by_name)]
+
+    @property
+    def prices(self) -> list[float]:
+        """The prices that every front is asked for."""
+        return front_prices(self.setting.price_range, self.learning.prices)
+
+    @property
+    def inner(self) -> list[bool]:
+        """Which prices lie in the inner part of the range, in the logarithm."""
+        low, high = self.setting.price_range
+        price = Price(None, (low, high))
+        first, last = self.learning.inner
+        places = price.encode(np.array(self.prices)).tolist()
+        return [first <= place <= last for place in places]
+
+    @property
+    def episodes(self) -> int:
+        """Test episodes."""
+        return self.learning.test_episodes or self.suite.episodes
+
+    @property
+    def report(self) -> Path:
+        """The table for readers that is written last."""
+        return self.output / self.setting.name / "learning.csv"
+
+    @property
+    def throughput(self) -> Path:
+        """The JSON of this machine's steps per second."""
+        return self.work / self.setting.name / "throughput.json"
+
+    @functools.cached_property
+    def envelopes(self) -> dict[str, Any]:
+        """The committed file of the setting's envelopes."""
+        committed_classes(
+            self.suite, self.setting, self.results
+        )  # made from what the suite says now
+        return read_envelopes(self.results / self.setting.name)
+
+    def envelope(self, name: str) -> dict[str, Any]:
+        """A class of the committed envelopes.
+
+        Raises:
+            ConfigurationError: there is none of that name.
+        """
+        classes = self.envelopes["classes"]
+        return classes[choice("class", name, classes)]
+
+    @property
+    def classes(self) -> list[str]:
+        """The classes of the committed envelopes that it is compared with."""
+        own = [] if self.solved else [self.course.against]
+        return own + ([self.course.memoryless] if self.course.memoryless else [])
+
+    @property
+    def memoryless(self) -> list[EnvelopePoint] | None:
+        """The envelope to get below while learning, as it was measured on the test seeds."""
+        name = self.course.memoryless
+        return None if name is None else hull_of(self.envelope(name))
+
+    def below(self, front: Points) -> bool:
+        """Whether a front is below the rules without memory; it counts from the middle's begin."""
+        if self.memoryless is None:
+            return False
+        return is_below(front, self.memoryless, MIDDLE[0] * self.envelopes["always"])
+
+    @property
+    def solved(self) -> bool:
+        """Whether the finished front is compared with an optimum, by costs."""
+        return self.course.against in SOLVED
+
+    @property
+    def vertices(self) -> list[dict[str, Any]]:
+        """The vertices of the envelope that the finished front is compared with, if it is one."""
+        own = self.course.against
+        return list(self.envelope(own)["vertices"]) if own in self.classes else []
+
+    @property
+    def tests(self) -> list[Test]:
+        """What the finished front is compared with, to be run on the test episodes."""
+
+        def test(policy: str, options: dict[str, Any]) -> Test:
+            return Test(
+                self.setting, tuple(options.items()), policy, self.episodes, self.suite.seed
+            )
+
+        free = {"cost_weight": 0.0}  # what was spent is counted at each price
+        if self.course.against == "optimum":
+            return [test(f"optimal:price={price!r}", free) for price in self.prices]
+        if self.course.schedules:
+            return [test(policy, free) for policy in self.course.schedules]
+        return [test(vertex["policy"], vertex["options"]) for vertex in self.vertices]
+
+    def experiment(self, kind: Kind, seed: int) -> Experiment:
+        """The training of one seed, with the measurements' spacing.
+
+        Raises:
+            ConfigurationError: a config that is not allowed.
+        """
+        if kind == "front":
+            value, every = load_checked(Experiment, self.course.front, "front"), self.learning.every
+        else:
+            value = self._plain()
+            every = self.learning.plain.every
+        plain = value.model_dump()
+        plain["validation"]["every"] = every
+        plain["training"] |= {"seed": seed, "threads": 1}
+        plain["training"]["timesteps"] = self.learning.timesteps or value.training.timesteps
+        plain["output"] = str(self.work / self.setting.name / f"{kind}_{seed}")
+        return parse(Experiment, plain, self.course.front, "front")
+
+    def _plain(self) -> Experiment:
+        """Plain PPO's training: without memory, on the squared error, at the suite's prices."""
+        setting, plain, course = self.setting, self.learning.plain, self.course
+        own = setting.price_exponent
+        priced = {"cost_weight": "random", "price_range": list(setting.price_range)}
+        return Experiment(
+            environment=EnvironmentConfig(
+                id=setting.environment.id, options=setting.environment.options | priced
+            ),
+            algorithm=self.learning.algorithm_of(course),
+            training=TrainingConfig(
+                timesteps=round(plain.timesteps * course.plain.longer),
+                num_envs=plain.num_envs,
+                price_exponent=self.suite.price_exponent if own is None else own,
+            ),
+            validation=ValidationConfig(episodes=512),
+            output=str(self.work),
+        )
+
+    def task(self) -> Task:
+        """What a finished front is tested in: its own environment, without a price in sight.
+
+        Where costs are compared tokens are free of charge, and counted at each price.
+        """
+        where = load_checked(Experiment, self.course.front, "front").environment
+        priced = ("cost_weight", "price_range")
+        own = {key: value for key, value in where.options.items() if key not in priced}
+        return make_task(where.id, **(own | ({"cost_weight": 0.0} if self.solved else {})))
+
+    def check(self) -> None:
+        """Whether the front knows what it is compared with: neither less nor more.
+
+        Raises:
+            ConfigurationError: another environment, setting or class; names the first difference.
+        """
+        where = load_checked(Experiment, self.course.front, "front").environment
+        options: dict[str, Any] = {}
+        local, free = False, set(_FREE)
+        if self.course.against == "schedules":
+            options = {"information": "centre"}
+        elif self.course.against == "optimum":
+            free.add("memory")  # it knows the errors themselves
+        else:
+            compared = self.envelope(self.course.against)
+            options, local = compared["options"], compared["mode"] == "local"
+        expected = {"id": self.setting.environment.id, "local": local}
+        expected |= envelope_task(self.setting, options.items()).settings
+        value = {"id": where.id, "local": where.local} | self.task().settings
+        expected |= {"cost_weight": "random", "price_range": list(self.setting.price_range)}
+        value |= {key: where.options.get(key) for key in ("cost_weight", "price_range")}
+        for key in dict.fromkeys([*expected, *value]):
+            if key not in free and value.get(key) != expected.get(key):
+                raise ConfigurationError(
+                    f"front = {self.course.front!r}: {key} = {value.get(key)!r} is not allowed in "
+                    f"{self.setting.name}: what it is compared with has {expected.get(key)!r}"
+                )
+
+
+class LearningRun(NamedTuple):
+    """The training of one seed in a setup; ``budget`` in processor seconds ends a plain one."""
+
+    setup: LearningSetup
+    kind: Kind
+    seed: int
+    budget: float = math.inf
+
+    @property
+    def experiment(self) -> Experiment:
+        """What is trained."""
+        return self.setup.experiment(self.kind, self.seed)
+
+    @property
+    def path(self) -> Path:
+        """The JSON of what it taught."""
+        return self.setup.work / self.setup.setting.name / f"{self.kind}_{self.seed}.json"
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """All that its result depends on, the budget apart."""
+        setup, course = self.setup, self.setup.course
+        return {
+            "training": training_of(self.experiment),
+            "course": course.model_dump(mode="json"),
+            "prices": setup.prices,
+            "episodes": setup.learning.episodes,
+            "test": {"episodes": setup.episodes, "seed": setup.suite.seed},
+            "envelopes": {name: setup.envelope(name)["sha256"] for name in setup.classes},
+        }
+
+    def result(self) -> dict[str, Any] | None:
+        """What it taught, if it is finished.
+
+        Raises:
+            ConfigurationError: the file is damaged, or was made from other inputs.
+        """
+        if not self.path.exists():
+            return None
+        content = read_json(self.path, "work")
+        check_inputs(self.inputs, content.get("inputs"), repr(str(self.path)))
+        return content
+
+
+def finished_runs(setup: LearningSetup, kind: Kind, seeds: int) -> list[dict[str, Any]]:
+    """What the first so many seeds taught, as far as they are finished.
+
+    Raises:
+        ConfigurationError: a file is damaged, or was made from other inputs.
+    """
+    results = [LearningRun(setup, kind, seed).result() for seed in range(seeds)]
+    return [result for result in results if result is not None]
+
+
+def report(setup: LearningSetup, seeds: int) -> dict[str, Any]:
+    """Write the setup's tables again and return what they hold; runs may end side by side."""
+    folder = setup.report.parent
+    folder.mkdir(parents=True, exist_ok=True)
+    with FileLock(setup.work / f".{setup.setting.name}.lock"):
+        speed = setup.throughput
+        write_learning(
+            folder,
+            {
+                "title": setup.setting.title,
+                "env": setup.setting.environment.id,
+                "course": setup.course.model_dump(mode="json"),
+                "prices": setup.prices,
+                "inner": setup.inner,
+                "seeds": seeds,
+                "fronts": finished_runs(setup, "front", seeds),
+                "plain": finished_runs(setup, "plain", min(seeds, setup.learning.plain.seeds)),
+            }
+            | ({"throughput": read_json(speed, "work")} if speed.exists() else {}),
+        )
+    return read_learning(folder)
+
+
+def write_learning(folder: Path, content: Mapping[str, Any]) -> None:
+    """Write the tables of a setup, the setup itself at the end."""
+    runs = [
+        {"kind": kind} | run
+        for kind, key in (("front", "fronts"), ("plain", "plain"))
+        for run in content[key]
+    ]
+    tables: dict[str, list[dict[str, Any]]] = {
+        "learning_trainings": runs,
+        "learning_curves": [
+            run | point | {"rate": rate, "mse": mse}
+            for run in runs
+            for point in run["curve"]
+            for rate, mse in point["front"]
+        ],
+        "learning_points": [
+            {"seed": front["seed"]} | point
+            for front in content["fronts"]
+            for point in front["points"]
+        ],
+        "learning": [dict(content)],
+    }
+    for table, rows in tables.items():
+        write_rows(folder, table, rows)
+
+
+def read_learning(folder: Path) -> dict[str, Any]:
+    """Return what a setup has found, from its tables.
+
+    Raises:
+        ConfigurationError: a table that cannot be read or is of another shape.
+    """
+    curves: dict[tuple[str, int], dict[int, dict[str, Any]]] = {}
+    for row in read_rows(folder, "learning_curves", "output"):
+        curve = curves.setdefault((row.pop("kind"), row.pop("seed")), {})
+        place = [row.pop("rate"), row.pop("mse")]
+        curve.setdefault(row["timesteps"], {"excess": None} | row | {"front": []})
+        curve[row["timesteps"]]["front"].append(place)
+    points = group_by(read_rows(folder, "learning_points", "output"), "seed")
+    runs: dict[str, list[dict[str, Any]]] = {"front": [], "plain": []}
+    for row in read_rows(folder, "learning_trainings", "output"):
+        kind = row.pop("kind")
+        row["curve"] = list(curves.get((kind, row["seed"]), {}).values())
+        if kind == "front":
+            row["points"] = points.get(row["seed"], [])
+        runs[kind].append(row)
+    result: dict[str, Any] = {"setting": folder.name, "throughput": None}
+    result |= dict(*read_rows(folder, "learning", "output")[:1])
+    result |= {"fronts": runs["front"], "plain": runs["plain"]}
+    result["reached"] = {
+        kind: [first_below(item) for item in every] for kind, every in runs.items()
+    }
+    return result | {"finished": judge_fronts(result)}
+
+
+def first_below(run: Mapping[str, Any]) -> dict[str, Any]:
+    """When a training's front first was below the memoryless envelope over its whole range.
+
+    Without ``first`` it never was, or there is no such envelope; ``above_later`` counts the
+    measurements after it that were not below.
+    """
+    curve = run["curve"]
+    result: dict[str, Any] = {
+        "seed": run["seed"],
+        "timesteps": curve[-1]["timesteps"],
+        "cpu_seconds": curve[-1]["cpu_seconds"],
+    }
+    below = [place for place, point in enumerate(curve) if point.get("below")]
+    if below:
+        first, later = curve[below[0]], curve[below[0] :]
+        result["first"] = {
+            "timesteps": first["timesteps"],
+            "cpu_seconds": first["cpu_seconds"],
+            "excess": first["excess"],
+            "rates": range_of(first["front"]),
+            "above_later": sum(not point["below"] for point in later),
+        }
+    return result
+
+
+def judge_fronts(setup: Mapping[str, Any]) -> dict[str, Any] | None:
+    """All seeds' finished fronts at the prices that count, beside what they are compared with.
+
+    With an optimum all prices count, otherwise the inner ones. ``above`` are seeds and prices
+    whose whole interval lies more than the allowed share above, ``worst`` has the largest
+    difference, ``rates`` are the lowest and the highest, ``closed`` the share of the gaps to
+    rollout and bound.
+    """
+    course = setup["course"]
+    counted = [course["against"] in SOLVED or inside for inside in setup["inner"]]
+    points = [
+        point | {"seed": front["seed"]}
+        for front in setup["fronts"]
+        for point, counts in zip(front["points"], counted, strict=True)
+        if counts and "difference" in point
+    ]
+    if not points:
+        return None
+    above = [p for p in points if p["difference"]["low"] > course["allowed"]]
+    worst = max(points, key=lambda point: float(point["difference"]["mean"]))
+    return {
+        "compared": len(points),
+        "above": [{key: p[key] for key in ("seed", "price", "difference")} for p in above],
+        "worst": {key: worst[key] for key in ("seed", "price", "difference")},
+        "rates": [choose(point["rate"] for point in points) for choose in (min, max)],
+        "mean": sum(p["difference"]["mean"] for p in points) / len(points),
+        "closed": {name: gap_share(points, name) for name in ("rollout", "bound")},
+    }
+
+
+def gap_share(points: Sequence[Mapping[str, Any]], name: str) -> float | None:
+    """The share of the gap between the envelope and what is known beyond it that is closed.
+
+    Over all points whose rate has both; ``None`` where nothing lies between.
+    """
+    known = [point for point in points if name in point]
+    gap = sum(point["envelope"] - point[name] for point in known)
+    return sum(point["envelope"] - point["mse"] for point in known) / gap if gap > 0.0 else None
+
+
+def run_reference(test: Test, work: Path) -> None:
+    """Run what a finished front is compared with on the test episodes, if that was not done."""
+    torch.set_num_threads(1)
+    if not test.path(work).exists():
+        run_test(test, work)
+
+
+def run_course(run: LearningRun, seeds: int) -> None:
+    """Train one seed, measure its front on the way, and test it if it is one with credit.
+
+    The setup's report, over so many ``seeds``, then holds it.
+
+    Raises:
+        KeyboardInterrupt: the training was interrupted.
+    """
+    torch.set_num_threads(1)
+    experiment, setup = run.experiment, run.setup
+    folder = Path(experiment.output)
+    measure: Measure = meter(experiment, setup.prices, setup.learning.episodes)
+    enough = False
+
+    def watch(record: dict[str, Any]) -> bool:
+        nonlocal enough
+        if run.kind == "plain":
+            enough = setup.below(record["front"]) or record["cpu_seconds"] >= run.budget
+        return enough
+
+    summary = train(
+        experiment, resume=holds_training(folder), quiet=True, watch=watch, measure=measure
+    )
+    if not summary["finished"] and not enough:
+        raise KeyboardInterrupt
+    result = {
+        "seed": run.seed,
+        "inputs": run.inputs,
+        "algorithm": experiment.algorithm.name,
+        "curve": curve(setup, folder),
+    }
+    if run.kind == "front":
+        result["points"] = evaluate_front(setup, folder / "best_model.zip")
+    write(run.path, result)
+    report(setup, seeds)
+
+
+def curve(setup: LearningSetup, folder: Path) -> list[dict[str, Any]]:
+    """The fronts of a training, with what they are above the rules without memory by.
+
+    ``cpu_seconds`` are of environment, policy and updates, on all threads.
+    """
+    lines = (folder / "validation.jsonl").read_text(encoding="utf-8").splitlines()
+    result = []
+    for record in map(json.loads, lines):
+        point = {key: record[key] for key in ("timesteps", "cpu_seconds", "return", "front")}
+        if setup.memoryless is not None:
+            above = excess_over(point["front"], setup.memoryless)
+            point["excess"] = above if above < float("inf") else None
+            point["below"] = setup.below(point["front"])
+        result.append(point)
+    return result
+
+
+def evaluate_front(setup: LearningSetup, model: Path) -> list[dict[str, Any]]:
+    """A finished front on the test episodes, price by price, beside what it is compared with.
+
+    Raises:
+        ConfigurationError: a rule does other than its committed envelope says.
+    """
+    references = {test.name: test.read(setup.work) for test in setup.tests}
+    for vertex in setup.vertices if setup.episodes == setup.suite.episodes else []:
+        check_vertex(vertex, references[vertex["name"]])
+    task, result = setup.task(), []
+    for place, price in enumerate(setup.prices):
+        policy = make_policy(f"model:{model},price={price!r}", task)
+        agent = run_episodes(task, policy, setup.episodes, setup.suite.seed)
+        point: dict[str, Any] = {
+            "price": price,
+            "rate": float(agent.rate.mean()),
+            "mse": float(agent.mse.mean()),
+        }
+        if setup.course.against == "optimum":
+            point |= above_optimum(price, task.horizon, agent, [list(references.values())[place]])
+        elif setup.course.schedules:
+            point |= above_optimum(price, task.horizon, agent, references.values())
+        else:
+            point |= beside_envelope(setup, agent, references)
+        result.append(point)
+    return result
+
+
+def above_optimum(
+    price: float, horizon: int, agent: EpisodeResults, candidates: Iterable[EpisodeResults]
+) -> dict[str, Any]:
+    """The cost of an episode at a price, and that of the candidate that costs least there.
+
+    All of them with tokens that cost nothing.
+    """
+
+    def returns(results: EpisodeResults) -> Array:
+        return results.returns - price * horizon * results.tokens
+
+    own = returns(agent)
+    best = max(map(returns, candidates), key=lambda each: float(each.mean()))
+    return {
+        "cost": -float(own.mean()),
+        "optimum": -float(best.mean()),
+        "difference": excess(own, best),
+    }
+
+
+def beside_envelope(
+    setup: LearningSetup, agent: EpisodeResults, references: Mapping[str, EpisodeResults]
+) -> dict[str, Any]:
+    """The line through the references at the front's own rate; left of it there is nothing."""
+    rate = float(agent.rate.mean())
+    below = best_mse(references, rate)
+    if below is None:
+        return {}
+    front = AgentFront(
+        agent.mse[None, None], below[None, None], np.array([[rate]]), np.ones((1, 1, 1))
+    )
+    difference = interval(front, np.array([rate]))
+    known = best_known(setup, rate, references)
+    return {"envelope": float(below.mean()), "difference": difference} | known
+
+
+def best_known(
+    setup: LearningSetup, rate: float, envelope: Mapping[str, EpisodeResults]
+) -> dict[str, float]:
+    """What is known of the best possible at a rate: a ``rollout`` and a lower ``bound``.
+
+    The rollout was run on the first of the test episodes: it is taken as a share of the envelope
+    on these, times the envelope on all.
+    """
+    result, folder = {}, setup.results / setup.setting.name
+    rollout, episodes = rollout_of(folder)
+    same = replace_value(setup.envelope(setup.course.against)["knows"]) == "scheduler_memory"
+    inside = same and bool(rollout) and rollout[0].rate <= rate <= rollout[-1].rate
+    below, own = best_mse(envelope, rate), height(rollout, rate) if inside else None
+    if own is not None and below is not None:
+        result["rollout"] = own / float(below[:episodes].mean()) * float(below.mean())
+    bound = bound_of(folder)
+    if bound is not None:
+        result["bound"] = at_least(bound, rate)
+    return result

@@ -1,0 +1,622 @@
+"""The pages of the results: data frames made of the tables, rendered by the templates.
+
+A new column of a page is a new entry in the rows of one of these frames.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import pandas as pd
+from rich.markdown import Markdown
+from rich.table import Table
+
+from fusion_gym.evaluation.envelope import EnvelopePoint, height
+from fusion_gym.validation import ConfigurationError, choice
+
+from ..output.markup import NONE, code, markup_number, plain_text, ranged, share
+from ..output.tables import table_tables
+from .config import NOMINAL, SOLVED, load_suite
+from .references import at_least, bound_of, hull_of, path_of, read_envelopes, rollout_of
+from .tables import VERDICT, Row, group_by, read_rows
+from .verdict import MIDDLE, RATES, SHARES, is_gain, read_cases
+
+ABOVE = 0.01  # a point lies above the envelope where its whole interval is further up than this
+HEADLINE = 0.2  # of the rate that always transmitting gets: where single errors are named
+LEAST_ROOM = 0.05  # below that the share of it that an agent closes says nothing
+ESTIMATE = "packets that hold the estimate"
+KNOWING = {
+    "memory": "memory, of a scheduler",
+    "hearing": "hearing, of sensors alone",
+    "deciding together": "deciding together",
+    ESTIMATE: "a packet with the estimate",
+}
+# Where a kind of knowledge is nothing of its own, and why.
+_REASONS = {
+    ("memory", "fusion_gym/MarkovJumpTracking-v0"): "nodes remember by themselves",
+    ("memory", "fusion_gym/RemoteEstimation-v0"): "nothing to remember",
+    (ESTIMATE, "fusion_gym/MarkovJumpTracking-v0"): "packets hold the node's estimate",
+    (ESTIMATE, "fusion_gym/UnknownInput-v0"): "the centre begins anew from what was sent",
+    (ESTIMATE, "fusion_gym/RemoteEstimation-v0"): "a packet is the value itself",
+}
+_MARKED = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def _percent(value: float) -> str:
+    """Return a share, with a digit behind the point where it is small."""
+    return f"{100.0 * value:.1f} %" if abs(value) < 0.0995 else f"{100.0 * value:.0f} %"
+
+
+TEMPLATES = jinja2.Environment(
+    loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates")),
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+    undefined=jinja2.StrictUndefined,
+)
+TEMPLATES.filters |= {
+    "share": share, "percent": _percent, "text": plain_text, "code": code, "ranged": ranged,
+    "mean": lambda values: float(np.mean(values)),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SettingResults:
+    """A setting's tables as pages and figures need them.
+
+    ``seeds[class]`` has rate and error at each price, by training seed; ``ahead`` are the
+    scheduler's references and ``known`` the centre's. What is not there is empty.
+    """
+
+    name: str
+    verdict: Row
+    classes: dict[str, Row]
+    worths: list[Row]
+    envelopes: Row
+    ahead: list[EnvelopePoint]
+    known: list[EnvelopePoint]
+    genie: Row | None
+    seeds: dict[str, list[list[tuple[float, float]]]]
+    validation: Row
+    rollout: list[EnvelopePoint]
+    rollout_episodes: int
+    bound: Row | None
+
+    @property
+    def label(self) -> str:
+        """The setting's name for readers: its title up to the first comma."""
+        return str(self.verdict["title"].split(",")[0])
+
+    @property
+    def always(self) -> float:
+        """The rate of always transmitting."""
+        return float(self.verdict["always"])
+
+    @property
+    def optimal(self) -> bool:
+        """Whether the scheduler's reference is the optimum."""
+        names = [point.name for point in self.ahead]
+        return bool(names) and all(name.startswith("optimal:") for name in names)
+
+    @property
+    def broadcast(self) -> str:
+        """What a sensor alone receives in the environment as it is."""
+        inputs = self.envelopes.get("inputs", {})
+        every = [front["broadcast"] for front in self.classes.values() if front["broadcast"]]
+        return str(next(iter([*inputs.get("broadcasts", ()), *every]), "none"))
+
+    @property
+    def known_classes(self) -> dict[str, Row]:
+        """The classes with agents, and committed ones where no class of the kind has any."""
+        committed = self.envelopes.get("classes", {})
+        there = {kind_of(front) for front in self.classes.values()}
+        others = {name: of for name, of in committed.items() if kind_of(of) not in there}
+        every = others | self.classes
+        return {name: every[name] for name in dict.fromkeys([*committed, *every]) if name in every}
+
+    def hull(self, name: str) -> list[EnvelopePoint]:
+        """Return the envelope of a class on the test seeds; empty without one."""
+        if name in self.classes:
+            return [
+                EnvelopePoint(p["name"], p["rate"], p["mse"])
+                for p in self.classes[name]["envelope"]
+            ]
+        committed = self.envelopes.get("classes", {})
+        return hull_of(committed[name]) if name in committed else []
+
+    def rules_at(self, name: str, rate: float) -> float | None:
+        """Return the error of a class's rules at a rate."""
+        hull = self.hull(name)
+        return height(hull, rate) if hull else None
+
+    def bound_at(self, rate: float) -> float:
+        """Return the proven bound at a rate."""
+        assert self.bound is not None
+        return at_least(self.bound, rate)
+
+    def worth(self, kind: str) -> Row:
+        """Return the row that stands for a kind: with memory if there is, of the farthest apart."""
+        rows = [row for row in self.worths if row["kind"] == kind]
+        if kind == "memory":
+            rows = [row for row in rows if row["knows"] == "sensors_memory"]
+        if kind == "hearing":
+            rows = [
+                row
+                for row in rows
+                if row["knows"].startswith("local_packets")
+                and row["less"].startswith(f"local_{self.broadcast}")
+            ]
+        return min(rows, key=lambda row: "memory" not in row["knows"], default={})
+
+    def reason(self, kind: str) -> str:
+        """Return why there is nothing of a kind, in a word."""
+        absent = f"fewer than half of {RATES} rates in common" if self.worth(kind) else ""
+        return _REASONS.get((kind, self.verdict["env"]), absent or "not compared")
+
+    def middle(self, name: str) -> str:
+        """Return a class's agents against its rules over the middle, or why there is nothing."""
+        if name in self.classes:
+            middle = self.classes[name].get("middle")
+            return share(middle) if middle else "no price in the middle"
+        return _REASONS.get(("memory", self.verdict["env"]), "no agents")
+
+    def sides(self) -> dict[str, list[Row]]:
+        """Return the fronts whose middle lies below, above or on both sides of the rules."""
+        sides: dict[str, list[Row]] = {"below": [], "above": [], "apart": []}
+        for front in self.classes.values():
+            if "middle" in front:
+                low, high = front["middle"]["low"], front["middle"]["high"]
+                sides["below" if high < 0.0 else "above" if low > 0.0 else "apart"].append(front)
+        return {side: fronts for side, fronts in sides.items() if fronts}
+
+    def gap(self, name: str) -> tuple[float, float] | None:
+        """Return how far rules and agents lie above a class's reference, over the middle."""
+        low, high = (end * self.always for end in MIDDLE)
+        points = self.classes[name]["points"] if name in self.classes else []
+        inside = [p for p in points if "reference" in p and low <= p["rate"] <= high]
+        below = sum(point["reference"] for point in inside)
+        if not inside or below <= 0.0:
+            return None
+        rules, agents = (sum(point[key] for point in inside) / below for key in ("envelope", "mse"))
+        return rules - 1.0, agents - 1.0
+
+    @property
+    def referred(self) -> list[str]:
+        """The classes with a reference of which something is said."""
+        scheduler = "sensors" if "sensors" in self.classes else "sensors_memory"
+        return [name for name in (scheduler, "centre") if self.gap(name)]
+
+    def reference(self, front: Mapping[str, Any]) -> str:
+        """Return what a class is referred to, in words."""
+        if front["mode"] == "centre":
+            return "the best periodic schedules"
+        return "the optimum" if self.optimal else "a lookahead with the model"
+
+
+def kind_of(content: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Return who decides, what a sensor alone receives, and what a packet holds."""
+    packet = content.get("packet") or content["options"].get("packet", "measurement")
+    return content["mode"], content["broadcast"] or "", str(packet)
+
+
+def read_results(results: Path) -> dict[str, SettingResults]:
+    """Return every setting that is judged, by name.
+
+    Raises:
+        ConfigurationError: there are none, or a table that cannot be read.
+    """
+    found = sorted(results.glob(f"*/{VERDICT}.csv"))
+    if not found:
+        earlier = ", and not JSON of an earlier version" * any(results.glob(f"*/{VERDICT}.json"))
+        raise ConfigurationError(
+            f"results = {str(results)!r} is not allowed: it must hold tables of the "
+            f"benchmark{earlier}"
+        )
+    return {path.parent.name: read_setting(path.parent) for path in found}
+
+
+def read_setting(folder: Path) -> SettingResults:
+    """Return one setting's results.
+
+    Raises:
+        ConfigurationError: a table that cannot be read or is of another shape.
+    """
+    verdict = read_verdict(folder)
+    classes = verdict.pop("classes")
+    policies = group_by(read_rows(folder, "policies"), "run")
+    seeds: dict[str, list[list[tuple[float, float]]]] = {}
+    validation: Row = {}
+    for run in read_rows(folder, "runs"):
+        if run.get("class") in classes:
+            validation = validation or run["inputs"]["training"]["validation"]
+            points = [(rate_of(p), p["mse"]["mean"]) for p in policies.get(run["run"], [])]
+            if len(points) == len(classes[run["class"]]["points"]):
+                seeds.setdefault(run["class"], []).append(points)
+    rollout, episodes = rollout_of(folder)
+    committed = path_of(folder.parent, folder.name)
+    return SettingResults(
+        name=folder.name,
+        verdict=verdict,
+        classes=classes,
+        worths=verdict.pop("worth"),
+        envelopes=read_envelopes(folder) if committed.exists() else {},
+        ahead=_places(policies.get("informed", [])),
+        known=_places(policies.get("references", [])),
+        genie=next(iter(policies.get("genie", [])), None),
+        seeds=seeds,
+        validation=validation,
+        rollout=rollout,
+        rollout_episodes=episodes,
+        bound=bound_of(folder),
+    )
+
+
+def read_verdict(folder: Path) -> Row:
+    """Return the verdict of a setting, with its classes by name.
+
+    Raises:
+        ConfigurationError: a table that cannot be read or is of another shape.
+    """
+    rows = read_rows(folder, VERDICT)
+    if len(rows) != 1 or rows[0]["always"] <= 0.0:
+        path = str(folder / f"{VERDICT}.csv")
+        raise ConfigurationError(
+            f"results = {path!r}: always = {[row['always'] for row in rows]} is not allowed: it "
+            "must be one positive rate"
+        )
+    parts = {
+        part: group_by(read_rows(folder, table), "class")
+        for part, table in (("points", "points"), ("at", "equal_rates"), ("envelope", "envelope"))
+    }
+    classes: dict[str, Row] = {}
+    for row in read_rows(folder, "fronts"):
+        name = row.pop("class")
+        classes[name] = {"broadcast": None} | row
+        classes[name] |= {part: every.get(name, []) for part, every in parts.items()}
+    return rows[0] | {"classes": classes, "worth": read_rows(folder, "worth")}
+
+
+def _places(policies: Sequence[Row]) -> list[EnvelopePoint]:
+    result = [EnvelopePoint(p["name"], rate_of(p), p["mse"]["mean"]) for p in policies]
+    return sorted(result, key=lambda point: (point.rate, point.mse))
+
+
+def rate_of(policy: Row) -> float:
+    """Return a tested policy's mean rate per sensor and step."""
+    return float(sum(policy["rate"]) / len(policy["rate"]))
+
+
+def cell(points: Sequence[EnvelopePoint], rate: float) -> str:
+    """Return the error at a rate between the points, or a dash."""
+    computed = bool(points) and points[0].rate > 0.0  # point by point: it ends with the last one
+    if not points or (computed and rate > points[-1].rate):
+        return NONE
+    result = height(points, rate)
+    return NONE if result is None else f"{result:.4g}"
+
+
+def above_of(front: Row) -> tuple[list[Row], int]:
+    """Return the points whose whole interval is above the envelope, and of how many."""
+    compared = [point for point in front["points"] if "difference" in point]
+    return [point for point in compared if point["difference"]["low"] > ABOVE], len(compared)
+
+
+def count_above(settings: Sequence[SettingResults]) -> tuple[int, int]:
+    """Return how many points of all classes lie above the envelope, and of how many."""
+    pairs = [above_of(front) for item in settings for front in item.classes.values()]
+    return sum(len(points) for points, _ in pairs), sum(count for _, count in pairs)
+
+
+# The frames of the report.
+
+
+def knowing_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
+    """Return what knowing more is worth to rules and to agents."""
+    return pd.DataFrame(
+        {"setting": plain_text(item.label), "of": who}
+        | {
+            head: share(item.worth(kind)[who]) if who in item.worth(kind) else item.reason(kind)
+            for kind, head in KNOWING.items()
+        }
+        for item in settings
+        for who in ("rules", "agents")
+    )
+
+
+def learning_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
+    """Return what learning is worth: agents against the rules of the same class."""
+    return pd.DataFrame(
+        {
+            "setting": plain_text(item.label),
+            "centre": item.middle("centre"),
+            "alone": item.middle(f"local_{item.broadcast}"),
+            "alone, memory": item.middle(f"local_{item.broadcast}_memory"),
+            "scheduler": item.middle("sensors"),
+            "scheduler, memory": item.middle("sensors_memory"),
+        }
+        for item in settings
+    )
+
+
+def headline_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
+    """Return the front page's table: what memory is worth to rules, and what learning is."""
+    frame, knowing = learning_frame(settings), knowing_frame(settings)
+    memory = knowing[knowing["of"] == "rules"][KNOWING["memory"]].to_numpy()
+    frame.insert(1, "rules of a scheduler: memory", memory)
+    return frame
+
+
+def classes_frame(results: SettingResults) -> pd.DataFrame:
+    """Return how the agents of each class did."""
+    rows = []
+    for name, front in results.classes.items():
+        above, count = above_of(front)
+        hindsight = front.get("hindsight_room")
+        rows.append(
+            {
+                "class": plain_text(name),
+                "seeds": front["seeds"],
+                "agents against rules, middle": share(front["middle"])
+                if "middle" in front
+                else "no price there",
+                "rates there": f"{len(front.get('rates', []))} of {RATES}",
+                "points above +1 %": f"{len(above)} of {count}",
+                "share of the gap to the reference closed": _closed(results, front),
+                "in hindsight": NONE if hindsight is None else f"{-hindsight:+.0%}",
+                "rules at a fifth of the rate": _strongest(results, name),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _closed(results: SettingResults, front: Row) -> str:
+    """Return how much of the room between rules and reference the agents close."""
+    if not any("reference" in point for point in front["points"]):
+        return "no reference"
+    what = results.reference(front).removeprefix("the ").removeprefix("a ")
+    room = front.get("room")
+    if room is None:
+        return f"none is left to {what}"
+    if room < LEAST_ROOM:
+        return f"room {room:.1%} only ({what})"
+    return f"{front['closed']:.0%} of {room:.1%} ({what})"
+
+
+def _strongest(results: SettingResults, name: str) -> str:
+    """Return the rules that are mixed at a typical rate, without their parameters."""
+    hull, rate = results.hull(name), HEADLINE * results.always
+    left = [point for point in hull if point.rate <= rate][-1:]
+    right = [point for point in hull if point.rate > rate][:1]
+    rules = dict.fromkeys(point.name.split(":")[0].split(" [")[0] for point in (*left, *right))
+    return ", ".join(code(rule) for rule in rules) or NONE
+
+
+def rates_frame(results: SettingResults) -> pd.DataFrame:
+    """Return rules and agents of each class at a few rates."""
+    simulated = "simulated"
+    if results.rollout:
+        simulated += f" ({results.rollout_episodes} episodes)"
+    classes = results.known_classes
+    rows = []
+    for name, front in classes.items():
+        last = "sensors_memory" if "sensors_memory" in classes else "sensors"
+        for row in front.get("at") or [{"rate": part * results.always} for part in SHARES]:
+            rate = row["rate"]
+            rules = markup_number(row.get("rules"))
+            if "at" not in front:  # without agents
+                error = results.rules_at(name, rate)
+                rules = NONE if error is None else f"{error:.4g}"
+            rows.append(
+                {
+                    "class": plain_text(name),
+                    "rate": f"{rate:.4g}",
+                    "rules": rules,
+                    "agents": markup_number(row.get("agents")),
+                    "difference": share(row.get("difference")),
+                    simulated: cell(results.rollout, rate) if name == last else NONE,
+                    "proven bound": f"{results.bound_at(rate):.4g}" if results.bound else NONE,
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def text_of(
+    results: Mapping[str, SettingResults], command: str, panels: Mapping[str, Sequence[str]]
+) -> str:
+    """Return the report in Markdown; ``panels`` has the small panels of each setting's figure."""
+    settings = list(results.values())
+    fronts = [front for item in settings for front in item.classes.values()]
+    return _render(
+        "report.md",
+        settings=settings,
+        command=command,
+        panels=panels,
+        trained=[front["seeds"] for front in fronts],
+        tuned=[item.envelopes["inputs"]["tuning"] for item in settings if item.envelopes],
+        validated=[item.validation for item in settings if item.validation],
+    )
+
+
+def _render(template: str, **values: Any) -> str:
+    """Return a template's text; it may call every function of this module."""
+    text = TEMPLATES.get_template(template).render(globals() | values)
+    return text.rstrip("\n") + "\n"
+
+
+# Parts of other pages.
+
+
+def update_pages(text: str, settings: Mapping[str, SettingResults], results: Path) -> str:
+    """Return the text with all its marked parts made again.
+
+    ``<!-- results: SETTING -->`` to ``<!-- end -->`` holds what was found in a setting, with
+    ``headline`` in its place the table of all settings and how many points lie above envelopes,
+    and with ``robustness`` what the folder ``results`` has of perturbed cases.
+
+    Raises:
+        ConfigurationError: a setting that neither the results nor the benchmark has.
+    """
+    titles = {setting.name: setting.title for setting in load_suite("benchmark").settings}
+
+    def part(match: re.Match[str]) -> str:
+        choice("results", match[2], dict.fromkeys(["headline", "robustness", *settings, *titles]))
+        content = _render(
+            "part.md",
+            name=match[2],
+            settings=list(settings.values()),
+            trained=[f["seeds"] for item in settings.values() for f in item.classes.values()],
+            results=settings.get(match[2]),
+            reports=read_cases(results, list(titles)),
+            titles=titles,
+        )
+        return f"{match[1]}\n{content}\n{match[3]}"
+
+    return _MARKED.sub(part, text)
+
+
+# Perturbed cases.
+
+
+def robustness_frame(reports: Sequence[Row], titles: Mapping[str, str]) -> pd.DataFrame:
+    """Return in how many cases agents are ahead of the rules; ``titles`` of settings by name."""
+    rows = []
+    for report in reports:
+        choice("setting", report["setting"], titles)
+        cases = report["cases"]
+        for kind, name in (("agents", "as they are"), ("trained", "trained over draws")):
+            if kind not in cases[NOMINAL]:
+                continue
+            result = {
+                row["title"]: row[kind]["middle"]
+                for case, row in cases.items()
+                if case != NOMINAL and "middle" in row.get(kind, {})
+            }
+            better = sum(is_gain(middle) for middle in result.values())
+            worse = sum(middle["low"] > 0.0 for middle in result.values())
+            worst = max(result, key=lambda title: float(result[title]["mean"]), default="")
+            rows.append(
+                {
+                    "setting": plain_text(titles[report["setting"]].partition(",")[0]),
+                    "agents": name,
+                    "as assumed": share(cases[NOMINAL][kind].get("middle")),
+                    "better": better,
+                    "undecided": len(result) - better - worse,
+                    "worse": worse,
+                    "at worst": f"{share(result[worst])}, {plain_text(worst)}" if worst else NONE,
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def robustness_text(results: Path, titles: Mapping[str, str], command: str) -> str:
+    """Return the page of perturbed cases of the settings with these titles.
+
+    Raises:
+        ConfigurationError: a table that cannot be read or is of another shape.
+    """
+    reports = read_cases(results, list(titles))
+    of = {name: [r for r in reports if r["class"] == name] for name in
+          sorted({report["class"] for report in reports})}  # fmt: skip
+    return _render("robustness.md", reports=reports, by_class=of, titles=titles, command=command)
+
+
+# Committed envelopes.
+
+
+def envelopes_text(results: Path, command: str) -> str:
+    """Return the page of the committed rules.
+
+    Raises:
+        ConfigurationError: a table that cannot be read or is of another shape.
+    """
+    folders = [path.parent for path in sorted(results.glob("*/classes.csv"))]
+    content = {folder.name: read_envelopes(folder) for folder in folders}
+    rows = pd.concat([envelopes_frame(results / name, item) for name, item in content.items()])
+    return _render("envelopes.md", command=command, rows=rows, settings=content)
+
+
+def envelopes_frame(folder: Path, envelopes: Row) -> pd.DataFrame:
+    """Return rules at a few rates; simulated were packets with a measurement."""
+    rates = [round(part * envelopes["always"], 4) for part in SHARES]
+    (rollout, episodes), bound = rollout_of(folder), bound_of(folder)
+    hulls: dict[str, dict[bool, list[EnvelopePoint]]] = {}
+    for content in envelopes["classes"].values():
+        mode, broadcast, packet = kind_of(content)
+        held = ESTIMATE if packet == "estimate" else ""
+        name = ", ".join(part for part in (mode, broadcast, held) if part)
+        hulls.setdefault(name, {})[content["memory"]] = hull_of(content)
+    rows = []
+    for name, by_memory in sorted(hulls.items()):
+        for rate in rates:
+            simulated = cell(rollout if name == "sensors" else [], rate)
+            rows.append(
+                {
+                    "setting": folder.name,
+                    "class": name,
+                    "rate": f"{rate:.4g}",
+                    "without memory": cell(by_memory.get(False, []), rate),
+                    "with memory": cell(by_memory.get(True, []), rate),
+                    "rollout": simulated if simulated == NONE else f"{simulated} ({episodes})",
+                    "bound": NONE if bound is None else f"{at_least(bound, rate):.4g}",
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+# How fast agents learn.
+
+
+def learning_text(studies: Sequence[Row], command: str) -> str:
+    """Return the page of how fast agents learn."""
+    return _render("learning.md", studies=studies, command=command, SOLVED=SOLVED)
+
+
+def learning_table(studies: Sequence[Row]) -> Markdown:
+    """Return its first table for the terminal."""
+    rows = TEMPLATES.get_template("learning_rows.md").make_module(globals())
+    return Markdown(str(rows.overview(studies)))  # type: ignore[attr-defined]
+
+
+# The quick benchmark beside the full one.
+
+
+def agreement_table(quick: Path, full: Path, settings: Sequence[str]) -> Table | None:
+    """Return each class of agents over the middle of its front, by both, and whether they agree.
+
+    They agree where their 95 % intervals have a value in common. ``None`` where the folder
+    ``full`` has no verdict of any class that the folder ``quick`` has.
+
+    Raises:
+        ConfigurationError: a verdict that is damaged.
+    """
+    ours, theirs = (
+        pd.DataFrame(
+            [
+                (name, row["class"], row["middle"])
+                for name in settings
+                if (folder / name / "fronts.csv").exists()
+                for row in read_rows(folder / name, "fronts")
+                if "middle" in row
+            ],
+            columns=["setting", "class", "middle"],
+        )
+        for folder in (quick, full)
+    )
+    both = ours.merge(theirs, on=["setting", "class"], suffixes=("_quick", "_full"))
+    if both.empty:
+        return None
+    rows = []
+    for *names, our, their in both.itertuples(index=False):
+        agree = our["low"] <= their["high"] and their["low"] <= our["high"]
+        rows.append((*names, share(our), share(their), "yes" if agree else "no"))
+    agreeing = sum(row[-1] == "yes" for row in rows)
+    return table_tables(
+        "agents against the rules of their class: the quick benchmark and the full one",
+        ("setting", "class", "quick", "full", "agree"),
+        rows,
+        f"{agreeing} of {len(rows)} verdicts agree: their 95 % intervals overlap",
+    )
