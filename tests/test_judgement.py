@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_suite import small_suite
 
-from fusion_gym.agents.reproduction.judging import below
+from fusion_gym.agents.papers.numbers import below
 from fusion_gym.agents.reproduction.round_robin_tobit.judging import always_below
 from fusion_gym.agents.suite import envelopes
 from fusion_gym.agents.suite.classes import classes_of

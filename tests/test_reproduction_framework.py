@@ -15,15 +15,17 @@ from command_runs import Ended, call
 from hostile_folder import contents
 from scipy import stats
 
-from fusion_gym.agents.reproduction import page, papers
-from fusion_gym.agents.reproduction.making import PieceJob, compute_jobs
-from fusion_gym.agents.reproduction.paper import Paper, Piece
-from fusion_gym.agents.reproduction.piece_result import (
-    Claim,
-    Number,
-    NumbersTable,
-    Picture,
-    PieceResult,
+from fusion_gym.agents.papers import cache, page, paper
+from fusion_gym.agents.papers.cache import PieceJob, code_of, simulate_piece
+from fusion_gym.agents.papers.numbers import Number
+from fusion_gym.agents.papers.paper import (
+    Data,
+    Paper,
+    PaperFigure,
+    Parameter,
+    Piece,
+    Settings,
+    numbers_within,
 )
 from fusion_gym.validation import ConfigurationError
 
@@ -32,41 +34,58 @@ PIECES = ("first", "second")
 Calls = list[tuple[str, int, int]]
 
 
+TEMPLATE = """{% from "parts.md" import figure, made, table with context %}
+# The paper {{ paper }}
+
+A. Author, “{{ paper }}”, 2020.
+
+| claim | where | verdict | evidence |
+|---|---|---|---|
+{% for piece in (first, second) %}
+{% call claim(paper ~ " claims | " ~ piece.name, "Section 1", "holds") %}
+{{ piece.count }} drawn
+{% endcall %}
+{% endfor %}
+
+{% for piece in (first, second) %}
+{% call table(piece.tables[piece.name], "Table of " ~ piece.name) %}{% endcall %}
+
+{{ made(piece.name) }}
+{% endfor %}
+{% call figure("figure_5", "Figure 5") %}What to see.{% endcall %}
+"""
+
+
 def a_paper(name: str, calls: Calls, drawn: bool) -> Paper:
     """A paper whose simulations are draws; it notes what is simulated in ``calls``.
 
     With ``drawn`` it has a figure.
     """
 
-    def computing(piece: str) -> Callable[[int, int], dict[str, Any]]:
-        def compute(episodes: int, seed: int) -> dict[str, Any]:
+    def a_piece(piece: str) -> Piece:
+        def simulate(episodes: int, seed: int, settings: Settings, stop: int = 9) -> Data:
             calls.append((f"{name}/{piece}", episodes, seed))
             sample = np.random.default_rng(seed).normal(size=episodes)
-            return {"sample": sample, "count": len(sample), "nested": {"list": [1.0, None]}}
+            return {"sample": sample[:stop], "count": len(sample), "nested": {"list": [1.0, None]}}
 
-        return compute
+        def summarise(data: Data) -> Data:
+            assert data["nested"] == {"list": [1.0, None]}
+            number = Number.of(f"mean of {piece}", data["sample"], printed=0.0, runs=10, unit="m")
+            return {"name": piece, "tables": {piece: [number]}}
 
-    def showing(piece: str) -> Callable[[dict[str, Any]], PieceResult]:
-        def show(stored: dict[str, Any]) -> PieceResult:
-            assert stored["nested"] == {"list": [1.0, None]}
-            number = Number.of(f"mean of {piece}", stored["sample"], printed=0.0, runs=10, unit="m")
-            picture = Picture(
-                f"figure_{piece}", f"Figure of {piece}", "What to see.",
-                lambda figure: figure.subplots().plot(stored["sample"]), (2.0, 1.5),
-            )  # fmt: skip
-            pictures = [picture] if drawn and piece == "first" else []
-            evidence = f"{stored['count']} drawn"
-            claim = Claim(f"{name} claims | {piece}", "Section 1", "holds", evidence)
-            return PieceResult(
-                pictures, [NumbersTable(piece, f"Table of {piece}", [number])], [claim], ["So."]
-            )
+        return Piece(piece, simulate, summarise, 1.0, USUAL)
 
-        return show
-
+    figure = PaperFigure(
+        "first", lambda figure, data: figure.subplots().plot(data["sample"]), (2.0, 1.5)
+    )
     return Paper(
-        name, f"The paper {name}", f"A. Author, “{name}”, 2020.",
-        [Piece(row, f"Piece {row}", computing(row), showing(row), 1.0, USUAL) for row in PIECES],
-    )  # fmt: skip
+        name,
+        [a_piece(piece) for piece in PIECES],
+        {"figure_5": figure} if drawn else {},
+        "fusion_gym/TobitOscillator-v0",
+        {"m": Parameter((0.5,), numbers_within(at_least=0.0))},
+        ("horizon",),
+    )
 
 
 @pytest.fixture
@@ -84,16 +103,17 @@ def drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calls:
 def put(monkeypatch: pytest.MonkeyPatch, folder: Path, drawn: bool) -> Calls:
     result: Calls = []
     texts = folder.with_name(f"{folder.name}_texts")
+    texts.mkdir()
+    for path in page.TEMPLATES.glob("*.md"):
+        (texts / path.name).write_text(path.read_text())
     for name in ("one", "two"):
-        (texts / name).mkdir(parents=True)
-        (texts / name / "introduction.md").write_text("Words.")
-        module = types.ModuleType(f"fusion_gym.agents.reproduction.{name}.pieces")
+        (texts / f"{name}.md").write_text(TEMPLATE)
+        module = types.ModuleType(f"fusion_gym.agents.papers.{name}")
         module.PAPER = a_paper(name, result, drawn)  # type: ignore[attr-defined]
         monkeypatch.setitem(sys.modules, module.__name__, module)
-    for module in (papers, page):
+    for module in (paper, page):
         monkeypatch.setattr(module, "NAMES", ("one", "two"))
-    (texts / "overview.md").write_text("# The papers\n")
-    monkeypatch.setattr(page, "TEXTS", texts)
+    monkeypatch.setattr(page, "TEMPLATES", texts)
     monkeypatch.chdir(folder)
     return result
 
@@ -184,15 +204,15 @@ def test_what_a_killed_process_left_is_removed(calls: Calls) -> None:
 
 
 def test_what_is_read_is_what_was_computed(calls: Calls, tmp_path: Path) -> None:
-    job = PieceJob("one", "first", 5, 11, tmp_path)
+    job = PieceJob("one", "first", 5, 11, {"m": (0.5,), "options": {}}, {}, tmp_path)
     assert not job.finished()
     with pytest.raises(FileNotFoundError):
         job.read()
-    compute_jobs(job)
+    simulate_piece(job)
     result = job.read()
     np.testing.assert_array_equal(result["sample"], np.random.default_rng(11).normal(size=5))
     assert result.keys() == {"sample", "count", "nested"}
-    other = PieceJob("one", "first", 6, 11, tmp_path)
+    other = job._replace(episodes=6)
     with pytest.raises(ConfigurationError, match="made from something else"):
         other.read()
     assert not other.finished()
@@ -201,15 +221,14 @@ def test_what_is_read_is_what_was_computed(calls: Calls, tmp_path: Path) -> None
 def test_a_piece_that_fails_leaves_the_others(
     calls: Calls, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(episodes: int, seed: int) -> dict[str, Any]:
+    def fail(episodes: int, seed: int, settings: Settings) -> Data:
         raise ConfigurationError("threshold = 3 is not allowed")
 
-    good = sys.modules["fusion_gym.agents.reproduction.one.pieces"].PAPER
-    first, second = good.pieces
-    bad = Piece("second", second.title, fail, second.show, 1.0, USUAL)
-    broken = Paper(good.name, good.title, good.citation, [first, bad])
+    module = sys.modules["fusion_gym.agents.papers.one"]
+    first, second = module.PAPER.pieces
+    bad = module.PAPER._replace(pieces=[first, second._replace(simulate=fail)])
     with monkeypatch.context() as patch:
-        patch.setattr(sys.modules["fusion_gym.agents.reproduction.one.pieces"], "PAPER", broken)
+        patch.setattr(module, "PAPER", bad)
         ended = call("reproduce", ["one", "--workers", "1", "--output", "pages", "--work", "work"])
         assert ended.status != 0
         assert "threshold = 3 is not allowed" in ended.err
@@ -217,6 +236,32 @@ def test_a_piece_that_fails_leaves_the_others(
     calls.clear()
     reproduce("one", "--resume")
     assert build_parts(calls) == ["one/second"]
+
+
+def test_an_edit_of_the_code_simulates_again(
+    calls: Calls, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Of the piece's module, or of one that it imports; comments and docstrings do not count."""
+    (tmp_path / "tree/rules").mkdir(parents=True)
+    monkeypatch.setattr(cache, "_ROOT", tmp_path / "tree")
+    codes = set()
+    for first, second in (
+        ("from .rules import b\n", "x = 1"),
+        ('"""Text."""\nfrom .rules import b  # words\n', "x = 1"),
+        ("from .rules import b\ny = 1\n", "x = 1"),
+        ('y = "rules.b:Rule"\n', "x = 2"),
+        ('y = "rules.b:Rule"\n', "x = 3"),
+    ):
+        (tmp_path / "tree/a.py").write_text(first)
+        (tmp_path / "tree/rules/b.py").write_text(second)
+        code_of.cache_clear()
+        cache.read_module.cache_clear()
+        codes.add(code_of("fusion_gym.a"))
+    assert len(codes) == 4
+    reproduce("one")
+    monkeypatch.setattr(cache, "code_of", lambda module: "other")
+    reproduce("one", "--resume")
+    assert [name for name, *_ in calls] == 2 * ["one/first", "one/second"]
 
 
 # --- verdicts -----------------------------------------------------------------------------------
@@ -294,7 +339,7 @@ def test_a_page_has_all_that_is_shown(drawn: Calls) -> None:
         assert (Path("pages") / figure).with_suffix(".svg").is_file()
     assert text.count("(40 episodes, the first with seed 2.)") == 2
     assert len(numbers["claims"]) == len(re.findall(r"\| \*\*holds\*\* \|", text)) == 2
-    sample = np.random.default_rng(2).normal(size=40)
+    sample = np.random.default_rng(2).normal(size=40)[:9]
     for table in numbers["tables"]:
         (entry,) = table["numbers"]
         expected = Number.of(entry["what"], sample, 0.0, 10, "m")
@@ -304,6 +349,17 @@ def test_a_page_has_all_that_is_shown(drawn: Calls) -> None:
     for line in text.splitlines():  # a bar in a cell makes no column
         if line.startswith("| one claims"):
             assert len(re.findall(r"(?<!\\)\|", line)) == 5
+
+
+def test_a_figure_simulates_its_piece_with_its_parameters(drawn: Calls) -> None:
+    words = ["--figure", "5", "--set", "m=0.7,0.2", "--episodes", "40"]
+    reproduce("one", *words)
+    assert drawn == [("one/first", 40, 0)]
+    assert set(pages()) == {"one", "one/figure_5.png", "one/figure_5.svg"}
+    reproduce("one", *words, "--resume")
+    assert len(drawn) == 1
+    reproduce("one", *words[:2], "--episodes", "40", "--resume")  # without the parameter
+    assert len(drawn) == 2
 
 
 # --- what is refused ----------------------------------------------------------------------------
@@ -316,10 +372,17 @@ def test_a_page_has_all_that_is_shown(drawn: Calls) -> None:
         (["one", "three"], ["paper = 'three'"]),
         ([], ["papers", "one", "two", "all"]),
         (["one", "--episodes", "1"], ["episodes = 1", "2"]),
+        (["one", "--figure", "6"], ["figure = '6'", "'5'"]),
+        (["all", "--figure", "5"], ["papers = ('all',)", "figure = '5'", "a single paper"]),
+        (["one", "--set", "m=0.7"], ["set = 'm'", "--figure"]),
+        (["one", "--figure", "5", "--set", "m=-1"], ["m = -1", ">= 0.0"]),
+        (["one", "--figure", "5", "--set", "m=1,1"], ["m = (1, 1)", "different numbers"]),
+        (["one", "--figure", "5", "--set", "n=1"], ["'n'", "known are horizon, m"]),
+        (["one", "--figure", "5", "--set", "horizon=0"], ["horizon = 0", ">= 1"]),
     ],
 )
 def test_one_clear_error_before_anything_runs(
-    calls: Calls, words: list[str], text: list[str]
+    drawn: Calls, words: list[str], text: list[str]
 ) -> None:
     ended = call("reproduce", words)
     assert ended.status != 0
@@ -327,5 +390,5 @@ def test_one_clear_error_before_anything_runs(
     (line,) = ended.err.splitlines()
     assert line.startswith("error: ")
     assert all(part in line for part in text), line
-    assert calls == []
+    assert drawn == []
     assert contents(Path()) == {}

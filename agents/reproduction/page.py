@@ -9,16 +9,14 @@ import matplotlib.pyplot as plt
 from PIL import Image
 
 from ..output import palette
-from ..output.files import read_json, replacing, write, write_text
+from ..output.files import replacing, write, write_text
 from .paper import Paper
-from .papers import NAMES
 from .piece_result import Claim, Number, NumbersTable, Picture, PieceResult
 
-OVERVIEW = "README.md"
 TEXTS = Path(__file__).parent
 
 
-def write_page(
+def write_old_page(
     paper: Paper,
     value: Mapping[str, PieceResult],
     jobs: Mapping[str, Mapping[str, int]],
@@ -52,28 +50,6 @@ def write_page(
     lines += [f"Made by `fusion-gym reproduce {paper.name}`.", ""]
     write_text(output / f"{paper.name}.md", "\n".join(lines))
     write(output / f"{paper.name}.json", _numbers(paper, value, jobs))
-
-
-def write_overview(output: Path) -> None:
-    """The page over all papers whose numbers are there."""
-    lines = [(TEXTS / "overview.md").read_text(encoding="utf-8")]
-    for name in NAMES:
-        path = output / f"{name}.json"
-        if not path.exists():
-            continue
-        content = read_json(path, "numbers")
-        judged = [n["verdict"] for t in content["tables"] for n in t["numbers"]]
-        agree, differ = judged.count("agrees"), judged.count("differs")
-        lines += [f"## [{content['title']}]({name}.md)", "", content["citation"], ""]
-        if agree + differ:
-            lines += [f"{agree} of {agree + differ} printed numbers agree with ours.", ""]
-        lines += ["| claim | where | verdict |", "|---|---|---|"]
-        lines += [
-            f"| {_cell(c['text'])} | {_cell(c['source'])} | {c['verdict']} |"
-            for c in content["claims"]
-        ]
-        lines += [""]
-    write_text(output / OVERVIEW, "\n".join(lines))
 
 
 def _draw(picture: Picture, folder: Path) -> None:

@@ -9,7 +9,7 @@ from .piece_result import PieceResult
 Compute = Callable[[int, int], dict[str, Any]]
 
 
-class Piece(NamedTuple):
+class OldPiece(NamedTuple):
     """A part of a simulation section: its runs, kept in the work folder, and what they show.
 
     ``compute(episodes, seed)`` returns numbers, texts, lists and arrays by name; ``show`` takes
@@ -26,10 +26,14 @@ class Piece(NamedTuple):
     usual: int = 1000
 
 
-class Paper(NamedTuple):
+class OldPaper(NamedTuple):
     """A paper: ``name`` is that of its page and its package, which has its ``introduction.md``."""
 
     name: str
     title: str
     citation: str
-    pieces: Sequence[Piece]
+    pieces: Sequence[OldPiece]
+
+
+Piece = OldPiece
+Paper = OldPaper

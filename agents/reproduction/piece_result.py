@@ -2,49 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
+from ..papers.numbers import Number, Verdict
 
-from fusion_gym.evaluation.intervals import mean_interval
-
-Verdict = Literal["holds", "holds partly", "does not hold"]
-
-
-class Number(NamedTuple):
-    """A number of ours, beside the printed one where there is one.
-
-    ``low`` and ``high`` are the 95 % interval of ``mean``. ``spread`` is the standard deviation of
-    what the paper prints, for its own number of runs: a single run's where it shows one.
-    """
-
-    what: str
-    mean: float
-    low: float
-    high: float
-    printed: float | None = None
-    spread: float = 0.0
-    unit: str = ""
-
-    @classmethod
-    def of(
-        cls, what: str, sample: Any, printed: float | None = None, runs: int = 1, unit: str = ""
-    ) -> Number:
-        """From a sample (episodes,), of which the paper prints the mean over ``runs``."""
-        values = np.asarray(sample, dtype=float)
-        result = mean_interval(values)
-        spread = float(values.std(ddof=1)) / np.sqrt(runs) if len(values) > 1 else 0.0
-        return cls(what, result.mean, result.low, result.high, printed, spread, unit)
-
-    @property
-    def verdict(self) -> str:
-        """Whether the printed number lies where 95 % of such runs would, ours being uncertain."""
-        if self.printed is None:
-            return "not printed"
-        allowed = math.hypot(1.96 * self.spread, 0.5 * (self.high - self.low))
-        return "agrees" if abs(self.printed - self.mean) <= allowed else "differs"
+__all__ = ["Number", "Verdict"]
 
 
 class NumbersTable(NamedTuple):

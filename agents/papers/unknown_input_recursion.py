@@ -1,4 +1,4 @@
-"""The paper's recursion (17)-(20) exactly as its text has it, on what the trigger delivered."""
+"""The recursion (17)-(20) of unknown_input exactly as its text has it, and its readings."""
 
 from typing import Any, NamedTuple
 
@@ -9,16 +9,12 @@ from scipy.linalg import block_diag
 from fusion_gym.arrays import Array
 from fusion_gym.systems.unknown_input.system import UnknownInputSystem
 
-from .runs import CARTS, EXAMPLES, PRINTED, TRIGGER, Record, halves, make_example, record_run
-
 # I - C ℬ L in (20) is a projection, its singular values are 0 or at least 1: what lies between is
 # rounding, and half a 1 tells one from the other.
-_EXACT, _SOME, _MACHINE = 0.5, 1e-8, 0.0
-_SMALL = 0.2  # ρ̄ over the noise's variance, where (1 + 1/ε) ρ̄ - V is negative
-_FACTOR = {PRINTED: 1.0, CARTS: 0.2}  # ε = ξ, as in the library's examples
+EXACT_CUTOFF, _SOME, _MACHINE = 0.5, 1e-8, 0.0
 EXACT, INVERTED = "(20), rounding set to zero", "(20), rounding inverted by the pseudo-inverse"
 PARTLY, DEVIATIONS = "(20), rounding above 1e-8 inverted", "0.001 as standard deviations"
-READINGS: dict[str, dict[str, Any]] = {
+UNKNOWN_INPUT_READINGS: dict[str, dict[str, Any]] = {
     EXACT: {},
     INVERTED: {"cutoff": _MACHINE},
     PARTLY: {"cutoff": _SOME},
@@ -148,80 +144,13 @@ def run(model: Model, held: Array, granted: NDArray[np.bool_], cutoff: float) ->
 _TRACES = ("state_bound", "best_bound")
 
 
-def compute_printed(episodes: int, seed: int) -> dict[str, Any]:
-    """Readings of the printed example, the gain (20) on the carts, Theorem 1 for a small ρ̄.
+def decoupling(paper: UnknownInputSystem, every_step: UnknownInputSystem) -> dict[str, Any]:
+    """Return rank and columns of C ℬ with ℬ as (3) prints it, for a = 2, and what bounds errors.
 
-    ``node`` (readings, l, 2, E): mean squared errors of state and input; ``trace``
-    (readings, l, E): the mean trace of (18); ``hidden`` (readings, l): the largest residual of
-    (14); ``power`` (2, E): the mean squares of state and input themselves.
+    ``conditions`` are the condition numbers of the C_i and of B, ``floor`` the result of
+    :func:`_floor`.
     """
-    data: dict[str, Any] = {"readings": list(READINGS)}
-    node, trace, hidden = [], [], []
-    for reading in READINGS.values():
-        task, system = make_example(example=PRINTED, filter="paper", **reading.get("options", {}))
-        observed = record_run(task, reading.get("policy", TRIGGER), episodes, seed)
-        cutoff = reading.get("cutoff", _EXACT)
-        every = _nodes(system, observed, _FACTOR[PRINTED], _rho(PRINTED), cutoff)
-        error = observed.truth[:, None] - np.stack([_estimate(each) for each in every], axis=1)
-        node.append(halves((error**2).mean(0), system.plant.size, 1))
-        trace.append([each["trace"].mean(0) for each in every])
-        hidden.append([float(each["hidden"].max()) for each in every])
-    data |= {"node": np.array(node), "trace": np.array(trace), "hidden": hidden}
-    data["power"] = halves((observed.truth**2).mean(0), system.plant.size, 0)
-    return data | _theorems(episodes, seed) | _lifted()
-
-
-def _estimate(each: dict[str, Array]) -> Array:
-    return np.moveaxis(each["estimate"], 1, 2)
-
-
-def _rho(example: str) -> float:
-    """ρ̄ of the example's trigger."""
-    task, _ = make_example(example=example, filter="paper")
-    return float(np.max(task.policy_defaults[TRIGGER]["rho_bar"]))
-
-
-def _nodes(
-    system: UnknownInputSystem, run_record: Record, factor: float, rho_bar: float, cutoff: float
-) -> list[dict[str, Array]]:
-    return [
-        run(model, run_record.held[:, i], run_record.granted[:, i], cutoff)
-        for i, model in enumerate(models(system, factor, rho_bar))
-    ]
-
-
-def _theorems(episodes: int, seed: int) -> dict[str, Any]:
-    """``excess`` (examples, E) of (18) over its least, ``sent`` and ``silent`` (l, E) traces of
-    Ξ_x at the carts, ``negative`` (E): the share of silent instants with an indefinite Ξ_x."""
-    excess, result = [], {}
-    for example in EXAMPLES:
-        task, system = make_example(example=example, filter="paper")
-        observed = record_run(task, TRIGGER, episodes, seed)
-        every = _nodes(system, observed, _FACTOR[example], _rho(example), _EXACT)
-        excess.append(np.mean([each["excess"].mean(0) for each in every], axis=0))
-        if example == PRINTED:
-            quiet = [~observed.granted[:, i] for i in range(len(every))]
-            for name, flip in (("silent", False), ("sent", True)):
-                result[name] = np.array(
-                    [
-                        np.nanmean(np.where(where ^ flip, each["trace"], np.nan), axis=0)
-                        for where, each in zip(quiet, every, strict=True)
-                    ]
-                )
-    small = _SMALL * 0.001
-    task, system = make_example(example=PRINTED, filter="paper", rho_bar=small, rho_initial=small)
-    observed = record_run(task, TRIGGER, episodes, seed)
-    every = _nodes(system, observed, _FACTOR[PRINTED], small, _EXACT)
-    least = np.stack([each["least"] for each in every], axis=1)
-    negative = float((least[~observed.granted] < 0.0).mean())
-    return result | {"excess": np.array(excess), "negative": negative, "small": small}
-
-
-def _lifted() -> dict[str, Any]:
-    """Rank and columns of C ℬ with ℬ as (3) prints it, for a = 2; condition numbers of the C_i and
-    of B; :func:`_floor`."""
-    paper = make_example(example=PRINTED, filter="paper")[1]
-    single = make_example(example=PRINTED, filter="paper", sampling_period=1)[1].plant
+    single = every_step.plant
     a, b = single.transition[..., 0], single.input_matrix[..., 0]
     lifted = block_diag(np.hstack((a @ b, b)), np.hstack((b, 0.0 * b)))
     c = paper.nodes.sensors.matrix[0, ..., 0]
