@@ -19,7 +19,7 @@ NAMES = (
     "unknown_input",
     "round_robin_tobit",
 )
-OLD = ("tobit_token_bucket", "adaptive_innovation", "round_robin_tobit")
+OLD = ("tobit_token_bucket", "round_robin_tobit")
 Data = dict[str, Any]
 Settings = Mapping[str, Any]
 _NOTHING: Settings = MappingProxyType({})

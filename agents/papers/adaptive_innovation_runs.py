@@ -1,48 +1,107 @@
-"""Errors, actual and conservative covariances of both sequential fusions, under every setting."""
+"""Runs of the tracking example side by side, and what is recorded of their errors."""
 
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+import fusion_gym
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.runs import Outcome
+from fusion_gym.core.system import Signals
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
+from fusion_gym.systems.correlated.system import CorrelatedTrackingState, CorrelatedTrackingSystem
 
-from .runs import SCALES, SENSORS, STEPS, Lane, Step, always, of_other_episodes, steps
+from .paper import Settings
 
-FUSIONS = ("sci", "sici")
-AT_BOUND, OTHERS, ALWAYS = "at the bounds", "requests of another episode", "always"
-EVERY = 5  # steps from one comparison of the nodes' matrices to the next
+STEPS = 600
+SENSORS = ("sensor 1", "sensor 2", "sensor 3")
 ELLIPSES = 100  # the step of Figure 9
+_EVERY = 5  # steps from one comparison of the nodes' matrices to the next
 _ROUNDING = 1e-8  # of a generalised eigenvalue: without noise below the bounds it is 1
 
-
-def lanes(episodes: int) -> dict[str, Lane]:
-    """The settings: the trigger at every noise scale, and two other policies at the bounds."""
-    return (
-        {AT_BOUND: Lane()}
-        | {f"scale {scale}": Lane(scale) for scale in SCALES}
-        | {OTHERS: Lane(ask=of_other_episodes(episodes)), ALWAYS: Lane(ask=always)}
-    )
+# Signals and the trigger's requests (sensors, N) to the requests of the same runs.
+Ask = Callable[[Signals, NDArray[np.bool_]], NDArray[np.bool_]]
 
 
-def compute_errors(episodes: int, seed: int) -> dict[str, Any]:
-    """Everything that Figures 4 to 9 and their claims need, by fusion rule; see :class:`_Record`.
+class Lane(NamedTuple):
+    """A setting in which every episode is run: actual over bound variances, who requests.
 
-    ``lanes`` names the first axis of all arrays whose names end in ``_by_lane``.
+    ``ask`` instead of the trigger's own requests; ``known_start`` puts x(0) at its mean.
     """
-    settings = lanes(episodes)
-    data: dict[str, Any] = {"lanes": list(settings)}
-    for fusion in FUSIONS:
-        record = _Record(len(settings), episodes, with_nodes=fusion == FUSIONS[0])
-        for step in steps(list(settings.values()), episodes, seed, fusion, track_actual=True):
-            record.add(step)
-        data |= {f"{fusion}_{name}": value for name, value in record.arrays().items()}
-    return data
+
+    scale: float = 1.0
+    ask: Ask | None = None
+    known_start: bool = False
 
 
-class _Record:
+def always(signals: Signals, event: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Every sensor, at every step."""
+    return np.ones_like(event)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SideBySide(CorrelatedTrackingSystem):
+    """The system with a noise scale for each run, (N,), and runs that begin at the mean, (N,)."""
+
+    scales: Array
+    known_start: NDArray[np.bool_]
+
+    def _scale(self, noise: Array) -> Array:
+        return self.scales
+
+    def start(self, noise: Array) -> CorrelatedTrackingState:
+        """Time 0, as in the system itself but for the runs that begin at the mean."""
+        state = super().start(noise)
+        truth = np.where(self.known_start, state.mean[0], state.truth)
+        return replace(state, truth=truth)
+
+
+class Step(NamedTuple):
+    """A step of all lanes: ``state`` after the delivery, ``outcome`` the network's answer."""
+
+    number: int
+    state: CorrelatedTrackingState
+    outcome: Outcome
+    innovation: Array  # (sensors, N)
+
+
+def steps(
+    lanes: Iterable[Lane], episodes: int, seed: int, settings: Settings, **options: Any
+) -> Iterator[Step]:
+    """Yield the steps of all lanes with the same episodes, one lane after another along N."""
+    lanes = list(lanes)
+    options = {"horizon": STEPS} | settings["options"] | options
+    task = fusion_gym.make_task(CorrelatedTrackingOptions(**options))
+    system = SideBySide(
+        **vars(task.system),
+        scales=np.repeat([lane.scale for lane in lanes], episodes),
+        known_start=np.repeat([lane.known_start for lane in lanes], episodes),
+    )
+    batch = EpisodeBatch(replace(task, system=system), len(lanes) * episodes)
+    runs = np.arange(batch.num_envs)
+    batch.seed(runs, (seed + runs % episodes).tolist())
+    batch.reset()
+    trigger = fusion_gym.make_policy(settings["policy"], task)
+    trigger.reset(batch.num_envs, seed)
+    for number in range(STEPS):
+        signals = batch.signals()
+        innovation = signals["innovation"][:, 0].copy()
+        event = trigger(signals)
+        requests = event.copy()
+        for place, lane in enumerate(lanes):
+            if lane.ask is not None:
+                own = slice(place * episodes, (place + 1) * episodes)
+                requests[:, own] = lane.ask(signals, event)[:, own]
+        outcome = batch.step(requests)
+        yield Step(number, batch.delivered, outcome, innovation)
+
+
+class ErrorRecord:
     """Sums over the steps of L settings with E episodes each.
 
     By lane, (L, …, E), means over an episode: ``mse``, ``actual`` and ``conservative`` (trace),
@@ -75,7 +134,7 @@ class _Record:
         self.stored: dict[str, Array] = {}
 
     def arrays(self) -> dict[str, Array]:
-        """All of it."""
+        """Return all of it by name."""
         compared = ("encloses", "encloses_plane", "node_bounded")
         return (
             {
@@ -88,7 +147,7 @@ class _Record:
         )
 
     def add(self, step: Step) -> None:
-        """Take in a step."""
+        """Add a step."""
         state = step.state
         assert state.joint is not None
         claimed, actual = state.covariance[0], state.joint[0, 0]
@@ -123,7 +182,7 @@ class _Record:
             self._row(name, self._lanes(value)[..., 0])
         if self.with_nodes:
             self._add(node_mse=((state.truth - state.mean[1:]) ** 2).sum(1))
-        if step.number % EVERY == 0:
+        if step.number % _EVERY == 0:
             self._compare(step)
         if step.number + 1 == ELLIPSES:
             own = np.arange(len(SENSORS) + 1)
