@@ -4,14 +4,16 @@ import numpy as np
 import pytest
 
 import fusion_gym
-from fusion_gym.agents.reproduction.judging import below, cite, percent, verdict
-from fusion_gym.agents.reproduction.tobit_token_bucket.runs import (
+from fusion_gym.agents.papers.numbers import below, cite, percent, verdict
+from fusion_gym.agents.papers.tobit_token_bucket_runs import (
     TRIGGER,
     Failing,
+    claimed,
+    perturbed,
     record_history,
     scheme,
+    terms,
 )
-from fusion_gym.agents.reproduction.tobit_token_bucket.theory import claimed, perturbed, terms
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.evaluation.intervals import Interval
 

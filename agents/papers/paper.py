@@ -19,7 +19,7 @@ NAMES = (
     "unknown_input",
     "round_robin_tobit",
 )
-OLD = ("tobit_token_bucket", "round_robin_tobit")
+OLD = ("round_robin_tobit",)
 Data = dict[str, Any]
 Settings = Mapping[str, Any]
 _NOTHING: Settings = MappingProxyType({})
@@ -163,11 +163,11 @@ def numbers_within(**limits: float) -> Callable[[str, Any], tuple[float, ...]]:
     return check
 
 
-def policy_of(rule: str) -> Callable[[str, Any], str]:
-    """Return a check for a rule's name with parameters."""
+def policy_of(rule: str = "NAME") -> Callable[[str, Any], str]:
+    """Return a check for a policy with parameters, of this rule where one is named."""
 
     def check(name: str, value: Any) -> str:
-        if not isinstance(value, str) or value.partition(":")[0] != rule:
+        if not isinstance(value, str) or rule not in ("NAME", value.partition(":")[0]):
             raise refusal(name, value, f"{rule!r}, or {rule + ':key=value,…'!r}")
         return value
 
