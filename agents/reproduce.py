@@ -149,10 +149,8 @@ def figure_job(
         ConfigurationError: an unknown parameter, or a value that is not allowed.
     """
     count = episodes or paper.piece(figure.piece).usual
-    restriction = dict(figure.restriction)
-    return PieceJob(
-        paper.name, figure.piece, count, seed, paper.settings(changes), restriction, work
-    )
+    settings, restriction = paper.settings(changes, figure.without), dict(figure.restriction)
+    return PieceJob(paper.name, figure.piece, count, seed, settings, restriction, work)
 
 
 def reproduce_figure(

@@ -9,7 +9,7 @@ import pytest
 from small_suite import small_suite
 
 from fusion_gym.agents.papers.numbers import below
-from fusion_gym.agents.reproduction.round_robin_tobit.judging import always_below
+from fusion_gym.agents.papers.round_robin_tobit_runs import always_below
 from fusion_gym.agents.suite import envelopes
 from fusion_gym.agents.suite.classes import classes_of
 from fusion_gym.agents.suite.config import load_suite

@@ -3,7 +3,7 @@
 import pytest
 from reproduction_checks import check_claims, check_numbers, check_pictures, committed, quick
 
-from fusion_gym.agents.papers.paper import NAMES, OLD, load_paper
+from fusion_gym.agents.papers.paper import NAMES, load_paper
 
 # Episodes, the least count of numbers, the count of figures, and the first words of claims that so
 # few episodes leave open: differences of a few per cent, rare errors, wide intervals.
@@ -28,7 +28,7 @@ PAPERS: dict[str, tuple[int, int, int, tuple[str, ...]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name not in OLD])
+@pytest.mark.parametrize("name", NAMES)
 def test_the_page_is_that_of_a_fresh_run(name: str) -> None:
     episodes, numbers, figures, uncertain = PAPERS[name]
     paper, page = load_paper(name), committed(name)

@@ -558,7 +558,9 @@ def _draw_ellipses(figure: Any, data: Data) -> None:
 
 
 def _figure(draw: Any, size: tuple[float, float], lanes: str, *fusions: str) -> PaperFigure:
-    return PaperFigure("fusion", draw, size, {"lanes": [lanes], "fusions": fusions or FUSIONS})
+    without = ("scales",) if lanes == "bounds" else ()
+    restriction = {"lanes": [lanes], "fusions": fusions or FUSIONS}
+    return PaperFigure("fusion", draw, size, restriction, without)
 
 
 PAPER = Paper(
@@ -568,7 +570,9 @@ PAPER = Paper(
         Piece("fusion", simulate_fusion, _summarise_fusion, 100.0, 200),
     ),
     {
-        "figure_3": PaperFigure("rates", _draw_thresholds, (7.2, 5.6), {"readings": [OURS]}),
+        "figure_3": PaperFigure(
+            "rates", _draw_thresholds, (7.2, 5.6), {"readings": [OURS]}, ("scales",)
+        ),
         "figure_4": _figure(_draw_tracking, (7.2, 6.4), "bounds"),
         "figure_5": _figure(_draw_traces, (7.2, 6.0), "bounds"),
         "figure_6": _figure(_draw_comparison, (7.2, 3.6), "bounds"),

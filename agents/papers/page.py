@@ -1,6 +1,5 @@
 """The pages of a reproduction: Markdown and JSON of a paper, its pictures, and the overview."""
 
-import importlib
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,9 +11,8 @@ from PIL import Image
 
 from ..output import palette
 from ..output.files import read_json, replacing, write, write_text
-from ..reproduction.page import write_old_page
 from .numbers import cite, number_text, percent
-from .paper import NAMES, OLD, Data, Paper, PaperFigure
+from .paper import NAMES, Data, Paper, PaperFigure
 
 OVERVIEW = "README.md"
 TEMPLATES = Path(__file__).parent
@@ -70,11 +68,6 @@ def render_page(paper: Paper, results: Mapping[str, Data], counts: Counts) -> Pa
 
 def write_page(paper: Paper, results: Mapping[str, Data], counts: Counts, output: Path) -> None:
     """Write a paper's pictures, its page and its numbers."""
-    if paper.name in OLD:
-        old = importlib.import_module(f"..reproduction.{paper.name}.pieces", __package__).PAPER
-        parts = {piece.name: piece.show(results[piece.name]) for piece in old.pieces}
-        write_old_page(old, parts, counts, output)
-        return
     page = render_page(paper, results, counts)
     for name, figure in paper.figures.items():
         write_figure(figure, results[figure.piece], output / paper.name / name)

@@ -2,7 +2,6 @@
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -19,7 +18,6 @@ NAMES = (
     "unknown_input",
     "round_robin_tobit",
 )
-OLD = ("round_robin_tobit",)
 Data = dict[str, Any]
 Settings = Mapping[str, Any]
 _NOTHING: Settings = MappingProxyType({})
@@ -45,13 +43,14 @@ class PaperFigure(NamedTuple):
     """A figure: ``draw(figure, data)`` draws the data of a piece into an empty matplotlib Figure.
 
     ``size`` is in inches. ``restriction`` has the keywords of ``simulate`` that leave out what the
-    figure does not show.
+    figure does not show, ``without`` the paper's parameters that do not change it.
     """
 
     piece: str
     draw: Callable[[Any, Data], None]
     size: tuple[float, float] = (7.2, 4.2)
     restriction: Settings = _NOTHING
+    without: Sequence[str] = ()
 
 
 class Parameter(NamedTuple):
@@ -74,13 +73,16 @@ class Paper(NamedTuple):
     parameters: Mapping[str, Parameter] = _NOTHING
     options: Sequence[str] = ()
 
-    def settings(self, changes: Settings) -> Data:
+    def settings(self, changes: Settings, without: Sequence[str] = ()) -> Data:
         """Return the parameters with these changes, and the changed options as ``options``.
+
+        Those named in ``without`` cannot be changed.
 
         Raises:
             ConfigurationError: an unknown name, or a value that is not allowed.
         """
-        keys("parameter", changes, [*self.parameters, *self.options])
+        known = [name for name in (*self.parameters, *self.options) if name not in without]
+        keys("parameter", changes, known)
         settings = {
             name: parameter.check(name, changes.get(name, parameter.default))
             for name, parameter in self.parameters.items()
@@ -113,26 +115,9 @@ def load_paper(name: str) -> Paper:
     Raises:
         ConfigurationError: there is no such paper.
     """
-    if choice("paper", name, NAMES) in OLD:
-        return _old(name)
-    module = importlib.import_module(f".{name}", __package__)
+    module = importlib.import_module(f".{choice('paper', name, NAMES)}", __package__)
     paper: Paper = module.PAPER
     return paper
-
-
-def _old(name: str) -> Paper:
-    """Return a paper of the package ``reproduction``, without its figures."""
-    paper = importlib.import_module(f"..reproduction.{name}.pieces", __package__).PAPER
-    pieces = [
-        Piece(piece.name, partial(_simulate, piece), dict, piece.weight, piece.usual)
-        for piece in paper.pieces
-    ]
-    return Paper(name, pieces, {}, "fusion_gym/TobitOscillator-v0")
-
-
-def _simulate(piece: Any, episodes: int, seed: int, settings: Settings) -> Data:
-    result: Data = piece.compute(episodes, seed)
-    return result
 
 
 def load_papers(names: Sequence[str]) -> list[Paper]:
