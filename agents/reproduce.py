@@ -14,7 +14,6 @@ were made from the same inputs by the same code.
 import itertools
 import shlex
 import sys
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,7 +21,7 @@ from typing import Annotated, Any
 import tyro
 
 from fusion_gym.policies.settings import parse_settings
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, integer
 
 from .command_line import Command, SetOptions
 from .input.options import OutputFolder, Seed, Whole
@@ -31,7 +30,7 @@ from .output.files import remove_partials
 from .output.folders import alone_in
 from .papers.cache import PieceJob, simulate_piece
 from .papers.page import draw_figure, write_figure, write_overview, write_page
-from .papers.paper import NAMES, Paper, PaperFigure, load_paper, load_papers
+from .papers.paper import NAMES, Paper, load_paper, load_papers
 from .suite.team import Team
 from .suite.workers import Work, side_by_side
 
@@ -68,7 +67,7 @@ class Reproduce(Command):
             ConfigurationError: no paper, an unknown name, or a parameter that is not allowed.
         """
         papers = load_papers(self.papers)
-        changes = parse_settings("parameter", itertools.chain(*self.options))
+        changes = parse_settings("option", itertools.chain(*self.options))
         if self.figure is not None:
             if len(papers) != 1:
                 raise ConfigurationError(
@@ -85,42 +84,38 @@ class Reproduce(Command):
             self._reproduce_pages(papers, self.output or Path("docs/reproduction"))
 
     def _reproduce_pages(self, papers: list[Paper], output: Path) -> None:
-        jobs = {
-            paper.name: [
-                PieceJob(
-                    paper.name, piece.name, self.episodes or piece.usual, self.seed,
-                    paper.settings({}), {}, self.work,
-                )
+        with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
+            print(f"simulations go into {self.work}, pages into {output}", file=sys.stderr)
+            jobs = [
+                PieceJob.of(paper, piece, self.episodes, self.seed, paper.settings({}), self.work)
+                for paper in papers
                 for piece in paper.pieces
             ]
-            for paper in papers
-        }  # fmt: skip
-        with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
+            self._simulate(jobs)
             for paper in papers:
-                remove_partials(self.work / paper.name)
-            print(f"simulations go into {self.work}, pages into {output}", file=sys.stderr)
-            self._simulate(itertools.chain(*jobs.values()))
-            for paper in papers:
-                results = {job.piece: job.read() for job in jobs[paper.name]}
-                counts = {
-                    job.piece: {"episodes": job.episodes, "seed": job.seed}
-                    for job in jobs[paper.name]
-                }
+                own = [job for job in jobs if job.paper == paper.name]
+                results = {job.piece: job.read() for job in own}
+                counts = {job.piece: {"episodes": job.episodes, "seed": job.seed} for job in own}
                 write_page(paper, results, counts, output)
                 print(f"{paper.name}: {output / paper.name}.md")
             write_overview(output)
 
     def _reproduce_figure(self, paper: Paper, name: str, changes: dict[str, Any]) -> None:
         name, figure = paper.figure(name)
-        job = figure_job(paper, figure, self.episodes, self.seed, changes, self.work)
+        settings = paper.settings(changes, figure.without)
         path = (self.output or Path("runs/figures")) / paper.name / name
         with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
-            remove_partials(self.work / paper.name)
+            job = PieceJob.of(
+                paper, paper.piece(figure.piece), self.episodes, self.seed, settings,
+                self.work / "figures", figure.restriction,
+            )  # fmt: skip
             self._simulate([job])
             write_figure(figure, job.read(), path)
         print(f"{paper.name}: {path}.png")
 
-    def _simulate(self, jobs: Iterable[PieceJob]) -> None:
+    def _simulate(self, jobs: list[PieceJob]) -> None:
+        for job in jobs:
+            remove_partials(job.path.parent)
         work = [
             Work(job.find().weight * job.episodes / job.find().usual, simulate_piece, (job,))
             for job in jobs
@@ -133,24 +128,6 @@ class Reproduce(Command):
         words = [word for word in sys.argv[1:] if word != "--resume"]
         command = shlex.join(["fusion-gym", "reproduce", *words, "--resume"])
         return f"interrupted; go on with: {command}"
-
-
-def figure_job(
-    paper: Paper,
-    figure: PaperFigure,
-    episodes: int | None,
-    seed: int,
-    changes: dict[str, Any],
-    work: Path,
-) -> PieceJob:
-    """Return the simulation that a figure needs under changed parameters.
-
-    Raises:
-        ConfigurationError: an unknown parameter, or a value that is not allowed.
-    """
-    count = episodes or paper.piece(figure.piece).usual
-    settings, restriction = paper.settings(changes, figure.without), dict(figure.restriction)
-    return PieceJob(paper.name, figure.piece, count, seed, settings, restriction, work)
 
 
 def reproduce_figure(
@@ -170,7 +147,7 @@ def reproduce_figure(
     """
     item = load_paper(paper)
     drawing = item.figure(figure)[1]
-    job = figure_job(item, drawing, episodes, seed, changes, Path())
-    return draw_figure(
-        drawing, job.find().simulate(job.episodes, seed, job.settings, **job.restriction)
-    )
+    settings, piece = item.settings(changes, drawing.without), item.piece(drawing.piece)
+    count = integer("episodes", piece.usual if episodes is None else episodes, at_least=2)
+    first = integer("seed", seed, at_least=0)
+    return draw_figure(drawing, piece.simulate(count, first, settings, **drawing.restriction))

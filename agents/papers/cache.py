@@ -17,7 +17,7 @@ from fusion_gym.validation import ConfigurationError
 
 from ..output.files import DAMAGED, replacing
 from ..output.folders import fingerprint
-from .paper import Data, Piece, load_paper
+from .paper import NOTHING, Data, Paper, Piece, Settings, load_paper
 
 _PLAIN = "plain"  # the entry that holds all that is no array, as JSON
 _ROOT = Path(fusion_gym.__file__).parent
@@ -37,24 +37,31 @@ class PieceJob(NamedTuple):
     restriction: Data
     work: Path
 
+    @classmethod
+    def of(
+        cls,
+        paper: Paper,
+        piece: Piece,
+        episodes: int | None,
+        seed: int,
+        settings: Data,
+        work: Path,
+        restriction: Settings = NOTHING,
+    ) -> "PieceJob":
+        """Return the job of a piece, with its usual number of episodes unless one is named."""
+        count = episodes or piece.usual
+        return cls(paper.name, piece.name, count, seed, settings, dict(restriction), work)
+
     @property
     def path(self) -> Path:
-        """The file of the result; a changed or partial piece has one of its own."""
-        usual = load_paper(self.paper).settings({})
-        changed = self.settings != usual or self.restriction
-        suffix = f"_{fingerprint(self.settings | self.restriction)}" if changed else ""
-        return self.work / self.paper / f"{self.piece}{suffix}.npz"
+        """The file of the result."""
+        return self.work / self.paper / f"{self.piece}.npz"
 
     @property
     def made_from(self) -> str:
         """A hash of the inputs and of the code."""
-        inputs = [self.paper, self.piece, self.episodes, self.seed, self.settings, self.restriction]
-        return fingerprint(
-            {
-                "inputs": inputs,
-                "code": code_of(getattr(self.find().simulate, "__module__", __name__)),
-            }
-        )
+        code = code_of(self.find().simulate.__module__)
+        return fingerprint(self._asdict() | {"work": "", "code": code})
 
     def find(self) -> Piece:
         """Return the piece itself."""

@@ -20,7 +20,7 @@ NAMES = (
 )
 Data = dict[str, Any]
 Settings = Mapping[str, Any]
-_NOTHING: Settings = MappingProxyType({})
+NOTHING: Settings = MappingProxyType({})
 
 
 class Piece(NamedTuple):
@@ -49,7 +49,7 @@ class PaperFigure(NamedTuple):
     piece: str
     draw: Callable[[Any, Data], None]
     size: tuple[float, float] = (7.2, 4.2)
-    restriction: Settings = _NOTHING
+    restriction: Settings = NOTHING
     without: Sequence[str] = ()
 
 
@@ -70,7 +70,7 @@ class Paper(NamedTuple):
     pieces: Sequence[Piece]
     figures: Mapping[str, PaperFigure]
     environment: str
-    parameters: Mapping[str, Parameter] = _NOTHING
+    parameters: Mapping[str, Parameter] = NOTHING
     options: Sequence[str] = ()
 
     def settings(self, changes: Settings, without: Sequence[str] = ()) -> Data:
@@ -82,7 +82,7 @@ class Paper(NamedTuple):
             ConfigurationError: an unknown name, or a value that is not allowed.
         """
         known = [name for name in (*self.parameters, *self.options) if name not in without]
-        keys("parameter", changes, known)
+        keys("option", changes, known)
         settings = {
             name: parameter.check(name, changes.get(name, parameter.default))
             for name, parameter in self.parameters.items()

@@ -175,9 +175,7 @@ def _summarise_estimates(data: Data) -> Data:
     by_censoring = below(data["change_uncensored"], data["change_censored"])
     return {
         "states": _STATES,
-        "tables": {
-            "fluctuation": grid(_STATES, dict(zip(_WHO, (*local, fused), strict=True))),
-        },
+        "tables": {"fluctuation": grid(_STATES, dict(zip(_WHO, (*local, fused), strict=True)))},
         "changes": means,
         "fused_changes": fused.mean(-1),
         "strongest": [int(place) + 1 for place in strongest],
