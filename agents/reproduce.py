@@ -30,7 +30,7 @@ from .output.files import remove_partials
 from .output.folders import alone_in
 from .papers.cache import PieceJob, simulate_piece
 from .papers.page import draw_figure, write_figure, write_overview, write_page
-from .papers.paper import NAMES, Paper, load_paper, load_papers
+from .papers.paper import NAMES, NOTHING, Data, Paper, Piece, Settings, load_paper, load_papers
 from .suite.team import Team
 from .suite.workers import Work, side_by_side
 
@@ -87,7 +87,7 @@ class Reproduce(Command):
         with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
             print(f"simulations go into {self.work}, pages into {output}", file=sys.stderr)
             jobs = [
-                PieceJob.of(paper, piece, self.episodes, self.seed, paper.settings({}), self.work)
+                self._job(paper, piece, self.work, paper.settings({}))
                 for paper in papers
                 for piece in paper.pieces
             ]
@@ -105,13 +105,17 @@ class Reproduce(Command):
         settings = paper.settings(changes, figure.without)
         path = (self.output or Path("runs/figures")) / paper.name / name
         with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
-            job = PieceJob.of(
-                paper, paper.piece(figure.piece), self.episodes, self.seed, settings,
-                self.work / "figures", figure.restriction,
-            )  # fmt: skip
+            work, piece = self.work / "figures", paper.piece(figure.piece)
+            job = self._job(paper, piece, work, settings, figure.restriction)
             self._simulate([job])
             write_figure(figure, job.read(), path)
         print(f"{paper.name}: {path}.png")
+
+    def _job(
+        self, paper: Paper, piece: Piece, work: Path, settings: Data, part: Settings = NOTHING
+    ) -> PieceJob:
+        count = self.episodes or piece.usual
+        return PieceJob(paper.name, piece.name, count, self.seed, settings, dict(part), work)
 
     def _simulate(self, jobs: list[PieceJob]) -> None:
         for job in jobs:

@@ -3,7 +3,7 @@
 Source: adaptive_innovation, Section 6.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -123,17 +123,14 @@ def simulate_rates(
         levels[number] = rule.threshold_after(last)
         last = np.where(requests, size, last)
     moved, after = np.diff(levels, axis=0) != 0.0, first[:-1]
-    changes = [
-        (moved & where).sum((0, 1)) / np.maximum(where.sum((0, 1)), 1) for where in (after, ~after)
-    ]
+    sums = [((moved & where).sum((0, 1)), where.sum((0, 1))) for where in (after, ~after)]
+    changes = [changed / np.maximum(count, 1) for changed, count in sums]
     return {
-        "readings": list(readings),
-        "rates": rates,
-        "changes": np.array(changes),
+        "readings": list(readings), "rates": rates, "changes": np.array(changes),
         "levels": levels[..., 0],
         "ceiling": float(rule.threshold_after(np.zeros((len(SENSORS), 1))).max()),
         "requested": first[..., 0].astype(np.int64),
-    }
+    }  # fmt: skip
 
 
 def _summarise_rates(data: Data) -> Data:
@@ -160,8 +157,7 @@ def _summarise_rates(data: Data) -> Data:
                 for name, sample in zip(SENSORS, samples, strict=True)
             ],
         },
-        "steps": STEPS,
-        "counts": [round(STEPS * printed) for printed in PRINTED],
+        "steps": STEPS, "counts": [round(STEPS * printed) for printed in PRINTED],
         "away": [(100.0 * p - n.mean) / n.spread for p, n in zip(PRINTED, numbers, strict=True)],
         "usual": float(norm.ppf(0.5 + 0.5 * 0.95 ** (1.0 / len(numbers)))),
         "spread": 100.0 * ours.std(1, ddof=1),
@@ -172,15 +168,10 @@ def _summarise_rates(data: Data) -> Data:
                 ("ours", OURS), ("printed_sign", PRINTED_SIGN), ("fixed", FIXED), ("timed", TIMED),
             )
         },
-        "agree": agree,
-        "falls": falls,
-        "unmoved": unmoved,
-        "after": after.mean(),
-        "silent": silent.mean(),
-        "shares": data["requested"][WINDOW].mean(0),
+        "agree": agree, "falls": falls, "unmoved": unmoved, "after": after.mean(),
+        "silent": silent.mean(), "shares": data["requested"][WINDOW].mean(0),
         "saves": verdict(estimate(sample).high < 1.0 for sample in ours),
-        "as_printed": verdict(agree),
-        "decreases": verdict(falls[:1]),
+        "as_printed": verdict(agree), "decreases": verdict(falls[:1]),
         "adapts": verdict([estimate(after).low > 0.0]),
         "moves_in_silence": verdict([float(silent.max()) > 0.0]),
         "limits": verdict([(by[TIMED] == 1.0).all(), unmoved == 0.0]),
@@ -221,18 +212,15 @@ def simulate_fusion(
     """
     scaled = {f"scale {scale}": Lane(scale) for scale in settings["scales"]}
     groups = {
-        "bounds": {AT_BOUND: Lane()},
-        "scales": scaled,
-        "first": dict([next(iter(scaled.items()))]),
+        "bounds": {AT_BOUND: Lane()}, "scales": scaled, "first": dict([next(iter(scaled.items()))]),
         "others": {OTHERS: Lane(ask=_of_other_episodes(episodes)), ALWAYS: Lane(ask=_always)},
-    }
+    }  # fmt: skip
     selected = {name: lane for group in lanes for name, lane in groups[group].items()}
     data: Data = {"lanes": list(selected), "scales": list(settings["scales"])}
     for fusion in fusions:
         record = ErrorRecord(len(selected), episodes, with_nodes=fusion == FUSIONS[0])
-        for step in steps(
-            selected.values(), episodes, seed, settings, fusion=fusion, track_actual=True
-        ):
+        options = {"fusion": fusion, "track_actual": True}
+        for step in steps(selected.values(), episodes, seed, settings, **options):
             record.add(step)
         data |= {f"{fusion}_{name}": value for name, value in record.arrays().items()}
     return data
@@ -248,171 +236,123 @@ class _Lanes:
         result: Array = self.data[f"{fusion}_{name}"][self.data["lanes"].index(lane)]
         return result
 
-    def relative(self, fusion: str, lane: str) -> Interval:
-        """MSE over actual trace, minus 1."""
-        return estimate(self(fusion, "mse", lane) / self(fusion, "actual", lane).mean() - 1.0)
+    def both(self, name: str, lane: str) -> Array:
+        """Return the data of both fusion rules, stacked."""
+        return np.stack([self(fusion, name, lane) for fusion in FUSIONS])
+
+    def relative(self, lane: str) -> list[Interval]:
+        """Return MSE over actual trace, minus 1, of both fusion rules."""
+        actual = self.both("actual", lane).mean(-1, keepdims=True)
+        return [estimate(sample) for sample in self.both("mse", lane) / actual - 1.0]
 
 
 def _close(interval: Interval) -> bool:
     return max(abs(interval.low), abs(interval.high)) <= _CLOSE
 
 
-def _hundredfold(interval: Interval) -> Interval:
-    return Interval(*(100.0 * value for value in interval))
+def _hundredfold(intervals: Iterable[Interval]) -> list[Interval]:
+    return [Interval(*(100.0 * value for value in interval)) for interval in intervals]
 
 
 def _summarise_fusion(data: Data) -> Data:
-    lanes, scaled = _Lanes(data), [f"scale {scale}" for scale in data["scales"]]
+    lanes, scaled = _Lanes(data), {f"scale {scale}": scale for scale in data["scales"]}
     names = {AT_BOUND: "trigger", OTHERS: "trigger's requests of another episode", ALWAYS: "always"}
-    below_names = {
-        lane: f"trigger, variances {scale} of the bounds"
-        for lane, scale in zip(scaled, data["scales"], strict=True)
-    }
+    low_names = {lane: f"trigger, variances {scaled[lane]} of the bounds" for lane in scaled}
     quantities = {"mse": "MSE", "actual": "actual trace", "conservative": "conservative trace"}
-    traces, scales = (
-        grid(
-            tuple(quantities.values()),
-            {
-                f"{NAMES[f]}, {label}": [lanes(f, quantity, lane) for quantity in quantities]
-                for f in FUSIONS
-                for lane, label in group.items()
-            },
-        )
-        for group in (names, below_names)
-    )
+
+    def traces(group: dict[str, str]) -> list[Number]:
+        rows = {
+            f"{NAMES[f]}, {label}": [lanes(f, quantity, lane) for quantity in quantities]
+            for f in FUSIONS
+            for lane, label in group.items()
+        }
+        return grid(tuple(quantities.values()), rows)
+
     inside = {
         f"{NAMES[f]}, variances {scale:g} of the bounds": 100.0 * lanes(f, "inside", lane)
         for f in FUSIONS
-        for lane, scale in zip(scaled, data["scales"], strict=True)
+        for lane, scale in scaled.items()
     }
-    numbers = {"traces": traces, "scales": scales, "inside": grid(STATES, inside)}
-    first = data["lanes"].index(scaled[0]), data["lanes"].index(scaled[-1]) + 1
-    within = [
-        np.abs(data[f"{f}_truth"] - data[f"{f}_mean"])[slice(*first)]
-        <= 3.0 * data[f"{f}_actual_deviation"][slice(*first)]
-        for f in FUSIONS
-    ]
+    left = lanes.both("square", AT_BOUND).mean(-1).sum(-1)
     return {
-        "tables": numbers,
-        "quantities": list(quantities.values()),
-        "states": STATES,
-        "rules": list(NAMES.values()),
-        "runs": data["sci_mse"].shape[-1],
-        "ellipses": ELLIPSES,
-        "within": [float(each.mean()) for each in within],
-        "left": [
-            1.0
-            - float(
-                1.0 - lanes(f, "square", AT_BOUND).mean(-1).sum()
-                / lanes(f, "level", AT_BOUND).sum(0).mean()
-            )
-            for f in FUSIONS
-        ],
-        "relative": [_hundredfold(lanes.relative(f, AT_BOUND)) for f in FUSIONS],
-        "independent": [_hundredfold(lanes.relative(f, OTHERS)) for f in FUSIONS],
-        **_summarise_figures(lanes, scaled),
-        **_summarise_bounds(lanes, scaled),
-        **_summarise_comparisons(lanes, scaled),
+        "tables": {
+            "traces": traces(names), "scales": traces(low_names), "inside": grid(STATES, inside),
+        },
+        "quantities": list(quantities.values()), "states": STATES, "rules": list(NAMES.values()),
+        "runs": data["sci_mse"].shape[-1], "ellipses": ELLIPSES,
+        "within": np.mean([_within(lanes, lane) for lane in scaled], axis=0),
+        "left": list(left / lanes.both("level", AT_BOUND).sum(1).mean(-1)),
+        "relative": _hundredfold(lanes.relative(AT_BOUND)),
+        "independent": _hundredfold(lanes.relative(OTHERS)),
+        **_summarise_figures(lanes, list(scaled)), **_summarise_bounds(lanes, list(scaled)),
+        **_summarise_comparisons(lanes, next(iter(scaled))),
     }  # fmt: skip
 
 
+def _within(lanes: _Lanes, lane: str) -> Array:
+    """The shares of a run's errors within three actual deviations, by fusion rule."""
+    error = np.abs(lanes.both("truth", lane) - lanes.both("mean", lane))
+    return np.asarray((error <= 3.0 * lanes.both("actual_deviation", lane)).mean((1, 2)))
+
+
 def _summarise_figures(lanes: _Lanes, scaled: list[str]) -> Data:
-    follows, under, lower = [], [], []
-    for f in FUSIONS:
-        square, level, mse, trace = (
-            lanes(f, name, AT_BOUND) for name in ("square", "level", "mse", "conservative")
-        )
-        follows += list(1.0 - square.mean(-1) / level.mean(-1))
-        curves = [lanes(f, f"{name}_steps", AT_BOUND) for name in ("mse", "conservative")]
-        lower.append(below(mse, trace))
-        under.append(100.0 * float((curves[0] <= curves[1]).mean()))
-    inside = {
-        f"{NAMES[f]}, {lane}, {state}": float(lanes(f, "inside", lane)[i].mean())
-        for f in FUSIONS
-        for lane in scaled
-        for i, state in enumerate(STATES)
-    }
-    more = [share > 0.99 for share in inside.values()]
-    where = min(inside, key=inside.__getitem__)
-    whole = [np.mean([lanes(f, "inside", lane).mean() for lane in scaled]) for f in FUSIONS]
+    square, level = (lanes.both(name, AT_BOUND).mean(-1) for name in ("square", "level"))
+    mse, trace = (lanes.both(f"{name}_steps", AT_BOUND) for name in ("mse", "conservative"))
+    lower = map(below, lanes.both("mse", AT_BOUND), lanes.both("conservative", AT_BOUND))
+    inside = np.stack([lanes.both("inside", lane).mean(-1) for lane in scaled], axis=1)
+    more, least = inside > 0.99, np.unravel_index(inside.argmin(), inside.shape)
+    rule, lane, state = map(int, least)
+    follows = 1.0 - square / level
     return {
-        "explained": 100.0 * min(follows),
-        "tracks": verdict(share > 0.99 for share in follows),
-        "close_below": 100 * _CLOSE,
-        "close": verdict(_close(lanes.relative(f, AT_BOUND)) for f in FUSIONS),
-        "under": under,
-        "below_conservative": verdict(lower),
-        "more": more,
-        "inside": verdict(more),
-        "least": 100.0 * inside[where],
-        "where": where,
-        "whole": [100.0 * float(share) for share in whole],
-    }
+        "explained": 100.0 * follows.min(), "tracks": verdict((follows > 0.99).ravel()),
+        "close_below": 100 * _CLOSE, "close": verdict(map(_close, lanes.relative(AT_BOUND))),
+        "under": 100.0 * (mse <= trace).mean(-1), "below_conservative": verdict(lower),
+        "more": more.ravel().tolist(), "inside": verdict(more.ravel()),
+        "least": 100.0 * inside.min(),
+        "where": f"{NAMES[FUSIONS[rule]]}, {scaled[lane]}, {STATES[state]}",
+        "whole": 100.0 * inside.mean((1, 2)),
+    }  # fmt: skip
 
 
 def _summarise_bounds(lanes: _Lanes, scaled: list[str]) -> Data:
     every = [AT_BOUND, *scaled]
-    ordered = [[float(lanes(f, "ordered", s).mean(-1).min()) for s in scaled] for f in FUSIONS]
-    sci, sici = ([float(lanes(f, "bounded", lane).mean()) for lane in every] for f in FUSIONS)
-    nodes = [float(lanes("sci", "node_bounded", lane).min()) for lane in every]
+    ordered = np.stack([lanes.both("ordered", lane).mean(-1).min(-1) for lane in scaled], axis=1)
+    bounded = np.stack([lanes.both("bounded", lane).mean(-1) for lane in every], axis=1)
+    nodes = min(float(lanes("sci", "node_bounded", lane).min()) for lane in every)
     gap = float(lanes("sci", "node_gap", AT_BOUND).max())
+    places = [name.removeprefix("scale ") for name in every]
+    close = [_close(each) for lane in (AT_BOUND, OTHERS) for each in lanes.relative(lane)]
     return {
-        "ordered_shares": ordered,
-        "ordered": verdict(share == 1.0 for shares in ordered for share in shares),
-        "node_share": min(nodes),
-        "node_bounds": verdict(share == 1.0 for share in nodes),
-        "gap": gap,
-        "least_bound": verdict([gap < 1e-9]),
-        "sci_share": min(sci),
-        "sci_bounds": verdict(share == 1.0 for share in sci),
-        "sici_shares": dict(
-            zip((name.removeprefix("scale ") for name in every), sici, strict=True)
-        ),
-        "sici_bounds": "holds" if min(sici) == 1.0 else "does not hold",
-        "bounded": [sci[0], sici[0]],
-        "worst": [max(float(lanes(f, "worst", lane).max()) for lane in every) for f in FUSIONS],
+        "ordered_shares": ordered, "ordered": verdict((ordered == 1.0).ravel()),
+        "node_share": nodes, "node_bounds": verdict([nodes == 1.0]),
+        "gap": gap, "least_bound": verdict([gap < 1e-9]), "sci_share": bounded[0].min(),
+        "sci_bounds": verdict(bounded[0] == 1.0),
+        "sici_shares": dict(zip(places, bounded[1].tolist(), strict=True)),
+        "sici_bounds": verdict([bounded[1].min() == 1.0]), "bounded": bounded[:, 0].tolist(),
+        "worst": np.max([lanes.both("worst", lane).max(-1) for lane in every], axis=0),
         "real": [estimate(top(lanes("sici", "whitened", lane))) for lane in (ALWAYS, AT_BOUND)],
-        "covariance": verdict(
-            _close(lanes.relative(f, lane)) for f in FUSIONS for lane in (AT_BOUND, OTHERS)
-        ),
-    }
+        "covariance": verdict(close),
+    }  # fmt: skip
 
 
-def _summarise_comparisons(lanes: _Lanes, scaled: list[str]) -> Data:
-    mse, trace, other = (
-        [lanes(f, name, lane) for f in FUSIONS]
-        for name, lane in (("mse", AT_BOUND), ("conservative", AT_BOUND), ("mse", OTHERS))
-    )
-    late = [lanes(f, "mse_steps", AT_BOUND)[399:600] for f in FUSIONS]
-    bounded = [float(lanes(f, "bounded", AT_BOUND).mean()) for f in FUSIONS]
-    beats = [float(lanes(f, "beats", AT_BOUND).mean(-1).min()) for f in FUSIONS]
-    node = lanes("sci", "node_mse", AT_BOUND)
+def _summarise_comparisons(lanes: _Lanes, scaled: str) -> Data:
+    mse, trace, beats = (lanes.both(name, AT_BOUND) for name in ("mse", "conservative", "beats"))
+    late = lanes.both("mse_steps", AT_BOUND)[:, _LATE]
+    bounded, beats = lanes.both("bounded", AT_BOUND).mean(-1), beats.mean(-1).min(-1)
+    node, other = lanes("sci", "node_mse", AT_BOUND), lanes.both("mse", OTHERS)
     better = [below(own, each) for own in mse for each in node]
-    whole, plane = (
-        [lanes(f, name, scaled[0]).mean(-1) for f in FUSIONS]
-        for name in ("encloses", "encloses_plane")
-    )
+    whole, plane = (lanes.both(name, scaled).mean(-1) for name in ("encloses", "encloses_plane"))
     accurate, tight = below(mse[1], mse[0]), below(trace[1], trace[0])
+    price = mse / lanes.both("mse", ALWAYS).mean(-1, keepdims=True) - 1.0
     return {
-        "mse": mse,
-        "trace": trace,
-        "node": node,
-        "other": other,
-        "wins": float((mse[1] < mse[0]).mean()),
-        "late": float((late[1] < late[0]).mean()),
+        "mse": list(mse), "trace": trace, "node": node, "other": list(other),
+        "wins": float((mse[1] < mse[0]).mean()), "late": float((late[1] < late[0]).mean()),
         "accurate": verdict([accurate, late[1].mean() < late[0].mean()]),
         "remark_3": verdict([accurate, tight, bounded[1] >= bounded[0]]),
-        "beats": beats,
-        "higher": verdict([*(share > 0.99 for share in beats), *better]),
-        "plane": plane,
-        "whole_ellipses": whole,
-        "encloses": verdict(share > 0.99 for shares in (*whole, *plane) for share in shares),
-        "price": [
-            _hundredfold(estimate(own / lanes(f, "mse", ALWAYS).mean() - 1.0))
-            for f, own in zip(FUSIONS, mse, strict=True)
-        ],
-        "effective": verdict(map(below, mse, other)),
-    }
+        "beats": beats.tolist(), "higher": verdict([*(beats > 0.99), *better]), "plane": plane,
+        "whole_ellipses": whole, "encloses": verdict((np.stack((whole, plane)) > 0.99).ravel()),
+        "price": _hundredfold(map(estimate, price)), "effective": verdict(map(below, mse, other)),
+    }  # fmt: skip
 
 
 # --- figures --------------------------------------------------------------------------------------

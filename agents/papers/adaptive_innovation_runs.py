@@ -78,10 +78,9 @@ def steps(
     options = {"horizon": STEPS} | settings["options"] | options
     task = fusion_gym.make_task(CorrelatedTrackingOptions(**options))
     system = SideBySide(
-        **vars(task.system),
-        scales=np.repeat([lane.scale for lane in lanes], episodes),
+        **vars(task.system), scales=np.repeat([lane.scale for lane in lanes], episodes),
         known_start=np.repeat([lane.known_start for lane in lanes], episodes),
-    )
+    )  # fmt: skip
     batch = EpisodeBatch(replace(task, system=system), len(lanes) * episodes)
     runs = np.arange(batch.num_envs)
     batch.seed(runs, (seed + runs % episodes).tolist())
@@ -158,18 +157,11 @@ class ErrorRecord:
         largest = _largest(actual, claimed)
         start = state.truth - np.array(CorrelatedTrackingOptions().initial_mean)[:, None]
         self._add(
-            rate=step.outcome.requested,
-            mse=mse,
-            actual=traces[0],
-            conservative=traces[1],
-            inside=np.abs(error) <= 3.0 * deviation,
-            ordered=deviation <= bound * (1.0 + _ROUNDING),
-            bounded=largest <= 1.0 + _ROUNDING,
-            whitened=_whitened(error, claimed),
-            square=error**2,
-            level=start**2,
-            beats=traces[1] <= linalg.trace(state.covariance[1:]),
-        )
+            rate=step.outcome.requested, mse=mse, actual=traces[0], conservative=traces[1],
+            inside=np.abs(error) <= 3.0 * deviation, ordered=deviation <= bound * (1.0 + _ROUNDING),
+            bounded=largest <= 1.0 + _ROUNDING, whitened=_whitened(error, claimed), square=error**2,
+            level=start**2, beats=traces[1] <= linalg.trace(state.covariance[1:]),
+        )  # fmt: skip
         self._most(worst=largest)
         for name, value in zip(("mse", "actual", "conservative"), (mse, *traces), strict=True):
             self._row(f"{name}_steps", self._lanes(value).mean(-1))

@@ -17,7 +17,7 @@ from fusion_gym.validation import ConfigurationError
 
 from ..output.files import DAMAGED, replacing
 from ..output.folders import fingerprint
-from .paper import NOTHING, Data, Paper, Piece, Settings, load_paper
+from .paper import Data, Piece, load_paper
 
 _PLAIN = "plain"  # the entry that holds all that is no array, as JSON
 _ROOT = Path(fusion_gym.__file__).parent
@@ -36,21 +36,6 @@ class PieceJob(NamedTuple):
     settings: Data
     restriction: Data
     work: Path
-
-    @classmethod
-    def of(
-        cls,
-        paper: Paper,
-        piece: Piece,
-        episodes: int | None,
-        seed: int,
-        settings: Data,
-        work: Path,
-        restriction: Settings = NOTHING,
-    ) -> "PieceJob":
-        """Return the job of a piece, with its usual number of episodes unless one is named."""
-        count = episodes or piece.usual
-        return cls(paper.name, piece.name, count, seed, settings, dict(restriction), work)
 
     @property
     def path(self) -> Path:

@@ -6,6 +6,7 @@ systems with correlated noises and fading measurements), Section 6.
 
 from __future__ import annotations
 
+import operator
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -21,16 +22,7 @@ from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingOptions
 from ..output.palette import BLACK, BLUE, GREEN, ORANGE, PURPLE, SENSORS, SKY, TRUTH, VERMILLION
 from .markov_jump_covariances import covariances
 from .numbers import Number, below, grid, verdict
-from .paper import (
-    Data,
-    Paper,
-    PaperFigure,
-    Parameter,
-    Piece,
-    Settings,
-    numbers_within,
-    policy_specs,
-)
+from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_list
 
 STATES = ("position", "velocity")
 UNITS = ("m", "m/s")
@@ -41,9 +33,8 @@ _LAST = 60  # steps that stand for the settled ones
 _SETTLED = 1e-9  # relative change over a period below which a trace repeats itself
 _MARGIN = 1e-5  # of a threshold beyond the range of those that make a difference
 _PRINTED = {  # of Section 6, with half of their last digit
-    "mean of β": ((0.65, 0.39, 0.45), 0.005),
-    "variance of β": ((0.09, 0.0499, 0.0585), 0.00005),
-}
+    "mean of β": ((0.65, 0.39, 0.45), 0.005), "variance of β": ((0.09, 0.0499, 0.0585), 0.00005),
+}  # fmt: skip
 _CLEAR = 4.0  # standard errors: not reached by chance in some dozens of comparisons
 _SAME = 1e-9  # relative difference of two recursions that are the same
 _PERIOD = 6  # steps, after which all sensors' sampling repeats
@@ -65,9 +56,8 @@ def trigger(m: float, literal: bool = False) -> str:
 
 def _lanes(settings: Settings) -> dict[str, str]:
     """The trigger at every threshold and the other policies, by their labels."""
-    return {f"m = {m:g}": trigger(m) for m in settings["m"]} | {
-        policy: policy for policy in settings["policies"]
-    }
+    lanes = {f"m = {m:g}": trigger(m) for m in settings["m"]}
+    return lanes | {policy: policy for policy in settings["policies"]}
 
 
 class Run(NamedTuple):
@@ -130,23 +120,16 @@ def simulate_schedule(episodes: int, seed: int, settings: Settings) -> Data:
     mean = (sensors.fading_values * sensors.fading_probabilities).sum(1)
     square = (sensors.fading_values**2 * sensors.fading_probabilities).sum(1)
     return {
-        "m": list(settings["m"]),
-        "labels": list(lanes),
+        "m": list(settings["m"]), "labels": list(lanes),
         "sent": np.array([run.sent for run in runs]),
         "trace": np.array([run.trace for run in runs]),
         "literal": run_markov_jump(short, trigger(0.0, literal=True), episodes, seed).sent,
-        "local": local,
-        "periods": sensors.period[:, 0],
-        "range": limits,
+        "local": local, "periods": sensors.period[:, 0], "range": limits,
         "at_ends": [float(share) for share in at_ends],
-        "radii": [
-            float(np.abs(np.linalg.eigvals(plant.transition[..., mode])).max())
-            for mode in range(plant.modes)
-        ],
-        "square_radius": float(plant.second_moment_radius()),
-        "mean of β": mean,
+        "radii": np.abs(np.linalg.eigvals(np.moveaxis(plant.transition, -1, 0))).max(-1).tolist(),
+        "square_radius": float(plant.second_moment_radius()), "mean of β": mean,
         "variance of β": square - mean**2,
-    }
+    }  # fmt: skip
 
 
 def period_of(values: Array) -> int | None:
@@ -166,7 +149,6 @@ def _summarise_schedule(data: Data) -> Data:
     values = np.column_stack((shares, packets, trace[:, :_SHOWN].mean(-1), settled))
     larger = [float((after >= before * (1.0 - 1e-12)).mean()) for before, after in pairwise(trace)]
     fused, own = ([period_of(item) for item in curves] for curves in (trace, data["local"]))
-    stable = [radius < 1.0 for radius in data["radii"]]
     return {
         "columns": columns,
         "tables": {
@@ -181,27 +163,19 @@ def _summarise_schedule(data: Data) -> Data:
                 for node, (value, ours) in enumerate(zip(printed, data[what].tolist(), strict=True))
             ],
         },
-        "shown": _SHOWN,
-        "instants": _INSTANTS,
-        "settled_from": _LONG - _LAST + 1,
-        "tolerance": _SETTLED,
-        "shares": shares,
-        "packets": packets,
+        "shown": _SHOWN, "instants": _INSTANTS, "settled_from": _LONG - _LAST + 1,
+        "tolerance": _SETTLED, "shares": shares, "packets": packets,
         "falls": verdict(now > later for now, later in pairwise(packets)),
         "quiet": int((~literal.all(-1)).nonzero()[0].max(initial=-1)) + 1,
         "everything": verdict([literal.all(), literal[_SHOWN // 2 :].all()]),
-        "matter": verdict([data["at_ends"][0] == 1.0, data["at_ends"][1] == 0.0]),
-        "larger": larger,
-        "grows": verdict(share == 1.0 for share in larger),
-        "settled": settled,
+        "matter": verdict([data["at_ends"][0] == 1.0, data["at_ends"][1] == 0.0]), "larger": larger,
+        "grows": verdict(share == 1.0 for share in larger), "settled": settled,
         "fused_periods": [period or "none" for period in fused],
         "periodic": verdict(period is not None for period in fused),
         "own_periods": [period or "none" for period in own],
-        "as_sampled": verdict(
-            period == int(due) for period, due in zip(own, data["periods"], strict=True)
-        ),
-        "stable": verdict((all(stable), data["square_radius"] < 1.0)),
-    }
+        "as_sampled": verdict(map(operator.eq, own, data["periods"])),
+        "stable": verdict((max(data["radii"]) < 1.0, data["square_radius"] < 1.0)),
+    }  # fmt: skip
 
 
 # --- tracking and its errors ----------------------------------------------------------------------
@@ -219,42 +193,31 @@ def simulate_tracking(episodes: int, seed: int, settings: Settings) -> Data:
     names = ("means", "few", "every", "squares")
     silent = run_markov_jump(task, "never", episodes, seed)
     return {
-        "m": list(settings["m"]),
-        "labels": list(lanes),
-        "truth": silent.truth[..., 0],
+        "m": list(settings["m"]), "labels": list(lanes), "truth": silent.truth[..., 0],
         "silent": silent.squared.mean(0),
         **{name: np.array(row) for name, row in zip(names, zip(*rows, strict=True), strict=True)},
-    }
+    }  # fmt: skip
 
 
 def _summarise_tracking(data: Data) -> Data:
     squares, silent = data["squares"], data["silent"]
+    square = squares.mean(-1).T
     columns = [f"mean squared error of the {state}" for state in STATES]
     rows = dict(zip(data["labels"], squares, strict=True)) | {"nothing sent": silent}
     states = range(len(STATES))
     raised = [below(now[s], later[s]) for now, later in pairwise(squares) for s in states]
-    top, few_top = (
-        (data[name][-1] >= data[name].max(0)).mean(0).tolist() for name in ("every", "few")
-    )
+    every, few = data["every"], data["few"]
+    top = (every[-1] >= every.max(0)).mean(0)
     first = [below(squares[0, s], later[s]) for later in squares[1:] for s in states]
     return {
-        "columns": columns,
-        "tables": {"errors": grid(columns, rows)},
-        "papers_runs": _PAPERS_RUNS,
-        "gain": {
-            state: 1.0 - squares[:, s].mean(-1) / silent[s].mean() for s, state in enumerate(STATES)
-        },
-        "tracks": verdict(
-            below(square[s], _TRACKED * silent[s]) for square in squares for s in states
-        ),
-        "roots": {state: np.sqrt(squares[:, s].mean(-1)) for s, state in enumerate(STATES)},
-        "raised": raised,
-        "worse": verdict(raised),
-        "top": top,
-        "few_top": few_top,
-        "on_top": verdict(share > 0.5 for share in top),
-        "first_best": verdict([all(first)]),
-    }
+        "columns": columns, "tables": {"errors": grid(columns, rows)}, "papers_runs": _PAPERS_RUNS,
+        "gain": {name: 1.0 - square[s] / silent[s].mean() for s, name in enumerate(STATES)},
+        "tracks": verdict(below(own[s], _TRACKED * silent[s]) for own in squares for s in states),
+        "roots": {name: np.sqrt(square[s]) for s, name in enumerate(STATES)},
+        "raised": raised, "worse": verdict(raised), "top": top,
+        "few_top": (few[-1] >= few.max(0)).mean(0),
+        "on_top": verdict(share > 0.5 for share in top), "first_best": verdict([all(first)]),
+    }  # fmt: skip
 
 
 # --- theorems -------------------------------------------------------------------------------------
@@ -289,12 +252,9 @@ def simulate_theorems(episodes: int, seed: int, settings: Settings) -> Data:
     return first | {
         "m": list(settings["m"]),
         "claimed": system.recursion.local_trace[:, system.filters.at(time)].mean(-1),
-        "fused": np.array(fused),
-        "traces": traces,
-        "least": least,
-        "moment_claimed": float(squares[1:].sum(1).mean()),
-        "ci": beside.squared.sum(1).mean(0),
-    }
+        "fused": np.array(fused), "traces": traces, "least": least,
+        "moment_claimed": float(squares[1:].sum(1).mean()), "ci": beside.squared.sum(1).mean(0),
+    }  # fmt: skip
 
 
 def _exact(system: Any, horizon: int) -> Array:
@@ -316,25 +276,16 @@ def _summarise_theorems(data: Data) -> Data:
     ratios = {f"node {i + 1}": pair for i, pair in enumerate(local)}
     ratios |= {f"fused, m = {m:g}": pair for m, pair in zip(data["m"], fused, strict=True)}
     ratios |= {"the state itself": moment}
+    rows = {name: [sample / claim] for name, (sample, claim) in ratios.items()}
     full = data["fused"][0]
     return {
-        "tables": {
-            "covariances": grid(
-                ("ratio",), {name: [sample / claim] for name, (sample, claim) in ratios.items()}
-            )
-        },
-        "local_pairs": local,
-        "fused_pairs": fused,
-        "moment_right": verdict([_agrees(*moment)]),
+        "tables": {"covariances": grid(("ratio",), rows)},
+        "local_pairs": local, "fused_pairs": fused, "moment_right": verdict([_agrees(*moment)]),
         "local_right": verdict(_agrees(*item) for item in local),
         "fused_right": verdict(_agrees(*item) for item in fused),
-        "crossed": verdict(
-            (data["difference"][0] < _SAME, *(least > -_SAME for least in data["least"]))
-        ),
-        "optimal": verdict(
-            [*(below(full, item) for item in data["local"]), below(full, data["ci"])]
-        ),
-    }
+        "crossed": verdict((data["difference"][0] < _SAME, *(np.array(data["least"]) > -_SAME))),
+        "optimal": verdict(below(full, other) for other in (*data["local"], data["ci"])),
+    }  # fmt: skip
 
 
 # --- what as many packets could bring -------------------------------------------------------------
@@ -358,16 +309,11 @@ def simulate_others(episodes: int, seed: int, settings: Settings) -> Data:
         if packets[-1] <= _SEARCHED:
             best.append(squared(f"periodic_optimum:packets={packets[-1]},period={_PERIOD}"))
     return {
-        "m": list(settings["m"][1:]),
-        "paper": np.array(paper),
-        "chance": np.array(chance),
-        "rates": rates,
-        "packets": packets,
-        "best": np.array(best),
-        "sent": squared("always"),
+        "m": list(settings["m"][1:]), "paper": np.array(paper), "chance": np.array(chance),
+        "rates": rates, "packets": packets, "best": np.array(best), "sent": squared("always"),
         "centralised": squared("always", example(filter="centralised")),
         "modes": squared("always", example(filter="imm")),
-    }
+    }  # fmt: skip
 
 
 def _summarise_others(data: Data) -> Data:
@@ -388,6 +334,7 @@ def _summarise_others(data: Data) -> Data:
     }
     shares = [sum(rates) / len(rates) for rates in data["rates"]]
     saves = all(share < 1.0 for share in shares)
+    near = all(not below(item["best"] * 1.1, item["paper"]) for item in schedules)
     return {
         "columns": columns,
         "tables": {
@@ -396,16 +343,12 @@ def _summarise_others(data: Data) -> Data:
             ),
             "beside": grid(("squared error",), beside),
         },
-        "shares": shares,
-        "period": _PERIOD,
-        "schedules": schedules,
+        "shares": shares, "period": _PERIOD, "schedules": schedules,
         "price": paper[0].mean() / data["sent"].mean() - 1.0,
         "redundant": verdict((saves, all(map(below, paper, chance)))),
-        "accurate": verdict(
-            (saves, all(not below(item["best"] * 1.1, item["paper"]) for item in schedules))
-        ),
+        "accurate": verdict((saves, near)),
         "linear_best": verdict([below(data["centralised"], data["sent"])]),
-    }
+    }  # fmt: skip
 
 
 # --- figures --------------------------------------------------------------------------------------
@@ -438,9 +381,8 @@ def _draw_instants(figure: Any, data: Data) -> None:
             axis.plot(
                 time[~there], 0.0 * time[~there] + base, "o", ms=2.6, mfc="none", color=colour
             )
-        axis.set_yticks(
-            [_LANE * lane + up for lane in range(count) for up in (0, 1)], ["0", "1"] * count
-        )
+        ticks = [_LANE * lane + up for lane in range(count) for up in (0, 1)]
+        axis.set_yticks(ticks, ["0", "1"] * count)
         axis.set_ylim(-0.5, _LANE * count - 0.2)
         axis.set_title(f"({chr(ord('a') + place)}) {label}", loc="left")
         for sensor in range(count):
@@ -528,7 +470,7 @@ PAPER = Paper(
     "fusion_gym/MarkovJumpTracking-v0",
     {
         "m": Parameter((0.0, 0.9, 1.3, 1.5), numbers_within(at_least=0.0)),
-        "policies": Parameter((), policy_specs),
+        "policies": Parameter((), policy_list),
     },
     ("horizon", "fusion"),
 )

@@ -40,9 +40,8 @@ def render_page(paper: Paper, results: Mapping[str, Data], counts: Counts) -> Pa
         cells = [_cell(row[0]), _cell(row[1]), f"**{verdict}**", _cell(row[3])]
         return f"| {' | '.join(cells)} |\n"
 
-    text = _template(f"{paper.name}.md").render(
-        pieces, paper=paper.name, claim=claim, counts=counts
-    )
+    template = _template(f"{paper.name}.md")
+    text = template.render(pieces, paper=paper.name, claim=claim, counts=counts)
     lines = text.splitlines()
     tables = [
         {

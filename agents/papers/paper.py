@@ -159,7 +159,7 @@ def policy_of(rule: str = "NAME") -> Callable[[str, Any], str]:
     return check
 
 
-def policy_specs(name: str, value: Any) -> tuple[str, ...]:
+def policy_list(name: str, value: Any) -> tuple[str, ...]:
     """Check one policy, or a list of them.
 
     Raises:

@@ -11,43 +11,16 @@ import numpy as np
 
 import fusion_gym
 from fusion_gym.arrays import Array
-from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import record_episode
 from fusion_gym.evaluation.intervals import Interval, mean_interval
 from fusion_gym.policies.registry import make_policy
 
 from ..output import palette
+from . import round_robin_tobit_runs as runs
+from . import round_robin_tobit_theorems as theorems
 from .numbers import Number, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_of
-from .round_robin_tobit_runs import (
-    FREE,
-    OSCILLATOR,
-    PAPER_RUNS,
-    ROUND_ROBIN_READINGS,
-    TRACKING,
-    SingleSensor,
-    always_below,
-    armse,
-    armse_number,
-    error_curve,
-    explained,
-    floor,
-    increase,
-    medians,
-    node_squares,
-    paired_increase,
-    reading_task,
-    squares,
-    walk,
-)
-from .round_robin_tobit_theorems import (
-    simulate_bounds,
-    simulate_theory,
-    summarise_bounds,
-    summarise_theory,
-)
 
 # Tables II and III of the paper: ARMSE1, ARMSE2, ARMSE3 by interval and by variance.
 TABLE_II = {
@@ -70,16 +43,15 @@ _ENDS = ("mean", "low", "high")
 
 def _options(interval: float, variance: float) -> dict[str, Any]:
     return {
-        "censoring_threshold": -interval,
-        "censoring_upper": interval,
+        "censoring_threshold": -interval, "censoring_upper": interval,
         "measurement_variance": variance,
-    }
+    }  # fmt: skip
 
 
 def _oscillator(settings: Settings, **options: Any) -> Task:
     """The oscillator with the first interval and the first variance."""
     own = _options(settings["interval"][0], settings["variance"][0])
-    return fusion_gym.make_task(OSCILLATOR, **(own | settings["options"] | options))
+    return fusion_gym.make_task(runs.OSCILLATOR, **(own | settings["options"] | options))
 
 
 # --- the bias in the filter, or ignored by it -----------------------------------------------------
@@ -92,43 +64,35 @@ def simulate_oscillator(episodes: int, seed: int, settings: Settings) -> Data:
     for name, task in tasks.items():
         run = record_episode(task, make_policy(settings["policy"], task), seed)
         result |= {"truth": run.truth, f"{name}_mean": run.mean}
-    for name, options in (("whole", FREE), ("clipped", {})):
+    for name, options in (("whole", runs.FREE), ("clipped", {})):
         task = _oscillator(settings, **options)
-        values = np.empty((task.horizon, task.sensors))
-
-        def look(
-            batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice, values: Array = values
-        ) -> None:
-            values[step] = batch.delivered.held[:, 0, 0]
-
-        walk(task, make_policy(settings["policy"], task), 1, seed, look)
-        result[f"held_{name}"] = values
+        policy = make_policy(settings["policy"], task)
+        result[f"held_{name}"] = runs.held_values(task, policy, seed)
     variance = {"measurement_variance": settings["variance"][0]}
-    least = floor(OSCILLATOR, **(variance | settings["options"]))
+    least = runs.floor(runs.OSCILLATOR, **(variance | settings["options"]))
     return result | {"interval": settings["interval"][0], "floor": least}
 
 
 def simulate_target(episodes: int, seed: int, settings: Settings) -> Data:
     """The RMSE of both filters."""
-    options = settings["options"]
-    tasks = {name: fusion_gym.make_task(TRACKING, **own, **options) for name, own in _BOTH.items()}
-    return _curves(tasks, episodes, seed, settings) | {"floor": floor(TRACKING, **options)}
+    env, options = runs.TRACKING, settings["options"]
+    tasks = {name: fusion_gym.make_task(env, **own, **options) for name, own in _BOTH.items()}
+    return _curves(tasks, episodes, seed, settings) | {"floor": runs.floor(env, **options)}
 
 
 def _curves(tasks: dict[str, Task], episodes: int, seed: int, settings: Settings) -> Data:
     errors = {
-        name: squares(task, make_policy(settings["policy"], task), episodes, seed)
+        name: runs.squares(task, make_policy(settings["policy"], task), episodes, seed)
         for name, task in tasks.items()
     }
     aware = tasks["aware"]
-    never = squares(aware, make_policy("never", aware), episodes, seed)
+    never = runs.squares(aware, make_policy("never", aware), episodes, seed)
     return {
-        **{f"{name}_rmse": error_curve(error) for name, error in errors.items()},
-        **{f"{name}_armse": armse(error) for name, error in errors.items()},
-        "difference": paired_increase(errors["aware"], errors["unaware"]),
-        "silent": armse(never)["mean"],
-        "bias_deviation": _bias_deviation(aware),
-    }
+        **{f"{name}_rmse": runs.error_curve(error) for name, error in errors.items()},
+        **{f"{name}_armse": runs.armse(error) for name, error in errors.items()},
+        "difference": runs.paired_increase(errors["aware"], errors["unaware"]),
+        "silent": runs.armse(never)["mean"], "bias_deviation": _bias_deviation(aware),
+    }  # fmt: skip
 
 
 def _bias_deviation(task: Task) -> float:
@@ -136,37 +100,28 @@ def _bias_deviation(task: Task) -> float:
 
 
 def _summarise_curves(data: Data, states: Sequence[str], units: Sequence[str]) -> Data:
-    aware, unaware, least = (
-        data["aware_armse"]["mean"],
-        data["unaware_armse"]["mean"],
-        data["floor"],
-    )
+    aware, unaware = (data[f"{name}_armse"]["mean"] for name in _BOTH)
     filters = {"aware": "FTKF-DB", "unaware": "FTKF (bias ignored)"}
-    ratio = aware[2] / least[2]
-    lower = always_below(data["difference"][..., :2])
+    ratio = aware[2] / data["floor"][2]
+    lower = runs.always_below(data["difference"][..., :2])
     return {
         "curves": [
-            armse_number(f"ARMSE of {state}, {label}", data[f"{key}_armse"], i, None, units[i])
+            runs.armse_number(f"ARMSE of {state}, {label}", data[f"{key}_armse"], i, None, units[i])
             for key, label in filters.items()
             for i, state in enumerate(states)
             if key == "aware" or i < 2
         ],
         "factors": [other / own for own, other in zip(aware, unaware, strict=True)],
-        "bias_mean": aware[2],
-        "lower": lower,
-        "ratio": ratio,
-        "far": aware[2] / data["silent"][2],
-        "satisfactory_below": _SATISFACTORY,
-        "satisfactory": verdict([ratio < _SATISFACTORY]),
-    }
+        "bias_mean": aware[2], "lower": lower, "ratio": ratio, "far": aware[2] / data["silent"][2],
+        "satisfactory_below": _SATISFACTORY, "satisfactory": verdict([ratio < _SATISFACTORY]),
+    }  # fmt: skip
 
 
 def _summarise_oscillator(data: Data) -> Data:
     result = _summarise_curves(data, ("x1", "x2", "b"), ("", "", ""))
     held, truth = np.abs(data["held_clipped"]), data["truth"]
-    tracks, misses = (
-        explained(data[f"{name}_armse"]["mean"], data["silent"]) for name in ("aware", "unaware")
-    )
+    means = (data[f"{name}_armse"]["mean"] for name in _BOTH)
+    tracks, misses = (runs.explained(mean, data["silent"]) for mean in means)
     return result | {
         "tables": {"oscillator": result["curves"]},
         "clipped": float(np.mean(held >= data["interval"])),
@@ -183,10 +138,9 @@ def _summarise_target(data: Data) -> Data:
     result = _summarise_curves(data, states, units)
     close = np.array(data["aware_armse"]["mean"]) / np.array(data["floor"])
     return result | {
-        "tables": {"target": result["curves"]},
-        "close": close,
+        "tables": {"target": result["curves"]}, "close": close,
         "optimum": verdict(abs(item - 1.0) < 0.03 for item in close),
-    }
+    }  # fmt: skip
 
 
 # --- local filters and the fused one --------------------------------------------------------------
@@ -196,51 +150,46 @@ def simulate_nodes(episodes: int, seed: int, settings: Settings) -> Data:
     """Local filters of a single sensor, and as nodes to which the fused estimate is fed back."""
     task = _oscillator(settings)
     policy = make_policy(settings["policy"], task)
-    fused, local = node_squares(task, policy, episodes, seed)
+    fused, local = runs.node_squares(task, policy, episodes, seed)
     run = record_episode(task, policy, seed)
     data: Data = {
-        "truth": run.truth, "fused_mean": run.mean, "fused_rmse": error_curve(fused),
-        "fused_armse": armse(fused),
+        "truth": run.truth, "fused_mean": run.mean, "fused_rmse": runs.error_curve(fused),
+        "fused_armse": runs.armse(fused),
     }  # fmt: skip
     for sensor in range(2):
-        single = SingleSensor(policy, sensor)
-        errors = squares(task, single, episodes, seed)
+        single = runs.SingleSensor(policy, sensor)
+        errors = runs.squares(task, single, episodes, seed)
         data[f"single_{sensor}_mean"] = record_episode(task, single, seed).mean
         data[f"node_{sensor}_mean"] = run.local_mean[:, sensor]
         for name, other in (("single", errors), ("node", local[:, :, sensor])):
-            data[f"{name}_{sensor}_rmse"] = error_curve(other)
-            data[f"{name}_{sensor}_armse"] = armse(other)
-            data[f"{name}_{sensor}_difference"] = paired_increase(fused, other)
-            data[f"{name}_{sensor}_increase"] = increase(fused, other)
+            data[f"{name}_{sensor}_rmse"] = runs.error_curve(other)
+            data[f"{name}_{sensor}_armse"] = runs.armse(other)
+            data[f"{name}_{sensor}_difference"] = runs.paired_increase(fused, other)
+            data[f"{name}_{sensor}_increase"] = runs.increase(fused, other)
     return data
 
 
 def _summarise_nodes(data: Data) -> Data:
     names = {
-        "fused": "FTKF-DB",
-        **{f"single_{i}": f"LTKF-DB-S{i + 1} by itself" for i in range(2)},
+        "fused": "FTKF-DB", **{f"single_{i}": f"LTKF-DB-S{i + 1} by itself" for i in range(2)},
         **{f"node_{i}": f"LTKF-DB-S{i + 1} as a node" for i in range(2)},
-    }
+    }  # fmt: skip
     columns = [f"ARMSE{state + 1}" for state in range(3)]
     claims = {}
     for what, states in (("states", range(2)), ("bias", range(2, 3))):
         for name in _LOCAL:
-            sensors, parts = [], []
+            rises, often = [], []
             for sensor in range(2):
-                result = data[f"{name}_{sensor}_increase"]
-                parts += [result["low"][state] > 0.0 for state in states]
-                sensors.append(
-                    {
-                        "ends": [Interval(*(result[key][i] for key in _ENDS)) for i in states],
-                        "often": always_below(data[f"{name}_{sensor}_difference"][..., states]),
-                    }
-                )
-            claims[f"{what}_{name}"] = {"verdict": verdict(parts), "sensors": sensors}
+                rise = data[f"{name}_{sensor}_increase"]
+                rises.append([Interval(*(rise[end][state] for end in _ENDS)) for state in states])
+                often.append(runs.always_below(data[f"{name}_{sensor}_difference"][..., states]))
+            parts = [interval.low > 0.0 for rise in rises for interval in rise]
+            claims[f"{what}_{name}"] = {"verdict": verdict(parts), "rises": rises, "often": often}
     return {
         "columns": columns,
         "tables": {
             "nodes": [
-                armse_number(f"{label}: {column}", data[f"{key}_armse"], state, None)
+                runs.armse_number(f"{label}: {column}", data[f"{key}_armse"], state, None)
                 for key, label in names.items()
                 for state, column in enumerate(columns)
             ]
@@ -282,43 +231,47 @@ def simulate_tables(
             for filter_ in _FILTERS:
                 task = _oscillator(settings, filter=filter_, **_options(interval, variance))
                 policy = make_policy(settings["policy"], task)
-                result = squares(task, policy, episodes, seed)
+                result = runs.squares(task, policy, episodes, seed)
                 rise = _rise(before.get(filter_, result), result)
-                row[filter_] = armse(result) | _median(result) | {"rise": rise}
+                row[filter_] = runs.armse(result) | _median(result) | {"rise": rise}
                 errors[filter_] = result
             own = {"measurement_variance": variance} | settings["options"]
-            row["floor"] = floor(OSCILLATOR, **own)
-            row["floor_all"] = floor(OSCILLATOR, access="any", **own)
+            row["floor"] = runs.floor(runs.OSCILLATOR, **own)
+            row["floor_all"] = runs.floor(runs.OSCILLATOR, access="any", **own)
             rows.append(row)
             before = errors
             first = first or {"row": row, "errors": errors}
         data[name] = rows
     task = _oscillator(settings)
-    never = squares(task, make_policy("never", task), episodes, seed)
-    return data | {"silent": armse(never), "bias_deviation": _bias_deviation(task)}
+    never = runs.squares(task, make_policy("never", task), episodes, seed)
+    return data | {"silent": runs.armse(never), "bias_deviation": _bias_deviation(task)}
 
 
 def _median(values: Array) -> dict[str, list[float]]:
     """Median over runs of a run's RMSE of x1, with its interval."""
-    middle, drawn = medians(values)
+    middle, drawn = runs.medians(values)
     return {"median": [middle, *np.quantile(drawn, [0.025, 0.975]).tolist()]}
 
 
 def _rise(before: Array, after: Array) -> dict[str, Any]:
     """From one row to the next, of ARMSE1, 2, 3 and the median: ends of the paired intervals."""
-    result = increase(before, after)
-    middle = np.quantile(medians(after)[1] - medians(before)[1], [0.025, 0.975])
+    result = runs.increase(before, after)
+    middle = np.quantile(runs.medians(after)[1] - runs.medians(before)[1], [0.025, 0.975])
     return {end: [*result[end], float(middle[i])] for i, end in enumerate(("low", "high"))}
+
+
+def _interval_names(rows: list[Data]) -> list[str]:
+    return [f"[{-row['interval']:g}, {row['interval']:g}]" for row in rows]
 
 
 def _summarise_tables(data: Data) -> Data:
     second, third = data["table_2"], data["table_3"]
-    interval_names = [f"[{-row['interval']:g}, {row['interval']:g}]" for row in second]
+    interval_names = _interval_names(second)
     variance_names = [f"R = {row['variance']:g}" for row in third]
     printed = {"table_2": list(TABLE_II.values()), "table_3": list(TABLE_III.values())}
     numbers = {
         name: [
-            armse_number(f"{label}, ARMSE{i + 1}", row["paper"], i, value)
+            runs.armse_number(f"{label}, ARMSE{i + 1}", row["paper"], i, value)
             for label, row, values in zip(labels, data[name], printed[name], strict=True)
             for i, value in enumerate(values)
         ]
@@ -333,17 +286,15 @@ def _summarise_tables(data: Data) -> Data:
     )
     beside = []
     for label, row in others.items():
-        beside += [armse_number(f"{label}: {heads[i]}", row["adf"], i, None) for i in range(3)]
+        beside += [runs.armse_number(f"{label}: {heads[i]}", row["adf"], i, None) for i in range(3)]
         for name, head in zip(("adf", "paper"), heads[3:], strict=True):
             beside.append(Number(f"{label}: {head}", *row[name]["median"]))
     return {
-        "tables": numbers | {"others": beside},
-        "heads": heads,
+        "tables": numbers | {"others": beside}, "heads": heads,
         "printed_rows": list(zip(variance_names, TABLE_III.values(), third, strict=True)),
-        **_broken(data, printed),
-        "narrow": _moves(second, "low", 1.0),
+        **_broken(data, printed), "narrow": _moves(second, "low", 1.0),
         "noise": _moves(third, "high", -1.0),
-    }
+    }  # fmt: skip
 
 
 def _broken(data: Data, printed: dict[str, Any]) -> Data:
@@ -356,10 +307,9 @@ def _broken(data: Data, printed: dict[str, Any]) -> Data:
     ]
     # An RMSE of so many runs of a Gaussian error has this relative deviation at each time, and its
     # mean over time no larger one.
-    chance = 1.0 - 4.0 / np.sqrt(2.0 * PAPER_RUNS)
+    chance = 1.0 - 4.0 / np.sqrt(2.0 * runs.PAPER_RUNS)
     return {
-        "papers_runs": PAPER_RUNS,
-        "entries": len(entries),
+        "papers_runs": runs.PAPER_RUNS, "entries": len(entries),
         "below": sum(value < chance * least for value, least, _ in entries),
         "below_all": sum(value < chance * least for value, _, least in entries),
         "printed_bias": [values[2] for values in TABLE_III.values()],
@@ -368,7 +318,7 @@ def _broken(data: Data, printed: dict[str, Any]) -> Data:
             for values in printed["table_2"][1:]
             for i, value in enumerate(values)
         ),
-    }
+    }  # fmt: skip
 
 
 def _moves(rows: list[Data], end: str, sign: float) -> Data:
@@ -379,11 +329,9 @@ def _moves(rows: list[Data], end: str, sign: float) -> Data:
     }
     return {
         "moved": {name: int(result[:3].sum()) for name, result in moved.items()},
-        "median": bool(moved["paper"][3]),
-        "chain": [row["paper"]["mean"] for row in rows],
-        "medians": [row["paper"]["median"][0] for row in rows],
-        "verdict": verdict(moved["paper"]),
-    }
+        "median": bool(moved["paper"][3]), "chain": [row["paper"]["mean"] for row in rows],
+        "medians": [row["paper"]["median"][0] for row in rows], "verdict": verdict(moved["paper"]),
+    }  # fmt: skip
 
 
 # --- what was tried to reach the printed values ---------------------------------------------------
@@ -392,23 +340,23 @@ def _moves(rows: list[Data], end: str, sign: float) -> Data:
 def simulate_tobit_readings(episodes: int, seed: int, settings: Settings) -> Data:
     """ARMSE of every reading at the widest and the narrowest interval."""
     data: Data = {}
-    for reading in ROUND_ROBIN_READINGS:
+    for reading in runs.ROUND_ROBIN_READINGS:
         for limit in (5.0, 0.5):
-            task = reading_task(reading, censoring_threshold=-limit, censoring_upper=limit)
+            task = runs.reading_task(reading, censoring_threshold=-limit, censoring_upper=limit)
             name = "always" if task.access == "any" else "round_robin"
-            errors = squares(task, make_policy(name, task), episodes, seed)
+            errors = runs.squares(task, make_policy(name, task), episodes, seed)
             roots = np.sqrt(errors.mean((1, 2)))
             far = mean_interval((roots > 10.0).astype(float))
-            data[f"{reading} {limit:g}"] = armse(errors) | {"far": list(far)}
+            data[f"{reading} {limit:g}"] = runs.armse(errors) | {"far": list(far)}
     return data
 
 
 def _summarise_tobit_readings(data: Data) -> Data:
     limits = {
-        limit: {reading: data[f"{reading} {limit:g}"] for reading in ROUND_ROBIN_READINGS}
+        limit: {reading: data[f"{reading} {limit:g}"] for reading in runs.ROUND_ROBIN_READINGS}
         for limit in (5.0, 0.5)
     }
-    off = dict.fromkeys(ROUND_ROBIN_READINGS, 1.0)
+    off = dict.fromkeys(runs.ROUND_ROBIN_READINGS, 1.0)
     for limit, readings in limits.items():
         for reading, result in readings.items():
             factors = np.array(result["mean"]) / np.array(TABLE_II[limit])
@@ -433,16 +381,20 @@ class CurveLine(NamedTuple):
     width: float = _WIDE
 
 
-def _unaware(values: Array) -> CurveLine:
-    return CurveLine("FTKF (bias ignored)", values, palette.PURPLE, "--")
-
-
-def _aware(values: Array) -> CurveLine:
-    return CurveLine("FTKF-DB (fused)", values, palette.FUSED)
-
-
-def _true(values: Array) -> CurveLine:
-    return CurveLine("true", values, palette.TRUTH, "-", _THIN)
+def _lines(data: Data, kind: str, state: int, *names: str) -> list[CurveLine]:
+    """The curves of some filters and of the true values."""
+    styles: dict[str, tuple[Any, ...]] = {
+        "unaware": ("FTKF (bias ignored)", palette.PURPLE, "--", _WIDE),
+        "aware": ("FTKF-DB (fused)", palette.FUSED, "-", _WIDE),
+        "fused": ("FTKF-DB (fused)", palette.FUSED, "-", _WIDE),
+        "truth": ("true", palette.TRUTH, "-", _THIN),
+    }
+    lines = []
+    for name in names:
+        values = data[name if name == "truth" else f"{name}_{kind}"][..., state]
+        label, *style = styles[name]
+        lines.append(CurveLine(label, values, *style))
+    return lines
 
 
 def _draw_curves(
@@ -505,45 +457,34 @@ def _draw_measurements(figure: Any, data: Data) -> None:
 
 
 def _draw_estimates(figure: Any, data: Data) -> None:
-    aware, unaware, truth = data["aware_mean"], data["unaware_mean"], data["truth"]
-    panels = [
-        (f"x{i + 1}", [_unaware(unaware[:, i]), _aware(aware[:, i]), _true(truth[:, i])])
-        for i in range(2)
-    ]
-    _draw_curves(figure, panels)
+    names = ("unaware", "aware", "truth")
+    _draw_curves(figure, [(f"x{i + 1}", _lines(data, "mean", i, *names)) for i in range(2)])
 
 
 def _draw_bias(figure: Any, data: Data) -> None:
-    lines = [_aware(data["aware_mean"][:, 2]), _true(data["truth"][:, 2])]
-    _draw_curves(figure, [("bias b", lines)])
+    _draw_curves(figure, [("bias b", _lines(data, "mean", 2, "aware", "truth"))])
 
 
 def _draw_state_errors(figure: Any, data: Data, labels: Sequence[str], step: str) -> None:
-    panels = [
-        (label, [_unaware(data["unaware_rmse"][..., i]), _aware(data["aware_rmse"][..., i])])
-        for i, label in enumerate(labels)
-    ]
+    names = ("unaware", "aware")
+    panels = [(label, _lines(data, "rmse", i, *names)) for i, label in enumerate(labels)]
     _draw_curves(figure, panels, step, from_zero=True)
 
 
 def _draw_bias_error(figure: Any, data: Data, label: str, step: str) -> None:
-    result = data["aware_rmse"][..., 2]
-    least = np.full(result.shape[1], data["bias_deviation"])
+    least = np.full(data["aware_rmse"].shape[1], data["bias_deviation"])
     line = CurveLine("√Ξ: no filter lies below", least, palette.CENTRAL, ":", _WIDE)
-    _draw_curves(figure, [(label, [_aware(result), line])], step, from_zero=True)
+    _draw_curves(figure, [(label, [*_lines(data, "rmse", 2, "aware"), line])], step, from_zero=True)
 
 
-def _node_lines(data: Data, name: str, kind: str, state: int) -> list[CurveLine]:
-    nodes = [
-        CurveLine(
-            f"LTKF-DB-S{i + 1}", data[f"{name}_{i}_{kind}"][..., state], palette.SENSORS[i], "-",
-            _THIN,
-        )
-        for i in range(2)
-    ]  # fmt: skip
-    if name == "node" and kind == "rmse":  # their bands are those of the fused
-        nodes = [node._replace(values=node.values[0]) for node in nodes]
-    return [*nodes, _aware(data[f"fused_{kind}"][..., state])]
+def _node_lines(data: Data, name: str, kind: str, state: int, *others: str) -> list[CurveLine]:
+    lines = []
+    for i, colour in enumerate(palette.SENSORS[:2]):
+        values = data[f"{name}_{i}_{kind}"][..., state]
+        if name == "node" and kind == "rmse":  # their bands are those of the fused
+            values = values[0]
+        lines.append(CurveLine(f"LTKF-DB-S{i + 1}", values, colour, "-", _THIN))
+    return lines + _lines(data, kind, state, "fused", *others)
 
 
 def _draw_node_states(figure: Any, data: Data, name: str) -> None:
@@ -552,8 +493,7 @@ def _draw_node_states(figure: Any, data: Data, name: str) -> None:
 
 
 def _draw_node_bias(figure: Any, data: Data, name: str) -> None:
-    lines = [*_node_lines(data, name, "mean", 2), _true(data["truth"][:, 2])]
-    _draw_curves(figure, [("bias b", lines)])
+    _draw_curves(figure, [("bias b", _node_lines(data, name, "mean", 2, "truth"))])
 
 
 def _draw_node_bias_error(figure: Any, data: Data, name: str) -> None:
@@ -566,10 +506,14 @@ def _draw_table(figure: Any, data: Data, name: str) -> None:
     printed = {(5.0, v): values for v, values in TABLE_III.items()} | {
         (limit, 0.6): values for limit, values in TABLE_II.items()
     }
+    printed_rows = [printed.get((r["interval"], r["variance"]), (np.nan,) * 3) for r in rows]
+    ticks, label = [f"{row['variance']:g}" for row in rows], "variance R of the sensors' noise"
+    if name == "table_2":
+        ticks, label = _interval_names(rows), "uncensored interval"
     axes = figure.subplots(1, 3)
+    axes[1].set_xlabel(label)
     for state, axis in enumerate(axes):
-        nothing = (np.nan,) * 3
-        values = [printed.get((row["interval"], row["variance"]), nothing)[state] for row in rows]
+        values = [row[state] for row in printed_rows]
         marks: list[tuple[str, Any, Any, str, str]] = [("printed", values, None, palette.INK, "x")]
         for (key, label), colour, marker in zip(
             _FILTERS.items(), (palette.FUSED, palette.BLUE), "os", strict=True
@@ -587,17 +531,10 @@ def _draw_table(figure: Any, data: Data, name: str) -> None:
             places, [row["floor"][state] for row in rows], width=0.8, color=palette.GREY,
             label="no filter lies in here", zorder=0,
         )  # fmt: skip
-        ticks = (
-            [f"[{-row['interval']:g}, {row['interval']:g}]" for row in rows]
-            if name == "table_2"
-            else [f"{row['variance']:g}" for row in rows]
-        )
         axis.set_xticks(places, ticks)
         axis.set_title(f"ARMSE{state + 1} (of {('x1', 'x2', 'b')[state]})")
         axis.set_ylim(bottom=0.0)
         axis.set_xlim(-0.6, len(rows) - 0.4)
-    second = name == "table_2"
-    axes[1].set_xlabel("uncensored interval" if second else "variance R of the sensors' noise")
     _legend(figure, axes)
 
 
@@ -619,8 +556,8 @@ PAPER = Paper(
         Piece("tables", simulate_tables, _summarise_tables, 30.0, 2000),
         Piece("readings", simulate_tobit_readings, _summarise_tobit_readings, 30.0),
         Piece("target", simulate_target, _summarise_target, 5.0),
-        Piece("theory", simulate_theory, summarise_theory, 20.0),
-        Piece("bounds", simulate_bounds, summarise_bounds, 30.0, 100),
+        Piece("theory", theorems.simulate_theory, theorems.summarise_theory, 20.0),
+        Piece("bounds", theorems.simulate_bounds, theorems.summarise_bounds, 30.0, 100),
     ),
     {
         "figure_2": _figure("oscillator", _draw_measurements, 4.6),
@@ -639,8 +576,7 @@ PAPER = Paper(
                 (9, _draw_node_bias_error, 3.4),
             )
         },
-        "table_2": _table("table_2"),
-        "table_3": _table("table_3"),
+        "table_2": _table("table_2"), "table_3": _table("table_3"),
         "figure_10": _figure(
             "target", _draw_state_errors, 4.8,
             labels=("position RMSE (m)", "velocity RMSE (m/s)"), step=_TARGET_STEP,
@@ -649,7 +585,7 @@ PAPER = Paper(
             "target", _draw_bias_error, 3.4, label="acceleration RMSE (m/s²)", step=_TARGET_STEP
         ),
     },
-    OSCILLATOR,
+    runs.OSCILLATOR,
     {
         "interval": Parameter(tuple(TABLE_II), numbers_within(above=0.0)),
         "variance": Parameter(tuple(TABLE_III), numbers_within(above=0.0)),

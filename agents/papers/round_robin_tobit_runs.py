@@ -110,6 +110,13 @@ def node_squares(task: Task, policy: Policy, episodes: int, seed: int) -> tuple[
     return fused, local
 
 
+def held_values(task: Task, policy: Policy, seed: int) -> Array:
+    """What the estimators hold (H, sensors) in the first run, by equation (4)."""
+    rows: list[Array] = []
+    walk(task, policy, 1, seed, lambda batch, *_: rows.append(batch.delivered.held[:, 0, 0].copy()))
+    return np.array(rows)
+
+
 def resampled(episodes: int, seed: int = 0) -> Array:
     """Weights (resamples, episodes) with sum 1 of bootstrap samples of the episodes."""
     drawn = np.random.default_rng(seed).multinomial(
@@ -271,8 +278,7 @@ class PrintedTobitFilter(TobitKalmanFilter):
 
 
 ROUND_ROBIN_READINGS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
-    "corrected equations": ("", {}),
-    "ϑ below (11) over R, as printed": ("theta", {}),
+    "corrected equations": ("", {}), "ϑ below (11) over R, as printed": ("theta", {}),
     "plus λ in (23), as printed": ("sign", {}),
     "plus λ of one argument in (23), as printed": ("argument", {}),
     "(13) as the variance of the censored value": ("variance", {}),

@@ -1,6 +1,5 @@
 """Lemma 1, the theorems and the remarks of round_robin_tobit, held to simulated episodes."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -18,6 +17,7 @@ from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.base import Policy
 from fusion_gym.systems.tobit.tobit_filter import expect_censored
 
+from . import round_robin_tobit_runs as measures
 from .numbers import Number, estimate, verdict
 from .paper import Data, Settings
 from .round_robin_tobit_runs import (
@@ -26,12 +26,7 @@ from .round_robin_tobit_runs import (
     TRACKING,
     PrintedTobitFilter,
     SingleSensor,
-    armse,
     censored,
-    resampled,
-    round_robin,
-    squares,
-    walk,
 )
 
 PLACES = (-7.0, -5.0, -4.0, 0.0, 4.5, 5.0, 6.0)  # true x1 at which Lemma 1 is tried
@@ -50,19 +45,16 @@ _CONSISTENT = 0.05  # deviation of NEES from 1
 # threshold subtracts it), and whether the correction holds the filter's covariance, as printed, or
 # the bound itself.
 UPPER = {
-    "as printed": (1.0, False),
-    "the sign of φ as in (15)": (-1.0, False),
-    "the bound in its own correction": (1.0, True),
-    "both": (-1.0, True),
-}
+    "as printed": (1.0, False), "the sign of φ as in (15)": (-1.0, False),
+    "the bound in its own correction": (1.0, True), "both": (-1.0, True),
+}  # fmt: skip
 # And for the lower bound whether the factor 1 - (1 - ᾱ - β̄)² stands at every step, as printed, or
 # at the sensor's turns alone, and whether the process covariance stands whole or, as in (49), with
 # the factor (1 - ᾱ - β̄)².
 LOWER = {
-    "as printed": (False, False),
-    "at the sensor's turns": (True, False),
+    "as printed": (False, False), "at the sensor's turns": (True, False),
     "as in (49)": (False, True),
-}
+}  # fmt: skip
 SHARE = 0.5  # ε of a node, the paper's 1/p
 
 
@@ -75,8 +67,7 @@ def simulate_theory(episodes: int, seed: int, settings: Settings) -> Data:
             for name, env in (("oscillator", OSCILLATOR), ("target", TRACKING))
             for key, value in _errors(env, episodes, seed).items()
         },
-        **_fusion(min(episodes, 200), seed),
-        **_worth(episodes, seed),
+        **_fusion(min(episodes, 200), seed), **_worth(episodes, seed),
     }  # fmt: skip
 
 
@@ -99,15 +90,12 @@ def _lemma(episodes: int, seed: int) -> dict[str, Any]:
     right = expect_censored(sensors, means)
     printed = PrintedTobitFilter(sensors, "theta").expect(means)
     return {
-        "mean": drawn.mean(1),
-        "mean_error": np.sqrt(spread / draws),
-        "variance": spread,
+        "mean": drawn.mean(1), "mean_error": np.sqrt(spread / draws), "variance": spread,
         "variance_error": np.sqrt(np.maximum(fourth - spread**2, 0.0) / draws),
-        "equation_12": right.value[0, 0],
-        "equation_12_printed": printed.value[0, 0],
+        "equation_12": right.value[0, 0], "equation_12_printed": printed.value[0, 0],
         "equation_13": sensors.variance[0, 0] * right.truncated_variance[0, 0],
         "total_variance": right.noise_variance[0, 0],
-    }
+    }  # fmt: skip
 
 
 def _errors(env: str, episodes: int, seed: int) -> dict[str, Any]:
@@ -141,7 +129,7 @@ def _errors(env: str, episodes: int, seed: int) -> dict[str, Any]:
         error = task.system.truth(batch.delivered) - mean
         values["nees"][runs] += linalg.dot(error, linalg.solve_vector(covariance, error)) / 3.0
 
-    walk(task, round_robin(task), episodes, seed, look, before)
+    measures.walk(task, measures.round_robin(task), episodes, seed, look, before)
     for name in ("nees", "predicted", "uncensored"):
         values[name] /= task.horizon
     return values
@@ -174,7 +162,7 @@ def _means(task: Any, episodes: int, seed: int, policy: str = "round_robin") -> 
     def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
         values[step, :, runs] = task.system.fused(batch.delivered)[0]
 
-    walk(task, fusion_gym.make_policy(policy, task), episodes, seed, look)
+    measures.walk(task, fusion_gym.make_policy(policy, task), episodes, seed, look)
     return values
 
 
@@ -187,9 +175,9 @@ def _worth(episodes: int, seed: int) -> dict[str, Any]:
     data: dict[str, Any] = {}
     for name, options in settings.items():
         task = fusion_gym.make_task(OSCILLATOR, **options)
-        errors = squares(task, round_robin(task), episodes, seed)
+        errors = measures.squares(task, measures.round_robin(task), episodes, seed)
         data[f"mse_{name}"] = errors.sum(2).mean(1)
-        data[f"armse_{name}"] = armse(errors)["mean"]
+        data[f"armse_{name}"] = measures.armse(errors)["mean"]
     return data
 
 
@@ -205,7 +193,7 @@ class Censoring(NamedTuple):
 
 
 @dataclass
-class BoundRecursion(ABC):
+class BoundRecursion:
     """A bound (states, states, N) of a sensor, beside the covariance P⁻ that it is to bound.
 
     ``inflation`` is 1 for a single filter and ε⁻¹ for a node, whose process covariance is
@@ -216,18 +204,6 @@ class BoundRecursion(ABC):
     sensor: int
     inflation: float
     value: Array = field(default_factory=lambda: np.zeros(0), init=False)
-
-    @abstractmethod
-    def begin(self, covariance: Array) -> None:
-        """At the first step, from P⁻."""
-
-    @abstractmethod
-    def holds(self, covariance: Array) -> NDArray[np.bool_]:
-        """Whether (N,) it bounds P⁻."""
-
-    @abstractmethod
-    def advance(self, covariance: Array, observed: Censoring, turn: bool) -> None:
-        """To the next step, from P⁻, what is expected, and whether it is this sensor's turn."""
 
     def moved(self, stored: Array, share: Array | float = 1.0) -> Array:
         """A ``stored`` Aᵀ and the process covariance, of which the lower bound may take a share."""
@@ -244,15 +220,15 @@ class Upper(BoundRecursion):
     own: bool
 
     def begin(self, covariance: Array) -> None:
-        """P^u = P⁻, as the proof has it."""
+        """At the first step: P^u = P⁻, as the proof has it."""
         self.value = covariance.copy()
 
     def holds(self, covariance: Array) -> NDArray[np.bool_]:
-        """See :class:`BoundRecursion`."""
+        """Return whether (N,) it bounds P⁻."""
         return matrix_below(covariance, self.value)
 
     def advance(self, covariance: Array, observed: Censoring, turn: bool) -> None:
-        """See :class:`BoundRecursion`."""
+        """Go to the next step, from P⁻, what is expected, and whether it is this sensor's turn."""
         sensors, stored = censored(self.task).centre.sensors, self.value
         if turn:
             row = sensors.measurement_matrix[self.sensor, 0]
@@ -272,21 +248,21 @@ class Lower(BoundRecursion):
     part: bool
 
     def begin(self, covariance: Array) -> None:
-        """P^l = 0, as the proof has it."""
+        """At the first step: P^l = 0, as the proof has it."""
         self.value = np.zeros_like(covariance)
 
     def holds(self, covariance: Array) -> NDArray[np.bool_]:
-        """See :class:`BoundRecursion`."""
+        """Return whether (N,) it bounds P⁻."""
         return matrix_below(self.value, covariance)
 
     def advance(self, covariance: Array, observed: Censoring, turn: bool) -> None:
-        """See :class:`BoundRecursion`."""
+        """Go to the next step, from P⁻, what is expected, and whether it is this sensor's turn."""
         inside = observed.inside**2 if turn or not self.turns else np.zeros_like(observed.inside)
         self.value = self.moved((1.0 - inside) * self.value, inside if self.part else 1.0)
 
 
 def failures(
-    task: Task, policy: Policy, episodes: int, seed: int, bounds: Sequence[BoundRecursion]
+    task: Task, policy: Policy, episodes: int, seed: int, bounds: Sequence[Upper | Lower]
 ) -> tuple[Array, Array]:
     """Shares of an episode's steps in which a bound fails.
 
@@ -312,11 +288,11 @@ def failures(
             turn = step % task.sensors == bound.sensor
             bound.advance(covariance * bound.inflation, observed[bound.sensor], turn)
 
-    walk(task, policy, episodes, seed, lambda *_: None, before)
+    measures.walk(task, policy, episodes, seed, lambda *_: None, before)
     return local / (task.horizon - 1), fused / (task.horizon - 1)
 
 
-def _of(task: Task, sensor: int, inflation: float) -> dict[str, BoundRecursion]:
+def _of(task: Task, sensor: int, inflation: float) -> dict[str, Upper | Lower]:
     """Both bounds of a sensor in all their readings."""
     uppers = {f"upper/{name}": Upper(task, sensor, inflation, *how) for name, how in UPPER.items()}
     lowers = {f"lower/{name}": Lower(task, sensor, inflation, *how) for name, how in LOWER.items()}
@@ -354,13 +330,13 @@ def simulate_bounds(episodes: int, seed: int, settings: Settings) -> Data:
         task = fusion_gym.make_task(env, **options)
         for sensor in range(2):
             single = _of(task, sensor, 1.0)
-            policy = SingleSensor(round_robin(task), sensor)
+            policy = SingleSensor(measures.round_robin(task), sensor)
             local, _ = failures(task, policy, episodes, seed, list(single.values()))
             for name, sample in zip(single, local, strict=True):
                 data[f"{example}:4/{name}/{sensor}"] = sample
         nodes = [_of(task, sensor, 1.0 / SHARE) for sensor in range(2)]
         bounds = [node[name] for name in nodes[0] for node in nodes]
-        _, fused = failures(task, round_robin(task), episodes, seed, bounds)
+        _, fused = failures(task, measures.round_robin(task), episodes, seed, bounds)
         for name, sample in zip(nodes[0], fused, strict=True):
             data[f"{example}:5/{name}"] = sample
     return data
@@ -376,10 +352,8 @@ def summarise_theory(data: Data) -> Data:
     }
     return {
         "tables": {"theory": [Number.of(what, data[name]) for what, name in numbers.items()]},
-        **_summarise_lemma(data),
-        **_summarise_filter(data),
-        **_summarise_federation(data),
-    }
+        **_summarise_lemma(data), **_summarise_filter(data), **_summarise_federation(data),
+    }  # fmt: skip
 
 
 def _summarise_lemma(data: Data) -> Data:
@@ -392,18 +366,14 @@ def _summarise_lemma(data: Data) -> Data:
     worst = int(np.argmax(np.abs(data["mean"] - data["equation_12_printed"])))
     most = int(np.argmax(np.abs(data["variance"] - data["equation_13"])))
     return {
-        "places": PLACES,
-        "worst": worst,
-        "most": most,
+        "places": PLACES, "worst": worst, "most": most,
         "off": {
-            "right": int(right.sum()),
-            "printed": int(printed.sum()),
-            "values": int(values.sum()),
+            "right": int(right.sum()), "printed": int(printed.sum()), "values": int(values.sum()),
             "total": int(total.sum()),
         },
         "mean_right": verdict([not printed.any(), not right.any()]),
         "variance_right": verdict([not values.any()]),
-    }
+    }  # fmt: skip
 
 
 def _summarise_filter(data: Data) -> Data:
@@ -411,41 +381,31 @@ def _summarise_filter(data: Data) -> Data:
     times = data["oscillator_surprised"].sum() / data["oscillator_sure"].sum()
     nees = [estimate(data[f"{name}_nees"]).mean for name in ("oscillator", "target")]
     better = mean_interval(data["mse_adf"] - data["mse_paper"])
-    weights = resampled(len(gap))
+    weights = measures.resampled(len(gap))
     ends = {}
     for name in ("oscillator", "target"):
-        product, first, second = (
-            weights @ data[f"{name}_{part}"] for part in ("product", "first", "second")
-        )
+        names = (f"{name}_{part}" for part in ("product", "first", "second"))
+        product, first, second = (weights @ data[part] for part in names)
         ends[name] = np.quantile(product / np.sqrt(first * second), [0.025, 0.5, 0.975])
     return {
-        "sure_below": SURE,
-        "gap": gap,
-        "times": times,
+        "sure_below": SURE, "gap": gap, "times": times,
         "approximates": verdict([abs(estimate(gap).mean) < 0.05, times < 2.0]),
-        "covariance_right": verdict(abs(mean - 1) < _CONSISTENT for mean in nees),
-        "better": better,
-        "least": verdict([better.low > 0.0]),
-        "correlation": ends,
+        "covariance_right": verdict(abs(mean - 1) < _CONSISTENT for mean in nees), "better": better,
+        "least": verdict([better.low > 0.0]), "correlation": ends,
         "uncorrelated": verdict(end[0] < 0.0 < end[2] for end in ends.values()),
-    }
+    }  # fmt: skip
 
 
 def _summarise_federation(data: Data) -> Data:
     ignored = mean_interval(data["mse_kalman"] - data["mse_paper"])
-    worse, calmer = (
-        np.array(data["armse_paper"]) / np.array(data[f"armse_{name}"]) for name in ("free", "calm")
-    )
+    own, free, calm = (np.array(data[f"armse_{name}"]) for name in ("paper", "free", "calm"))
+    worse, calmer = own / free, own / calm
     return {
-        "node_shares": SHARES,
-        "optimum": verdict([data["shares_gap"] < 1e-6]),
-        "usual": verdict([data["without_gap"] < 1e-9]),
-        "ignored": ignored,
-        "impairs": verdict([ignored.low > 0.0]),
-        "worse": worse,
-        "calmer": calmer,
+        "node_shares": SHARES, "optimum": verdict([data["shares_gap"] < 1e-6]),
+        "usual": verdict([data["without_gap"] < 1e-9]), "ignored": ignored,
+        "impairs": verdict([ignored.low > 0.0]), "worse": worse, "calmer": calmer,
         "insensitive": verdict([worse.max() < 1.1, calmer.max() < 1.1]),
-    }
+    }  # fmt: skip
 
 
 def summarise_bounds(data: Data) -> Data:
@@ -487,9 +447,6 @@ def _summarise_bound(data: Data, bound: str) -> Data:
     best = min(by, key=lambda reading: sum(by[reading]))
     printed = by["as printed"]
     return {
-        "printed": printed,
-        "readings": len(by),
-        "best": best,
-        "shares": by[best],
+        "printed": printed, "readings": len(by), "best": best, "shares": by[best],
         "verdict": verdict([max(printed) == 0.0, max(by[best]) == 0.0]),
-    }
+    }  # fmt: skip

@@ -16,21 +16,10 @@ from fusion_gym.policies.registry import make_policy
 
 from ..output.palette import FUSED, INK, MEASURED, TRUTH
 from ..output.palette import SENSORS as COLOURS
+from . import tobit_token_bucket_runs as runs
 from .numbers import below, estimate, grid, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
-from .tobit_token_bucket_runs import (
-    SENSORS,
-    TRIGGER,
-    Failing,
-    History,
-    claimed,
-    conditioned,
-    perturbed,
-    record_history,
-    scheme,
-    single_sensor,
-    terms,
-)
+from .tobit_token_bucket_runs import SENSORS, TRIGGER, History, record_history, scheme
 
 _NODES = range(SENSORS)
 _NODE_NAMES = tuple(f"node {m + 1}" for m in _NODES)
@@ -69,60 +58,42 @@ def simulate_network(episodes: int, seed: int, settings: Settings) -> Data:
     poor = (result.tokens_before < needed)[:, None]
     requested, granted = result.requested, result.granted
     return {
-        "level": np.append(bucket.initial, result.tokens[:, 0]),
-        "requested": requested[..., 0],
-        "granted": granted[..., 0],
-        "measured": result.measurement[..., 0],
-        "held": result.held[..., 0],
-        "rate_requested": requested.mean(0),
+        "level": np.append(bucket.initial, result.tokens[:, 0]), "requested": requested[..., 0],
+        "granted": granted[..., 0], "measured": result.measurement[..., 0],
+        "held": result.held[..., 0], "rate_requested": requested.mean(0),
         "rate_granted": granted.mean(0),
         "grant_share": granted.sum((0, 1)) / np.maximum(requested.sum((0, 1)), 1),
-        "tokens": result.tokens.mean(0),
-        "lowest": float(result.tokens.min()),
+        "tokens": result.tokens.mean(0), "lowest": float(result.tokens.min()),
         "highest": float(result.tokens.max()),
         "wanted": (free.requested.transpose(2, 0, 1) @ costs).mean(1),
         "spent": (granted.transpose(2, 0, 1) @ costs).mean(1),
         "poor_grants": int((granted & poor).sum()),
         "uncalled_grants": int((granted & ~requested).sum()),
-        "rich_refusals": int((requested & ~granted & ~poor).sum()),
-        "grants": int(granted.sum()),
-        "rate": bucket.rate,
-        "capacity": bucket.capacity,
-        "needed": float(needed),
-        "mse": result.fused_error.mean(0),
-        "mse_unlimited": free.fused_error.mean(0),
-    }
+        "rich_refusals": int((requested & ~granted & ~poor).sum()), "grants": int(granted.sum()),
+        "rate": bucket.rate, "capacity": bucket.capacity, "needed": float(needed),
+        "mse": result.fused_error.mean(0), "mse_unlimited": free.fused_error.mean(0),
+    }  # fmt: skip
 
 
 def _summarise_network(data: Data) -> Data:
     columns = ("events", "transmissions")
+    inside = data["lowest"] >= 0.0 and data["highest"] <= data["capacity"]
+    wanted, spent = estimate(data["wanted"]), estimate(data["spent"])
     rates = zip(data["rate_requested"], data["rate_granted"], strict=True)
     means = {
-        "transmissions an event": [data["grant_share"]],
-        "level of tokens": [data["tokens"]],
+        "transmissions an event": [data["grant_share"]], "level of tokens": [data["tokens"]],
         "tokens spent a step": [data["spent"]],
         "tokens asked for a step without a bucket": [data["wanted"]],
-    }
+    }  # fmt: skip
     return {
         "columns": columns,
         "tables": {
             "rates": grid(columns, dict(zip(_NODE_NAMES, rates, strict=True))),
             "tokens": grid(("mean",), means),
         },
-        "sent_with_tokens": verdict(
-            [
-                data["poor_grants"] == 0,
-                data["uncalled_grants"] == 0,
-                data["lowest"] >= 0.0 and data["highest"] <= data["capacity"],
-            ]
-        ),
+        "protocol": verdict((data["poor_grants"] == 0, data["uncalled_grants"] == 0, inside)),
         "saves": verdict(estimate(rate).high < 1.0 for rate in data["rate_requested"]),
-        "limited": verdict(
-            (
-                estimate(data["wanted"]).low > data["rate"],
-                estimate(data["spent"]).high <= data["rate"],
-            )
-        ),
+        "limited": verdict((wanted.low > data["rate"], spent.high <= data["rate"])),
         "costs": verdict([below(data["mse_unlimited"], data["mse"])]),
     }
 
@@ -141,13 +112,10 @@ def simulate_estimates(
     local = np.abs(np.diff(result.truth[:, None] - result.local_mean, axis=0))
     fused = np.abs(np.diff(result.truth - result.mean, axis=0))
     censored = (result.measurement <= 0.0)[1:]
-    beside = [record_history(single_sensor(m), episodes, seed) for m in singles]
+    beside = [record_history(runs.single_sensor(m), episodes, seed) for m in singles]
     return {
-        "truth": result.truth[..., 0],
-        "local": result.local_mean[..., 0],
-        "fused": result.mean[..., 0],
-        "local_change": local.mean(0),
-        "fused_change": fused.mean(0),
+        "truth": result.truth[..., 0], "local": result.local_mean[..., 0],
+        "fused": result.mean[..., 0], "local_change": local.mean(0), "fused_change": fused.mean(0),
         "change_censored": _mean_where(local[:, 2, 1], censored[:, 2, 1]),
         "change_uncensored": _mean_where(local[:, 2, 1], ~censored[:, 2, 1]),
         "mse": result.fused_error.mean(0),
@@ -156,7 +124,7 @@ def simulate_estimates(
         "single_moved": np.array([np.abs(np.diff(o.mean, axis=0)).mean((0, 1)) for o in beside]),
         "single_rate": [float(item.granted.mean()) for item in beside],
         "rate": float(result.granted.mean()),
-    }
+    }  # fmt: skip
 
 
 def _mean_where(values: Any, selection: Any) -> Any:
@@ -176,14 +144,12 @@ def _summarise_estimates(data: Data) -> Data:
     return {
         "states": _STATES,
         "tables": {"fluctuation": grid(_STATES, dict(zip(_WHO, (*local, fused), strict=True)))},
-        "changes": means,
-        "fused_changes": fused.mean(-1),
-        "strongest": [int(place) + 1 for place in strongest],
-        "rougher": "yes" if rougher else "no",
+        "changes": means, "fused_changes": fused.mean(-1),
+        "strongest": [int(place) + 1 for place in strongest], "rougher": "yes" if rougher else "no",
         "fluctuates": verdict((rougher, largest, by_censoring)),
         "smooths": verdict(below(data["moved"], single) for single in data["single_moved"]),
         "effective": verdict(below(data["mse"], single) for single in data["single_mse"]),
-    }
+    }  # fmt: skip
 
 
 # --- errors and bounds ----------------------------------------------------------------------------
@@ -209,20 +175,17 @@ def simulate_errors(episodes: int, seed: int, settings: Settings) -> Data:
 
 
 def _summarise_errors(data: Data) -> Data:
-    local, fused = data["by_local_error"], data["by_fused_error"]
+    local, fused, smooth = (data[f"{n}_error"] for n in ("by_local", "by_fused", "rough_fused"))
     columns = {
-        "squared error": "by_{}_error",
-        "trace of the bound": "by_{}_trace",
-        "lg squared error": "lg_{}_error",
-        "lg trace": "lg_{}_trace",
-    }
+        "squared error": "by_{}_error", "trace of the bound": "by_{}_trace",
+        "lg squared error": "lg_{}_error", "lg trace": "lg_{}_trace",
+    }  # fmt: skip
     rows = {
         who: [data[name.format("local")][m] for name in columns.values()]
         for m, who in enumerate(_NODE_NAMES)
     } | {"fused": [data[name.format("fused")] for name in columns.values()]}
     return {
-        "columns": list(columns),
-        "tables": {"errors": grid(tuple(columns), rows)},
+        "columns": list(columns), "tables": {"errors": grid(tuple(columns), rows)},
         "ratio": local.mean(-1) / fused.mean(),
         "times": data["by_fused_trace"].mean() / fused.mean(),
         "trace_shares": [float(share.mean()) for share in data["share_trace"]],
@@ -230,10 +193,8 @@ def _summarise_errors(data: Data) -> Data:
         "smaller_bound": verdict(np.all(share == 1.0) for share in data["share_trace"]),
         "mostly_smaller": verdict(estimate(share).low > 0.5 for share in data["share_error"]),
         "improves": verdict(below(fused, own) for own in local),
-        "smooth": verdict(
-            below(data["rough_fused_error"], own) for own in data["rough_local_error"]
-        ),
-    }
+        "smooth": verdict(below(smooth, own) for own in data["rough_local_error"]),
+    }  # fmt: skip
 
 
 # --- theorems and failures of sensors -------------------------------------------------------------
@@ -245,31 +206,28 @@ def simulate_bucket_theorems(episodes: int, seed: int, settings: Settings) -> Da
     result = record_history(task, episodes, seed)
     gaps = [result.truth - result.mean, *(result.truth - result.local_mean[:, m] for m in _NODES)]
     bounds = [result.bound, *(result.local_bound[:, m] for m in _NODES)]
-    eigenvalues, deviations = zip(*map(claimed, gaps, bounds), strict=True)
+    eigenvalues, deviations = zip(*map(runs.claimed, gaps, bounds), strict=True)
     recorded = record_history(task, few, seed)
-    parts = terms(task, recorded)
+    parts = runs.terms(task, recorded)
     never = record_history(task, few, seed, make_policy("never", task))
     long = record_history(scheme(horizon=_LONG), few, seed)
     windows, traces = (
         values.reshape(-1, _WINDOW, few).mean(1) for values in (long.fused_error, long.fused_trace)
     )
     failed = [
-        record_history(task, episodes, seed, Failing(make_policy(TRIGGER, task), m)) for m in _NODES
+        record_history(task, episodes, seed, runs.Failing(make_policy(TRIGGER, task), m))
+        for m in _NODES
     ]
     silent = record_history(task, episodes, seed, make_policy("never", task))
+    gains = runs.perturbed(parts, recorded, seed)
     return {
-        "eigenvalue": np.array(eigenvalues),
-        "eigenvalue_error": np.array(deviations),
-        **{f"gain_{name}": values for name, values in perturbed(parts, recorded, seed).items()},
-        **conditioned(parts),
+        "eigenvalue": np.array(eigenvalues), "eigenvalue_error": np.array(deviations),
+        **{f"gain_{name}": values for name, values in gains.items()}, **runs.conditioned(parts),
         "growth": np.exp(np.diff(np.log(never.fused_trace), axis=0)).mean(0),
-        "windows": windows,
-        "traces": traces,
-        "healthy": result.fused_error.mean(0),
+        "windows": windows, "traces": traces, "healthy": result.fused_error.mean(0),
         "failed": np.array([item.fused_error.mean(0) for item in failed]),
-        "silent": silent.fused_error.mean(0),
-        "few": few,
-    }
+        "silent": silent.fused_error.mean(0), "few": few,
+    }  # fmt: skip
 
 
 def _summarise_bucket_theorems(data: Data) -> Data:
@@ -281,6 +239,8 @@ def _summarise_bucket_theorems(data: Data) -> Data:
     stays = not below(first * 1.2, last) and not below(data["traces"][1] * 1.5, data["traces"][-1])
     share, difference = data["gain_larger"], float(data["gain_difference"].max())
     healthy, failed, silent = data["healthy"], data["failed"], data["silent"]
+    helped = [below(item, silent) for item in failed]
+    unharmed = [not below(healthy * 1.1, item) for item in failed]
     means = {
         "share of gains beside (37) with a larger bound": [share],
         "(42) holds, share of deliveries": [data["holds_delivered"]],
@@ -288,42 +248,26 @@ def _summarise_bucket_theorems(data: Data) -> Data:
         "growth a step of the trace if nothing is sent": [data["growth"]],
     }
     failures = {
-        "no sensor": [healthy],
-        **{f"sensor {m + 1}": [failed[m]] for m in _NODES},
+        "no sensor": [healthy], **{f"sensor {m + 1}": [failed[m]] for m in _NODES},
         "all sensors": [silent],
-    }
+    }  # fmt: skip
     return {
         "tables": {
             "theorems": grid(("mean",), means),
             "failures": grid(("fused squared error",), failures),
         },
-        "largest": value.max(-1),
-        "loose": 1.0 / value[1:].mean(),
-        "top_error": _CLEAR * error[0][place],
-        "top_time": place + 1,
-        "mean_eigenvalue": value[0].mean(),
-        "local_bound": verdict(covered[1:]),
-        "fused_bound": verdict(covered[:1]),
-        "larger": share.mean(),
-        "difference": difference,
+        "largest": value.max(-1), "loose": 1.0 / value[1:].mean(),
+        "top_error": _CLEAR * error[0][place], "top_time": place + 1,
+        "mean_eigenvalue": value[0].mean(), "local_bound": verdict(covered[1:]),
+        "fused_bound": verdict(covered[:1]), "larger": share.mean(), "difference": difference,
         "counted": data["gain_counted"].mean(),
         "minimises": verdict([np.all(share >= 1.0 - 1e-12), difference < 1e-9]),
-        "delivered": data["holds_delivered"].mean(),
-        "not_delivered": data["holds_silent"].mean(),
-        "least": float(data["least_silent"].min()),
-        "first_window": first,
-        "last_window": last,
-        "window": _WINDOW,
-        "long": _LONG,
-        "mean_growth": data["growth"].mean(),
+        "delivered": data["holds_delivered"].mean(), "not_delivered": data["holds_silent"].mean(),
+        "least": float(data["least_silent"].min()), "first_window": first, "last_window": last,
+        "window": _WINDOW, "long": _LONG, "mean_growth": data["growth"].mean(),
         "bounded": verdict((everywhere, stays)),  # (42) in every step, as the theorem asks
-        "resilient": verdict(
-            [
-                *(below(item, silent) for item in failed),
-                *(not below(healthy * 1.1, item) for item in failed),
-            ]
-        ),
-    }
+        "resilient": verdict([*helped, *unharmed]),
+    }  # fmt: skip
 
 
 # --- other readings, other filters ----------------------------------------------------------------
@@ -340,13 +284,11 @@ def simulate_bucket_readings(episodes: int, seed: int, settings: Settings) -> Da
         share.append((error[:, None] < result.local_error).mean((0, 2)))
     plain, free = scheme(filter="kalman"), scheme(tokens="unlimited")
     return {
-        "readings": list(READINGS),
-        "local": np.array(local),
-        "fused": np.array(fused),
+        "readings": list(READINGS), "local": np.array(local), "fused": np.array(fused),
         "share": np.array(share),
         "ignoring": run_episodes(plain, make_policy(TRIGGER, plain), episodes, seed).mse,
         "always": run_episodes(free, make_policy("always", free), episodes, seed).mse,
-    }
+    }  # fmt: skip
 
 
 def _summarise_bucket_readings(data: Data) -> Data:
@@ -366,11 +308,10 @@ def _summarise_bucket_readings(data: Data) -> Data:
             [m + 1 for m in _NODES if not below(own, local[m])]
             for local, own in zip(data["local"], fused, strict=True)
         ],
-        "printed": fused[0],
-        "standard": fused[-1],
+        "printed": fused[0], "standard": fused[-1],
         "optimal": verdict([not below(fused[-1], fused[0])]),
         "handles_censoring": verdict([below(fused[0], data["ignoring"])]),
-    }
+    }  # fmt: skip
 
 
 # --- figures --------------------------------------------------------------------------------------
@@ -463,9 +404,8 @@ def _draw_errors(figure: Any, data: Data, sensor: int) -> None:
     """The logarithm of squared errors and of the traces of the bounds, of a run and the mean."""
     axes = figure.subplots(2, 1, sharex=True)
     own, dashes = COLOURS[sensor], (0, (2.5, 0.8))
-    for axis, kind, title in zip(
-        axes, ("one", "mean"), ("one episode", "mean over all episodes"), strict=True
-    ):
+    kinds = (("one", "one episode"), ("mean", "mean over all episodes"))
+    for axis, (kind, title) in zip(axes, kinds, strict=True):
 
         def curve(name: str, kind: str = kind) -> Array:
             values = data[f"{kind}_{name}"]
@@ -487,7 +427,8 @@ def _draw_errors(figure: Any, data: Data, sensor: int) -> None:
     _legend(figure, handles, 2)
 
 
-_SIZE = (7.2, 4.4)
+_SIZE, _TALL = (7.2, 4.4), (7.2, 4.8)
+_NO_SINGLES: Settings = {"singles": ()}
 PAPER = Paper(
     "tobit_token_bucket",
     (
@@ -499,22 +440,14 @@ PAPER = Paper(
     ),
     {
         "figure_2": PaperFigure("network", _draw_tokens, _SIZE),
-        **{
-            f"figure_{3 + i}": PaperFigure(
-                "network", partial(_draw_measurements, component=i), (7.2, 4.8)
-            )
-            for i in range(2)
-        },
-        **{
-            f"figure_{5 + m}": PaperFigure(
-                "estimates", partial(_draw_states, sensor=m), _SIZE, {"singles": []}
-            )
-            for m in _NODES
-        },
-        **{
-            f"figure_{8 + m}": PaperFigure("errors", partial(_draw_errors, sensor=m), (7.2, 5.4))
-            for m in _NODES
-        },
+        "figure_3": PaperFigure("network", partial(_draw_measurements, component=0), _TALL),
+        "figure_4": PaperFigure("network", partial(_draw_measurements, component=1), _TALL),
+        "figure_5": PaperFigure("estimates", partial(_draw_states, sensor=0), _SIZE, _NO_SINGLES),
+        "figure_6": PaperFigure("estimates", partial(_draw_states, sensor=1), _SIZE, _NO_SINGLES),
+        "figure_7": PaperFigure("estimates", partial(_draw_states, sensor=2), _SIZE, _NO_SINGLES),
+        "figure_8": PaperFigure("errors", partial(_draw_errors, sensor=0), (7.2, 5.4)),
+        "figure_9": PaperFigure("errors", partial(_draw_errors, sensor=1), (7.2, 5.4)),
+        "figure_10": PaperFigure("errors", partial(_draw_errors, sensor=2), (7.2, 5.4)),
     },
     "fusion_gym/TobitOscillator-v0",
     {"policy": Parameter(TRIGGER, policy_of())},

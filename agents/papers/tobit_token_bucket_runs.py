@@ -99,13 +99,12 @@ def single_sensor(sensor: int) -> Task:
     """Return the task of a single sensor: its third of the bucket and no feedback."""
     options, trigger = TobitOscillatorOptions(), DynamicEvent()
     return scheme(
-        measurement_matrices=(np.eye(2).tolist(),),
-        token_rate=options.token_rate / SENSORS,
+        measurement_matrices=(np.eye(2).tolist(),), token_rate=options.token_rate / SENSORS,
         token_capacity=options.token_capacity / SENSORS,
         initial_tokens=options.initial_tokens / SENSORS,
         trigger_threshold=trigger.column("threshold", SENSORS)[sensor],
         trigger_decay=trigger.column("decay", SENSORS)[sensor],
-    )
+    )  # fmt: skip
 
 
 def record_history(task: Task, episodes: int, seed: int, policy: Policy | None = None) -> History:
@@ -113,37 +112,22 @@ def record_history(task: Task, episodes: int, seed: int, policy: Policy | None =
     policy = fusion_gym.make_policy(TRIGGER, task) if policy is None else policy
     batch = EpisodeBatch.seeded(task, episodes, seed)
     policy.reset(episodes, seed)
-    rows: dict[str, list[NDArray[Any]]] = {name: [] for name in History._fields}
+    rows = []
     for _ in range(task.horizon):
         before, tokens = batch.state, batch.tokens
         outcome = batch.step(policy(batch.signals()))
-        state = batch.delivered
+        state, granted = batch.delivered, outcome.granted
         planned, expected = state.prediction.outcomes, state.prediction.expectation
-        values = {
-            "truth": state.truth,
-            "measurement": state.measurement,
-            "held": state.held,
-            "held_before": before.held,
-            "requested": outcome.requested,
-            "granted": outcome.granted,
-            "tokens": batch.tokens,
-            "tokens_before": tokens,
-            "prior_mean": state.prior_mean,
-            "prior_covariance": state.prior_covariance,
-            "uncensored": expected.uncensored_probability,
-            "hazard": expected.hazard,
-            "local_mean": state.local_mean,
-            "local_bound": np.where(
-                outcome.granted[:, None, None],
-                planned.delivered_covariance,
-                planned.silent_covariance,
-            ),
-            "mean": state.mean,
-            "bound": state.covariance,
-        }
-        for name, value in values.items():
-            rows[name].append(np.array(value))
-    return History(**{name: np.array(row) for name, row in rows.items()})
+        bounds = (planned.delivered_covariance, planned.silent_covariance)
+        bound = np.where(granted[:, None, None], *bounds)
+        values = (
+            state.truth, state.measurement, state.held, before.held, outcome.requested, granted,
+            batch.tokens, tokens, state.prior_mean, state.prior_covariance,
+            expected.uncensored_probability, expected.hazard, state.local_mean, bound, state.mean,
+            state.covariance,
+        )  # fmt: skip
+        rows.append([np.array(value) for value in values])
+    return History(*map(np.array, zip(*rows, strict=True)))
 
 
 class Terms(NamedTuple):
@@ -214,14 +198,10 @@ def terms(task: Task, history: History) -> Terms:
     ) + k2 * _squared(bias)
     held = np.moveaxis(history.held_before, -1, 2) / np.maximum(q, _FLOOR)
     return Terms(
-        first=k1,
-        prior=np.broadcast_to(prior, (horizon, len(share), episodes, *prior.shape[-2:])),
-        matrix=observed,
-        probability=q,
-        noise=noise,
-        pinned=np.where(silent[..., None], np.sqrt(k5) * held, 0.0),
-        silent=silent,
-    )
+        first=k1, prior=np.broadcast_to(prior, (horizon, len(share), episodes, *prior.shape[-2:])),
+        matrix=observed, probability=q, noise=noise,
+        pinned=np.where(silent[..., None], np.sqrt(k5) * held, 0.0), silent=silent,
+    )  # fmt: skip
 
 
 def perturbed(value: Terms, history: History, seed: int) -> dict[str, Array]:
@@ -246,9 +226,8 @@ def perturbed(value: Terms, history: History, seed: int) -> dict[str, Array]:
     counted = usable.sum((0, 1))
     return {
         "larger": np.where(usable, larger, 0.0).sum((0, 1)) / np.maximum(counted, 1),
-        "difference": difference.max((0, 1)),
-        "counted": counted / usable[..., 0].size,
-    }
+        "difference": difference.max((0, 1)), "counted": counted / usable[..., 0].size,
+    }  # fmt: skip
 
 
 def conditioned(value: Terms) -> dict[str, Array]:

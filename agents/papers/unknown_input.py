@@ -3,6 +3,7 @@
 Source: unknown_input, Section 4.
 """
 
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,19 +21,10 @@ from fusion_gym.systems.unknown_input.nodes import TableNodes
 from fusion_gym.systems.unknown_input.system import UnknownInputSystem
 
 from ..output import palette
+from . import unknown_input_recursion as recursion
 from .numbers import Number, below, estimate, grid, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
-from .unknown_input_recursion import (
-    DEVIATIONS,
-    EXACT,
-    EXACT_CUTOFF,
-    INVERTED,
-    PARTLY,
-    UNKNOWN_INPUT_READINGS,
-    decoupling,
-    models,
-    run,
-)
+from .unknown_input_recursion import EXACT_CUTOFF
 
 PRINTED, CARTS = "paper", "two_carts"
 EXAMPLES = (PRINTED, CARTS)
@@ -91,21 +83,15 @@ def record_run(task: Task, policy: str, episodes: int, seed: int) -> Record:
     rule = fusion_gym.make_policy(policy, task)
     batch = EpisodeBatch.seeded(task, episodes, seed)
     rule.reset(episodes, seed)
-    rows: dict[str, list[NDArray[Any]]] = {name: [] for name in Record._fields}
+    rows = []
     for _ in range(task.horizon):
         apart = batch.state.measurement - batch.state.held
         outcome = batch.step(rule(batch.signals()))
         state = batch.delivered
-        for name, value in (
-            ("truth", state.truth),
-            ("local", state.estimates.mean),
-            ("fused", state.estimates.fused_mean),
-            ("held", state.held),
-            ("square", (apart**2).sum(1)),
-            ("granted", outcome.granted),
-        ):
-            rows[name].append(np.array(value))
-    return Record(**{name: np.array(row) for name, row in rows.items()})
+        means = state.estimates.mean, state.estimates.fused_mean
+        values = (state.truth, *means, state.held, (apart**2).sum(1), outcome.granted)
+        rows.append([np.array(value) for value in values])
+    return Record(*map(np.array, zip(*rows, strict=True)))
 
 
 def halves(value: Array, states: int, axis: int) -> Array:
@@ -197,27 +183,19 @@ def _under_the_trigger(system: UnknownInputSystem, rule: AdaptiveThreshold, reco
     limit = np.broadcast_to(high, rho.shape[1:])
     steady = [(part[:, 0] ** 2).sum(1).mean(0) for part in np.array_split(errors, 2)]
     return {
-        "truth": record.truth[..., 0],
-        "local": record.local[..., 0],
-        "fused": record.fused[..., 0],
-        "granted": record.granted[..., 0].astype(np.int64),
-        "square": (errors**2).mean(-1),
+        "truth": record.truth[..., 0], "local": record.local[..., 0], "fused": record.fused[..., 0],
+        "granted": record.granted[..., 0].astype(np.int64), "square": (errors**2).mean(-1),
         "bound": np.moveaxis(np.diagonal(bounds, axis1=1, axis2=2), 1, 0),
-        "each": halves((errors**2).mean(0), n, 1),
-        "filled": np.array(filled),
-        "power": halves((record.truth**2).mean(0), n, 0),
-        "steady": np.array(steady),
-        "within": float(
-            (record.square[silent] <= np.broadcast_to(high, silent.shape)[silent]).mean()
-        ),
+        "each": halves((errors**2).mean(0), n, 1), "filled": np.array(filled),
+        "power": halves((record.truth**2).mean(0), n, 0), "steady": np.array(steady),
+        "within": float((record.square <= high)[silent].mean()),
         "rho_range": [
             float(np.diff(rho, axis=0).min()),
             float((rho / low).min()),
             float((rho / high).max()),
         ],
-        "settled": (rho < 0.99 * limit).sum(0).max(0).astype(float),
-        "radius": nodes.tables.radius,
-    }
+        "settled": (rho < 0.99 * limit).sum(0).max(0).astype(float), "radius": nodes.tables.radius,
+    }  # fmt: skip
 
 
 def _summarise_filters(data: Data) -> Data:
@@ -236,9 +214,7 @@ def _summarise_filters(data: Data) -> Data:
         for node in item["each"][1:, block]
     ]
     return {
-        "examples": examples,
-        "columns": columns,
-        "tables": {"settings": grid(columns, rows)},
+        "examples": examples, "columns": columns, "tables": {"settings": grid(columns, rows)},
         "level": float(np.sqrt(data[f"{PRINTED}_bound"][-1, 0, 2:].sum())),
         "tracked_below": _TRACKED,
         "tracked": [verdict([estimate(r).high < _TRACKED]) for r in examples[0]["relative"]],
@@ -253,41 +229,33 @@ def _summarise_filters(data: Data) -> Data:
             least >= 0.0 and low >= 1.0 and high <= 1.0
             for least, low, high in (item["rho_range"] for item in examples)
         ),
-        "within_limit": verdict(item["within"] == 1.0 for item in examples),
-        "better": better,
+        "within_limit": verdict(item["within"] == 1.0 for item in examples), "better": better,
         "improves": verdict(better),
         "reduces": verdict(estimate(rate).high < _FEW for rate in examples[0]["rates"]),
-    }
+    }  # fmt: skip
 
 
 def _summarise_example(data: Data, example: str) -> Data:
-    part = {
-        name.removeprefix(f"{example}_"): value
-        for name, value in data.items()
-        if name.startswith(example)
-    }
+    start = f"{example}_"
+    part = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
     ours, fixed, walk = (data["lanes"].index(name) for name in (OURS, FIXED, WALK))
     power, mse = part["power"].mean(-1), part["mse"]
     tops = [[estimate(sample).high for sample in place] for place in part["filled"]]
     states = [entry for entry, _ in _STATES[example]]
     slack = (part["bound"][:, 0] / part["square"][:, 0]).mean(0)
     return part | {
-        "name": NAMES[example],
-        "power": power,
-        "relative": mse[ours] / power[:, None],
+        "name": NAMES[example], "power": power, "relative": mse[ours] / power[:, None],
         "walk": mse[walk] / power[:, None],
         "under": float((part["square"] <= part["bound"]).mean()),
-        "nodes": max(max(place) for place in tops[1:]),
-        "fused_fill": max(tops[0]),
+        "nodes": max(max(place) for place in tops[1:]), "fused_fill": max(tops[0]),
         "radius": float(part["radius"].max()),
         "growth": part["steady"][1] / part["steady"][0].mean(),
         "best": [nodes[nodes.mean(-1).argmin()] for nodes in part["each"][1:].swapaxes(0, 1)],
-        "rates": part["rates"][ours],
-        "average": 100.0 * part["rates"][ours].mean(0),
+        "rates": part["rates"][ours], "average": 100.0 * part["rates"][ours].mean(0),
         "fixed": 100.0 * part["rates"][fixed].mean(0),
         "root": np.sqrt(part["each"][0].mean(-1)) / np.sqrt(power),  # fused over the quantity's own
         "slack": slack[states],
-    }
+    }  # fmt: skip
 
 
 # --- the printed recursion ------------------------------------------------------------------------
@@ -302,9 +270,9 @@ def simulate_printed(episodes: int, seed: int, settings: Settings) -> Data:
     (examples, E) of (18) over its least, ``sent`` and ``silent`` (l, E) traces of Ξ_x on the
     printed example, ``negative``: the share of silent instants with an indefinite Ξ_x.
     """
-    data: Data = {"readings": list(UNKNOWN_INPUT_READINGS)}
+    data: Data = {"readings": list(recursion.UNKNOWN_INPUT_READINGS)}
     node, trace, hidden = [], [], []
-    for reading in UNKNOWN_INPUT_READINGS.values():
+    for reading in recursion.UNKNOWN_INPUT_READINGS.values():
         options, policy = reading.get("options", {}), reading.get("policy", TRIGGER)
         cutoff = reading.get("cutoff", EXACT_CUTOFF)
         record, every = _recursion(PRINTED, policy, episodes, seed, cutoff, **options)
@@ -315,29 +283,20 @@ def simulate_printed(episodes: int, seed: int, settings: Settings) -> Data:
         hidden.append([float(each["hidden"].max()) for each in every])
     data |= {"node": np.array(node), "trace": np.array(trace), "hidden": hidden}
     data["power"] = halves((record.truth**2).mean(0), 2, 0)
-    excess: list[Array] = []
-    for example in reversed(EXAMPLES):
-        record, every = _recursion(example, TRIGGER, episodes, seed)
-        excess.insert(0, np.mean([each["excess"].mean(0) for each in every], axis=0))
-    for name, sent in (("silent", False), ("sent", True)):
-        data[name] = np.array(
-            [
-                np.nanmean(np.where(record.granted[:, i] == sent, each["trace"], np.nan), axis=0)
-                for i, each in enumerate(every)
-            ]
-        )
+    runs = [_recursion(example, TRIGGER, episodes, seed) for example in EXAMPLES]
+    excess = [np.mean([each["excess"].mean(0) for each in every], axis=0) for _, every in runs]
+    record, every = runs[0]
+    traces, granted = np.stack([each["trace"] for each in every], axis=1), record.granted
+    for name, where in (("silent", ~granted), ("sent", granted)):
+        data[name] = np.nanmean(np.where(where, traces, np.nan), axis=0)
     small = _SMALL * 0.001
     record, every = _recursion(PRINTED, TRIGGER, episodes, seed, rho_bar=small, rho_initial=small)
     least = np.stack([each["least"] for each in every], axis=1)
-    systems = [make_example(example=PRINTED, filter="paper", **o)[1] for o in _PERIODS]
-    return data | decoupling(*systems) | {
-        "excess": np.array(excess),
-        "negative": float((least[~record.granted] < 0.0).mean()),
-        "small": small,
-    }  # fmt: skip
-
-
-_PERIODS: tuple[dict[str, Any], ...] = ({}, {"sampling_period": 1})
+    paper = make_example(example=PRINTED, filter="paper")[1]
+    every_step = make_example(example=PRINTED, filter="paper", sampling_period=1)[1]
+    negative = float((least[~record.granted] < 0.0).mean())
+    data |= {"excess": np.array(excess), "negative": negative, "small": small}
+    return data | recursion.decoupling(paper, every_step)
 
 
 def _recursion(
@@ -354,20 +313,20 @@ def _recursion(
     rho_bar = options.get("rho_bar", float(np.max(usual.policy_defaults[TRIGGER]["rho_bar"])))
     record = record_run(task, policy, episodes, seed)
     return record, [
-        run(model, record.held[:, i], record.granted[:, i], cutoff)
-        for i, model in enumerate(models(system, _FACTOR[example], rho_bar))
+        recursion.run(model, record.held[:, i], record.granted[:, i], cutoff)
+        for i, model in enumerate(recursion.models(system, _FACTOR[example], rho_bar))
     ]
 
 
 def _summarise_printed(data: Data) -> Data:
     node, readings = data["node"], data["readings"]
-    exact = readings.index(EXACT)
+    exact = readings.index(recursion.EXACT)
     state, trace = node[exact, :, 0], data["trace"][exact]
     power = data["power"].mean(-1)
     share = node.mean(-1) / power[:, None].T
-    best, where = min(
-        (float(each), name) for each, name in zip(share[:, :, 1].min(1), readings, strict=True)
-    )
+    inverted, partly, small = recursion.INVERTED, recursion.PARTLY, recursion.DEVIATIONS
+    selected = {"inverted": inverted, "partly": partly, "small": small}
+    least = share[:, :, 1].min(1)
     columns = [f"node {i + 1}, {kind}" for kind in KINDS for i in range(node.shape[1])]
     return {
         "tables": {
@@ -378,20 +337,13 @@ def _summarise_printed(data: Data) -> Data:
                 for i in range(node.shape[1])
             ]
         },
-        "columns": columns,
-        "power": power,
-        "residual": max(data["hidden"][exact]),
+        "columns": columns, "power": power, "residual": max(data["hidden"][exact]),
         "below_trace": list(zip(state.mean(-1), trace.mean(-1), strict=True)),
         "tighter": 100.0 * (data["silent"].mean(-1) / data["sent"].mean(-1) - 1.0),
-        "excess": 100.0 * data["excess"].mean(-1),
-        "floor": np.sqrt(np.array(data["floor"])),
-        "share": {
-            name: share[readings.index(reading), :, 0]
-            for name, reading in (("inverted", INVERTED), ("partly", PARTLY), ("small", DEVIATIONS))
-        },
-        "partly": data["hidden"][readings.index(PARTLY)][0],
-        "best": best,
-        "where": where,
+        "excess": 100.0 * data["excess"].mean(-1), "floor": np.sqrt(np.array(data["floor"])),
+        "share": {name: share[readings.index(selected[name]), :, 0] for name in selected},
+        "partly": data["hidden"][readings.index(partly)][0], "best": least.min(),
+        "where": readings[least.argmin()],
         "decouples": "holds" if data["rank"] == data["columns"] else "does not hold",
         "hides": verdict([max(data["hidden"][exact]) < 1e-6]),
         "bounds": verdict(
@@ -405,9 +357,13 @@ def _summarise_printed(data: Data) -> Data:
 
 # --- figures --------------------------------------------------------------------------------------
 
+Entries = Mapping[str, Sequence[tuple[int, str]]]
 # Entries of [x; d] that stand for the paper's: what each is called, and its unit.
-_STATES = {PRINTED: ((0, "$x^1$"), (1, "$x^2$")), CARTS: ((0, "cart 1 (m)"), (2, "cart 2 (m)"))}
-_INPUTS = {PRINTED: ((2, "$d^1$"), (3, "$d^2$")), CARTS: ((4, "force (N)"),)}
+_STATES: Entries = {
+    PRINTED: ((0, "$x^1$"), (1, "$x^2$")),
+    CARTS: ((0, "cart 1 (m)"), (2, "cart 2 (m)")),
+}
+_INPUTS: Entries = {PRINTED: ((2, "$d^1$"), (3, "$d^2$")), CARTS: ((4, "force (N)"),)}
 _TITLES = {PRINTED: "printed example", CARTS: "two carts"}
 _WALK = "Kalman filter, random-walk input"
 
@@ -456,25 +412,18 @@ def _legend(figure: Any, axes: Any, columns: int) -> None:
     )
 
 
-def _draw_states(figure: Any, data: Data) -> None:
+def _draw_estimates(figure: Any, data: Data, entries: Entries) -> None:
     axes = _grid(figure, data, 2)
     for column, example in enumerate(EXAMPLES):
-        for row, (entry, label) in enumerate(_STATES[example]):
+        for row, (entry, label) in enumerate(entries[example]):
             _curves(axes[row, column], data, example, entry)
             axes[row, column].set_ylabel(label)
+    if len(entries[CARTS]) == 1:
+        axes[1, 1].remove()
+        axes[0, 1].tick_params(labelbottom=True)
+        axes[0, 1].set_xlabel("sampling instant k")
+        axes = [*axes[:, 0].tolist(), axes[0, 1]]
     _legend(figure, axes, 6)
-
-
-def _draw_inputs(figure: Any, data: Data) -> None:
-    axes = _grid(figure, data, 2)
-    for column, example in enumerate(EXAMPLES):
-        for row, (entry, label) in enumerate(_INPUTS[example]):
-            _curves(axes[row, column], data, example, entry)
-            axes[row, column].set_ylabel(label)
-    axes[1, 1].remove()
-    axes[0, 1].tick_params(labelbottom=True)
-    axes[0, 1].set_xlabel("sampling instant k")
-    _legend(figure, [*axes[:, 0].tolist(), axes[0, 1]], 6)
 
 
 def _labels(data: Data, example: str) -> list[tuple[str, str]]:
@@ -483,33 +432,27 @@ def _labels(data: Data, example: str) -> list[tuple[str, str]]:
     return [("fused", palette.FUSED), *own]
 
 
-def _bounded(axis: Any, data: Data, example: str, entries: list[int]) -> None:
+def _draw_bounds(figure: Any, data: Data, entries: Entries, label: str, unit: str) -> None:
     """Bounds solid, mean squared errors dotted, summed over the entries."""
-    bound = data[f"{example}_bound"][..., entries].sum(-1)
-    square = data[f"{example}_square"][..., entries].sum(-1)
-    for place, (label, colour) in enumerate(_labels(data, example)):
-        width = 2.2 if place == 0 else 1.3
-        axis.plot(_time(data), bound[:, place], color=colour, lw=width, label=label)
-        axis.plot(_time(data), square[:, place], ":", color=colour, lw=width)
-    axis.set_yscale("log")
-
-
-def _both(axis: Any) -> None:
-    """Explain the two kinds of lines."""
+    axes = _grid(figure, data, 1)
+    for column, example in enumerate(EXAMPLES):
+        axis, places = axes[0, column], [entry for entry, _ in entries[example]]
+        bound, square = (data[f"{example}_{n}"][..., places].sum(-1) for n in ("bound", "square"))
+        for place, (name, colour) in enumerate(_labels(data, example)):
+            width = 2.2 if place == 0 else 1.3
+            axis.plot(_time(data), bound[:, place], color=colour, lw=width, label=name)
+            axis.plot(_time(data), square[:, place], ":", color=colour, lw=width)
+        axis.set_yscale("log")
+        text = label.format(entries[example][0][1].replace(" (m)", ""))
+        axis.set_ylabel(text + (unit if example == CARTS else ""))
     axis.plot([], [], "-", color=palette.INK, label="upper bound")
     axis.plot([], [], ":", color=palette.INK, label="MSE")
+    _legend(figure, axes, 7)
 
 
 def _draw_state_bound(figure: Any, data: Data, place: int) -> None:
-    axes = _grid(figure, data, 1)
-    for column, example in enumerate(EXAMPLES):
-        entry, label = _STATES[example][place]
-        axis = axes[0, column]
-        _bounded(axis, data, example, [entry])
-        unit = " (m²)" if example == CARTS else ""
-        axis.set_ylabel(f"{label.replace(' (m)', '')}: squared error{unit}")
-    _both(axes[0, 1])
-    _legend(figure, axes, 7)
+    entries = {example: _STATES[example][place : place + 1] for example in EXAMPLES}
+    _draw_bounds(figure, data, entries, "{}: squared error", " (m²)")
 
 
 def _draw_input_bounds(figure: Any, data: Data) -> None:
@@ -529,16 +472,6 @@ def _draw_input_bounds(figure: Any, data: Data) -> None:
     axes[0, 1].yaxis.set_major_locator(FixedLocator([5.0, 7.0, 10.0, 14.0]))
     axes[0, 1].yaxis.set_major_formatter(FormatStrFormatter("%g"))
     axes[0, 1].yaxis.set_minor_locator(NullLocator())
-    _legend(figure, axes, 7)
-
-
-def _draw_input_trace(figure: Any, data: Data) -> None:
-    axes = _grid(figure, data, 1)
-    for column, example in enumerate(EXAMPLES):
-        axis = axes[0, column]
-        _bounded(axis, data, example, [entry for entry, _ in _INPUTS[example]])
-        axis.set_ylabel("trace" + (" (N²)" if example == CARTS else ""))
-    _both(axes[0, 1])
     _legend(figure, axes, 7)
 
 
@@ -566,15 +499,16 @@ PAPER = Paper(
         Piece("printed", simulate_printed, _summarise_printed, 60.0, 500),
     ),
     {
-        "figure_1": _figure(_draw_states, 5.0, WALK),
-        "figure_2": _figure(_draw_inputs, 5.0, WALK),
+        "figure_1": _figure(partial(_draw_estimates, entries=_STATES), 5.0, WALK),
+        "figure_2": _figure(partial(_draw_estimates, entries=_INPUTS), 5.0, WALK),
         "figure_3": _figure(partial(_draw_state_bound, place=0), 3.6),
         "figure_4": _figure(partial(_draw_state_bound, place=1), 3.6),
-        "figure_5": _figure(_draw_input_bounds, 3.6),
-        "figure_6": _figure(_draw_input_trace, 3.6),
+        "figure_5": _figure(_draw_input_bounds, 3.6), "figure_6": _figure(
+            partial(_draw_bounds, entries=_INPUTS, label="trace", unit=" (N²)"), 3.6
+        ),
         "figure_7": _figure(_draw_instants, 2.6),
     },
     "fusion_gym/UnknownInput-v0",
     {"policy": Parameter(TRIGGER, policy_of(TRIGGER))},
     ("horizon", "rho_bar", "rho_initial", "adaptation"),
-)
+)  # fmt: skip

@@ -21,12 +21,11 @@ UNKNOWN_INPUT_READINGS: dict[str, dict[str, Any]] = {
     "every step sampled, a = 1": {"options": {"sampling_period": 1}},
     DEVIATIONS: {
         "options": {
-            "process_covariance": ((1e-6, 0.0), (0.0, 1e-6)),
-            "measurement_covariance": 1e-6,
+            "process_covariance": ((1e-6, 0.0), (0.0, 1e-6)), "measurement_covariance": 1e-6,
         }
     },
     "everything transmitted": {"policy": "always"},
-}
+}  # fmt: skip
 
 
 class Model(NamedTuple):
@@ -45,21 +44,13 @@ class Model(NamedTuple):
 
 def models(system: UnknownInputSystem, factor: float, rho_bar: float) -> list[Model]:
     """Of every node."""
-    model, sensors, n = system.nodes.model, system.nodes.sensors, system.plant.size
-    return [
-        Model(
-            system.plant.transition[..., 0],
-            system.plant.input_matrix[..., 0],
-            system.plant.process_covariance[..., 0],
-            sensors.matrix[i, ..., 0],
-            sensors.covariance[i, ..., 0],
-            factor,
-            rho_bar,
-            model.initial_mean[:n, 0],
-            model.initial_covariance[:n, :n, 0],
-        )
-        for i in range(sensors.count)
-    ]
+    model, sensors, plant = system.nodes.model, system.nodes.sensors, system.plant
+    n = plant.size
+    lifted = (plant.transition, plant.input_matrix, plant.process_covariance)
+    start = (model.initial_mean[:n, 0], model.initial_covariance[:n, :n, 0])
+    measured = zip(sensors.matrix[..., 0], sensors.covariance[..., 0], strict=True)
+    a, b, w = (matrix[..., 0] for matrix in lifted)
+    return [Model(a, b, w, c, v, factor, rho_bar, *start) for c, v in measured]
 
 
 def gains(model: Model, bound: Array, silent: NDArray[np.bool_], cutoff: float) -> dict[str, Array]:
@@ -91,13 +82,9 @@ def gains(model: Model, bound: Array, silent: NDArray[np.bool_], cutoff: float) 
         return retention @ phi @ retention.swapaxes(1, 2) + n @ noise @ n.swapaxes(1, 2)
 
     return {
-        "input": onto_input,
-        "gain": gain,
-        "best": best,
-        "state_bound": spread(gain),
-        "best_bound": spread(best),
-        "input_bound": onto_input @ omega @ onto_input.swapaxes(1, 2),
-    }
+        "input": onto_input, "gain": gain, "best": best, "state_bound": spread(gain),
+        "best_bound": spread(best), "input_bound": onto_input @ omega @ onto_input.swapaxes(1, 2),
+    }  # fmt: skip
 
 
 def _pseudo_inverse(matrix: Array, cutoff: float) -> Array:
@@ -117,9 +104,8 @@ def run(model: Model, held: Array, granted: NDArray[np.bool_], cutoff: float) ->
     episodes = held.shape[-1]
     mean = np.broadcast_to(model.mean, (episodes, len(model.mean)))
     bound = np.broadcast_to(model.covariance, (episodes, *model.covariance.shape))
-    rows: dict[str, list[NDArray[Any]]] = {
-        name: [] for name in ("estimate", "trace", "least", "hidden", "excess")
-    }
+    names = ("estimate", "trace", "least", "hidden", "excess")
+    rows = []
     b, c = model.inputs, model.matrix
     for measurement, sent in zip(held, granted, strict=True):
         result = gains(model, bound, ~sent, cutoff)
@@ -130,15 +116,9 @@ def run(model: Model, held: Array, granted: NDArray[np.bool_], cutoff: float) ->
         least = np.linalg.eigvalsh(0.5 * (bound + bound.swapaxes(1, 2)))[:, 0]
         trace, best = (np.trace(result[name], axis1=1, axis2=2) for name in _TRACES)
         estimate = np.concatenate((mean, (result["input"] @ apart)[..., 0]), axis=1)
-        for name, value in (
-            ("estimate", estimate),
-            ("trace", trace),
-            ("least", least),
-            ("hidden", np.abs(b - result["gain"] @ c @ b).max((1, 2))),
-            ("excess", trace / best - 1.0),
-        ):
-            rows[name].append(value)
-    return {name: np.array(row) for name, row in rows.items()}
+        hidden = np.abs(b - result["gain"] @ c @ b).max((1, 2))
+        rows.append((estimate, trace, least, hidden, trace / best - 1.0))
+    return dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))
 
 
 _TRACES = ("state_bound", "best_bound")
@@ -156,20 +136,18 @@ def decoupling(paper: UnknownInputSystem, every_step: UnknownInputSystem) -> dic
     c = paper.nodes.sensors.matrix[0, ..., 0]
     observed = np.hstack((c, 0.0 * c)) @ lifted
     return {
-        "rank": int(np.linalg.matrix_rank(observed)),
-        "columns": int(observed.shape[1]),
+        "rank": int(np.linalg.matrix_rank(observed)), "columns": int(observed.shape[1]),
         "conditions": [float(np.linalg.cond(m)) for m in (*paper.nodes.sensors.matrix[..., 0], b)],
         "floor": _floor(paper),
-    }
+    }  # fmt: skip
 
 
 def _floor(system: UnknownInputSystem) -> list[list[float]]:
     """Mean squared errors (l, 2) of state and input of C⁻¹ y, all that (14) leaves, always sent."""
     b = system.plant.input_matrix[..., 0]
     result = []
-    for c, v in zip(
-        system.nodes.sensors.matrix[..., 0], system.nodes.sensors.covariance[..., 0], strict=True
-    ):
+    sensors = system.nodes.sensors
+    for c, v in zip(sensors.matrix[..., 0], sensors.covariance[..., 0], strict=True):
         spread = np.linalg.inv(c) @ v @ np.linalg.inv(c).T
         a, w = system.plant.transition[..., 0], system.plant.process_covariance[..., 0]
         into = np.linalg.inv(b)
