@@ -163,13 +163,9 @@ def test_bounds_of_a_filter_that_is_never_censored() -> None:
         assert upper.holds(covariance).all()
         assert lower.holds(covariance).all()
         assert not upper.holds(1.001 * covariance).any()
-        assert not replace_value(lower, 1.001 * covariance).holds(covariance).any()
-
-
-def replace_value(bound: Lower, value: np.ndarray) -> Lower:  # type: ignore[type-arg]
-    other = replace(bound)
-    other.value = value
-    return other
+        other = replace(lower)
+        other.value = 1.001 * covariance
+        assert not other.holds(covariance).any()
 
 
 def test_matrices_are_ordered_by_their_eigenvalues() -> None:

@@ -65,12 +65,7 @@ def test_verdicts_and_their_words() -> None:
     assert verdict([True, False]) == "holds partly"
     assert verdict([False]) == "does not hold"
     assert cite(Interval(0.7, 0.6991, 100.0)) == "0.700 [0.699, 100]"
-    assert [percent(share) for share in (0.0, 0.4567, 0.9996, 1.0)] == [
-        "0 %",
-        "46 %",
-        "99.96 %",
-        "100 %",
-    ]
+    assert percent((0.0, 0.4567, 0.9996, 1.0)) == "0 %, 46 %, 99.96 %, 100 %"
     assert percent(0.0004) == "0.04 %"
     sample = np.random.default_rng(1).normal(size=200)
     assert below(sample, sample + 0.1)
