@@ -24,7 +24,8 @@ PAPERS: dict[str, tuple[int, tuple[str, ...]]] = {
         "The actual deviations never exceed", "P̄ is the covariance", "The trigger saves",
     )),
     "markov_jump": (30, (
-        "The algorithm tracks", "The tracking becomes worse", "The RMSE curve", "The trigger reduces",
+        "The algorithm tracks", "The tracking becomes worse", "The RMSE curve",
+        "The trigger reduces",
     )),
     "unknown_input": (24, ("Fusion by covariance intersection",)),
     "round_robin_tobit": (24, (
