@@ -1,92 +1,156 @@
-"""Make the simulation sections of the five papers anew: figures, tables and claims.
+"""Reproduce the simulation sections of the five papers: figures, tables and claims.
 
     fusion-gym reproduce tobit_token_bucket
     fusion-gym reproduce all --resume
+    fusion-gym reproduce markov_jump --figure 5 --set m=0.7 --episodes 200
 
 Into the output folder go a page a paper (``PAPER.md``), its figures (PNG and SVG), its numbers
-(``PAPER.json``), and ``README.md`` with every claim's verdict. Simulations are kept in the work
-folder as they are finished; ``--resume`` skips those, if they were made from the same inputs.
+(``PAPER.json``), and ``README.md`` with every claim's verdict. With ``--figure`` one figure alone
+is simulated and drawn, under other parameters of the paper or options of its environment.
+Simulations are kept in the work folder as they are finished; ``--resume`` skips those, if they
+were made from the same inputs by the same code.
 """
 
+import itertools
 import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
-from .command_line import Command
-from .experiments.workers import Call as Work
-from .experiments.workers import Pool as Team
-from .experiments.workers import side_by_side
+from fusion_gym.policies.settings import parse_settings
+from fusion_gym.validation import ConfigurationError, integer
+
+from .command_line import Command, SetOptions
+from .experiments.workers import Call, Pool, side_by_side
 from .input.options import OutputFolder, Seed, Whole
 from .output.ending import ended_like_by_ctrl_c
 from .output.files import remove_partials
 from .output.folders import alone_in
-from .reproduction.making import PieceJob, compute_jobs, results_of
-from .reproduction.page import write_overview, write_page
-from .reproduction.paper import Paper, Piece
-from .reproduction.papers import NAMES, papers
+from .papers.cache import PieceJob, simulate_piece
+from .papers.page import draw_figure, write_figure, write_overview, write_page
+from .papers.paper import NAMES, NOTHING, Data, Paper, Piece, Settings, load_paper, load_papers
 
 
 @dataclass(frozen=True)
 class Reproduce(Command):
-    """Make the simulation sections of the five papers anew."""
+    """Reproduce the simulation sections of the five papers."""
 
     papers: Annotated[
         tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar=f"{{{','.join(NAMES)},all}}")
     ]
     """Papers by name, or all."""
+    figure: str | None = None
+    """One figure of one paper, by its number or name, instead of pages."""
+    options: SetOptions = ()
+    """Parameters of the figure, or options of the paper's environment."""
     episodes: Annotated[int | None, Whole(2, 100_000_000)] = None
     """Episodes of every simulation, instead of its own number."""
     seed: Seed = 0
     """Seed of the first episode."""
     resume: bool = False
     """Keep simulations that are finished."""
-    output: Annotated[Path, OutputFolder()] = Path("docs/reproduction")
-    """Folder for pages, figures and numbers."""
+    output: Annotated[Path | None, OutputFolder()] = None
+    """Folder for pages, figures and numbers: docs/reproduction, or runs/figures for a figure."""
     work: Annotated[Path, OutputFolder()] = Path("runs/reproduction")
     """Folder for simulations."""
     workers: Annotated[int, Whole(1, 512)] = 2
     """Processes side by side."""
 
     def run(self) -> None:
-        """Simulate what is not there, then write every page.
+        """Simulate what is not there, then write every page, or the figure.
 
         Raises:
-            ConfigurationError: no paper, or one that there is not.
+            ConfigurationError: no paper, an unknown name, or a parameter that is not allowed.
         """
-        names = papers(self.papers)
-        jobs = {
-            name.name: {piece.name: self._job(name, piece) for piece in name.pieces}
-            for name in names
-        }
-        with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
-            for item in names:
-                remove_partials(self.work / item.name)
-            every = [job for some in jobs.values() for job in some.values()]
-            left = [job for job in every if not (self.resume and job.finished())]
-            print(f"simulations go into {self.work}, pages into {self.output}", file=sys.stderr)
-            work = [
-                Work(job.find().weight * job.episodes / job.find().usual, compute_jobs, (job,))
-                for job in left
-            ]
-            side_by_side(work, Team(self.workers), "reproducing")
-            for item in names:
-                counts = {
-                    name: {"episodes": job.episodes, "seed": job.seed}
-                    for name, job in jobs[item.name].items()
-                }
-                write_page(item, results_of(item, jobs[item.name]), counts, self.output)
-                print(f"{item.name}: {self.output / item.name}.md")
-            write_overview(self.output)
+        papers = load_papers(self.papers)
+        changes = parse_settings("option", itertools.chain(*self.options))
+        if self.figure is not None:
+            if len(papers) != 1:
+                raise ConfigurationError(
+                    f"papers = {self.papers!r} is not allowed with figure = {self.figure!r}: "
+                    "it must be a single paper"
+                )
+            self._reproduce_figure(papers[0], self.figure, changes)
+        elif changes:
+            raise ConfigurationError(
+                f"set = {next(iter(changes))!r} is not allowed without --figure: the pages' claims "
+                "are about the papers' own parameters"
+            )
+        else:
+            self._reproduce_pages(papers, self.output or Path("docs/reproduction"))
 
-    def _job(self, paper: Paper, piece: Piece) -> PieceJob:
-        return PieceJob(paper.name, piece.name, self.episodes or piece.usual, self.seed, self.work)
+    def _reproduce_pages(self, papers: list[Paper], output: Path) -> None:
+        with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
+            print(f"simulations go into {self.work}, pages into {output}", file=sys.stderr)
+            jobs = [
+                self._job(paper, piece, self.work, paper.settings({}))
+                for paper in papers
+                for piece in paper.pieces
+            ]
+            self._simulate(jobs)
+            for paper in papers:
+                own = [job for job in jobs if job.paper == paper.name]
+                results = {job.piece: job.read() for job in own}
+                counts = {job.piece: {"episodes": job.episodes, "seed": job.seed} for job in own}
+                write_page(paper, results, counts, output)
+                print(f"{paper.name}: {output / paper.name}.md")
+            write_overview(output)
+
+    def _reproduce_figure(self, paper: Paper, name: str, changes: dict[str, Any]) -> None:
+        name, figure = paper.figure(name)
+        settings = paper.settings(changes, figure.without)
+        path = (self.output or Path("runs/figures")) / paper.name / name
+        with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
+            work, piece = self.work / "figures", paper.piece(figure.piece)
+            job = self._job(paper, piece, work, settings, figure.restriction)
+            self._simulate([job])
+            write_figure(figure, job.read(), path)
+        print(f"{paper.name}: {path}.png")
+
+    def _job(
+        self, paper: Paper, piece: Piece, work: Path, settings: Data, part: Settings = NOTHING
+    ) -> PieceJob:
+        count = self.episodes or piece.usual
+        return PieceJob(paper.name, piece.name, count, self.seed, settings, dict(part), work)
+
+    def _simulate(self, jobs: list[PieceJob]) -> None:
+        for job in jobs:
+            remove_partials(job.path.parent)
+        work = [
+            Call(job.find().weight * job.episodes / job.find().usual, simulate_piece, (job,))
+            for job in jobs
+            if not (self.resume and job.finished())
+        ]
+        side_by_side(work, Pool(self.workers), "reproducing")
 
     def interrupted(self) -> str:
         """Finished simulations are kept."""
         words = [word for word in sys.argv[1:] if word != "--resume"]
         command = shlex.join(["fusion-gym", "reproduce", *words, "--resume"])
         return f"interrupted; go on with: {command}"
+
+
+def reproduce_figure(
+    paper: str, figure: str, episodes: int | None = None, seed: int = 0, **changes: Any
+) -> Any:
+    """Return a figure of a paper as a matplotlib Figure, simulated under changed parameters.
+
+    Args:
+        paper: The paper's name.
+        figure: The figure's number or name.
+        episodes: Episodes of the simulation, instead of the paper's own number.
+        seed: Seed of the first episode.
+        changes: Parameters of the paper, or options of its environment.
+
+    Raises:
+        ConfigurationError: an unknown name, or a value that is not allowed.
+    """
+    item = load_paper(paper)
+    drawing = item.figure(figure)[1]
+    settings, piece = item.settings(changes, drawing.without), item.piece(drawing.piece)
+    count = integer("episodes", piece.usual if episodes is None else episodes, at_least=2)
+    first = integer("seed", seed, at_least=0)
+    return draw_figure(drawing, piece.simulate(count, first, settings, **drawing.restriction))

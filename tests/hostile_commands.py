@@ -40,7 +40,8 @@ BASES: dict[str, dict[str, list[str]]] = {
     "report": {"results": ["results"]},
     "table": {"config": ["rows.yaml"], "episodes": ["2"]},
     "reproduce": {
-        "papers": ["markov_jump"], "output": ["made"], "work": ["made_too"], "episodes": ["2"],
+        "papers": ["markov_jump"], "figure": ["5"], "output": ["made"], "work": ["made_too"],
+        "episodes": ["2"],
     },
     "watch": {"env": [ENV], "set": ["horizon=4"], "policy": ["always"], "save": ["made.gif"]},
     "export": {"model": ["zoo:remote_estimation_sensors"], "onnx": ["made.onnx"]},

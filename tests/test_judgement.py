@@ -12,8 +12,8 @@ from fusion_gym.agents.experiments import references as envelopes
 from fusion_gym.agents.experiments.classes import classes_of
 from fusion_gym.agents.experiments.config import load_suite
 from fusion_gym.agents.experiments.report import robustness_frame
-from fusion_gym.agents.reproduction.judging import below
-from fusion_gym.agents.reproduction.round_robin_tobit.judging import always_below
+from fusion_gym.agents.papers.numbers import below
+from fusion_gym.agents.papers.round_robin_tobit_runs import always_below
 from fusion_gym.evaluation.envelope import best_mse
 
 NOISE = np.array([-3.0, 1.0, -2.0, 3.5])

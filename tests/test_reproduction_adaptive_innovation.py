@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fusion_gym.agents.reproduction.adaptive_innovation.errors import _largest, _whitened
+from fusion_gym.agents.papers.adaptive_innovation_runs import _largest, _whitened
 
 
 def test_a_bound_is_reported_from_what_is_none() -> None:

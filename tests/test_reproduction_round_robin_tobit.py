@@ -8,28 +8,27 @@ from reproduction_checks import SEED
 from scipy import stats
 
 import fusion_gym
-from fusion_gym.agents.reproduction.round_robin_tobit.bounds import (
+from fusion_gym.agents.papers.round_robin_tobit_runs import (
+    OSCILLATOR,
+    ROUND_ROBIN_READINGS,
+    TRACKING,
+    PrintedTobitFilter,
+    SingleSensor,
+    always_below,
+    armse,
+    censored,
+    explained,
+    floor,
+    increase,
+    reading_task,
+    round_robin,
+    squares,
+)
+from fusion_gym.agents.papers.round_robin_tobit_theorems import (
     Censoring,
     Lower,
     Upper,
     matrix_below,
-)
-from fusion_gym.agents.reproduction.round_robin_tobit.judging import always_below, explained
-from fusion_gym.agents.reproduction.round_robin_tobit.readings import (
-    READINGS,
-    PrintedTobitFilter,
-    reading_task,
-)
-from fusion_gym.agents.reproduction.round_robin_tobit.runs import (
-    OSCILLATOR,
-    TRACKING,
-    Turn,
-    armse,
-    censored,
-    floor,
-    increase,
-    round_robin,
-    squares,
 )
 from fusion_gym.evaluation.episodes import run_episodes
 
@@ -46,7 +45,7 @@ def test_squared_errors_are_those_of_the_evaluation() -> None:
 def test_a_single_sensor_transmits_at_its_turns_alone() -> None:
     task = fusion_gym.make_task(OSCILLATOR)
     for sensor in range(2):
-        rate = run_episodes(task, Turn(sensor), 2, 0).rate
+        rate = run_episodes(task, SingleSensor(round_robin(task), sensor), 2, 0).rate
         np.testing.assert_allclose(rate.mean(0), np.eye(2)[sensor] / 2)
 
 
@@ -132,11 +131,11 @@ def test_printed_equations_are_as_printed(latent: float) -> None:
 def test_readings_are_run() -> None:
     """Each is another filter or another system; the first is the environment's own."""
     errors = {}
-    for reading in READINGS:
+    for reading in ROUND_ROBIN_READINGS:
         task = reading_task(reading)
         name = "always" if task.access == "any" else "round_robin"
         errors[reading] = squares(task, fusion_gym.make_policy(name, task), 3, 0).mean()
-    assert len(set(errors.values())) == len(READINGS)
+    assert len(set(errors.values())) == len(ROUND_ROBIN_READINGS)
     own = fusion_gym.make_task(OSCILLATOR)
     assert errors["corrected equations"] == squares(own, round_robin(own), 3, 0).mean()
 
@@ -164,13 +163,9 @@ def test_bounds_of_a_filter_that_is_never_censored() -> None:
         assert upper.holds(covariance).all()
         assert lower.holds(covariance).all()
         assert not upper.holds(1.001 * covariance).any()
-        assert not replace_value(lower, 1.001 * covariance).holds(covariance).any()
-
-
-def replace_value(bound: Lower, value: np.ndarray) -> Lower:  # type: ignore[type-arg]
-    other = replace(bound)
-    other.value = value
-    return other
+        other = replace(lower)
+        other.value = 1.001 * covariance
+        assert not other.holds(covariance).any()
 
 
 def test_matrices_are_ordered_by_their_eigenvalues() -> None:

@@ -4,14 +4,16 @@ import numpy as np
 import pytest
 
 import fusion_gym
-from fusion_gym.agents.reproduction.judging import below, cite, percent, verdict
-from fusion_gym.agents.reproduction.tobit_token_bucket.runs import (
+from fusion_gym.agents.papers.numbers import below, cite, percent, verdict
+from fusion_gym.agents.papers.tobit_token_bucket_runs import (
     TRIGGER,
     Failing,
+    claimed,
+    perturbed,
     record_history,
     scheme,
+    terms,
 )
-from fusion_gym.agents.reproduction.tobit_token_bucket.theory import claimed, perturbed, terms
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.evaluation.intervals import Interval
 
@@ -63,12 +65,7 @@ def test_verdicts_and_their_words() -> None:
     assert verdict([True, False]) == "holds partly"
     assert verdict([False]) == "does not hold"
     assert cite(Interval(0.7, 0.6991, 100.0)) == "0.700 [0.699, 100]"
-    assert [percent(share) for share in (0.0, 0.4567, 0.9996, 1.0)] == [
-        "0 %",
-        "46 %",
-        "99.96 %",
-        "100 %",
-    ]
+    assert percent((0.0, 0.4567, 0.9996, 1.0)) == "0 %, 46 %, 99.96 %, 100 %"
     assert percent(0.0004) == "0.04 %"
     sample = np.random.default_rng(1).normal(size=200)
     assert below(sample, sample + 0.1)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fusion_gym.agents.reproduction.unknown_input.printed import gains, models
-from fusion_gym.agents.reproduction.unknown_input.runs import CARTS, leading, make_example
+from fusion_gym.agents.papers.unknown_input import CARTS, leading, make_example
+from fusion_gym.agents.papers.unknown_input_recursion import gains, models
 
 
 def test_errors_of_the_bound_itself_fill_it() -> None:

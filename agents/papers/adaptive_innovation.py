@@ -1,0 +1,529 @@
+"""Robust sequential fusion under the adaptive innovation trigger: Figures 3 to 9 and the rates.
+
+Source: adaptive_innovation, Section 6.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullLocator
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+import fusion_gym
+from fusion_gym.arrays import Array
+from fusion_gym.core.system import Signals
+from fusion_gym.evaluation.intervals import Interval
+from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
+from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
+
+from ..output import palette
+from .adaptive_innovation_runs import ELLIPSES, SENSORS, STEPS, Ask, ErrorRecord, Lane, steps, top
+from .numbers import Number, below, estimate, grid, verdict
+from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_of
+
+STATES = ("position", "velocity", "acceleration")
+UNITS = ("m", "m/s", "m/s²")
+FUSIONS = ("sci", "sici")
+NAMES = {"sci": "SCI", "sici": "SICI"}
+TRIGGER = "adaptive_innovation"
+PRINTED = (0.6067, 0.485, 0.7067)  # Section 6, one run
+RULE = AdaptiveInnovation()
+_A, _B, _C = (float(RULE.column(name, 1)[0, 0]) for name in ("threshold", "offset", "sensitivity"))
+OURS, PRINTED_SIGN = "the trigger as we read it", "the sign in (10) as printed, -b + c |ε|"
+FIXED, TIMED = "c = 0", "a = 0"
+AT_BOUND, OTHERS, ALWAYS = "at the bounds", "requests of another episode", "always"
+_CLOSE = 0.1  # relative difference of two traces that still counts as close
+
+
+# --- thresholds and rates -------------------------------------------------------------------------
+
+
+class _Reading:
+    """A trigger with another threshold or another innovation; one object for each batch.
+
+    ``threshold`` takes the sizes |ε| at the last request and now, and is compared with the
+    size's ``power``.
+    """
+
+    def __init__(
+        self,
+        threshold: Callable[[Array, Array], Array],
+        innovation: Callable[[Signals], Array] | None = None,
+        power: int = 2,
+    ) -> None:
+        self.threshold, self.innovation, self.power = threshold, innovation, power
+        self.last: Array = np.zeros(1)
+
+    def __call__(self, signals: Signals, event: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        own = signals["innovation"][:, 0]
+        size = np.abs(own if self.innovation is None else self.innovation(signals))
+        last = np.broadcast_to(self.last, size.shape)
+        request = size**self.power >= self.threshold(last, size)
+        self.last = np.where(request, size, last)
+        return np.asarray(request)
+
+
+def _ours(last: Array, now: Array) -> Array:
+    return _A * np.exp(-(_B + _C * last))
+
+
+def _printed(last: Array, now: Array) -> Array:
+    return _A * np.exp(-_B + _C * last)
+
+
+def _against_the_centre(signals: Signals) -> Array:
+    matrix = np.array(CorrelatedTrackingOptions().measurement_matrices)[:, 0]
+    return signals["measurement"][:, 0] - matrix @ signals["prior_mean"]
+
+
+def _readings() -> dict[str, Lane]:
+    return {
+        OURS: Lane(),
+        PRINTED_SIGN: Lane(ask=_Reading(_printed)),
+        "the threshold after this very step's innovation, l(k) = k": Lane(
+            ask=_Reading(lambda last, now: _ours(now, now))
+        ),
+        "|ε|² instead of |ε| in the exponent": Lane(
+            ask=_Reading(lambda last, now: _ours(last**2, now))
+        ),
+        "|ε| instead of |ε|² against the threshold": Lane(ask=_Reading(_ours, power=1)),
+        "ε against the fused prediction (SICI)": Lane(ask=_Reading(_ours, _against_the_centre)),
+        "x(0) exactly at its mean": Lane(known_start=True),
+        "actual variances 0.8 of the bounds": Lane(scale=0.8),
+        FIXED: Lane(ask=_Reading(lambda last, now: _ours(0.0 * last, now))),
+        TIMED: Lane(ask=_Reading(lambda last, now: 0.0 * last)),
+    }
+
+
+def simulate_rates(
+    episodes: int, seed: int, settings: Settings, readings: Sequence[str] = tuple(_readings())
+) -> Data:
+    """Rates (readings, sensors, E) of every reading; innovations and requests of the first.
+
+    ``changes`` (2, E): shares of the steps after a request, then after silence, in which a
+    threshold differs from the step before. ``levels`` (H, sensors) are the thresholds in force.
+    """
+    lanes = _readings()
+    requested = np.empty((STEPS, len(SENSORS), len(readings) * episodes), dtype=np.bool_)
+    innovation = np.empty((STEPS, len(SENSORS), episodes))
+    run = steps([lanes[name] for name in readings], episodes, seed, settings, fusion="sici")
+    for step in run:
+        requested[step.number] = step.outcome.requested
+        innovation[step.number] = step.innovation[:, :episodes]
+    rates = requested.mean(0).reshape(len(SENSORS), len(readings), episodes).swapaxes(0, 1)
+    task = fusion_gym.make_task(CorrelatedTrackingOptions(**settings["options"]))
+    rule = fusion_gym.make_policy(settings["policy"], task)
+    assert isinstance(rule, AdaptiveInnovation)
+    first, last = requested[..., :episodes], np.zeros((len(SENSORS), episodes))
+    levels = np.empty(innovation.shape)
+    for number, (size, requests) in enumerate(zip(np.abs(innovation), first, strict=True)):
+        levels[number] = rule.threshold_after(last)
+        last = np.where(requests, size, last)
+    moved, after = np.diff(levels, axis=0) != 0.0, first[:-1]
+    sums = [((moved & where).sum((0, 1)), where.sum((0, 1))) for where in (after, ~after)]
+    changes = [changed / np.maximum(count, 1) for changed, count in sums]
+    return {
+        "readings": list(readings), "rates": rates, "changes": np.array(changes),
+        "levels": levels[..., 0],
+        "ceiling": float(rule.threshold_after(np.zeros((len(SENSORS), 1))).max()),
+        "requested": first[..., 0].astype(np.int64),
+    }  # fmt: skip
+
+
+def _summarise_rates(data: Data) -> Data:
+    readings, rates = data["readings"], data["rates"]
+    by = dict(zip(readings, rates, strict=True))
+    ours = by[OURS]
+    numbers = [
+        Number.of(f"{name}, rate", 100.0 * sample, 100.0 * printed, unit="%")
+        for name, sample, printed in zip(SENSORS, ours, PRINTED, strict=True)
+    ]
+    agree = [number.verdict == "agrees" for number in numbers]
+    far = np.abs(100.0 * (rates.mean(-1) - np.array(PRINTED))).max(1)
+    size = np.linspace(0.0, 5.0, 51)
+    falls = [bool((np.diff(level(size, size)) < 0.0).all()) for level in (_printed, _ours)]
+    unmoved = float(np.ptp(_ours(0.0 * size, size)))
+    after, silent = data["changes"]
+    return {
+        "tables": {
+            "rates": numbers,
+            "readings": [
+                Number.of(f"{reading}: {name}", 100.0 * sample, unit="%")
+                for reading, samples in by.items()
+                if reading not in (OURS, FIXED, TIMED)
+                for name, sample in zip(SENSORS, samples, strict=True)
+            ],
+        },
+        "steps": STEPS, "counts": [round(STEPS * printed) for printed in PRINTED],
+        "away": [(100.0 * p - n.mean) / n.spread for p, n in zip(PRINTED, numbers, strict=True)],
+        "usual": float(norm.ppf(0.5 + 0.5 * 0.95 ** (1.0 / len(numbers)))),
+        "spread": 100.0 * ours.std(1, ddof=1),
+        "nearest": sorted(zip(far.tolist(), readings, strict=True)),
+        "percent": {
+            name: 100.0 * by[reading]
+            for name, reading in (
+                ("ours", OURS), ("printed_sign", PRINTED_SIGN), ("fixed", FIXED), ("timed", TIMED),
+            )
+        },
+        "agree": agree, "falls": falls, "unmoved": unmoved, "after": after.mean(),
+        "silent": silent.mean(), "shares": data["requested"][WINDOW].mean(0),
+        "saves": verdict(estimate(sample).high < 1.0 for sample in ours),
+        "as_printed": verdict(agree), "decreases": verdict(falls[:1]),
+        "adapts": verdict([estimate(after).low > 0.0]),
+        "moves_in_silence": verdict([float(silent.max()) > 0.0]),
+        "limits": verdict([(by[TIMED] == 1.0).all(), unmoved == 0.0]),
+    }  # fmt: skip
+
+
+# --- errors, actual and conservative variances ----------------------------------------------------
+
+
+def _of_other_episodes(episodes: int) -> Ask:
+    """What the trigger requests in the next episode of the first lane.
+
+    The same rates and patterns of requests, but independent of the episode's own noise.
+    """
+
+    def ask(signals: Signals, event: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        others = np.roll(event[:, :episodes], -1, axis=1)
+        return np.tile(others, event.shape[1] // episodes)
+
+    return ask
+
+
+def _always(signals: Signals, event: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return np.ones_like(event)
+
+
+def simulate_fusion(
+    episodes: int,
+    seed: int,
+    settings: Settings,
+    lanes: Sequence[str] = ("bounds", "scales", "others"),
+    fusions: Sequence[str] = FUSIONS,
+) -> Data:
+    """Everything that Figures 4 to 9 and their claims need, by fusion rule.
+
+    See :class:`ErrorRecord`. ``lanes`` are groups: the trigger at the bounds of the variances, at
+    every noise scale or at the first alone, and two other policies at the bounds.
+    """
+    scaled = {f"scale {scale}": Lane(scale) for scale in settings["scales"]}
+    groups = {
+        "bounds": {AT_BOUND: Lane()}, "scales": scaled, "first": dict([next(iter(scaled.items()))]),
+        "others": {OTHERS: Lane(ask=_of_other_episodes(episodes)), ALWAYS: Lane(ask=_always)},
+    }  # fmt: skip
+    selected = {name: lane for group in lanes for name, lane in groups[group].items()}
+    data: Data = {"lanes": list(selected), "scales": list(settings["scales"])}
+    for fusion in fusions:
+        record = ErrorRecord(len(selected), episodes, with_nodes=fusion == FUSIONS[0])
+        options = {"fusion": fusion, "track_actual": True}
+        for step in steps(selected.values(), episodes, seed, settings, **options):
+            record.add(step)
+        data |= {f"{fusion}_{name}": value for name, value in record.arrays().items()}
+    return data
+
+
+class _Lanes:
+    """The data by fusion rule, name and setting."""
+
+    def __init__(self, data: Data) -> None:
+        self.data = data
+
+    def __call__(self, fusion: str, name: str, lane: str) -> Array:
+        result: Array = self.data[f"{fusion}_{name}"][self.data["lanes"].index(lane)]
+        return result
+
+    def both(self, name: str, lane: str) -> Array:
+        """Return the data of both fusion rules, stacked."""
+        return np.stack([self(fusion, name, lane) for fusion in FUSIONS])
+
+    def relative(self, lane: str) -> list[Interval]:
+        """Return MSE over actual trace, minus 1, of both fusion rules."""
+        actual = self.both("actual", lane).mean(-1, keepdims=True)
+        return [estimate(sample) for sample in self.both("mse", lane) / actual - 1.0]
+
+
+def _close(interval: Interval) -> bool:
+    return max(abs(interval.low), abs(interval.high)) <= _CLOSE
+
+
+def _hundredfold(intervals: Iterable[Interval]) -> list[Interval]:
+    return [Interval(*(100.0 * value for value in interval)) for interval in intervals]
+
+
+def _summarise_fusion(data: Data) -> Data:
+    lanes, scaled = _Lanes(data), {f"scale {scale}": scale for scale in data["scales"]}
+    names = {AT_BOUND: "trigger", OTHERS: "trigger's requests of another episode", ALWAYS: "always"}
+    low_names = {lane: f"trigger, variances {scaled[lane]} of the bounds" for lane in scaled}
+    quantities = {"mse": "MSE", "actual": "actual trace", "conservative": "conservative trace"}
+
+    def traces(group: dict[str, str]) -> list[Number]:
+        rows = {
+            f"{NAMES[f]}, {label}": [lanes(f, quantity, lane) for quantity in quantities]
+            for f in FUSIONS
+            for lane, label in group.items()
+        }
+        return grid(tuple(quantities.values()), rows)
+
+    inside = {
+        f"{NAMES[f]}, variances {scale:g} of the bounds": 100.0 * lanes(f, "inside", lane)
+        for f in FUSIONS
+        for lane, scale in scaled.items()
+    }
+    left = lanes.both("square", AT_BOUND).mean(-1).sum(-1)
+    return {
+        "tables": {
+            "traces": traces(names), "scales": traces(low_names), "inside": grid(STATES, inside),
+        },
+        "quantities": list(quantities.values()), "states": STATES, "rules": list(NAMES.values()),
+        "runs": data["sci_mse"].shape[-1], "ellipses": ELLIPSES,
+        "within": np.mean([_within(lanes, lane) for lane in scaled], axis=0),
+        "left": list(left / lanes.both("level", AT_BOUND).sum(1).mean(-1)),
+        "relative": _hundredfold(lanes.relative(AT_BOUND)),
+        "independent": _hundredfold(lanes.relative(OTHERS)),
+        **_summarise_figures(lanes, list(scaled)), **_summarise_bounds(lanes, list(scaled)),
+        **_summarise_comparisons(lanes, next(iter(scaled))),
+    }  # fmt: skip
+
+
+def _within(lanes: _Lanes, lane: str) -> Array:
+    """The shares of a run's errors within three actual deviations, by fusion rule."""
+    error = np.abs(lanes.both("truth", lane) - lanes.both("mean", lane))
+    return np.asarray((error <= 3.0 * lanes.both("actual_deviation", lane)).mean((1, 2)))
+
+
+def _summarise_figures(lanes: _Lanes, scaled: list[str]) -> Data:
+    square, level = (lanes.both(name, AT_BOUND).mean(-1) for name in ("square", "level"))
+    mse, trace = (lanes.both(f"{name}_steps", AT_BOUND) for name in ("mse", "conservative"))
+    lower = map(below, lanes.both("mse", AT_BOUND), lanes.both("conservative", AT_BOUND))
+    inside = np.stack([lanes.both("inside", lane).mean(-1) for lane in scaled], axis=1)
+    more, least = inside > 0.99, np.unravel_index(inside.argmin(), inside.shape)
+    rule, lane, state = map(int, least)
+    follows = 1.0 - square / level
+    return {
+        "explained": 100.0 * follows.min(), "tracks": verdict((follows > 0.99).ravel()),
+        "close_below": 100 * _CLOSE, "close": verdict(map(_close, lanes.relative(AT_BOUND))),
+        "under": 100.0 * (mse <= trace).mean(-1), "below_conservative": verdict(lower),
+        "more": more.ravel().tolist(), "inside": verdict(more.ravel()),
+        "least": 100.0 * inside.min(),
+        "where": f"{NAMES[FUSIONS[rule]]}, {scaled[lane]}, {STATES[state]}",
+        "whole": 100.0 * inside.mean((1, 2)),
+    }  # fmt: skip
+
+
+def _summarise_bounds(lanes: _Lanes, scaled: list[str]) -> Data:
+    every = [AT_BOUND, *scaled]
+    ordered = np.stack([lanes.both("ordered", lane).mean(-1).min(-1) for lane in scaled], axis=1)
+    bounded = np.stack([lanes.both("bounded", lane).mean(-1) for lane in every], axis=1)
+    nodes = min(float(lanes("sci", "node_bounded", lane).min()) for lane in every)
+    gap = float(lanes("sci", "node_gap", AT_BOUND).max())
+    places = [name.removeprefix("scale ") for name in every]
+    close = [_close(each) for lane in (AT_BOUND, OTHERS) for each in lanes.relative(lane)]
+    return {
+        "ordered_shares": ordered, "ordered": verdict((ordered == 1.0).ravel()),
+        "node_share": nodes, "node_bounds": verdict([nodes == 1.0]),
+        "gap": gap, "least_bound": verdict([gap < 1e-9]), "sci_share": bounded[0].min(),
+        "sci_bounds": verdict(bounded[0] == 1.0),
+        "sici_shares": dict(zip(places, bounded[1].tolist(), strict=True)),
+        "sici_bounds": verdict([bounded[1].min() == 1.0]), "bounded": bounded[:, 0].tolist(),
+        "worst": np.max([lanes.both("worst", lane).max(-1) for lane in every], axis=0),
+        "real": [estimate(top(lanes("sici", "whitened", lane))) for lane in (ALWAYS, AT_BOUND)],
+        "covariance": verdict(close),
+    }  # fmt: skip
+
+
+def _summarise_comparisons(lanes: _Lanes, scaled: str) -> Data:
+    mse, trace, beats = (lanes.both(name, AT_BOUND) for name in ("mse", "conservative", "beats"))
+    late = lanes.both("mse_steps", AT_BOUND)[:, _LATE]
+    bounded, beats = lanes.both("bounded", AT_BOUND).mean(-1), beats.mean(-1).min(-1)
+    node, other = lanes("sci", "node_mse", AT_BOUND), lanes.both("mse", OTHERS)
+    better = [below(own, each) for own in mse for each in node]
+    whole, plane = (lanes.both(name, scaled).mean(-1) for name in ("encloses", "encloses_plane"))
+    accurate, tight = below(mse[1], mse[0]), below(trace[1], trace[0])
+    price = mse / lanes.both("mse", ALWAYS).mean(-1, keepdims=True) - 1.0
+    return {
+        "mse": list(mse), "trace": trace, "node": node, "other": list(other),
+        "wins": float((mse[1] < mse[0]).mean()), "late": float((late[1] < late[0]).mean()),
+        "accurate": verdict([accurate, late[1].mean() < late[0].mean()]),
+        "remark_3": verdict([accurate, tight, bounded[1] >= bounded[0]]),
+        "beats": beats.tolist(), "higher": verdict([*(beats > 0.99), *better]), "plane": plane,
+        "whole_ellipses": whole, "encloses": verdict((np.stack((whole, plane)) > 0.99).ravel()),
+        "price": _hundredfold(map(estimate, price)), "effective": verdict(map(below, mse, other)),
+    }  # fmt: skip
+
+
+# --- figures --------------------------------------------------------------------------------------
+
+WINDOW = slice(299, 400)  # the steps of Figure 3
+_LATE = slice(399, 600)  # and of Figure 6
+_COLOURS = {"sci": palette.SKY, "sici": palette.FUSED}
+_DRAWN = 5  # steps from one point of a crowded line to the next
+_TIME = np.arange(1, STEPS + 1)
+_SUM = "sum over states (SI units)"
+
+
+def _draw_thresholds(figure: Any, data: Data) -> None:
+    time, requested = _TIME[WINDOW], data["requested"].astype(bool)[WINDOW]
+    axes = figure.subplots(len(SENSORS), 1, sharex=True, sharey=True)
+    for i, (axis, name) in enumerate(zip(axes, SENSORS, strict=True)):
+        colour, requests = palette.SENSORS[i], requested[:, i]
+        axis.step(time, data["levels"][WINDOW, i], where="mid", color=colour, lw=1.6)
+        axis.plot(time[requests], np.full(requests.sum(), 0.01), "|", color=palette.BLACK, ms=6)
+        axis.set_title(f"({'abc'[i]}) {name}", loc="left", color=colour)
+        axis.set_ylim(0.0, 1.02 * data["ceiling"] or 1.0)
+        axis.set_ylabel("θ (m²)" if i == 0 else "θ (m²/s²)" if i == 1 else "θ (m²/s⁴)")
+    axes[-1].set_xlabel("step k")
+    axes[-1].set_xlim(time[0], time[-1])
+
+
+def _draw_tracking(figure: Any, data: Data) -> None:
+    lanes = _Lanes(data)
+    axes = figure.subplots(3, 1, sharex=True)
+    for state, axis in enumerate(axes):
+        truth = lanes("sci", "truth", AT_BOUND)[:, state]
+        axis.plot(_TIME, truth, color=palette.TRUTH, lw=3.0, label="true value")
+        for fusion in FUSIONS:
+            axis.plot(
+                _TIME, lanes(fusion, "mean", AT_BOUND)[:, state], color=_COLOURS[fusion],
+                lw=2.0 if fusion == "sci" else 1.0, label=NAMES[fusion],
+            )  # fmt: skip
+        axis.set_title(f"({'abc'[state]}) {STATES[state]}", loc="left")
+        axis.set_ylabel(f"$x_{state + 1}$ ({UNITS[state]})")
+    axes[-1].set_xlabel("step k")
+    axes[-1].set_xlim(0, STEPS)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+
+
+def _draw_traces(figure: Any, data: Data) -> None:
+    lanes = _Lanes(data)
+    axes = figure.subplots(2, 1, sharex=True, sharey=True)
+    for place, (fusion, axis) in enumerate(zip(FUSIONS, axes, strict=True)):
+        for name, colour, label in (
+            ("conservative", palette.BLACK, "trace of conservative variance"),
+            ("actual", palette.GREEN, "trace of actual variance"),
+            ("mse", _COLOURS[fusion], f"MSE of {NAMES[fusion]}"),
+        ):
+            curve = lanes(fusion, f"{name}_steps", AT_BOUND)
+            axis.plot(_TIME, curve, color=colour, lw=1.6, label=label)
+        axis.set_yscale("log")
+        axis.set_ylabel(_SUM)
+        axis.set_title(f"({'ab'[place]}) {NAMES[fusion]}", loc="left")
+        axis.legend(loc="upper right", ncols=3, fontsize=9, columnspacing=1.0)
+        axis.set_ylim(0.2, 4.0)
+        axis.yaxis.set_major_locator(FixedLocator([0.2, 0.3, 0.5, 1.0, 2.0, 4.0]))
+        axis.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+        axis.yaxis.set_minor_locator(NullLocator())
+    axes[-1].set_xlabel("step k")
+    axes[-1].set_xlim(0, STEPS)
+
+
+def _draw_comparison(figure: Any, data: Data) -> None:
+    axis = figure.subplots()
+    for fusion in FUSIONS:
+        mse = _Lanes(data)(fusion, "mse_steps", AT_BOUND)[_LATE]
+        axis.plot(_TIME[_LATE], mse, color=_COLOURS[fusion], lw=1.8, label=NAMES[fusion])
+    axis.set_xlabel("step k")
+    axis.set_ylabel(f"MSE, {_SUM}")
+    axis.set_xlim(_TIME[_LATE][0], STEPS)
+    axis.set_ylim(bottom=0.0)
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", ncols=2)
+
+
+def _draw_errors(figure: Any, data: Data, fusion: str) -> None:
+    lanes, scales = _Lanes(data), data["scales"]
+    axes = figure.subplots(3, len(scales), sharex=True, sharey="row", squeeze=False)
+    time = _TIME[::_DRAWN]
+    for column, scale in enumerate(scales):
+        truth, mean, actual, bound = (
+            lanes(fusion, name, f"scale {scale}")[::_DRAWN]
+            for name in ("truth", "mean", "actual_deviation", "conservative_deviation")
+        )
+        for state in range(3):
+            axis = axes[state, column]
+            for sign in (3.0, -3.0):
+                (robust,) = axis.plot(time, sign * bound[:, state], color=palette.BLACK, lw=0.9)
+                (own,) = axis.plot(time, sign * actual[:, state], color=palette.GREEN, lw=0.9)
+            error = (truth - mean)[:, state]
+            (curve,) = axis.plot(time, error, color=_COLOURS[fusion], lw=1.1)
+        axes[0, column].set_title(f"({chr(ord('a') + column)}) {scale:g} of bounds", loc="left")
+        axes[2, column].set_xlabel("step k")
+    for state, row in enumerate(axes):
+        row[0].set_ylabel(f"{STATES[state]}\nerror ({UNITS[state]})")
+        limit = max(
+            lanes(fusion, "conservative_deviation", f"scale {scale}")[60:, state].max()
+            for scale in scales
+        )
+        row[0].set_ylim(-3.0 * limit * 1.05, 3.0 * limit * 1.05)
+    names = ("error of the fused estimate", "robust ±3σ", "actual ±3σ")
+    figure.legend((curve, robust, own), names, loc="outside upper center", ncols=3)
+
+
+def _ellipse(covariance: Array) -> Array:
+    around = np.linspace(0.0, 2.0 * np.pi, 181)
+    root = np.linalg.cholesky(covariance[:2, :2])
+    return np.asarray(root @ np.stack((np.cos(around), np.sin(around))))
+
+
+def _draw_ellipses(figure: Any, data: Data) -> None:
+    axes = figure.subplots(2, 2)
+    for row, fusion in zip(axes, FUSIONS, strict=True):
+        both = _Lanes(data)(fusion, "ellipses", f"scale {data['scales'][0]}")
+        colours = (_COLOURS[fusion], *palette.SENSORS)
+        names = (NAMES[fusion], *SENSORS)
+        for axis in row:
+            for place in (3, 2, 1, 0):
+                for kind, style in ((0, "-"), (1, ":")):
+                    axis.plot(
+                        *_ellipse(both[kind, place]), style, color=colours[place], lw=1.8,
+                        label=names[place] if kind == 0 else None,
+                    )  # fmt: skip
+            axis.set_xlabel("position error (m)")
+        row[0].set_ylabel("velocity error (m/s)")
+        row[0].set_title(f"({'ab'[FUSIONS.index(fusion)]}) {NAMES[fusion]}", loc="left")
+        row[1].set_title("enlarged", loc="left")
+        near = np.abs(_ellipse(both[0, 1])).max(1)
+        row[1].set_xlim(-1.3 * near[0], 1.3 * near[0])
+        row[1].set_ylim(-1.3 * near[1], 1.3 * near[1])
+    entries = [axis.get_legend_handles_labels() for axis in axes[:, 0]]
+    handles, labels = (
+        [each[part][-1] for each in entries] + entries[0][part][-2::-1] for part in (0, 1)
+    )
+    for label, style in (("conservative", "-"), ("actual", ":")):
+        handles.append(axes[0, 0].plot([], [], style, color=palette.INK, lw=1.8)[0])
+        labels.append(label)
+    figure.legend(handles, labels, loc="outside upper center", ncols=7, columnspacing=0.8)
+
+
+def _figure(draw: Any, size: tuple[float, float], lanes: str, *fusions: str) -> PaperFigure:
+    without = ("scales",) if lanes == "bounds" else ()
+    restriction = {"lanes": [lanes], "fusions": fusions or FUSIONS}
+    return PaperFigure("fusion", draw, size, restriction, without)
+
+
+PAPER = Paper(
+    "adaptive_innovation",
+    (
+        Piece("rates", simulate_rates, _summarise_rates, 45.0, 200),
+        Piece("fusion", simulate_fusion, _summarise_fusion, 100.0, 200),
+    ),
+    {
+        "figure_3": PaperFigure(
+            "rates", _draw_thresholds, (7.2, 5.6), {"readings": [OURS]}, ("scales",)
+        ),
+        "figure_4": _figure(_draw_tracking, (7.2, 6.4), "bounds"),
+        "figure_5": _figure(_draw_traces, (7.2, 6.0), "bounds"),
+        "figure_6": _figure(_draw_comparison, (7.2, 3.6), "bounds"),
+        "figure_7": _figure(partial(_draw_errors, fusion="sci"), (7.2, 5.6), "scales", "sci"),
+        "figure_8": _figure(partial(_draw_errors, fusion="sici"), (7.2, 5.6), "scales", "sici"),
+        "figure_9": _figure(_draw_ellipses, (7.6, 6.6), "first"),
+    },
+    "fusion_gym/CorrelatedTracking-v0",
+    {
+        "scales": Parameter((0.8, 0.6, 0.4), numbers_within(above=0.0, at_most=1.0)),
+        "policy": Parameter(TRIGGER, policy_of(TRIGGER)),
+    },
+    ("process_variance", "trigger_threshold", "trigger_offset", "trigger_sensitivity"),
+)

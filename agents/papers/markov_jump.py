@@ -1,0 +1,476 @@
+"""Fusion of event-triggered estimates of a Markov jump system: Figures 2 to 5 and the theorems.
+
+Source: markov_jump (event-triggered distributed fusion estimation for asynchronous Markov jump
+systems with correlated noises and fading measurements), Section 6.
+"""
+
+from __future__ import annotations
+
+import operator
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import fusion_gym
+from fusion_gym.arrays import Array
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingOptions
+
+from ..output.palette import BLACK, BLUE, GREEN, ORANGE, PURPLE, SENSORS, SKY, TRUTH, VERMILLION
+from .markov_jump_covariances import covariances
+from .numbers import Number, below, grid, verdict
+from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_list
+
+STATES = ("position", "velocity")
+UNITS = ("m", "m/s")
+_PAPERS_RUNS = 100
+_TRACKED = 0.9  # of the squared error of an estimate that receives nothing
+_LONG, _SHOWN, _INSTANTS = 200, 100, 60  # steps
+_LAST = 60  # steps that stand for the settled ones
+_SETTLED = 1e-9  # relative change over a period below which a trace repeats itself
+_MARGIN = 1e-5  # of a threshold beyond the range of those that make a difference
+_PRINTED = {  # of Section 6, with half of their last digit
+    "mean of β": ((0.65, 0.39, 0.45), 0.005), "variance of β": ((0.09, 0.0499, 0.0585), 0.00005),
+}  # fmt: skip
+_CLEAR = 4.0  # standard errors: not reached by chance in some dozens of comparisons
+_SAME = 1e-9  # relative difference of two recursions that are the same
+_PERIOD = 6  # steps, after which all sensors' sampling repeats
+_SEARCHED = 4  # packets in a period, up to which all schedules are compared
+
+
+def example(**options: Any) -> Task:
+    """Return the paper's Section 6, with other ``options`` where they are named."""
+    return fusion_gym.make_task(MarkovJumpTrackingOptions(**options))
+
+
+def trigger(m: float, literal: bool = False) -> str:
+    """Return the paper's trigger (33) at the threshold m; m = 0 stands for all that is sent.
+
+    ``literal`` takes (33) by its word there too.
+    """
+    return f"local_variance:m={m!r}" if m or literal else "always"
+
+
+def _lanes(settings: Settings) -> dict[str, str]:
+    """The trigger at every threshold and the other policies, by their labels."""
+    lanes = {f"m = {m:g}": trigger(m) for m in settings["m"]}
+    return lanes | {policy: policy for policy in settings["policies"]}
+
+
+class Run(NamedTuple):
+    """E episodes of H steps, k = 1..H first.
+
+    ``truth`` and ``mean`` (H, n, E), the fused estimate · ``local_error`` (H, l, n, E) · of the
+    first episode, which for a trigger that looks at covariances is every one: ``sent`` (H, l) bool
+    and the ``trace`` (H,) of the fused covariance.
+    """
+
+    truth: Array
+    mean: Array
+    local_error: Array
+    sent: NDArray[np.bool_]
+    trace: Array
+
+    @property
+    def squared(self) -> Array:
+        """Squared errors (H, n, E)."""
+        return np.square(self.truth - self.mean)
+
+
+def run_markov_jump(task: Task, policy: str, episodes: int, seed: int) -> Run:
+    """Run episodes with the seeds ``seed``, ``seed + 1``, …"""
+    rule = fusion_gym.make_policy(policy, task)
+    batch = EpisodeBatch.seeded(task, episodes, seed)
+    rule.reset(episodes, seed)
+    rows: list[tuple[Any, ...]] = []
+    for _ in range(task.horizon):
+        outcome = batch.step(rule(batch.signals()))
+        state = batch.delivered
+        mean, covariance = task.system.fused(state)
+        truth = task.system.truth(state)
+        local = task.system.local_means(state) if hasattr(state, "node_mean") else mean[None]
+        trace = np.trace(covariance)[:1]
+        rows.append((truth, mean, truth - local, outcome.granted[:, 0], trace))
+    truth, mean, local, sent, trace = (np.array(row) for row in zip(*rows, strict=True))
+    return Run(truth, mean, local, sent, trace[:, 0])
+
+
+# --- what is sent, and the covariances ------------------------------------------------------------
+
+
+def simulate_schedule(episodes: int, seed: int, settings: Settings) -> Data:
+    """Schedules and traces of one run, for none depends on the data."""
+    lanes, options = _lanes(settings), settings["options"]
+    task = example(**({"horizon": _LONG} | options))
+    short = example(**({"horizon": _SHOWN} | options))
+    system: Any = task.system
+    runs = [run_markov_jump(task, policy, episodes, seed) for policy in lanes.values()]
+    local = system.recursion.local_trace[:, system.filters.at(np.arange(1, task.horizon + 1))]
+    cycle = system.filters.period
+    gaps = local[:, -cycle:] - system.full_rate_traces().mean()
+    limits = [float(gaps.min()), float(gaps.max())]
+    at_ends = [
+        run_markov_jump(short, trigger(m, literal=True), episodes, seed).sent[-2 * cycle :].mean()
+        for m in (limits[0] - _MARGIN, limits[1] + _MARGIN)
+    ]
+    sensors, plant = system.sensors, system.plant
+    mean = (sensors.fading_values * sensors.fading_probabilities).sum(1)
+    square = (sensors.fading_values**2 * sensors.fading_probabilities).sum(1)
+    return {
+        "m": list(settings["m"]), "labels": list(lanes),
+        "sent": np.array([run.sent for run in runs]),
+        "trace": np.array([run.trace for run in runs]),
+        "literal": run_markov_jump(short, trigger(0.0, literal=True), episodes, seed).sent,
+        "local": local, "periods": sensors.period[:, 0], "range": limits,
+        "at_ends": [float(share) for share in at_ends],
+        "radii": np.abs(np.linalg.eigvals(np.moveaxis(plant.transition, -1, 0))).max(-1).tolist(),
+        "square_radius": float(plant.second_moment_radius()), "mean of β": mean,
+        "variance of β": square - mean**2,
+    }  # fmt: skip
+
+
+def period_of(values: Array) -> int | None:
+    """After how many steps values (H,) repeat themselves at their end; None if they do not."""
+    last = values[-_LAST:]
+    for period in range(1, _LAST // 3):
+        if np.abs(last[period:] - last[:-period]).max() <= _SETTLED * np.abs(last).max():
+            return period
+    return None
+
+
+def _summarise_schedule(data: Data) -> Data:
+    sent, trace = data["sent"].astype(bool)[:, :_SHOWN], data["trace"]
+    literal, shares = data["literal"].astype(bool), sent.mean(1)
+    packets, settled = shares.sum(-1), trace[:, -_LAST:].mean(-1)
+    columns = ("node 1", "node 2", "node 3", "packets a step", "mean trace", "settled trace")
+    values = np.column_stack((shares, packets, trace[:, :_SHOWN].mean(-1), settled))
+    larger = [float((after >= before * (1.0 - 1e-12)).mean()) for before, after in pairwise(trace)]
+    fused, own = ([period_of(item) for item in curves] for curves in (trace, data["local"]))
+    return {
+        "columns": columns,
+        "tables": {
+            "schedule": [
+                Number(f"{label}: {what}", value, value, value)
+                for label, row in zip(data["labels"], values.tolist(), strict=True)
+                for what, value in zip(columns, row, strict=True)
+            ],
+            "fading": [
+                Number(f"{what} of node {node + 1}", ours, ours, ours, value, half / 1.96)
+                for what, (printed, half) in _PRINTED.items()
+                for node, (value, ours) in enumerate(zip(printed, data[what].tolist(), strict=True))
+            ],
+        },
+        "shown": _SHOWN, "instants": _INSTANTS, "settled_from": _LONG - _LAST + 1,
+        "tolerance": _SETTLED, "shares": shares, "packets": packets,
+        "falls": verdict(now > later for now, later in pairwise(packets)),
+        "quiet": int((~literal.all(-1)).nonzero()[0].max(initial=-1)) + 1,
+        "everything": verdict([literal.all(), literal[_SHOWN // 2 :].all()]),
+        "matter": verdict([data["at_ends"][0] == 1.0, data["at_ends"][1] == 0.0]), "larger": larger,
+        "grows": verdict(share == 1.0 for share in larger), "settled": settled,
+        "fused_periods": [period or "none" for period in fused],
+        "periodic": verdict(period is not None for period in fused),
+        "own_periods": [period or "none" for period in own],
+        "as_sampled": verdict(map(operator.eq, own, data["periods"])),
+        "stable": verdict((max(data["radii"]) < 1.0, data["square_radius"] < 1.0)),
+    }  # fmt: skip
+
+
+# --- tracking and its errors ----------------------------------------------------------------------
+
+
+def simulate_tracking(episodes: int, seed: int, settings: Settings) -> Data:
+    """Estimates of one episode and root mean square errors at every threshold."""
+    task, lanes = example(**settings["options"]), _lanes(settings)
+    runs = (run_markov_jump(task, policy, episodes, seed) for policy in lanes.values())
+    rows = []
+    for run in runs:
+        squared = run.squared
+        few, every = (np.sqrt(part.mean(-1)) for part in (squared[..., :_PAPERS_RUNS], squared))
+        rows.append((run.mean[..., 0], few, every, squared.mean(0)))
+    names = ("means", "few", "every", "squares")
+    silent = run_markov_jump(task, "never", episodes, seed)
+    return {
+        "m": list(settings["m"]), "labels": list(lanes), "truth": silent.truth[..., 0],
+        "silent": silent.squared.mean(0),
+        **{name: np.array(row) for name, row in zip(names, zip(*rows, strict=True), strict=True)},
+    }  # fmt: skip
+
+
+def _summarise_tracking(data: Data) -> Data:
+    squares, silent = data["squares"], data["silent"]
+    square = squares.mean(-1).T
+    columns = [f"mean squared error of the {state}" for state in STATES]
+    rows = dict(zip(data["labels"], squares, strict=True)) | {"nothing sent": silent}
+    states = range(len(STATES))
+    raised = [below(now[s], later[s]) for now, later in pairwise(squares) for s in states]
+    every, few = data["every"], data["few"]
+    top = (every[-1] >= every.max(0)).mean(0)
+    first = [below(squares[0, s], later[s]) for later in squares[1:] for s in states]
+    return {
+        "columns": columns, "tables": {"errors": grid(columns, rows)}, "papers_runs": _PAPERS_RUNS,
+        "gain": {name: 1.0 - square[s] / silent[s].mean() for s, name in enumerate(STATES)},
+        "tracks": verdict(below(own[s], _TRACKED * silent[s]) for own in squares for s in states),
+        "roots": {name: np.sqrt(square[s]) for s, name in enumerate(STATES)},
+        "raised": raised, "worse": verdict(raised), "top": top,
+        "few_top": (few[-1] >= few.max(0)).mean(0),
+        "on_top": verdict(share > 0.5 for share in top), "first_best": verdict([all(first)]),
+    }  # fmt: skip
+
+
+# --- theorems -------------------------------------------------------------------------------------
+
+
+def simulate_theorems(episodes: int, seed: int, settings: Settings) -> Data:
+    """Actual and claimed covariances of nodes and centre; the printed recursion beside ours.
+
+    The first threshold must be 0, where all is sent.
+    """
+    task = example()
+    system: Any = task.system
+    time = np.arange(1, task.horizon + 1)
+    fused, traces, least = [], [], []
+    first: Data = {}
+    for m in settings["m"]:
+        run = run_markov_jump(task, trigger(m), episodes, seed)
+        fused.append(run.squared.sum(1).mean(0))
+        traces.append(float(run.trace.mean()))
+        if not first:
+            exact = _exact(system, task.horizon)
+            gaps = [covariances(system, run.sent, swapped) - exact for swapped in (True, False)]
+            first = {
+                "local": np.square(run.local_error).sum(2).mean(0),
+                "moment": np.square(run.truth).sum(1).mean(0),
+                "difference": [float(np.abs(gap).max() / np.abs(exact).max()) for gap in gaps],
+            }
+        sigma = covariances(system, run.sent, swapped=True)
+        least.append(float(np.linalg.eigvalsh((sigma + np.swapaxes(sigma, 1, 2)) / 2.0).min()))
+    beside = run_markov_jump(example(fusion="ci"), trigger(0.0), episodes, seed)
+    _, squares = system.model.state_moments(task.horizon)
+    return first | {
+        "m": list(settings["m"]),
+        "claimed": system.recursion.local_trace[:, system.filters.at(time)].mean(-1),
+        "fused": np.array(fused), "traces": traces, "least": least,
+        "moment_claimed": float(squares[1:].sum(1).mean()), "ci": beside.squared.sum(1).mean(0),
+    }  # fmt: skip
+
+
+def _exact(system: Any, horizon: int) -> Array:
+    """Joint covariances (H + 1, l n, l n) of the nodes' own errors, the library's."""
+    joint = system.recursion.local[..., system.filters.at(np.arange(horizon + 1))]
+    size = joint.shape[0] * joint.shape[2]
+    return np.ascontiguousarray(joint.transpose(4, 0, 2, 1, 3)).reshape(horizon + 1, size, size)
+
+
+def _agrees(sample: Array, claim: float) -> bool:
+    error = sample.std(ddof=1) / np.sqrt(len(sample))
+    return bool(abs(sample.mean() - claim) <= _CLEAR * error)
+
+
+def _summarise_theorems(data: Data) -> Data:
+    local = list(zip(data["local"], data["claimed"].tolist(), strict=True))
+    fused = list(zip(data["fused"], data["traces"], strict=True))
+    moment = (data["moment"], data["moment_claimed"])
+    ratios = {f"node {i + 1}": pair for i, pair in enumerate(local)}
+    ratios |= {f"fused, m = {m:g}": pair for m, pair in zip(data["m"], fused, strict=True)}
+    ratios |= {"the state itself": moment}
+    rows = {name: [sample / claim] for name, (sample, claim) in ratios.items()}
+    full = data["fused"][0]
+    return {
+        "tables": {"covariances": grid(("ratio",), rows)},
+        "local_pairs": local, "fused_pairs": fused, "moment_right": verdict([_agrees(*moment)]),
+        "local_right": verdict(_agrees(*item) for item in local),
+        "fused_right": verdict(_agrees(*item) for item in fused),
+        "crossed": verdict((data["difference"][0] < _SAME, *(np.array(data["least"]) > -_SAME))),
+        "optimal": verdict(below(full, other) for other in (*data["local"], data["ci"])),
+    }  # fmt: skip
+
+
+# --- what as many packets could bring -------------------------------------------------------------
+
+
+def simulate_others(episodes: int, seed: int, settings: Settings) -> Data:
+    """Mean squared errors of random requests and the best schedules at the trigger's packets."""
+    task = example()
+    paper, chance, rates, packets, best = [], [], [], [], []
+
+    def squared(policy: str, task: Task = task) -> Array:
+        return run_markov_jump(task, policy, episodes, seed).squared.sum(1).mean(0)
+
+    for m in settings["m"][1:]:
+        run = run_markov_jump(task, trigger(m), episodes, seed)
+        share = run.sent.mean(0)
+        paper.append(run.squared.sum(1).mean(0))
+        rates.append(share.tolist())
+        chance.append(squared("random:rate=" + "/".join(f"{item:.6g}" for item in share)))
+        packets.append(int(run.sent[-_PERIOD:].sum()))
+        if packets[-1] <= _SEARCHED:
+            best.append(squared(f"periodic_optimum:packets={packets[-1]},period={_PERIOD}"))
+    return {
+        "m": list(settings["m"][1:]), "paper": np.array(paper), "chance": np.array(chance),
+        "rates": rates, "packets": packets, "best": np.array(best), "sent": squared("always"),
+        "centralised": squared("always", example(filter="centralised")),
+        "modes": squared("always", example(filter="imm")),
+    }  # fmt: skip
+
+
+def _summarise_others(data: Data) -> Data:
+    m, paper, chance = data["m"], data["paper"], data["chance"]
+    columns = ("the paper's trigger", "random, same rates")
+    searched = [i for i, count in enumerate(data["packets"]) if count <= _SEARCHED]
+    schedules = [
+        {"m": m[i], "packets": data["packets"][i], "paper": paper[i], "best": best}
+        for i, best in zip(searched, data["best"], strict=True)
+    ]
+    beside = {
+        "the paper's scheme, all sent (m = 0)": [data["sent"]],
+        "one linear filter for all measurements": [data["centralised"]],
+        "interacting multiple models, all measurements": [data["modes"]],
+    } | {
+        f"best schedule of {item['packets']} packets in {_PERIOD} steps": [item["best"]]
+        for item in schedules
+    }
+    shares = [sum(rates) / len(rates) for rates in data["rates"]]
+    saves = all(share < 1.0 for share in shares)
+    near = all(not below(item["best"] * 1.1, item["paper"]) for item in schedules)
+    return {
+        "columns": columns,
+        "tables": {
+            "rates": grid(
+                columns, {f"m = {level:g}": (paper[i], chance[i]) for i, level in enumerate(m)}
+            ),
+            "beside": grid(("squared error",), beside),
+        },
+        "shares": shares, "period": _PERIOD, "schedules": schedules,
+        "price": paper[0].mean() / data["sent"].mean() - 1.0,
+        "redundant": verdict((saves, all(map(below, paper, chance)))),
+        "accurate": verdict((saves, near)),
+        "linear_best": verdict([below(data["centralised"], data["sent"])]),
+    }  # fmt: skip
+
+
+# --- figures --------------------------------------------------------------------------------------
+
+# A colour and a line for each threshold or policy, the same in all figures.
+_LINES: tuple[tuple[str, Any], ...] = (
+    (GREEN, "-"),
+    (BLUE, (0, (5, 1))),
+    (ORANGE, "-"),
+    (VERMILLION, (0, (1.5, 0.8))),
+    (PURPLE, "-"),
+    (SKY, (0, (5, 1))),
+    (BLACK, (0, (1.5, 0.8))),
+)
+_TIME = "time k (steps of 0.5 s)"
+_LANE = 1.7
+
+
+def _draw_instants(figure: Any, data: Data) -> None:
+    """A panel a threshold, without m = 0 unless it stands alone."""
+    lanes = list(zip(data["labels"], data["sent"].astype(bool)[:, :_INSTANTS], strict=True))
+    lanes = [lane for lane in lanes if lane[0] != "m = 0"] or lanes
+    axes = figure.subplots(len(lanes), 1, sharex=True, squeeze=False)[:, 0]
+    for place, (axis, (label, sent)) in enumerate(zip(axes, lanes, strict=True)):
+        time, count = np.arange(1, len(sent) + 1), sent.shape[-1]
+        for sensor in range(count):
+            base, colour = _LANE * (count - 1 - sensor), SENSORS[sensor]
+            there = sent[:, sensor]
+            axis.plot(time[there], base + there[there], "o", ms=4, color=colour)
+            axis.plot(
+                time[~there], 0.0 * time[~there] + base, "o", ms=2.6, mfc="none", color=colour
+            )
+        ticks = [_LANE * lane + up for lane in range(count) for up in (0, 1)]
+        axis.set_yticks(ticks, ["0", "1"] * count)
+        axis.set_ylim(-0.5, _LANE * count - 0.2)
+        axis.set_title(f"({chr(ord('a') + place)}) {label}", loc="left")
+        for sensor in range(count):
+            height = (_LANE * (count - 1 - sensor) + 1.0) / (_LANE * count + 0.3)
+            axis.text(
+                1.01, height, f"node {sensor + 1}", transform=axis.transAxes, va="center",
+                color=SENSORS[sensor],
+            )  # fmt: skip
+    axes[len(lanes) // 2].set_ylabel("received (1) or not (0)")
+    axes[-1].set_xlabel(_TIME)
+
+
+def _draw_tracking(figure: Any, data: Data) -> None:
+    axes = figure.subplots(len(STATES), 1, sharex=True)
+    truth = data["truth"]
+    time = np.arange(1, len(truth) + 1)
+    for state, axis in enumerate(axes):
+        handles = axis.plot(time, truth[:, state], color=TRUTH, lw=1.8, label="state")
+        handles += _curves(axis, data, data["means"][..., state])
+        _title(axis, state, STATES[state])
+    axes[-1].set_xlabel(_TIME)
+    _legend(figure, handles)
+
+
+def _draw_errors(figure: Any, data: Data) -> None:
+    """RMSE over as many runs as in the paper, and over all."""
+    axes = figure.subplots(len(STATES), 1, sharex=True)
+    for state, axis in enumerate(axes):
+        _curves(axis, data, data["few"][..., state], width=0.7, alpha=0.55)
+        handles = _curves(axis, data, data["every"][..., state], width=2.0)
+        axis.set_ylim(bottom=0.0)
+        _title(axis, state, f"RMSE of {STATES[state]}")
+    axes[-1].set_xlabel(_TIME)
+    _legend(figure, handles)
+
+
+def _draw_traces(figure: Any, data: Data) -> None:
+    axis = figure.subplots()
+    handles = _curves(axis, data, data["trace"][:, :_SHOWN], width=1.8)
+    axis.set_ylabel("trace of $P_0$ (m² and m²/s²)")
+    axis.set_ylim(bottom=0.0)
+    axis.set_xlabel(_TIME)
+    _legend(figure, handles)
+
+
+def _title(axis: Any, state: int, what: str) -> None:
+    axis.set_title(f"({'ab'[state]}) {what}", loc="left")
+    axis.set_ylabel(f"{STATES[state]} ({UNITS[state]})")
+
+
+def _curves(axis: Any, data: Data, values: Array, width: float = 1.4, alpha: float = 1.0) -> Any:
+    """Draw a curve (H,) of each threshold or policy; return their handles."""
+    handles = []
+    time = np.arange(1, values.shape[1] + 1)
+    for place, (label, curve) in enumerate(zip(data["labels"], values, strict=True)):
+        colour, line = _LINES[place % len(_LINES)]
+        handles += axis.plot(
+            time, curve, color=colour, lw=width, ls=line if alpha == 1.0 else "-", alpha=alpha,
+            label=label,
+        )  # fmt: skip
+    return handles
+
+
+def _legend(figure: Any, handles: Any) -> None:
+    figure.legend(
+        handles=handles, loc="outside upper center", ncols=len(handles), handlelength=1.8,
+        columnspacing=1.2, handletextpad=0.5,
+    )  # fmt: skip
+
+
+PAPER = Paper(
+    "markov_jump",
+    (
+        Piece("schedule", simulate_schedule, _summarise_schedule, 5.0, 2),
+        Piece("tracking", simulate_tracking, _summarise_tracking, 20.0),
+        Piece("theorems", simulate_theorems, _summarise_theorems, 60.0, 3000),
+        Piece("others", simulate_others, _summarise_others, 30.0),
+    ),
+    {
+        "figure_2": PaperFigure("schedule", _draw_instants, (7.2, 6.4)),
+        "figure_3": PaperFigure("tracking", _draw_tracking, (7.2, 5.0)),
+        "figure_4": PaperFigure("tracking", _draw_errors, (7.2, 5.0)),
+        "figure_5": PaperFigure("schedule", _draw_traces, (7.2, 3.9)),
+    },
+    "fusion_gym/MarkovJumpTracking-v0",
+    {
+        "m": Parameter((0.0, 0.9, 1.3, 1.5), numbers_within(at_least=0.0)),
+        "policies": Parameter((), policy_list),
+    },
+    ("horizon", "fusion"),
+)

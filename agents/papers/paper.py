@@ -1,0 +1,171 @@
+"""A paper as simulated pieces, the numbers of its page, and its figures."""
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import fusion_gym
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError, choice, keys, number, refusal
+
+NAMES = (
+    "tobit_token_bucket",
+    "adaptive_innovation",
+    "markov_jump",
+    "unknown_input",
+    "round_robin_tobit",
+)
+Data = dict[str, Any]
+Settings = Mapping[str, Any]
+NOTHING: Settings = MappingProxyType({})
+
+
+class Piece(NamedTuple):
+    """A part of a simulation section.
+
+    ``simulate(episodes, seed, settings)`` returns numbers, texts, lists and arrays by name; the
+    restriction of a figure is added as keywords. ``summarise`` takes them and returns what the page
+    inserts beside them, its ``tables`` as lists of numbers by name. ``weight`` is about how many
+    seconds of one core ``usual`` episodes take.
+    """
+
+    name: str
+    simulate: Callable[..., Data]
+    summarise: Callable[[Data], Data]
+    weight: float
+    usual: int = 1000
+
+
+class PaperFigure(NamedTuple):
+    """A figure: ``draw(figure, data)`` draws the data of a piece into an empty matplotlib Figure.
+
+    ``size`` is in inches. ``restriction`` has the keywords of ``simulate`` that leave out what the
+    figure does not show, ``without`` the paper's parameters that do not change it.
+    """
+
+    piece: str
+    draw: Callable[[Any, Data], None]
+    size: tuple[float, float] = (7.2, 4.2)
+    restriction: Settings = NOTHING
+    without: Sequence[str] = ()
+
+
+class Parameter(NamedTuple):
+    """What a figure may change: ``check(name, value)`` returns the value or refuses it."""
+
+    default: Any
+    check: Callable[[str, Any], Any]
+
+
+class Paper(NamedTuple):
+    """A paper: its pieces in the order of its page, its figures by name, and what may be set.
+
+    ``options`` names the options of ``environment`` that a figure may change as well.
+    """
+
+    name: str
+    pieces: Sequence[Piece]
+    figures: Mapping[str, PaperFigure]
+    environment: str
+    parameters: Mapping[str, Parameter] = NOTHING
+    options: Sequence[str] = ()
+
+    def settings(self, changes: Settings, without: Sequence[str] = ()) -> Data:
+        """Return the parameters with these changes, and the changed options as ``options``.
+
+        Those named in ``without`` cannot be changed.
+
+        Raises:
+            ConfigurationError: an unknown name, or a value that is not allowed.
+        """
+        known = [name for name in (*self.parameters, *self.options) if name not in without]
+        keys("option", changes, known)
+        settings = {
+            name: parameter.check(name, changes.get(name, parameter.default))
+            for name, parameter in self.parameters.items()
+        }
+        options = {name: value for name, value in changes.items() if name in self.options}
+        task = fusion_gym.make_task(self.environment, **options)
+        for policy in [settings.get("policy", "always"), *settings.get("policies", ())]:
+            make_policy(policy, task)
+        return settings | {"options": options}
+
+    def figure(self, name: str) -> tuple[str, PaperFigure]:
+        """Return a figure with its full name, also for its number alone.
+
+        Raises:
+            ConfigurationError: there is no such figure.
+        """
+        full = name if name in self.figures else f"figure_{name}"
+        if full not in self.figures:
+            choice("figure", name, [known.removeprefix("figure_") for known in self.figures])
+        return full, self.figures[full]
+
+    def piece(self, name: str) -> Piece:
+        """Return a piece by its name."""
+        return next(piece for piece in self.pieces if piece.name == name)
+
+
+def load_paper(name: str) -> Paper:
+    """Return a paper from its module.
+
+    Raises:
+        ConfigurationError: there is no such paper.
+    """
+    module = importlib.import_module(f".{choice('paper', name, NAMES)}", __package__)
+    paper: Paper = module.PAPER
+    return paper
+
+
+def load_papers(names: Sequence[str]) -> list[Paper]:
+    """Return some papers, each once; ``all`` stands for all of them.
+
+    Raises:
+        ConfigurationError: no name, or an unknown one.
+    """
+    if not names:
+        raise ConfigurationError(f"papers = () is not allowed: name some of {[*NAMES, 'all']}")
+    for name in names:
+        choice("paper", name, (*NAMES, "all"))
+    return [load_paper(name) for name in (NAMES if "all" in names else dict.fromkeys(names))]
+
+
+def numbers_within(**limits: float) -> Callable[[str, Any], tuple[float, ...]]:
+    """Return a check for one number, or up to nine different ones, within limits."""
+
+    def check(name: str, value: Any) -> tuple[float, ...]:
+        entries = value if isinstance(value, list | tuple) else (value,)
+        if not 1 <= len(entries) <= 9:
+            raise refusal(name, value, "a number, or up to nine separated by commas")
+        result = tuple(number(name, entry, **limits) for entry in entries)
+        if len(set(result)) < len(result):
+            raise refusal(name, value, "different numbers")
+        return result
+
+    return check
+
+
+def policy_of(rule: str = "NAME") -> Callable[[str, Any], str]:
+    """Return a check for a policy with parameters, of this rule where one is named."""
+
+    def check(name: str, value: Any) -> str:
+        if not isinstance(value, str) or rule not in ("NAME", value.partition(":")[0]):
+            raise refusal(name, value, f"{rule!r}, or {rule + ':key=value,…'!r}")
+        return value
+
+    return check
+
+
+def policy_list(name: str, value: Any) -> tuple[str, ...]:
+    """Check one policy, or a list of them.
+
+    Raises:
+        ConfigurationError: anything else.
+    """
+    entries = (value,) if isinstance(value, str) else tuple(np.atleast_1d(value).tolist())
+    if not all(isinstance(entry, str) for entry in entries):
+        raise refusal(name, value, "a policy, or a list of them")
+    return entries

@@ -1,0 +1,595 @@
+"""Federated Tobit Kalman filtering under the round-robin protocol: Figures 2 to 11, both tables.
+
+Source: round_robin_tobit, Section IV.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import fusion_gym
+from fusion_gym.arrays import Array
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import record_episode
+from fusion_gym.evaluation.intervals import Interval, mean_interval
+from fusion_gym.policies.registry import make_policy
+
+from ..output import palette
+from . import round_robin_tobit_runs as runs
+from . import round_robin_tobit_theorems as theorems
+from .numbers import Number, verdict
+from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_of
+
+# Tables II and III of the paper: ARMSE1, ARMSE2, ARMSE3 by interval and by variance.
+TABLE_II = {
+    5.0: (0.2329, 0.4768, 0.2515),
+    1.0: (4.4252, 4.1257, 3.6580),
+    0.5: (7.1406, 6.7888, 5.7826),
+}
+TABLE_III = {
+    0.6: (0.2329, 0.4768, 0.2515),
+    0.1: (0.0948, 0.3707, 0.2082),
+    0.06: (0.0742, 0.2924, 0.1601),
+}
+_PRECISE = 0.9  # share of the open-loop variance that an estimate which tracks precisely explains
+_SATISFACTORY = 1.5  # times the least that any filter can have
+_BOTH: dict[str, dict[str, Any]] = {"aware": {}, "unaware": {"bias_aware": False}}
+_FILTERS = {"paper": "the paper's filter", "adf": "assumed-density filter"}
+_LOCAL = ("single", "node")
+_ENDS = ("mean", "low", "high")
+
+
+def _options(interval: float, variance: float) -> dict[str, Any]:
+    return {
+        "censoring_threshold": -interval, "censoring_upper": interval,
+        "measurement_variance": variance,
+    }  # fmt: skip
+
+
+def _oscillator(settings: Settings, **options: Any) -> Task:
+    """The oscillator with the first interval and the first variance."""
+    own = _options(settings["interval"][0], settings["variance"][0])
+    return fusion_gym.make_task(runs.OSCILLATOR, **(own | settings["options"] | options))
+
+
+# --- the bias in the filter, or ignored by it -----------------------------------------------------
+
+
+def simulate_oscillator(episodes: int, seed: int, settings: Settings) -> Data:
+    """One run, what its estimators hold by (4), and the RMSE of both filters."""
+    tasks = {name: _oscillator(settings, **options) for name, options in _BOTH.items()}
+    result = _curves(tasks, episodes, seed, settings)
+    for name, task in tasks.items():
+        run = record_episode(task, make_policy(settings["policy"], task), seed)
+        result |= {"truth": run.truth, f"{name}_mean": run.mean}
+    for name, options in (("whole", runs.FREE), ("clipped", {})):
+        task = _oscillator(settings, **options)
+        policy = make_policy(settings["policy"], task)
+        result[f"held_{name}"] = runs.held_values(task, policy, seed)
+    variance = {"measurement_variance": settings["variance"][0]}
+    least = runs.floor(runs.OSCILLATOR, **(variance | settings["options"]))
+    return result | {"interval": settings["interval"][0], "floor": least}
+
+
+def simulate_target(episodes: int, seed: int, settings: Settings) -> Data:
+    """The RMSE of both filters."""
+    env, options = runs.TRACKING, settings["options"]
+    tasks = {name: fusion_gym.make_task(env, **own, **options) for name, own in _BOTH.items()}
+    return _curves(tasks, episodes, seed, settings) | {"floor": runs.floor(env, **options)}
+
+
+def _curves(tasks: dict[str, Task], episodes: int, seed: int, settings: Settings) -> Data:
+    errors = {
+        name: runs.squares(task, make_policy(settings["policy"], task), episodes, seed)
+        for name, task in tasks.items()
+    }
+    aware = tasks["aware"]
+    never = runs.squares(aware, make_policy("never", aware), episodes, seed)
+    return {
+        **{f"{name}_rmse": runs.error_curve(error) for name, error in errors.items()},
+        **{f"{name}_armse": runs.armse(error) for name, error in errors.items()},
+        "difference": runs.paired_increase(errors["aware"], errors["unaware"]),
+        "silent": runs.armse(never)["mean"], "bias_deviation": _bias_deviation(aware),
+    }  # fmt: skip
+
+
+def _bias_deviation(task: Task) -> float:
+    return float(np.sqrt(np.asarray(task.settings["bias_noise_covariance"])[0, 0]))
+
+
+def _summarise_curves(data: Data, states: Sequence[str], units: Sequence[str]) -> Data:
+    aware, unaware = (data[f"{name}_armse"]["mean"] for name in _BOTH)
+    filters = {"aware": "FTKF-DB", "unaware": "FTKF (bias ignored)"}
+    ratio = aware[2] / data["floor"][2]
+    lower = runs.always_below(data["difference"][..., :2])
+    return {
+        "curves": [
+            runs.armse_number(f"ARMSE of {state}, {label}", data[f"{key}_armse"], i, None, units[i])
+            for key, label in filters.items()
+            for i, state in enumerate(states)
+            if key == "aware" or i < 2
+        ],
+        "factors": [other / own for own, other in zip(aware, unaware, strict=True)],
+        "bias_mean": aware[2], "lower": lower, "ratio": ratio, "far": aware[2] / data["silent"][2],
+        "satisfactory_below": _SATISFACTORY, "satisfactory": verdict([ratio < _SATISFACTORY]),
+    }  # fmt: skip
+
+
+def _summarise_oscillator(data: Data) -> Data:
+    result = _summarise_curves(data, ("x1", "x2", "b"), ("", "", ""))
+    held, truth = np.abs(data["held_clipped"]), data["truth"]
+    means = (data[f"{name}_armse"]["mean"] for name in _BOTH)
+    tracks, misses = (runs.explained(mean, data["silent"]) for mean in means)
+    return result | {
+        "tables": {"oscillator": result["curves"]},
+        "clipped": float(np.mean(held >= data["interval"])),
+        "worst": [np.abs(data[f"{n}_mean"] - truth)[:, :2].max() for n in ("aware", "unaware")],
+        "precise": _PRECISE,
+        "explained": [[max(share, 0.0) for share in shares] for shares in (tracks, misses)],
+        "tracks": verdict(share >= _PRECISE for share in tracks),
+        "misses": verdict([max(misses[:2]) < _PRECISE, misses[2] < 0.05]),
+    }
+
+
+def _summarise_target(data: Data) -> Data:
+    states, units = ("position", "velocity", "acceleration"), ("m", "m/s", "m/s²")
+    result = _summarise_curves(data, states, units)
+    close = np.array(data["aware_armse"]["mean"]) / np.array(data["floor"])
+    return result | {
+        "tables": {"target": result["curves"]}, "close": close,
+        "optimum": verdict(abs(item - 1.0) < 0.03 for item in close),
+    }  # fmt: skip
+
+
+# --- local filters and the fused one --------------------------------------------------------------
+
+
+def simulate_nodes(episodes: int, seed: int, settings: Settings) -> Data:
+    """Local filters of a single sensor, and as nodes to which the fused estimate is fed back."""
+    task = _oscillator(settings)
+    policy = make_policy(settings["policy"], task)
+    fused, local = runs.node_squares(task, policy, episodes, seed)
+    run = record_episode(task, policy, seed)
+    data: Data = {
+        "truth": run.truth, "fused_mean": run.mean, "fused_rmse": runs.error_curve(fused),
+        "fused_armse": runs.armse(fused),
+    }  # fmt: skip
+    for sensor in range(2):
+        single = runs.SingleSensor(policy, sensor)
+        errors = runs.squares(task, single, episodes, seed)
+        data[f"single_{sensor}_mean"] = record_episode(task, single, seed).mean
+        data[f"node_{sensor}_mean"] = run.local_mean[:, sensor]
+        for name, other in (("single", errors), ("node", local[:, :, sensor])):
+            data[f"{name}_{sensor}_rmse"] = runs.error_curve(other)
+            data[f"{name}_{sensor}_armse"] = runs.armse(other)
+            data[f"{name}_{sensor}_difference"] = runs.paired_increase(fused, other)
+            data[f"{name}_{sensor}_increase"] = runs.increase(fused, other)
+    return data
+
+
+def _summarise_nodes(data: Data) -> Data:
+    names = {
+        "fused": "FTKF-DB", **{f"single_{i}": f"LTKF-DB-S{i + 1} by itself" for i in range(2)},
+        **{f"node_{i}": f"LTKF-DB-S{i + 1} as a node" for i in range(2)},
+    }  # fmt: skip
+    columns = [f"ARMSE{state + 1}" for state in range(3)]
+    claims = {}
+    for what, states in (("states", range(2)), ("bias", range(2, 3))):
+        for name in _LOCAL:
+            rises, often = [], []
+            for sensor in range(2):
+                rise = data[f"{name}_{sensor}_increase"]
+                rises.append([Interval(*(rise[end][state] for end in _ENDS)) for state in states])
+                often.append(runs.always_below(data[f"{name}_{sensor}_difference"][..., states]))
+            parts = [interval.low > 0.0 for rise in rises for interval in rise]
+            claims[f"{what}_{name}"] = {"verdict": verdict(parts), "rises": rises, "often": often}
+    return {
+        "columns": columns,
+        "tables": {
+            "nodes": [
+                runs.armse_number(f"{label}: {column}", data[f"{key}_armse"], state, None)
+                for key, label in names.items()
+                for state, column in enumerate(columns)
+            ]
+        },
+        "claims": claims,
+        "means": {
+            name: [data[f"{key}_armse"]["mean"] for key in (f"{name}_0", f"{name}_1", "fused")]
+            for name in _LOCAL
+        },
+    }
+
+
+# --- censoring intervals and noise variances ------------------------------------------------------
+
+
+def simulate_tables(
+    episodes: int, seed: int, settings: Settings, tables: Sequence[str] = ("table_2", "table_3")
+) -> Data:
+    """The rows of both tables, by the paper's filter and by the assumed-density filter.
+
+    Both begin with the first interval and the first variance.
+    """
+    intervals, variances = settings["interval"], settings["variance"]
+    first: Data = {}
+    data: Data = {}
+    for name in tables:
+        rows: list[Data] = []
+        before: dict[str, Array] = {}
+        for interval, variance in (
+            [(limit, variances[0]) for limit in intervals]
+            if name == "table_2"
+            else [(intervals[0], variance) for variance in variances]
+        ):
+            if not rows and first:
+                rows, before = [first["row"]], first["errors"]
+                continue
+            row: Data = {"interval": interval, "variance": variance}
+            errors = {}
+            for filter_ in _FILTERS:
+                task = _oscillator(settings, filter=filter_, **_options(interval, variance))
+                policy = make_policy(settings["policy"], task)
+                result = runs.squares(task, policy, episodes, seed)
+                rise = _rise(before.get(filter_, result), result)
+                row[filter_] = runs.armse(result) | _median(result) | {"rise": rise}
+                errors[filter_] = result
+            own = {"measurement_variance": variance} | settings["options"]
+            row["floor"] = runs.floor(runs.OSCILLATOR, **own)
+            row["floor_all"] = runs.floor(runs.OSCILLATOR, access="any", **own)
+            rows.append(row)
+            before = errors
+            first = first or {"row": row, "errors": errors}
+        data[name] = rows
+    task = _oscillator(settings)
+    never = runs.squares(task, make_policy("never", task), episodes, seed)
+    return data | {"silent": runs.armse(never), "bias_deviation": _bias_deviation(task)}
+
+
+def _median(values: Array) -> dict[str, list[float]]:
+    """Median over runs of a run's RMSE of x1, with its interval."""
+    middle, drawn = runs.medians(values)
+    return {"median": [middle, *np.quantile(drawn, [0.025, 0.975]).tolist()]}
+
+
+def _rise(before: Array, after: Array) -> dict[str, Any]:
+    """From one row to the next, of ARMSE1, 2, 3 and the median: ends of the paired intervals."""
+    result = runs.increase(before, after)
+    middle = np.quantile(runs.medians(after)[1] - runs.medians(before)[1], [0.025, 0.975])
+    return {end: [*result[end], float(middle[i])] for i, end in enumerate(("low", "high"))}
+
+
+def _interval_names(rows: list[Data]) -> list[str]:
+    return [f"[{-row['interval']:g}, {row['interval']:g}]" for row in rows]
+
+
+def _summarise_tables(data: Data) -> Data:
+    second, third = data["table_2"], data["table_3"]
+    interval_names = _interval_names(second)
+    variance_names = [f"R = {row['variance']:g}" for row in third]
+    printed = {"table_2": list(TABLE_II.values()), "table_3": list(TABLE_III.values())}
+    numbers = {
+        name: [
+            runs.armse_number(f"{label}, ARMSE{i + 1}", row["paper"], i, value)
+            for label, row, values in zip(labels, data[name], printed[name], strict=True)
+            for i, value in enumerate(values)
+        ]
+        for name, labels in (("table_2", interval_names), ("table_3", variance_names))
+    }
+    others = {f"{interval_names[0]}, {variance_names[0]}": second[0]}
+    others |= dict(zip(interval_names[1:], second[1:], strict=True))
+    others |= dict(zip(variance_names[1:], third[1:], strict=True))
+    heads = (
+        *(f"ARMSE{i + 1}" for i in range(3)),
+        *(f"median run, {_FILTERS[name]}" for name in ("adf", "paper")),
+    )
+    beside = []
+    for label, row in others.items():
+        beside += [runs.armse_number(f"{label}: {heads[i]}", row["adf"], i, None) for i in range(3)]
+        for name, head in zip(("adf", "paper"), heads[3:], strict=True):
+            beside.append(Number(f"{label}: {head}", *row[name]["median"]))
+    return {
+        "tables": numbers | {"others": beside}, "heads": heads,
+        "printed_rows": list(zip(variance_names, TABLE_III.values(), third, strict=True)),
+        **_broken(data, printed), "narrow": _moves(second, "low", 1.0),
+        "noise": _moves(third, "high", -1.0),
+    }  # fmt: skip
+
+
+def _broken(data: Data, printed: dict[str, Any]) -> Data:
+    """How many printed values no filter can have."""
+    entries = [
+        (value, row["floor"][i], row["floor_all"][i])
+        for name, start in (("table_2", 0), ("table_3", 1))
+        for row, values in list(zip(data[name], printed[name], strict=True))[start:]
+        for i, value in enumerate(values)
+    ]
+    # An RMSE of so many runs of a Gaussian error has this relative deviation at each time, and its
+    # mean over time no larger one.
+    chance = 1.0 - 4.0 / np.sqrt(2.0 * runs.PAPER_RUNS)
+    return {
+        "papers_runs": runs.PAPER_RUNS, "entries": len(entries),
+        "below": sum(value < chance * least for value, least, _ in entries),
+        "below_all": sum(value < chance * least for value, _, least in entries),
+        "printed_bias": [values[2] for values in TABLE_III.values()],
+        "beyond": sum(
+            value > data["silent"]["high"][i]
+            for values in printed["table_2"][1:]
+            for i, value in enumerate(values)
+        ),
+    }  # fmt: skip
+
+
+def _moves(rows: list[Data], end: str, sign: float) -> Data:
+    """Which errors move from row to row as claimed by more than chance: ARMSE and the median."""
+    moved = {
+        name: np.array([sign * np.array(row[name]["rise"][end]) for row in rows[1:]]).min(0) > 0
+        for name in _FILTERS
+    }
+    return {
+        "moved": {name: int(result[:3].sum()) for name, result in moved.items()},
+        "median": bool(moved["paper"][3]), "chain": [row["paper"]["mean"] for row in rows],
+        "medians": [row["paper"]["median"][0] for row in rows], "verdict": verdict(moved["paper"]),
+    }  # fmt: skip
+
+
+# --- what was tried to reach the printed values ---------------------------------------------------
+
+
+def simulate_tobit_readings(episodes: int, seed: int, settings: Settings) -> Data:
+    """ARMSE of every reading at the widest and the narrowest interval."""
+    data: Data = {}
+    for reading in runs.ROUND_ROBIN_READINGS:
+        for limit in (5.0, 0.5):
+            task = runs.reading_task(reading, censoring_threshold=-limit, censoring_upper=limit)
+            name = "always" if task.access == "any" else "round_robin"
+            errors = runs.squares(task, make_policy(name, task), episodes, seed)
+            roots = np.sqrt(errors.mean((1, 2)))
+            far = mean_interval((roots > 10.0).astype(float))
+            data[f"{reading} {limit:g}"] = runs.armse(errors) | {"far": list(far)}
+    return data
+
+
+def _summarise_tobit_readings(data: Data) -> Data:
+    limits = {
+        limit: {reading: data[f"{reading} {limit:g}"] for reading in runs.ROUND_ROBIN_READINGS}
+        for limit in (5.0, 0.5)
+    }
+    off = dict.fromkeys(runs.ROUND_ROBIN_READINGS, 1.0)
+    for limit, readings in limits.items():
+        for reading, result in readings.items():
+            factors = np.array(result["mean"]) / np.array(TABLE_II[limit])
+            off[reading] = max(off[reading], *factors, *(1.0 / factors))
+    best = min(off, key=off.__getitem__)
+    return {"limits": limits, "printed": TABLE_II, "best": best, "off": off[best]}
+
+
+# --- figures --------------------------------------------------------------------------------------
+
+_STEP, _TARGET_STEP = "time step k", "time step k (0.1 s each)"
+_THIN, _WIDE = 1.3, 2.0
+
+
+class CurveLine(NamedTuple):
+    """A curve over time with its name, colour and dashes; ``values`` (H,), or (3, H) with ends."""
+
+    label: str
+    values: Array
+    colour: str
+    style: str = "-"
+    width: float = _WIDE
+
+
+def _lines(data: Data, kind: str, state: int, *names: str) -> list[CurveLine]:
+    """The curves of some filters and of the true values."""
+    styles: dict[str, tuple[Any, ...]] = {
+        "unaware": ("FTKF (bias ignored)", palette.PURPLE, "--", _WIDE),
+        "aware": ("FTKF-DB (fused)", palette.FUSED, "-", _WIDE),
+        "fused": ("FTKF-DB (fused)", palette.FUSED, "-", _WIDE),
+        "truth": ("true", palette.TRUTH, "-", _THIN),
+    }
+    lines = []
+    for name in names:
+        values = data[name if name == "truth" else f"{name}_{kind}"][..., state]
+        label, *style = styles[name]
+        lines.append(CurveLine(label, values, *style))
+    return lines
+
+
+def _draw_curves(
+    figure: Any,
+    panels: Sequence[tuple[str, Sequence[CurveLine]]],
+    step: str = _STEP,
+    from_zero: bool = False,
+) -> None:
+    """Panels one over another over a common time, each with the name of its axis."""
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, (name, lines) in zip(axes, panels, strict=True):
+        for line in lines:
+            curve = np.atleast_2d(line.values)
+            time = np.arange(1, curve.shape[1] + 1)
+            axis.plot(
+                time, curve[0], color=line.colour, linestyle=line.style, linewidth=line.width,
+                label=line.label,
+            )  # fmt: skip
+            if len(curve) > 1:
+                axis.fill_between(
+                    time, curve[1], curve[2], color=line.colour, alpha=0.18, linewidth=0
+                )
+        axis.set_ylabel(name)
+        axis.margins(x=0.01)
+        if from_zero:
+            axis.set_ylim(bottom=0.0)
+    axes[-1].set_xlabel(step)
+    _legend(figure, axes)
+
+
+def _legend(figure: Any, axes: Sequence[Any]) -> None:
+    """Below the axes, each name once."""
+    entries: dict[str, Any] = {}
+    for axis in axes:
+        handles, labels = axis.get_legend_handles_labels()
+        entries.update(zip(labels, handles, strict=True))
+    figure.legend(
+        entries.values(), entries.keys(), loc="outside lower center", ncols=min(4, len(entries))
+    )
+
+
+def _draw_measurements(figure: Any, data: Data) -> None:
+    whole, clipped, limit = data["held_whole"], data["held_clipped"], data["interval"]
+    axes = figure.subplots(whole.shape[1], 1, sharex=True)
+    steps = np.arange(1, len(whole) + 1)
+    for number, axis in enumerate(axes):
+        for values, colour, width, label in (
+            (whole, palette.BLACK, _THIN, "uncensored"),
+            (clipped, palette.SENSORS[number], _WIDE, f"censored, sensor {number + 1}"),
+        ):
+            axis.step(
+                steps, values[:, number], where="post", color=colour, linewidth=width, label=label
+            )
+        for side in (-limit, limit):
+            axis.axhline(side, color=palette.INK, linewidth=0.8, linestyle="--")
+        axis.set_ylabel(f"measurement\nof x{number + 1} (sensor {number + 1})")
+        axis.margins(x=0.01)
+    axes[-1].set_xlabel(_STEP)
+    _legend(figure, axes)
+
+
+def _draw_estimates(figure: Any, data: Data) -> None:
+    names = ("unaware", "aware", "truth")
+    _draw_curves(figure, [(f"x{i + 1}", _lines(data, "mean", i, *names)) for i in range(2)])
+
+
+def _draw_bias(figure: Any, data: Data) -> None:
+    _draw_curves(figure, [("bias b", _lines(data, "mean", 2, "aware", "truth"))])
+
+
+def _draw_state_errors(figure: Any, data: Data, labels: Sequence[str], step: str) -> None:
+    names = ("unaware", "aware")
+    panels = [(label, _lines(data, "rmse", i, *names)) for i, label in enumerate(labels)]
+    _draw_curves(figure, panels, step, from_zero=True)
+
+
+def _draw_bias_error(figure: Any, data: Data, label: str, step: str) -> None:
+    least = np.full(data["aware_rmse"].shape[1], data["bias_deviation"])
+    line = CurveLine("√Ξ: no filter lies below", least, palette.CENTRAL, ":", _WIDE)
+    _draw_curves(figure, [(label, [*_lines(data, "rmse", 2, "aware"), line])], step, from_zero=True)
+
+
+def _node_lines(data: Data, name: str, kind: str, state: int, *others: str) -> list[CurveLine]:
+    lines = []
+    for i, colour in enumerate(palette.SENSORS[:2]):
+        values = data[f"{name}_{i}_{kind}"][..., state]
+        if name == "node" and kind == "rmse":  # their bands are those of the fused
+            values = values[0]
+        lines.append(CurveLine(f"LTKF-DB-S{i + 1}", values, colour, "-", _THIN))
+    return lines + _lines(data, kind, state, "fused", *others)
+
+
+def _draw_node_states(figure: Any, data: Data, name: str) -> None:
+    panels = [(f"RMSE{i + 1} (of x{i + 1})", _node_lines(data, name, "rmse", i)) for i in range(2)]
+    _draw_curves(figure, panels, from_zero=True)
+
+
+def _draw_node_bias(figure: Any, data: Data, name: str) -> None:
+    _draw_curves(figure, [("bias b", _node_lines(data, name, "mean", 2, "truth"))])
+
+
+def _draw_node_bias_error(figure: Any, data: Data, name: str) -> None:
+    _draw_curves(figure, [("RMSE3 (of b)", _node_lines(data, name, "rmse", 2))], from_zero=True)
+
+
+def _draw_table(figure: Any, data: Data, name: str) -> None:
+    """Printed values, ours, and what no filter can be below."""
+    rows, places = data[name], np.arange(len(data[name]))
+    printed = {(5.0, v): values for v, values in TABLE_III.items()} | {
+        (limit, 0.6): values for limit, values in TABLE_II.items()
+    }
+    printed_rows = [printed.get((r["interval"], r["variance"]), (np.nan,) * 3) for r in rows]
+    ticks, label = [f"{row['variance']:g}" for row in rows], "variance R of the sensors' noise"
+    if name == "table_2":
+        ticks, label = _interval_names(rows), "uncensored interval"
+    axes = figure.subplots(1, 3)
+    axes[1].set_xlabel(label)
+    for state, axis in enumerate(axes):
+        values = [row[state] for row in printed_rows]
+        marks: list[tuple[str, Any, Any, str, str]] = [("printed", values, None, palette.INK, "x")]
+        for (key, label), colour, marker in zip(
+            _FILTERS.items(), (palette.FUSED, palette.BLUE), "os", strict=True
+        ):
+            mean, low, high = np.array([[row[key][e][state] for e in _ENDS] for row in rows]).T
+            marks.append((label, mean, np.stack([mean - low, high - mean]), colour, marker))
+        for shift, (label, mean, ends, colour, marker) in zip(
+            (-0.18, 0.0, 0.18), marks, strict=True
+        ):
+            axis.errorbar(
+                places + shift, mean, yerr=ends, fmt=marker, color=colour,
+                markersize=8, markeredgewidth=2, label=label, capsize=3,
+            )  # fmt: skip
+        axis.bar(
+            places, [row["floor"][state] for row in rows], width=0.8, color=palette.GREY,
+            label="no filter lies in here", zorder=0,
+        )  # fmt: skip
+        axis.set_xticks(places, ticks)
+        axis.set_title(f"ARMSE{state + 1} (of {('x1', 'x2', 'b')[state]})")
+        axis.set_ylim(bottom=0.0)
+        axis.set_xlim(-0.6, len(rows) - 0.4)
+    _legend(figure, axes)
+
+
+def _figure(piece: str, draw: Any, height: float, **keywords: Any) -> PaperFigure:
+    without = ("interval", "variance") if piece == "target" else ()
+    return PaperFigure(piece, partial(draw, **keywords), (7.2, height), without=without)
+
+
+def _table(name: str) -> PaperFigure:
+    draw = partial(_draw_table, name=name)
+    return PaperFigure("tables", draw, (7.2, 3.8), {"tables": [name]})
+
+
+PAPER = Paper(
+    "round_robin_tobit",
+    (
+        Piece("oscillator", simulate_oscillator, _summarise_oscillator, 12.0, 2000),
+        Piece("nodes", simulate_nodes, _summarise_nodes, 12.0, 2000),
+        Piece("tables", simulate_tables, _summarise_tables, 30.0, 2000),
+        Piece("readings", simulate_tobit_readings, _summarise_tobit_readings, 30.0),
+        Piece("target", simulate_target, _summarise_target, 5.0),
+        Piece("theory", theorems.simulate_theory, theorems.summarise_theory, 20.0),
+        Piece("bounds", theorems.simulate_bounds, theorems.summarise_bounds, 30.0, 100),
+    ),
+    {
+        "figure_2": _figure("oscillator", _draw_measurements, 4.6),
+        "figure_3": _figure("oscillator", _draw_estimates, 4.8),
+        "figure_4": _figure("oscillator", _draw_bias, 3.4),
+        "figure_5": _figure(
+            "oscillator", _draw_state_errors, 4.8,
+            labels=("RMSE1 (of x1)", "RMSE2 (of x2)"), step=_STEP,
+        ),
+        "figure_6": _figure("oscillator", _draw_bias_error, 3.4, label="RMSE3 (of b)", step=_STEP),
+        **{
+            f"figure_{number}{suffix}": _figure("nodes", draw, height, name=name)
+            for name, suffix in zip(_LOCAL, ("", "_nodes"), strict=True)
+            for number, draw, height in (
+                (7, _draw_node_states, 4.8), (8, _draw_node_bias, 3.4),
+                (9, _draw_node_bias_error, 3.4),
+            )
+        },
+        "table_2": _table("table_2"), "table_3": _table("table_3"),
+        "figure_10": _figure(
+            "target", _draw_state_errors, 4.8,
+            labels=("position RMSE (m)", "velocity RMSE (m/s)"), step=_TARGET_STEP,
+        ),
+        "figure_11": _figure(
+            "target", _draw_bias_error, 3.4, label="acceleration RMSE (m/s²)", step=_TARGET_STEP
+        ),
+    },
+    runs.OSCILLATOR,
+    {
+        "interval": Parameter(tuple(TABLE_II), numbers_within(above=0.0)),
+        "variance": Parameter(tuple(TABLE_III), numbers_within(above=0.0)),
+        "policy": Parameter("round_robin", policy_of()),
+    },
+    ("horizon", "process_covariance", "bias_noise_covariance"),
+)  # fmt: skip

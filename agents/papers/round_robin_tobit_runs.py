@@ -1,0 +1,305 @@
+"""Runs of the biased oscillator and the biased target, and the measures of their errors."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import fusion_gym
+from fusion_gym import gaussian
+from fusion_gym.arrays import Array
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.runs import Outcome
+from fusion_gym.core.system import Signals
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import BATCH
+from fusion_gym.policies.base import Policy, Requests
+from fusion_gym.systems.tobit.centre import FeedbackCentre
+from fusion_gym.systems.tobit.filters import Expectation
+from fusion_gym.systems.tobit.system import CensoredSystem
+from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
+
+from .numbers import Number, Verdict
+
+OSCILLATOR = "fusion_gym/BiasedOscillator-v0"
+TRACKING = "fusion_gym/BiasedTracking-v0"
+STATES = 3  # x1, x2, b
+PAPER_RUNS = 1000
+_RESAMPLES = 500
+_CLEAR = 4.0  # standard errors: of 200 comparisons without a difference none is likely to reach it
+_MOST = 0.5  # share of the points
+FREE = {"censoring_threshold": -np.inf, "censoring_upper": np.inf}
+
+
+@dataclass
+class SingleSensor:
+    """Another policy's requests of one sensor; the others never transmit."""
+
+    policy: Policy
+    sensor: int
+    knowledge: Any = "clock"
+
+    def reset(self, runs: int, seed: int = 0) -> None:
+        """Forget everything."""
+        self.policy.reset(runs, seed)
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Return the requests (sensors, N)."""
+        requests = self.policy(signals)
+        return requests & (np.arange(len(requests))[:, None] == self.sensor)
+
+
+def round_robin(task: Task) -> Policy:
+    """The policy that the paper runs."""
+    return fusion_gym.make_policy("round_robin", task)
+
+
+def censored(task: Task) -> CensoredSystem:
+    """The task's system, known for what it is."""
+    assert isinstance(task.system, CensoredSystem)
+    return task.system
+
+
+def walk(
+    task: Task,
+    policy: Policy,
+    episodes: int,
+    seed: int,
+    look: Callable[[EpisodeBatch, Outcome, int, slice], None],
+    before: Callable[[EpisodeBatch, int, slice], None] | None = None,
+) -> None:
+    """Run episodes in batches; ``look`` after every step, ``before`` it what was sensed.
+
+    Both get the batch, the step from 0, and which of the episodes the batch holds.
+    """
+    for first in range(0, episodes, BATCH):
+        count = min(BATCH, episodes - first)
+        runs = slice(first, first + count)
+        batch = EpisodeBatch.seeded(task, count, seed + first)
+        policy.reset(count, seed + first)
+        for step in range(task.horizon):
+            requests = policy(batch.signals())
+            if before is not None:
+                before(batch, step, runs)
+            look(batch, batch.step(requests), step, runs)
+
+
+def squares(task: Task, policy: Policy, episodes: int, seed: int) -> Array:
+    """Squared errors (episodes, H, states) of the fused estimate."""
+    values = np.empty((episodes, task.horizon, STATES))
+
+    def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
+        values[runs, step] = outcome.squared_error.T
+
+    walk(task, policy, episodes, seed, look)
+    return values
+
+
+def node_squares(task: Task, policy: Policy, episodes: int, seed: int) -> tuple[Array, Array]:
+    """Squared errors of the fused estimate, and (episodes, H, sensors, states) of the nodes."""
+    fused = np.empty((episodes, task.horizon, STATES))
+    local = np.empty((episodes, task.horizon, task.sensors, STATES))
+
+    def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
+        fused[runs, step] = outcome.squared_error.T
+        error = task.system.truth(batch.delivered) - task.system.local_means(batch.delivered)
+        local[runs, step] = (error**2).transpose(2, 0, 1)
+
+    walk(task, policy, episodes, seed, look)
+    return fused, local
+
+
+def held_values(task: Task, policy: Policy, seed: int) -> Array:
+    """What the estimators hold (H, sensors) in the first run, by equation (4)."""
+    rows: list[Array] = []
+    walk(task, policy, 1, seed, lambda batch, *_: rows.append(batch.delivered.held[:, 0, 0].copy()))
+    return np.array(rows)
+
+
+def resampled(episodes: int, seed: int = 0) -> Array:
+    """Weights (resamples, episodes) with sum 1 of bootstrap samples of the episodes."""
+    drawn = np.random.default_rng(seed).multinomial(
+        episodes, np.full(episodes, 1.0 / episodes), size=_RESAMPLES
+    )
+    return np.asarray(drawn / episodes)
+
+
+def armse(squared: Array) -> dict[str, list[float]]:
+    """The paper's ARMSE a state: mean over time of the root of the mean over runs.
+
+    ``mean``, ``low`` and ``high`` of the 95 % bootstrap interval over episodes, and ``spread``, the
+    standard deviation of what so many runs as the paper's would give.
+    """
+    drawn = _drawn(squared)
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+    spread = drawn.std(0) * np.sqrt(len(squared) / PAPER_RUNS)
+    mean = np.sqrt(squared.mean(0)).mean(0)
+    return {
+        "mean": mean.tolist(), "low": low.tolist(), "high": high.tolist(),
+        "spread": spread.tolist(),
+    }  # fmt: skip
+
+
+def increase(before: Array, after: Array) -> dict[str, list[float]]:
+    """How far :func:`armse` rises a state, from one filter to another on the same seeds.
+
+    ``mean``, ``low`` and ``high`` of the 95 % bootstrap interval of the paired difference.
+    """
+    low, high = np.quantile(_drawn(after) - _drawn(before), [0.025, 0.975], axis=0)
+    mean = (np.sqrt(after.mean(0)) - np.sqrt(before.mean(0))).mean(0)
+    return {"mean": mean.tolist(), "low": low.tolist(), "high": high.tolist()}
+
+
+def medians(squared: Array, state: int = 0) -> tuple[float, Array]:
+    """Median over runs of a run's RMSE of a state, and (resamples,) of bootstrap samples."""
+    roots = np.sqrt(squared[..., state].mean(1))
+    order = np.argsort(roots)
+    reached = np.cumsum(resampled(len(roots))[:, order], axis=1) >= 0.5
+    return float(np.median(roots)), roots[order][np.argmax(reached, axis=1)]
+
+
+def _drawn(squared: Array) -> Array:
+    """ARMSE (resamples, states) of bootstrap samples, the same episodes for every filter."""
+    episodes, horizon, states = squared.shape
+    means = resampled(episodes) @ squared.reshape(episodes, -1)
+    return np.asarray(np.sqrt(means.reshape(-1, horizon, states)).mean(1))
+
+
+def armse_number(
+    what: str, lists: dict[str, list[float]], state: int, printed: float | None, unit: str = ""
+) -> Number:
+    """One entry of :func:`armse` beside the printed one."""
+    mean, low, high, spread = (lists[key][state] for key in ("mean", "low", "high", "spread"))
+    return Number(what, mean, low, high, printed, spread, unit)
+
+
+def error_curve(squared: Array) -> Array:
+    """RMSE over time with its 95 % interval: (3, H, states), the root mean, its low, its high."""
+    mean = squared.mean(0)
+    half = 1.96 * squared.std(0, ddof=1) / np.sqrt(len(squared))
+    return np.sqrt(np.stack([mean, np.maximum(mean - half, 0.0), mean + half]))
+
+
+def paired_increase(ours: Array, others: Array) -> Array:
+    """Paired difference of squared errors over time: (2, H, states), mean and standard error."""
+    difference = ours - others
+    return np.stack([difference.mean(0), difference.std(0, ddof=1) / np.sqrt(len(difference))])
+
+
+def floor(env: str, **options: Any) -> list[float]:
+    """ARMSE that no filter beats: Kalman's, on the same packets without censoring.
+
+    The system without censoring is linear and Gaussian, so its covariances are the least there
+    are, and a clipped packet says no more than the whole one. They follow from the matrices alone.
+    """
+    task = fusion_gym.make_task(env, filter="kalman", **(FREE | options))
+    policy = fusion_gym.make_policy("always" if task.access == "any" else "round_robin", task)
+    deviations = np.empty((task.horizon, STATES))
+
+    def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
+        covariance = task.system.fused(batch.delivered)[1]
+        deviations[step] = np.sqrt(np.diagonal(covariance[..., 0]))
+
+    walk(task, policy, 1, 0, look)
+    return [float(value) for value in deviations.mean(0)]
+
+
+class Comparison(NamedTuple):
+    """Of how many points one curve is clearly lower, clearly higher, or lower by the mean."""
+
+    verdict: Verdict
+    lower: int
+    higher: int
+    by_mean: int
+    points: int
+
+
+def always_below(difference: Array) -> Comparison:
+    """Whether one curve lies below another at every step, and how often it does.
+
+    ``difference`` (2, H, …) is the mean of the paired differences of squared errors with its
+    standard error. It holds if no point has the other order by more than chance and more than half
+    of them have this one clearly; partly if more have this one clearly than the other.
+    """
+    mean, error = difference
+    lower = (mean < -_CLEAR * error) & (error > 0)
+    higher = (mean > _CLEAR * error) & (error > 0)
+    if not higher.any() and lower.mean() > _MOST:
+        result: Verdict = "holds"
+    else:
+        result = "holds partly" if lower.sum() > higher.sum() else "does not hold"
+    return Comparison(result, lower.sum(), higher.sum(), (mean < 0).sum(), mean.size)
+
+
+def explained(armse: Sequence[float], silent: Sequence[float]) -> list[float]:
+    """Shares of the open-loop variance that an estimate explains, a state each."""
+    return [1.0 - (first / none) ** 2 for first, none in zip(armse, silent, strict=True)]
+
+
+@dataclass(frozen=True)
+class PrintedTobitFilter(TobitKalmanFilter):
+    """The Tobit Kalman filter with one of the paper's equations as it stands there.
+
+    ``printed``: ``"theta"`` divides by R instead of √R in the ϑ below (11); ``"sign"`` adds
+    √R λ(ϑʳ, ϑˡ) in (23) instead of subtracting it; ``"argument"`` adds √R λ(ϑʳ - ϑˡ) there, with
+    the λ of one argument of Theorem 4; ``"variance"`` takes (13) at its word, as the variance of
+    the censored value.
+    """
+
+    printed: str = "sign"
+
+    def expect(self, mean: Array) -> Expectation:
+        """See :class:`fusion_gym.systems.tobit.filters.NodeFilter`."""
+        usual = super().expect(mean)
+        deviation = self.sensors.deviation
+        if self.printed == "variance":
+            total = np.maximum(usual.noise_variance / deviation**2, 1e-12)
+            return usual._replace(truncated_variance=total)
+        inside = usual.uncensored_probability
+        if self.printed == "theta":
+            return self._scaled(usual.latent, deviation * deviation)
+        if self.printed == "sign":
+            return usual._replace(value=usual.value - 2.0 * inside * deviation * usual.hazard)
+        width = (self.sensors.upper - self.sensors.threshold) / deviation
+        shift = usual.hazard - gaussian.hazard(width)
+        return usual._replace(value=usual.value - inside * deviation * shift)
+
+    def _scaled(self, latent: Array, scale: Array) -> Expectation:
+        low, high = (self.sensors.threshold - latent) / scale, (self.sensors.upper - latent) / scale
+        moments = gaussian.interval_moments(low, high)
+        below, above = gaussian.upper_tail(-low), gaussian.upper_tail(high)
+        inside = moments.probability
+        centre = latent + self.sensors.deviation * moments.mean
+        value = below * self.sensors.threshold + above * self.sensors.upper + inside * centre
+        within = np.clip(moments.variance, 1e-12, 1.0)
+        noise = inside * self.sensors.variance * within
+        return Expectation(latent, value, noise, inside, moments.mean, within)
+
+
+ROUND_ROBIN_READINGS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+    "corrected equations": ("", {}), "ϑ below (11) over R, as printed": ("theta", {}),
+    "plus λ in (23), as printed": ("sign", {}),
+    "plus λ of one argument in (23), as printed": ("argument", {}),
+    "(13) as the variance of the censored value": ("variance", {}),
+    "Ξ = 0.25 a standard deviation": ("", {"bias_noise_covariance": [[0.0625]]}),
+    "R = 0.6 a standard deviation": ("", {"measurement_variance": 0.36}),
+    "both standard deviations": (
+        "", {"bias_noise_covariance": [[0.0625]], "measurement_variance": 0.36},
+    ),
+    "no round robin: both sensors at every step": ("", {"access": "any"}),
+    "assumed-density filter instead": ("", {"filter": "adf"}),
+}  # fmt: skip
+
+
+def reading_task(reading: str, **options: Any) -> Task:
+    """The oscillator in a reading of :data:`ROUND_ROBIN_READINGS`."""
+    printed, changed = ROUND_ROBIN_READINGS[reading]
+    task = fusion_gym.make_task(OSCILLATOR, **(dict(changed) | options))
+    if not printed:
+        return task
+    system = censored(task)
+    centre = system.centre
+    assert isinstance(centre, FeedbackCentre)
+    filter_ = PrintedTobitFilter(centre.sensors, printed)
+    return replace(task, system=replace(system, centre=replace(centre, filter=filter_)))

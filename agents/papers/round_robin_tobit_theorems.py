@@ -1,0 +1,452 @@
+"""Lemma 1, the theorems and the remarks of round_robin_tobit, held to simulated episodes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import fusion_gym
+from fusion_gym import gaussian, linalg
+from fusion_gym.arrays import Array
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.runs import Outcome
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.intervals import mean_interval
+from fusion_gym.policies.base import Policy
+from fusion_gym.systems.tobit.tobit_filter import expect_censored
+
+from . import round_robin_tobit_runs as measures
+from .numbers import Number, estimate, verdict
+from .paper import Data, Settings
+from .round_robin_tobit_runs import (
+    FREE,
+    OSCILLATOR,
+    TRACKING,
+    PrintedTobitFilter,
+    SingleSensor,
+    censored,
+)
+
+PLACES = (-7.0, -5.0, -4.0, 0.0, 4.5, 5.0, 6.0)  # true x1 at which Lemma 1 is tried
+_DRAWS = 200  # measurements an episode, at each of them
+SHARES = ((0.5, 0.5), (0.9, 0.1), (0.1, 0.9))
+SURE = 0.05  # predicted probability of no censoring, at most, of a surprise
+# Where the bounds are tried: a head of the table, and what it stands for.
+EXAMPLES: dict[str, tuple[str, dict[str, Any]]] = {
+    "oscillator": (OSCILLATOR, {}),
+    "oscillator, [-0.5, 0.5]": (OSCILLATOR, {"censoring_threshold": -0.5, "censoring_upper": 0.5}),
+    "target, uncensored": (TRACKING, {}),
+}
+_CLEAR = 4.0  # standard errors
+_CONSISTENT = 0.05  # deviation of NEES from 1
+# Where the text leaves a choice: the sign of φ (Theorem 4 adds it, (15) with an infinite right
+# threshold subtracts it), and whether the correction holds the filter's covariance, as printed, or
+# the bound itself.
+UPPER = {
+    "as printed": (1.0, False), "the sign of φ as in (15)": (-1.0, False),
+    "the bound in its own correction": (1.0, True), "both": (-1.0, True),
+}  # fmt: skip
+# And for the lower bound whether the factor 1 - (1 - ᾱ - β̄)² stands at every step, as printed, or
+# at the sensor's turns alone, and whether the process covariance stands whole or, as in (49), with
+# the factor (1 - ᾱ - β̄)².
+LOWER = {
+    "as printed": (False, False), "at the sensor's turns": (True, False),
+    "as in (49)": (False, True),
+}  # fmt: skip
+SHARE = 0.5  # ε of a node, the paper's 1/p
+
+
+def simulate_theory(episodes: int, seed: int, settings: Settings) -> Data:
+    """What the claims of Lemma 1, Theorems 1 and 2 and the remarks are judged by."""
+    return {
+        **_lemma(episodes, seed),
+        **{
+            f"{name}_{key}": value
+            for name, env in (("oscillator", OSCILLATOR), ("target", TRACKING))
+            for key, value in _errors(env, episodes, seed).items()
+        },
+        **_fusion(min(episodes, 200), seed), **_worth(episodes, seed),
+    }  # fmt: skip
+
+
+def _lemma(episodes: int, seed: int) -> dict[str, Any]:
+    """Mean and variance of y at fixed states: simulated, with standard errors, and by Lemma 1."""
+    sensors = censored(fusion_gym.make_task(OSCILLATOR)).centre.sensors
+    places, draws = np.array(PLACES), episodes * _DRAWS
+    truth = np.zeros((3, len(places)))
+    truth[0] = places
+    noise = np.random.default_rng(seed).standard_normal((sensors.noise_channels, draws))
+    drawn = np.stack(
+        [
+            sensors.measure(np.repeat(truth[:, [i]], draws, axis=1), noise)[0, 0]
+            for i in range(len(places))
+        ]
+    )
+    spread = drawn.var(1, ddof=1)
+    fourth = ((drawn - drawn.mean(1, keepdims=True)) ** 4).mean(1)
+    means = np.broadcast_to(truth, (sensors.count, *truth.shape))
+    right = expect_censored(sensors, means)
+    printed = PrintedTobitFilter(sensors, "theta").expect(means)
+    return {
+        "mean": drawn.mean(1), "mean_error": np.sqrt(spread / draws), "variance": spread,
+        "variance_error": np.sqrt(np.maximum(fourth - spread**2, 0.0) / draws),
+        "equation_12": right.value[0, 0], "equation_12_printed": printed.value[0, 0],
+        "equation_13": sensors.variance[0, 0] * right.truncated_variance[0, 0],
+        "total_variance": right.noise_variance[0, 0],
+    }  # fmt: skip
+
+
+def _errors(env: str, episodes: int, seed: int) -> dict[str, Any]:
+    """Consistency, censoring probabilities and correlation in time, along the round robin."""
+    task = fusion_gym.make_task(env)
+    names = ("nees", "predicted", "uncensored", "sure", "surprised", "product", "first", "second")
+    values = {name: np.zeros(episodes) for name in names}
+    last = np.zeros((episodes, 3))
+
+    def before(batch: EpisodeBatch, step: int, runs: slice) -> None:
+        error = batch.state.truth - batch.state.prior_mean
+        if step:
+            earlier = last[runs].T
+            values["product"][runs] += error[2] * earlier[2]
+            values["first"][runs] += earlier[2] ** 2
+            values["second"][runs] += error[2] ** 2
+        last[runs] = error.T
+        sensor = step % task.sensors
+        signals = batch.signals()
+        inside = np.asarray(signals["uncensored_probability"])[sensor, 0]
+        free = ~np.asarray(signals["censored"])[sensor, 0]
+        sure = inside < SURE
+        values["predicted"][runs] += inside
+        values["uncensored"][runs] += free
+        values["sure"][runs] += np.where(sure, inside, 0.0)
+        values["surprised"][runs] += sure & free
+
+    def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
+        assert np.all(np.argmax(outcome.granted, axis=0) == step % task.sensors)
+        mean, covariance = task.system.fused(batch.delivered)
+        error = task.system.truth(batch.delivered) - mean
+        values["nees"][runs] += linalg.dot(error, linalg.solve_vector(covariance, error)) / 3.0
+
+    measures.walk(task, measures.round_robin(task), episodes, seed, look, before)
+    for name in ("nees", "predicted", "uncensored"):
+        values[name] /= task.horizon
+    return values
+
+
+def _fusion(episodes: int, seed: int) -> dict[str, Any]:
+    """How far the fused estimate moves with the shares ε, and with B = 0 with the bias."""
+    means = []
+    for shares in SHARES:
+        task = fusion_gym.make_task(OSCILLATOR, information_shares=list(shares))
+        means.append(_means(task, episodes, seed))
+    without = [
+        _means(
+            fusion_gym.make_task(
+                OSCILLATOR, access="any", bias_gain=[[0.0], [0.0]], bias_aware=aware
+            ),
+            episodes, seed, "always",
+        )[..., :2, :]
+        for aware in (True, False)
+    ]  # fmt: skip
+    return {
+        "shares_gap": float(max(np.abs(other - means[0]).max() for other in means[1:])),
+        "without_gap": float(np.abs(without[0] - without[1]).max()),
+    }
+
+
+def _means(task: Any, episodes: int, seed: int, policy: str = "round_robin") -> Array:
+    values = np.empty((task.horizon, 3, episodes))
+
+    def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
+        values[step, :, runs] = task.system.fused(batch.delivered)[0]
+
+    measures.walk(task, fusion_gym.make_policy(policy, task), episodes, seed, look)
+    return values
+
+
+def _worth(episodes: int, seed: int) -> dict[str, Any]:
+    """Squared errors (episodes,), summed over states, of other filters on the same measurements."""
+    settings: dict[str, dict[str, Any]] = {
+        "paper": {}, "adf": {"filter": "adf"}, "kalman": {"filter": "kalman"},
+        "free": {"filter": "kalman"} | FREE, "calm": {"bias_noise_covariance": [[0.0025]]},
+    }  # fmt: skip
+    data: dict[str, Any] = {}
+    for name, options in settings.items():
+        task = fusion_gym.make_task(OSCILLATOR, **options)
+        errors = measures.squares(task, measures.round_robin(task), episodes, seed)
+        data[f"mse_{name}"] = errors.sum(2).mean(1)
+        data[f"armse_{name}"] = measures.armse(errors)["mean"]
+    return data
+
+
+# --- the bounds of Theorems 4 and 5 ---
+
+
+class Censoring(NamedTuple):
+    """What a sensor's filter expects, (N,): α, 1 - α - β, and φ of Theorem 4 without its sign."""
+
+    left: Array
+    inside: Array
+    narrowing: Array
+
+
+@dataclass
+class BoundRecursion:
+    """A bound (states, states, N) of a sensor, beside the covariance P⁻ that it is to bound.
+
+    ``inflation`` is 1 for a single filter and ε⁻¹ for a node, whose process covariance is
+    Q/ε by (27).
+    """
+
+    task: Task
+    sensor: int
+    inflation: float
+    value: Array = field(default_factory=lambda: np.zeros(0), init=False)
+
+    def moved(self, stored: Array, share: Array | float = 1.0) -> Array:
+        """A ``stored`` Aᵀ and the process covariance, of which the lower bound may take a share."""
+        model = censored(self.task).model
+        process = model.process_covariance * self.inflation
+        return linalg.congruence(model.transition, stored) + share * process
+
+
+@dataclass
+class Upper(BoundRecursion):
+    """P^u of Theorem 4, in a reading of :data:`UPPER`."""
+
+    sign: float
+    own: bool
+
+    def begin(self, covariance: Array) -> None:
+        """At the first step: P^u = P⁻, as the proof has it."""
+        self.value = covariance.copy()
+
+    def holds(self, covariance: Array) -> NDArray[np.bool_]:
+        """Return whether (N,) it bounds P⁻."""
+        return matrix_below(covariance, self.value)
+
+    def advance(self, covariance: Array, observed: Censoring, turn: bool) -> None:
+        """Go to the next step, from P⁻, what is expected, and whether it is this sensor's turn."""
+        sensors, stored = censored(self.task).centre.sensors, self.value
+        if turn:
+            row = sensors.measurement_matrix[self.sensor, 0]
+            cross = linalg.matvec(self.value if self.own else covariance, row)
+            noise = sensors.variance[self.sensor, 0] * (1.0 + self.sign * observed.narrowing)
+            weight = (1.0 - observed.left) ** 2
+            innovation = weight * linalg.dot(row, cross) + noise
+            stored = stored - linalg.outer(cross, cross) * weight / innovation
+        self.value = self.moved(stored)
+
+
+@dataclass
+class Lower(BoundRecursion):
+    """P^l of Theorem 4, in a reading of :data:`LOWER`."""
+
+    turns: bool
+    part: bool
+
+    def begin(self, covariance: Array) -> None:
+        """At the first step: P^l = 0, as the proof has it."""
+        self.value = np.zeros_like(covariance)
+
+    def holds(self, covariance: Array) -> NDArray[np.bool_]:
+        """Return whether (N,) it bounds P⁻."""
+        return matrix_below(self.value, covariance)
+
+    def advance(self, covariance: Array, observed: Censoring, turn: bool) -> None:
+        """Go to the next step, from P⁻, what is expected, and whether it is this sensor's turn."""
+        inside = observed.inside**2 if turn or not self.turns else np.zeros_like(observed.inside)
+        self.value = self.moved((1.0 - inside) * self.value, inside if self.part else 1.0)
+
+
+def failures(
+    task: Task, policy: Policy, episodes: int, seed: int, bounds: Sequence[Upper | Lower]
+) -> tuple[Array, Array]:
+    """Shares of an episode's steps in which a bound fails.
+
+    Of Theorem 4, (bounds, episodes); of Theorem 5, (pairs, episodes), for pairs of bounds of both
+    sensors in the order in which they stand.
+    """
+    pairs = [bounds[i : i + 2] for i in range(0, len(bounds) - 1, 2)]
+    local, fused = np.zeros((len(bounds), episodes)), np.zeros((len(pairs), episodes))
+
+    def before(batch: EpisodeBatch, step: int, runs: slice) -> None:
+        covariance = batch.state.prior_covariance
+        observed = [_seen(task, batch, sensor) for sensor in range(task.sensors)]
+        for place, bound in enumerate(bounds):
+            own = covariance * bound.inflation
+            if step == 0:
+                bound.begin(own)
+            local[place, runs] += ~bound.holds(own)
+        for place, pair in enumerate(pairs if step else []):
+            ends = _joined([item.value for item in pair]), covariance[:2, :2]
+            low, high = ends if isinstance(pair[0], Lower) else ends[::-1]
+            fused[place, runs] += ~matrix_below(low, high)
+        for bound in bounds:
+            turn = step % task.sensors == bound.sensor
+            bound.advance(covariance * bound.inflation, observed[bound.sensor], turn)
+
+    measures.walk(task, policy, episodes, seed, lambda *_: None, before)
+    return local / (task.horizon - 1), fused / (task.horizon - 1)
+
+
+def _of(task: Task, sensor: int, inflation: float) -> dict[str, Upper | Lower]:
+    """Both bounds of a sensor in all their readings."""
+    uppers = {f"upper/{name}": Upper(task, sensor, inflation, *how) for name, how in UPPER.items()}
+    lowers = {f"lower/{name}": Lower(task, sensor, inflation, *how) for name, how in LOWER.items()}
+    return {**uppers, **lowers}
+
+
+def _seen(task: Task, batch: EpisodeBatch, sensor: int) -> Censoring:
+    sensors, expected = censored(task).centre.sensors, batch.state.prediction.expectation
+    limit, deviation = sensors.threshold[sensor, 0], sensors.deviation[sensor, 0]
+    low = (limit - expected.latent[sensor, 0]) / deviation
+    hazard = gaussian.hazard(low)
+    inside = expected.uncensored_probability[sensor, 0]
+    return Censoring(gaussian.upper_tail(-low), inside, hazard * (hazard - low))
+
+
+def matrix_below(first: Array, second: Array) -> NDArray[np.bool_]:
+    """Whether (N,) ``first`` ≤ ``second``, both (n, n, N), up to rounding; NaN bounds nothing."""
+    scale = np.maximum(linalg.trace(np.abs(first)), linalg.trace(np.abs(second)))
+    gap = linalg.add_diagonal(second - first, np.broadcast_to(1e-9 * scale, second.shape[1:]))
+    return np.asarray(np.isfinite(linalg.cholesky(gap)).all((0, 1)))
+
+
+def _joined(parts: list[Array]) -> Array:
+    """(Σ P_m⁻¹)⁻¹ of x, as Theorem 5 joins the bounds; NaN where one is indefinite."""
+    return linalg.inverse(sum((linalg.inverse(part) for part in parts), np.zeros(1)))[:2, :2]
+
+
+def simulate_bounds(episodes: int, seed: int, settings: Settings) -> Data:
+    """Failures of the bounds of Theorems 4 and 5 in both examples, and in the narrow interval.
+
+    Shares of failures (episodes,) by example, theorem, end, reading and sensor.
+    """
+    data: Data = {}
+    for example, (env, options) in EXAMPLES.items():
+        task = fusion_gym.make_task(env, **options)
+        for sensor in range(2):
+            single = _of(task, sensor, 1.0)
+            policy = SingleSensor(measures.round_robin(task), sensor)
+            local, _ = failures(task, policy, episodes, seed, list(single.values()))
+            for name, sample in zip(single, local, strict=True):
+                data[f"{example}:4/{name}/{sensor}"] = sample
+        nodes = [_of(task, sensor, 1.0 / SHARE) for sensor in range(2)]
+        bounds = [node[name] for name in nodes[0] for node in nodes]
+        _, fused = failures(task, measures.round_robin(task), episodes, seed, bounds)
+        for name, sample in zip(nodes[0], fused, strict=True):
+            data[f"{example}:5/{name}"] = sample
+    return data
+
+
+def summarise_theory(data: Data) -> Data:
+    """Return the verdicts on Lemma 1, Theorems 1 and 2 and the remarks, and their numbers."""
+    numbers = {
+        "NEES of the fused estimate, oscillator": "oscillator_nees",
+        "NEES of the fused estimate, target": "target_nees",
+        "share of uncensored packets, predicted by (9)": "oscillator_predicted",
+        "share of uncensored packets, simulated": "oscillator_uncensored",
+    }
+    return {
+        "tables": {"theory": [Number.of(what, data[name]) for what, name in numbers.items()]},
+        **_summarise_lemma(data), **_summarise_filter(data), **_summarise_federation(data),
+    }  # fmt: skip
+
+
+def _summarise_lemma(data: Data) -> Data:
+    def clear(value: str, against: str) -> NDArray[np.bool_]:
+        error = np.maximum(data[f"{value}_error"], 1e-12)
+        return np.asarray(np.abs(data[value] - data[against]) > _CLEAR * error)
+
+    right, printed = clear("mean", "equation_12"), clear("mean", "equation_12_printed")
+    values, total = clear("variance", "equation_13"), clear("variance", "total_variance")
+    worst = int(np.argmax(np.abs(data["mean"] - data["equation_12_printed"])))
+    most = int(np.argmax(np.abs(data["variance"] - data["equation_13"])))
+    return {
+        "places": PLACES, "worst": worst, "most": most,
+        "off": {
+            "right": int(right.sum()), "printed": int(printed.sum()), "values": int(values.sum()),
+            "total": int(total.sum()),
+        },
+        "mean_right": verdict([not printed.any(), not right.any()]),
+        "variance_right": verdict([not values.any()]),
+    }  # fmt: skip
+
+
+def _summarise_filter(data: Data) -> Data:
+    gap = data["oscillator_predicted"] - data["oscillator_uncensored"]
+    times = data["oscillator_surprised"].sum() / data["oscillator_sure"].sum()
+    nees = [estimate(data[f"{name}_nees"]).mean for name in ("oscillator", "target")]
+    better = mean_interval(data["mse_adf"] - data["mse_paper"])
+    weights = measures.resampled(len(gap))
+    ends = {}
+    for name in ("oscillator", "target"):
+        names = (f"{name}_{part}" for part in ("product", "first", "second"))
+        product, first, second = (weights @ data[part] for part in names)
+        ends[name] = np.quantile(product / np.sqrt(first * second), [0.025, 0.5, 0.975])
+    return {
+        "sure_below": SURE, "gap": gap, "times": times,
+        "approximates": verdict([abs(estimate(gap).mean) < 0.05, times < 2.0]),
+        "covariance_right": verdict(abs(mean - 1) < _CONSISTENT for mean in nees), "better": better,
+        "least": verdict([better.low > 0.0]), "correlation": ends,
+        "uncorrelated": verdict(end[0] < 0.0 < end[2] for end in ends.values()),
+    }  # fmt: skip
+
+
+def _summarise_federation(data: Data) -> Data:
+    ignored = mean_interval(data["mse_kalman"] - data["mse_paper"])
+    own, free, calm = (np.array(data[f"armse_{name}"]) for name in ("paper", "free", "calm"))
+    worse, calmer = own / free, own / calm
+    return {
+        "node_shares": SHARES, "optimum": verdict([data["shares_gap"] < 1e-6]),
+        "usual": verdict([data["without_gap"] < 1e-9]), "ignored": ignored,
+        "impairs": verdict([ignored.low > 0.0]), "worse": worse, "calmer": calmer,
+        "insensitive": verdict([worse.max() < 1.1, calmer.max() < 1.1]),
+    }  # fmt: skip
+
+
+def summarise_bounds(data: Data) -> Data:
+    """Return how often the bounds fail, by reading, and the verdicts on Theorems 4 and 5."""
+    rows = {}
+    for name in (key.partition(":")[2] for key in data if key.startswith("oscillator:")):
+        theorem, end, reading, *sensor = name.split("/")
+        which = f", sensor {int(sensor[0]) + 1}" if sensor else ""
+        rows[f"Theorem {theorem}, {end} bound, {reading}{which}"] = name
+    return {
+        "examples": list(EXAMPLES),
+        "tables": {
+            "bounds": [
+                Number.of(f"{row}: {example}", 100 * data[f"{example}:{name}"], unit="%")
+                for row, name in rows.items()
+                for example in EXAMPLES
+            ]
+        },
+        "ends": {
+            f"{end}_{theorem}": _summarise_bound(data, f"{theorem}/{end}")
+            for theorem in (4, 5)
+            for end in ("upper", "lower")
+        },
+    }
+
+
+def _summarise_bound(data: Data, bound: str) -> Data:
+    """It holds if it does as printed; partly if it does in some reading."""
+    by: dict[str, list[float]] = {}
+    for reading in UPPER if bound.endswith("upper") else LOWER:
+        for example in EXAMPLES:
+            start = f"{example}:{bound}/{reading}"
+            shares = [
+                float(sample.mean())
+                for key, sample in data.items()
+                if key == start or key.startswith(f"{start}/")
+            ]
+            by.setdefault(reading, []).append(max(shares))
+    best = min(by, key=lambda reading: sum(by[reading]))
+    printed = by["as printed"]
+    return {
+        "printed": printed, "readings": len(by), "best": best, "shares": by[best],
+        "verdict": verdict([max(printed) == 0.0, max(by[best]) == 0.0]),
+    }  # fmt: skip

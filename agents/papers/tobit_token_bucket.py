@@ -1,0 +1,459 @@
+"""Tobit Kalman fusion filtering with a token bucket: Figures 2 to 10 and the theorems.
+
+Source: tobit_token_bucket, Section 4.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from matplotlib.patches import Patch
+
+from fusion_gym.arrays import Array
+from fusion_gym.evaluation import run_episodes
+from fusion_gym.policies.registry import make_policy
+
+from ..output.palette import FUSED, INK, MEASURED, TRUTH
+from ..output.palette import SENSORS as COLOURS
+from . import tobit_token_bucket_runs as runs
+from .numbers import below, estimate, grid, verdict
+from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
+from .tobit_token_bucket_runs import SENSORS, TRIGGER, History, record_history, scheme
+
+_NODES = range(SENSORS)
+_NODE_NAMES = tuple(f"node {m + 1}" for m in _NODES)
+_WHO = (*_NODE_NAMES, "fused")
+_STATES = ("first state", "second state")
+_CURVES = ("local_error", "local_trace", "fused_error", "fused_trace")
+_CLEAR = 4.0  # standard errors: of 400 eigenvalues none of 1 is likely to lie as far above
+_LONG, _WINDOW = 1000, 200  # steps
+# What each reading changes. The paper's text leaves the first two open; the others take out what
+# it has in its filter, and the last puts the standard Tobit Kalman filter in its place.
+READINGS: dict[str, dict[str, Any]] = {
+    "as printed, one noise of variance 0.05 on B": {},
+    "noise of covariance diag(0.05, 0.05) on the states": {"process_noise": "full"},
+    "nothing arrives: prediction, no held update": {"silent": "predict"},
+    "no event error κ₆ Ξ in a delivery": {"event_error": False},
+    "neither held update nor event error": {"silent": "predict", "event_error": False},
+    "standard Tobit Kalman filter": {"filter": "tobit"},
+}
+
+
+def _record(episodes: int, seed: int, settings: Settings, **options: Any) -> History:
+    task = scheme(**(settings["options"] | options))
+    return record_history(task, episodes, seed, make_policy(settings["policy"], task))
+
+
+# --- tokens, events and measurements --------------------------------------------------------------
+
+
+def simulate_network(episodes: int, seed: int, settings: Settings) -> Data:
+    """Tokens, events, grants, and the measurements before and after the protocol."""
+    bucket = scheme(**settings["options"]).bucket
+    result = _record(episodes, seed, settings)
+    free = _record(episodes, seed, settings, tokens="unlimited")
+    costs = bucket.cost[:, 0]
+    needed = costs.max() * SENSORS
+    poor = (result.tokens_before < needed)[:, None]
+    requested, granted = result.requested, result.granted
+    return {
+        "level": np.append(bucket.initial, result.tokens[:, 0]), "requested": requested[..., 0],
+        "granted": granted[..., 0], "measured": result.measurement[..., 0],
+        "held": result.held[..., 0], "rate_requested": requested.mean(0),
+        "rate_granted": granted.mean(0),
+        "grant_share": granted.sum((0, 1)) / np.maximum(requested.sum((0, 1)), 1),
+        "tokens": result.tokens.mean(0), "lowest": float(result.tokens.min()),
+        "highest": float(result.tokens.max()),
+        "wanted": (free.requested.transpose(2, 0, 1) @ costs).mean(1),
+        "spent": (granted.transpose(2, 0, 1) @ costs).mean(1),
+        "poor_grants": int((granted & poor).sum()),
+        "uncalled_grants": int((granted & ~requested).sum()),
+        "rich_refusals": int((requested & ~granted & ~poor).sum()), "grants": int(granted.sum()),
+        "rate": bucket.rate, "capacity": bucket.capacity, "needed": float(needed),
+        "mse": result.fused_error.mean(0), "mse_unlimited": free.fused_error.mean(0),
+    }  # fmt: skip
+
+
+def _summarise_network(data: Data) -> Data:
+    columns = ("events", "transmissions")
+    inside = data["lowest"] >= 0.0 and data["highest"] <= data["capacity"]
+    wanted, spent = estimate(data["wanted"]), estimate(data["spent"])
+    rates = zip(data["rate_requested"], data["rate_granted"], strict=True)
+    means = {
+        "transmissions an event": [data["grant_share"]], "level of tokens": [data["tokens"]],
+        "tokens spent a step": [data["spent"]],
+        "tokens asked for a step without a bucket": [data["wanted"]],
+    }  # fmt: skip
+    return {
+        "columns": columns,
+        "tables": {
+            "rates": grid(columns, dict(zip(_NODE_NAMES, rates, strict=True))),
+            "tokens": grid(("mean",), means),
+        },
+        "protocol": verdict((data["poor_grants"] == 0, data["uncalled_grants"] == 0, inside)),
+        "saves": verdict(estimate(rate).high < 1.0 for rate in data["rate_requested"]),
+        "limited": verdict((wanted.low > data["rate"], spent.high <= data["rate"])),
+        "costs": verdict([below(data["mse_unlimited"], data["mse"])]),
+    }
+
+
+# --- states and estimates -------------------------------------------------------------------------
+
+
+def simulate_estimates(
+    episodes: int, seed: int, settings: Settings, singles: Sequence[int] = _NODES
+) -> Data:
+    """States, local and fused estimates, and how far they fluctuate from step to step.
+
+    ``singles`` are the sensors whose filters also run without the others.
+    """
+    result = _record(episodes, seed, settings)
+    local = np.abs(np.diff(result.truth[:, None] - result.local_mean, axis=0))
+    fused = np.abs(np.diff(result.truth - result.mean, axis=0))
+    censored = (result.measurement <= 0.0)[1:]
+    beside = [record_history(runs.single_sensor(m), episodes, seed) for m in singles]
+    return {
+        "truth": result.truth[..., 0], "local": result.local_mean[..., 0],
+        "fused": result.mean[..., 0], "local_change": local.mean(0), "fused_change": fused.mean(0),
+        "change_censored": _mean_where(local[:, 2, 1], censored[:, 2, 1]),
+        "change_uncensored": _mean_where(local[:, 2, 1], ~censored[:, 2, 1]),
+        "mse": result.fused_error.mean(0),
+        "single_mse": np.array([item.fused_error.mean(0) for item in beside]),
+        "moved": np.abs(np.diff(result.mean, axis=0)).mean((0, 1)),
+        "single_moved": np.array([np.abs(np.diff(o.mean, axis=0)).mean((0, 1)) for o in beside]),
+        "single_rate": [float(item.granted.mean()) for item in beside],
+        "rate": float(result.granted.mean()),
+    }  # fmt: skip
+
+
+def _mean_where(values: Any, selection: Any) -> Any:
+    """Mean of values (H, E) by episode where ``selection``; not a number where nothing is."""
+    with np.errstate(invalid="ignore"):
+        return (values * selection).sum(0) / selection.sum(0)
+
+
+def _summarise_estimates(data: Data) -> Data:
+    local, fused = data["local_change"], data["fused_change"]
+    means = local.mean(-1)
+    strongest = np.unravel_index(int(means.argmax()), means.shape)
+    rougher = all(below(fused[s], local[m, s]) for m in _NODES for s in range(2))
+    others = [local[m, s] for m in _NODES for s in range(2) if (m, s) != (2, 1)]
+    largest = all(below(other, local[2, 1]) for other in others)
+    by_censoring = below(data["change_uncensored"], data["change_censored"])
+    return {
+        "states": _STATES,
+        "tables": {"fluctuation": grid(_STATES, dict(zip(_WHO, (*local, fused), strict=True)))},
+        "changes": means, "fused_changes": fused.mean(-1),
+        "strongest": [int(place) + 1 for place in strongest], "rougher": "yes" if rougher else "no",
+        "fluctuates": verdict((rougher, largest, by_censoring)),
+        "smooths": verdict(below(data["moved"], single) for single in data["single_moved"]),
+        "effective": verdict(below(data["mse"], single) for single in data["single_mse"]),
+    }  # fmt: skip
+
+
+# --- errors and bounds ----------------------------------------------------------------------------
+
+
+def simulate_errors(episodes: int, seed: int, settings: Settings) -> Data:
+    """Squared errors and traces of the bounds, local and fused."""
+    history = _record(episodes, seed, settings)
+    result: Data = {}
+    for name in _CURVES:
+        values = getattr(history, name)
+        logarithm = np.log10(values)
+        result[f"one_{name}"] = values[..., 0]
+        result[f"mean_{name}"] = values.mean(-1)
+        result[f"by_{name}"] = values.mean(0)
+        result[f"lg_{name}"] = logarithm.mean(0)
+        if name.endswith("error"):
+            result[f"rough_{name}"] = np.abs(np.diff(logarithm, axis=0)).mean(0)
+    error, trace = history.fused_error[:, None], history.fused_trace[:, None]
+    result["share_error"] = (error < history.local_error).mean(0)
+    result["share_trace"] = (trace < history.local_trace).mean(0)
+    return result
+
+
+def _summarise_errors(data: Data) -> Data:
+    local, fused, smooth = (data[f"{n}_error"] for n in ("by_local", "by_fused", "rough_fused"))
+    columns = {
+        "squared error": "by_{}_error", "trace of the bound": "by_{}_trace",
+        "lg squared error": "lg_{}_error", "lg trace": "lg_{}_trace",
+    }  # fmt: skip
+    rows = {
+        who: [data[name.format("local")][m] for name in columns.values()]
+        for m, who in enumerate(_NODE_NAMES)
+    } | {"fused": [data[name.format("fused")] for name in columns.values()]}
+    return {
+        "columns": list(columns), "tables": {"errors": grid(tuple(columns), rows)},
+        "ratio": local.mean(-1) / fused.mean(),
+        "times": data["by_fused_trace"].mean() / fused.mean(),
+        "trace_shares": [float(share.mean()) for share in data["share_trace"]],
+        "gaps": [estimate(fused - own) for own in local],
+        "smaller_bound": verdict(np.all(share == 1.0) for share in data["share_trace"]),
+        "mostly_smaller": verdict(estimate(share).low > 0.5 for share in data["share_error"]),
+        "improves": verdict(below(fused, own) for own in local),
+        "smooth": verdict(below(smooth, own) for own in data["rough_local_error"]),
+    }  # fmt: skip
+
+
+# --- theorems and failures of sensors -------------------------------------------------------------
+
+
+def simulate_bucket_theorems(episodes: int, seed: int, settings: Settings) -> Data:
+    """Bounds, gains and condition (42) on recorded episodes; long runs, starved runs, failures."""
+    task, few = scheme(), max(2, episodes // 10)
+    result = record_history(task, episodes, seed)
+    gaps = [result.truth - result.mean, *(result.truth - result.local_mean[:, m] for m in _NODES)]
+    bounds = [result.bound, *(result.local_bound[:, m] for m in _NODES)]
+    eigenvalues, deviations = zip(*map(runs.claimed, gaps, bounds), strict=True)
+    recorded = record_history(task, few, seed)
+    parts = runs.terms(task, recorded)
+    never = record_history(task, few, seed, make_policy("never", task))
+    long = record_history(scheme(horizon=_LONG), few, seed)
+    windows, traces = (
+        values.reshape(-1, _WINDOW, few).mean(1) for values in (long.fused_error, long.fused_trace)
+    )
+    failed = [
+        record_history(task, episodes, seed, runs.Failing(make_policy(TRIGGER, task), m))
+        for m in _NODES
+    ]
+    silent = record_history(task, episodes, seed, make_policy("never", task))
+    gains = runs.perturbed(parts, recorded, seed)
+    return {
+        "eigenvalue": np.array(eigenvalues), "eigenvalue_error": np.array(deviations),
+        **{f"gain_{name}": values for name, values in gains.items()}, **runs.conditioned(parts),
+        "growth": np.exp(np.diff(np.log(never.fused_trace), axis=0)).mean(0),
+        "windows": windows, "traces": traces, "healthy": result.fused_error.mean(0),
+        "failed": np.array([item.fused_error.mean(0) for item in failed]),
+        "silent": silent.fused_error.mean(0), "few": few,
+    }  # fmt: skip
+
+
+def _summarise_bucket_theorems(data: Data) -> Data:
+    value, error = data["eigenvalue"], data["eigenvalue_error"]
+    covered = (value - _CLEAR * error <= 1.0).all(-1)
+    place = int(value[0].argmax())
+    first, last = data["windows"][1], data["windows"][-1]
+    everywhere = min(data["holds_silent"].min(), data["holds_delivered"].min()) == 1.0
+    stays = not below(first * 1.2, last) and not below(data["traces"][1] * 1.5, data["traces"][-1])
+    share, difference = data["gain_larger"], float(data["gain_difference"].max())
+    healthy, failed, silent = data["healthy"], data["failed"], data["silent"]
+    helped = [below(item, silent) for item in failed]
+    unharmed = [not below(healthy * 1.1, item) for item in failed]
+    means = {
+        "share of gains beside (37) with a larger bound": [share],
+        "(42) holds, share of deliveries": [data["holds_delivered"]],
+        "(42) holds, share of steps without": [data["holds_silent"]],
+        "growth a step of the trace if nothing is sent": [data["growth"]],
+    }
+    failures = {
+        "no sensor": [healthy], **{f"sensor {m + 1}": [failed[m]] for m in _NODES},
+        "all sensors": [silent],
+    }  # fmt: skip
+    return {
+        "tables": {
+            "theorems": grid(("mean",), means),
+            "failures": grid(("fused squared error",), failures),
+        },
+        "largest": value.max(-1), "loose": 1.0 / value[1:].mean(),
+        "top_error": _CLEAR * error[0][place], "top_time": place + 1,
+        "mean_eigenvalue": value[0].mean(), "local_bound": verdict(covered[1:]),
+        "fused_bound": verdict(covered[:1]), "larger": share.mean(), "difference": difference,
+        "counted": data["gain_counted"].mean(),
+        "minimises": verdict([np.all(share >= 1.0 - 1e-12), difference < 1e-9]),
+        "delivered": data["holds_delivered"].mean(), "not_delivered": data["holds_silent"].mean(),
+        "least": float(data["least_silent"].min()), "first_window": first, "last_window": last,
+        "window": _WINDOW, "long": _LONG, "mean_growth": data["growth"].mean(),
+        "bounded": verdict((everywhere, stays)),  # (42) in every step, as the theorem asks
+        "resilient": verdict([*helped, *unharmed]),
+    }  # fmt: skip
+
+
+# --- other readings, other filters ----------------------------------------------------------------
+
+
+def simulate_bucket_readings(episodes: int, seed: int, settings: Settings) -> Data:
+    """Local and fused squared errors under every reading."""
+    local, fused, share = [], [], []
+    for options in READINGS.values():
+        result = record_history(scheme(**options), episodes, seed)
+        error = result.fused_error
+        local.append(result.local_error.mean(0))
+        fused.append(error.mean(0))
+        share.append((error[:, None] < result.local_error).mean((0, 2)))
+    plain, free = scheme(filter="kalman"), scheme(tokens="unlimited")
+    return {
+        "readings": list(READINGS), "local": np.array(local), "fused": np.array(fused),
+        "share": np.array(share),
+        "ignoring": run_episodes(plain, make_policy(TRIGGER, plain), episodes, seed).mse,
+        "always": run_episodes(free, make_policy("always", free), episodes, seed).mse,
+    }  # fmt: skip
+
+
+def _summarise_bucket_readings(data: Data) -> Data:
+    fused = data["fused"]
+    rows = {
+        name: (*local, own)
+        for name, local, own in zip(data["readings"], data["local"], fused, strict=True)
+    }
+    beside = {
+        "Kalman filters that ignore censoring, the paper's trigger and bucket": [data["ignoring"]],
+        "the paper's filter, always sending, no bucket": [data["always"]],
+    }
+    return {
+        "columns": _WHO,
+        "tables": {"readings": grid(_WHO, rows), "beside": grid(("fused",), beside)},
+        "not_below": [
+            [m + 1 for m in _NODES if not below(own, local[m])]
+            for local, own in zip(data["local"], fused, strict=True)
+        ],
+        "printed": fused[0], "standard": fused[-1],
+        "optimal": verdict([not below(fused[-1], fused[0])]),
+        "handles_censoring": verdict([below(fused[0], data["ignoring"])]),
+    }  # fmt: skip
+
+
+# --- figures --------------------------------------------------------------------------------------
+
+_CENSORED = "#e4e6ea"  # opaque, so that grid and palette leave it as it is
+_TIME = "time t (steps)"
+
+
+def _legend(figure: Any, handles: Sequence[Any], columns: int) -> None:
+    figure.legend(
+        handles=handles, loc="outside upper center", ncols=columns, handlelength=1.6,
+        columnspacing=1.2, handletextpad=0.5,
+    )  # fmt: skip
+
+
+def _draw_tokens(figure: Any, data: Data) -> None:
+    level, requested, granted = (data[name] for name in ("level", "requested", "granted"))
+    requested, granted = requested.astype(bool), granted.astype(bool)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+    upper.step(np.arange(len(level)), level, where="post", color=INK, lw=1.6)
+    least = upper.axhline(
+        data["needed"], color=MEASURED, lw=1.6, ls="--", label="needed for a grant"
+    )
+    upper.set_ylabel("tokens")
+    upper.set_ylim(0.0, data["capacity"] + 1.0)
+    time = np.arange(1, len(requested) + 1)
+    (sent,) = lower.plot([], [], "|", color=INK, ms=9, mew=1.8, label="event, sent")
+    (refused,) = lower.plot([], [], "x", color=INK, ms=5, mew=1.0, label="event, refused")
+    for sensor in _NODES:
+        for selection, mark, size, width in (
+            (granted[:, sensor], "|", 9, 1.8),
+            (requested[:, sensor] & ~granted[:, sensor], "x", 4, 1.0),
+        ):
+            times = time[selection]
+            lower.plot(
+                times, np.full(len(times), SENSORS - sensor), mark, color=COLOURS[sensor], ms=size,
+                mew=width,
+            )  # fmt: skip
+    lower.set_yticks(range(1, SENSORS + 1), _NODE_NAMES[::-1])
+    lower.set_ylim(0.4, SENSORS + 0.6)
+    lower.grid(axis="y", visible=False)
+    lower.set_xlabel(_TIME)
+    (line,) = upper.plot([], [], color=INK, lw=1.6, label="tokens")
+    _legend(figure, [line, least, sent, refused], 4)
+
+
+def _draw_measurements(figure: Any, data: Data, component: int) -> None:
+    """A panel a node."""
+    measured, held = (data[name][..., component] for name in ("measured", "held"))
+    axes = figure.subplots(SENSORS, 1, sharex=True, sharey=True)
+    time = np.arange(1, len(measured) + 1)
+    for sensor, axis in enumerate(axes):
+        (before,) = axis.plot(
+            time, measured[:, sensor], color="#8d929b", lw=1.1,
+            label="before the protocol: censored measurement $y$",
+        )  # fmt: skip
+        axis.step(time, held[:, sensor], where="post", color=COLOURS[sensor], lw=1.7)
+        axis.set_ylabel(_NODE_NAMES[sensor])
+    figure.supylabel(f"component {component + 1} of the measurement (no unit)", fontsize=11)
+    axes[-1].set_xlabel(_TIME)
+    label = "after: held by the filter, " + r"$\bar{y}$"
+    (after,) = axes[0].plot([], [], color=INK, lw=1.7, label=label)
+    _legend(figure, [before, after], 1)
+
+
+def _draw_states(figure: Any, data: Data, sensor: int) -> None:
+    """A panel a state."""
+    truth, local, fused = data["truth"], data["local"][:, sensor], data["fused"]
+    axes = figure.subplots(truth.shape[1], 1, sharex=True)
+    time = np.arange(1, len(truth) + 1)
+    for state, axis in enumerate(axes):
+        handles = [
+            axis.plot(time, values[:, state], mark, color=colour, lw=width, ms=3, label=label)[0]
+            for values, mark, colour, width, label in (
+                (local, "o-", COLOURS[sensor], 1.0, f"estimate, node {sensor + 1}"),
+                (truth, "-", TRUTH, 1.4, "state"),
+                (fused, "-", FUSED, 1.4, "fused estimate"),
+            )
+        ]
+        low, high = axis.get_ylim()
+        axis.axhspan(low, 0.0, color=_CENSORED, lw=0)
+        axis.set_ylim(low, high)
+        axis.set_ylabel(f"$x_{state + 1}$ (no unit)")
+    axes[-1].set_xlabel(_TIME)
+    handles.append(Patch(color=_CENSORED, lw=0, label="censored"))
+    _legend(figure, handles, 4)
+
+
+def _draw_errors(figure: Any, data: Data, sensor: int) -> None:
+    """The logarithm of squared errors and of the traces of the bounds, of a run and the mean."""
+    axes = figure.subplots(2, 1, sharex=True)
+    own, dashes = COLOURS[sensor], (0, (2.5, 0.8))
+    kinds = (("one", "one episode"), ("mean", "mean over all episodes"))
+    for axis, (kind, title) in zip(axes, kinds, strict=True):
+
+        def curve(name: str, kind: str = kind) -> Array:
+            values = data[f"{kind}_{name}"]
+            return np.log10(values[:, sensor] if values.ndim > 1 else values)
+
+        time = np.arange(1, len(curve("fused_error")) + 1)
+        handles = [
+            axis.plot(time, curve(name), color=colour, lw=width, ls=line, label=label)[0]
+            for name, colour, width, line, label in (
+                ("local_trace", own, 2.4, "-", f"bound, node {sensor + 1}"),
+                ("local_error", own, 1.3, dashes, f"squared error, node {sensor + 1}"),
+                ("fused_trace", FUSED, 2.4, "-", "bound, fused"),
+                ("fused_error", FUSED, 1.3, dashes, "squared error, fused"),
+            )
+        ]
+        axis.set_title(title, loc="left")
+        axis.set_ylabel("lg (no unit)")
+    axes[-1].set_xlabel(_TIME)
+    _legend(figure, handles, 2)
+
+
+_SIZE, _TALL = (7.2, 4.4), (7.2, 4.8)
+_NO_SINGLES: Settings = {"singles": ()}
+PAPER = Paper(
+    "tobit_token_bucket",
+    (
+        Piece("network", simulate_network, _summarise_network, 6.0, 2000),
+        Piece("estimates", simulate_estimates, _summarise_estimates, 12.0, 2000),
+        Piece("errors", simulate_errors, _summarise_errors, 5.0, 2000),
+        Piece("theorems", simulate_bucket_theorems, _summarise_bucket_theorems, 25.0, 2000),
+        Piece("readings", simulate_bucket_readings, _summarise_bucket_readings, 12.0, 2000),
+    ),
+    {
+        "figure_2": PaperFigure("network", _draw_tokens, _SIZE),
+        "figure_3": PaperFigure("network", partial(_draw_measurements, component=0), _TALL),
+        "figure_4": PaperFigure("network", partial(_draw_measurements, component=1), _TALL),
+        "figure_5": PaperFigure("estimates", partial(_draw_states, sensor=0), _SIZE, _NO_SINGLES),
+        "figure_6": PaperFigure("estimates", partial(_draw_states, sensor=1), _SIZE, _NO_SINGLES),
+        "figure_7": PaperFigure("estimates", partial(_draw_states, sensor=2), _SIZE, _NO_SINGLES),
+        "figure_8": PaperFigure("errors", partial(_draw_errors, sensor=0), (7.2, 5.4)),
+        "figure_9": PaperFigure("errors", partial(_draw_errors, sensor=1), (7.2, 5.4)),
+        "figure_10": PaperFigure("errors", partial(_draw_errors, sensor=2), (7.2, 5.4)),
+    },
+    "fusion_gym/TobitOscillator-v0",
+    {"policy": Parameter(TRIGGER, policy_of())},
+    (
+        *("horizon", "token_rate", "token_capacity", "initial_tokens"),
+        *("trigger_threshold", "trigger_decay", "trigger_divisor", "trigger_initial"),
+        *("process_variance", "measurement_variance"),
+    ),
+)

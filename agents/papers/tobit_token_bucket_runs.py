@@ -1,0 +1,267 @@
+"""Recorded episodes of the token-bucket paper, and its theorems computed on them."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import fusion_gym
+from fusion_gym import linalg
+from fusion_gym.arrays import Array
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.system import Signals
+from fusion_gym.core.task import Task
+from fusion_gym.policies.base import Policy, Requests
+from fusion_gym.policies.rules.dynamic_event import DynamicEvent
+from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
+
+TRIGGER = "dynamic_event"
+SENSORS = 3
+_UNCENSORED = 0.01  # q from which (37) is evaluated as printed: it holds 1/q when nothing arrives
+_FLOOR = 1e-140  # of q where it divides and the ratio is squared
+
+
+class History(NamedTuple):
+    """E episodes of H steps; t = 1..H first, episodes last.
+
+    ``truth`` (H, n, E) · ``measurement`` (H, l, m, E), censored · ``held`` (H, l, m, E), what the
+    filters have of it after the step, and ``held_before`` · ``requested``, ``granted`` (H, l, E) ·
+    ``tokens`` (H, E) after the step, ``tokens_before`` · ``prior_mean`` (H, n, E) and
+    ``prior_covariance`` (H, n, n, E) of the centre · ``uncensored`` and ``hazard`` (H, l, m, E),
+    q and λ of the prediction · ``local_mean`` (H, l, n, E), ``local_bound`` (H, l, n, n, E) of the
+    nodes before the feedback · ``mean`` (H, n, E), ``bound`` (H, n, n, E) fused.
+    """
+
+    truth: Array
+    measurement: Array
+    held: Array
+    held_before: Array
+    requested: NDArray[np.bool_]
+    granted: NDArray[np.bool_]
+    tokens: Array
+    tokens_before: Array
+    prior_mean: Array
+    prior_covariance: Array
+    uncensored: Array
+    hazard: Array
+    local_mean: Array
+    local_bound: Array
+    mean: Array
+    bound: Array
+
+    @property
+    def local_error(self) -> Array:
+        """The nodes' squared errors eᵀe (H, l, E)."""
+        return np.square(self.truth[:, None] - self.local_mean).sum(2)
+
+    @property
+    def fused_error(self) -> Array:
+        """The centre's squared error (H, E)."""
+        return np.square(self.truth - self.mean).sum(1)
+
+    @property
+    def local_trace(self) -> Array:
+        """Traces (H, l, E) of the nodes' bounds."""
+        return np.trace(self.local_bound, axis1=2, axis2=3)
+
+    @property
+    def fused_trace(self) -> Array:
+        """Trace (H, E) of the fused bound."""
+        return np.trace(self.bound, axis1=1, axis2=2)
+
+
+@dataclass
+class Failing:
+    """The paper's trigger, but one sensor never sends: it has failed."""
+
+    policy: Policy
+    sensor: int
+    knowledge: Any = "own_memory"
+
+    def reset(self, runs: int, seed: int = 0) -> None:
+        """Forget everything."""
+        self.policy.reset(runs, seed)
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Return the trigger's requests, none of the failed sensor."""
+        requests = self.policy(signals).copy()
+        requests[self.sensor] = False
+        return requests
+
+
+def scheme(**options: Any) -> Task:
+    """The paper's example with other ``options`` where they are named."""
+    return fusion_gym.make_task(TobitOscillatorOptions(**options))
+
+
+def single_sensor(sensor: int) -> Task:
+    """Return the task of a single sensor: its third of the bucket and no feedback."""
+    options, trigger = TobitOscillatorOptions(), DynamicEvent()
+    return scheme(
+        measurement_matrices=(np.eye(2).tolist(),), token_rate=options.token_rate / SENSORS,
+        token_capacity=options.token_capacity / SENSORS,
+        initial_tokens=options.initial_tokens / SENSORS,
+        trigger_threshold=trigger.column("threshold", SENSORS)[sensor],
+        trigger_decay=trigger.column("decay", SENSORS)[sensor],
+    )  # fmt: skip
+
+
+def record_history(task: Task, episodes: int, seed: int, policy: Policy | None = None) -> History:
+    """Run the paper's trigger, or another policy, and keep everything."""
+    policy = fusion_gym.make_policy(TRIGGER, task) if policy is None else policy
+    batch = EpisodeBatch.seeded(task, episodes, seed)
+    policy.reset(episodes, seed)
+    rows = []
+    for _ in range(task.horizon):
+        before, tokens = batch.state, batch.tokens
+        outcome = batch.step(policy(batch.signals()))
+        state, granted = batch.delivered, outcome.granted
+        planned, expected = state.prediction.outcomes, state.prediction.expectation
+        bounds = (planned.delivered_covariance, planned.silent_covariance)
+        bound = np.where(granted[:, None, None], *bounds)
+        values = (
+            state.truth, state.measurement, state.held, before.held, outcome.requested, granted,
+            batch.tokens, tokens, state.prior_mean, state.prior_covariance,
+            expected.uncensored_probability, expected.hazard, state.local_mean, bound, state.mean,
+            state.covariance,
+        )  # fmt: skip
+        rows.append([np.array(value) for value in values])
+    return History(*map(np.array, zip(*rows, strict=True)))
+
+
+class Terms(NamedTuple):
+    """(30) of a node and step as κ₁ (I - K q C) P (I - K q C)ᵀ + K S Kᵀ, in units of q.
+
+    ``prior`` P (…, n, n) · ``matrix`` C (…, m, n) · ``probability`` q (…, m) · ``noise`` q⁻¹ S q⁻¹
+    without the held value's square and ``pinned`` √κ₅ ȳ/q, zero where something arrived ·
+    ``silent`` where nothing did. Axes: steps, nodes, episodes first.
+    """
+
+    first: float
+    prior: Array
+    matrix: Array
+    probability: Array
+    noise: Array
+    pinned: Array
+    silent: NDArray[np.bool_]
+
+    @property
+    def gain(self) -> Array:
+        """K q by (37), without loss where ȳ/q is huge (Sherman and Morrison)."""
+        cross = self.first * self.prior @ _transposed(self.matrix)
+        inverse = np.linalg.inv(self.matrix @ cross + self.noise)
+        turned = inverse @ self.pinned[..., None]
+        size = 1.0 + self.pinned[..., None, :] @ turned
+        return cross @ (inverse - turned / size @ _transposed(turned))
+
+    def bound(self, gain: Array) -> Array:
+        """Trace of (30) for any K q."""
+        keep = np.eye(self.prior.shape[-1]) - gain @ self.matrix
+        pinned = gain @ self.pinned[..., None]
+        return _trace(
+            self.first * keep @ self.prior @ _transposed(keep)
+            + gain @ self.noise @ _transposed(gain)
+            + pinned @ _transposed(pinned)
+        )
+
+    @property
+    def contraction(self) -> Array:
+        """κ₁ w a² of (42), a the largest singular value of a rotation, which is 1."""
+        keep = np.eye(self.prior.shape[-1]) - self.gain @ self.matrix
+        return self.first * np.linalg.norm(keep, ord=2, axis=(-2, -1)) ** 2
+
+
+def terms(task: Task, history: History) -> Terms:
+    """The terms of (30) in every recorded step of the paper's filter, thresholds zero."""
+    system: Any = task.system
+    centre = system.centre
+    sensors, constants = centre.sensors, centre.filter.constants
+    k1, k2, k3, k4, k5, k6, _, _ = constants.kappa
+    grow, shift = constants.second_moment
+    horizon, _, episodes = history.truth.shape
+    share = centre.feedback.share[:, 0]
+    prior = np.moveaxis(history.prior_covariance, -1, 1)[:, None] / share[:, None, None, None]
+    observed = sensors.measurement_matrix[..., 0][:, None]
+    q = np.moveaxis(history.uncensored, -1, 2)
+    mean = np.moveaxis(history.prior_mean, -1, 1)
+    latent = (observed @ mean[:, None, ..., None])[..., 0]
+    moment = grow * observed @ prior @ _transposed(observed) + shift * _squared(latent)
+    bias = np.moveaxis(history.hazard, -1, 2) * sensors.deviation[:, None, :, 0]
+    time = np.arange(1.0, horizon + 1.0)
+    event = centre.filter.event_error.at(time).T[:, :, None, None]
+    variances = np.diagonal(moment, axis1=-2, axis2=-1)
+    own = (q * sensors.variance[:, None, :, 0] + k3 * q * (1.0 - q) * variances + k6 * event) / q**2
+    silent = ~np.moveaxis(history.granted, -1, 2)
+    noise = np.where(
+        silent[..., None, None], k4 * moment, own[..., None] * np.eye(q.shape[-1])
+    ) + k2 * _squared(bias)
+    held = np.moveaxis(history.held_before, -1, 2) / np.maximum(q, _FLOOR)
+    return Terms(
+        first=k1, prior=np.broadcast_to(prior, (horizon, len(share), episodes, *prior.shape[-2:])),
+        matrix=observed, probability=q, noise=noise,
+        pinned=np.where(silent[..., None], np.sqrt(k5) * held, 0.0), silent=silent,
+    )  # fmt: skip
+
+
+def perturbed(value: Terms, history: History, seed: int) -> dict[str, Array]:
+    """Theorem 2 by trial: other gains, and the library's bound beside (30).
+
+    Per episode (E,), over its steps with q of at least 0.01: ``larger``, the share of gains K + ΔK
+    whose bound has the larger trace, ΔK random and of relative size 10⁻³ to 1; ``difference``, the
+    largest relative difference of the trace from the filter's own.
+    """
+    generator = np.random.default_rng(seed)
+    usable = value.probability.min(-1) >= _UNCENSORED
+    gain = value.gain
+    least = value.bound(gain)
+    size = np.linalg.norm(gain, axis=(-2, -1))[..., None, None]
+    larger = np.zeros(usable.shape)
+    scales = (1e-3, 1e-2, 1e-1, 1.0)
+    for scale in scales:
+        other = gain + scale * size * generator.standard_normal(gain.shape)
+        larger += (value.bound(other) >= least * (1.0 - 1e-12)) / len(scales)
+    library = np.moveaxis(history.local_trace, -1, 2)
+    difference = np.where(usable, np.abs(least / library - 1.0), 0.0)
+    counted = usable.sum((0, 1))
+    return {
+        "larger": np.where(usable, larger, 0.0).sum((0, 1)) / np.maximum(counted, 1),
+        "difference": difference.max((0, 1)), "counted": counted / usable[..., 0].size,
+    }  # fmt: skip
+
+
+def conditioned(value: Terms) -> dict[str, Array]:
+    """Condition (42) by episode (E,): the share of steps in which it holds, of each kind."""
+    holds = value.contraction < 1.0
+    silent = value.silent
+    return {
+        "holds_delivered": (holds & ~silent).sum((0, 1)) / np.maximum((~silent).sum((0, 1)), 1),
+        "holds_silent": (holds & silent).sum((0, 1)) / np.maximum(silent.sum((0, 1)), 1),
+        "least_silent": np.where(silent, value.contraction, np.inf).min((0, 1)),
+    }
+
+
+def claimed(error: Array, bound: Array) -> tuple[Array, Array]:
+    """Largest eigenvalue (H,) of E[z zᵀ], z = P^(-1/2) e, and its standard error.
+
+    At most 1 if the bound holds on average. ``error`` (H, n, E), ``bound`` (H, n, n, E).
+    """
+    root = np.moveaxis(linalg.factor(bound), -1, 1)
+    turned = np.moveaxis(error, 1, -1)[..., None]
+    whitened = np.linalg.solve(root, turned)[..., 0]
+    second = np.einsum("tei,tej->tij", whitened, whitened) / error.shape[-1]
+    values, vectors = np.linalg.eigh(second)
+    along = np.einsum("tei,ti->te", whitened, vectors[..., -1]) ** 2
+    return values[:, -1], along.std(-1, ddof=1) / np.sqrt(error.shape[-1])
+
+
+def _transposed(matrix: Array) -> Array:
+    return np.swapaxes(matrix, -2, -1)
+
+
+def _squared(vector: Array) -> Array:
+    return vector[..., :, None] * vector[..., None, :]
+
+
+def _trace(matrix: Array) -> Array:
+    return np.trace(matrix, axis1=-2, axis2=-1)

@@ -1,0 +1,514 @@
+"""Joint input and state filters under an adaptive threshold: Figures 1 to 7 and the theorems.
+
+Source: unknown_input, Section 4.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullLocator
+from numpy.typing import NDArray
+
+import fusion_gym
+from fusion_gym.arrays import Array
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
+from fusion_gym.systems.unknown_input.environment import UnknownInputOptions
+from fusion_gym.systems.unknown_input.nodes import TableNodes
+from fusion_gym.systems.unknown_input.system import UnknownInputSystem
+
+from ..output import palette
+from . import unknown_input_recursion as recursion
+from .numbers import Number, below, estimate, grid, verdict
+from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
+from .unknown_input_recursion import EXACT_CUTOFF
+
+PRINTED, CARTS = "paper", "two_carts"
+EXAMPLES = (PRINTED, CARTS)
+NAMES = {PRINTED: "the printed example", CARTS: "two carts"}
+TRIGGER = "adaptive_threshold"
+OURS, FIXED = "paper's filter and trigger", "paper's filter, fixed threshold ρ̄"
+WALK = "Kalman filter with a random-walk input, paper's trigger"
+LANES: dict[str, tuple[str, dict[str, Any]]] = {
+    OURS: (TRIGGER, {"filter": "paper"}),
+    FIXED: (TRIGGER, {"filter": "paper"}),
+    "paper's filter, always": ("always", {"filter": "paper"}),
+    "exact filter, always": ("always", {"filter": "predict", "fusion": "exact_ci"}),
+    WALK: (TRIGGER, {"filter": "random_walk"}),
+    "Kalman filter with a random-walk input, always": ("always", {"filter": "random_walk"}),
+}
+KINDS = ("states", "inputs")
+_HOLD = {PRINTED: {"hold_variance": 0.05}}  # as the example's page does
+_TRACKED = 0.1  # of a quantity's mean square: an error below it is called accurate
+_FEW = 0.5  # a rate below it is called a significant reduction
+_GROWN = 1.1  # second half over first half of an episode: more is growth
+_SMALL = 0.2  # ρ̄ over the noise's variance, where (1 + 1/ε) ρ̄ - V is negative
+_FACTOR = {PRINTED: 1.0, CARTS: 0.2}  # ε = ξ, as in the library's examples
+
+
+class Record(NamedTuple):
+    """E episodes of H sampling instants, times first, episodes last.
+
+    ``truth`` (H, s, E) of [x(k); d(k - 1)] · ``local`` (H, l, s, E) the nodes' estimates, ``fused``
+    (H, s, E) · ``held`` (H, l, m, E) the last delivered measurements after the step · ``square``
+    (H, l, E) |σ|² before it · ``granted`` (H, l, E).
+    """
+
+    truth: Array
+    local: Array
+    fused: Array
+    held: Array
+    square: Array
+    granted: NDArray[np.bool_]
+
+    @property
+    def errors(self) -> Array:
+        """Errors (H, l + 1, s, E), the fused estimate first."""
+        every = np.concatenate((self.fused[:, None], self.local), axis=1)
+        return self.truth[:, None] - every
+
+
+def make_example(**options: Any) -> tuple[Task, UnknownInputSystem]:
+    """Return the task of these options with its system."""
+    task = fusion_gym.make_task(UnknownInputOptions(**({"horizon": 100} | options)))
+    assert isinstance(task.system, UnknownInputSystem)
+    return task, task.system
+
+
+def record_run(task: Task, policy: str, episodes: int, seed: int) -> Record:
+    """Run a policy and record what the figures show."""
+    rule = fusion_gym.make_policy(policy, task)
+    batch = EpisodeBatch.seeded(task, episodes, seed)
+    rule.reset(episodes, seed)
+    rows = []
+    for _ in range(task.horizon):
+        apart = batch.state.measurement - batch.state.held
+        outcome = batch.step(rule(batch.signals()))
+        state = batch.delivered
+        means = state.estimates.mean, state.estimates.fused_mean
+        values = (state.truth, *means, state.held, (apart**2).sum(1), outcome.granted)
+        rows.append([np.array(value) for value in values])
+    return Record(*map(np.array, zip(*rows, strict=True)))
+
+
+def halves(value: Array, states: int, axis: int) -> Array:
+    """Sums over the states and over the inputs, stacked along ``axis`` in the place of both."""
+    first, last = np.split(value, [states], axis=axis)
+    return np.stack((first.sum(axis), last.sum(axis)), axis=axis)
+
+
+def leading(errors: Array, bounds: Array) -> Array:
+    """How far errors (H, n, E) fill their bounds (n, n, H): sample (E,) in the worst direction.
+
+    The errors are whitened with the bounds, 1 is what a bound allows; the direction is that in
+    which they are largest over all times and episodes.
+    """
+    root = np.linalg.inv(np.linalg.cholesky(np.moveaxis(bounds, -1, 0)))
+    z = root @ errors
+    moment = np.einsum("hie,hje->ije", z, z) / len(z)
+    direction = np.linalg.eigh(moment.mean(-1))[1][:, -1]
+    return np.einsum("i,ije,j->e", direction, moment, direction)
+
+
+# --- the printed example beside two carts ---------------------------------------------------------
+
+
+def simulate_filters(
+    episodes: int, seed: int, settings: Settings, lanes: tuple[str, ...] = tuple(LANES)
+) -> Data:
+    """Everything by example; ``mse`` (lanes, 2, E) and ``rates`` (lanes, l, E) by lane."""
+    data: Data = {"lanes": list(lanes)}
+    for example in EXAMPLES:
+        result = _example(example, episodes, seed, settings, lanes)
+        data |= {f"{example}_{name}": value for name, value in result.items()}
+    return data
+
+
+def _example(
+    example: str, episodes: int, seed: int, settings: Settings, lanes: tuple[str, ...]
+) -> Data:
+    data: Data = {}
+    mse, rates = [], []
+    for name in lanes:
+        policy, options = LANES[name]
+        policy = settings["policy"] if policy == TRIGGER else policy
+        options = {"example": example} | options | settings["options"]
+        if name == WALK:
+            options |= _HOLD.get(example, {})
+        task, system = make_example(**options)
+        rule = fusion_gym.make_policy(settings["policy"], task)
+        assert isinstance(rule, AdaptiveThreshold)
+        if name == FIXED:
+            task, system = make_example(**(options | {"rho_initial": rule.rho_bar}))
+        record = record_run(task, policy, episodes, seed)
+        mse.append(halves((record.errors[:, 0] ** 2).mean(0), system.plant.size, 0))
+        rates.append(record.granted.mean(0))
+        if name == OURS:
+            data |= _under_the_trigger(system, rule, record)
+        if name == WALK:
+            data["walk"] = record.fused[..., 0]
+    return data | {"mse": np.array(mse), "rates": np.array(rates)}
+
+
+def _under_the_trigger(system: UnknownInputSystem, rule: AdaptiveThreshold, record: Record) -> Data:
+    """The paper's figures, and how far errors fill their bounds.
+
+    Estimates are the fused one, then the nodes'. ``truth`` (H, s), ``local`` (H, l, s), ``fused``
+    (H, s) and ``granted`` (H, l) are of the first episode; ``square`` and ``bound`` (H, l + 1, s)
+    are mean squared errors and bounds; ``each`` (l + 1, 2, E) squared errors and ``filled``
+    (l + 1, 2, E) how far they fill their bounds, of states and inputs; ``power`` (2, E) the mean
+    square of both, ``steady`` (2, E) the fused squared errors in the two halves of the episodes;
+    ``within`` the share of silent steps with |σ|² at most ρ̄; ``rho_range`` the least step of the
+    thresholds and their extremes over ρ₀ and ρ̄; ``settled`` (E,) the judgements after which every
+    threshold is at 99 % of ρ̄ at least.
+    """
+    nodes = system.nodes
+    assert isinstance(nodes, TableNodes)
+    n, errors = nodes.model.size, record.errors
+    bounds = np.concatenate((nodes.fused[None], nodes.tables.covariance))[..., 1:]
+    blocks = (slice(None, n), slice(n, None))
+    filled = [
+        [leading(errors[:, place, block], bounds[place, block, block]) for block in blocks]
+        for place in range(len(bounds))
+    ]
+    sensors = record.square.shape[1]
+    low, high = (rule.column(name, sensors) for name in ("rho_initial", "rho_bar"))
+    levels = [np.broadcast_to(low, record.square.shape[1:])]  # ρ, at first of the first judgement
+    for row in record.square:
+        levels.append(rule.threshold_after(levels[-1], row))
+    rho, silent = np.array(levels), ~record.granted
+    limit = np.broadcast_to(high, rho.shape[1:])
+    steady = [(part[:, 0] ** 2).sum(1).mean(0) for part in np.array_split(errors, 2)]
+    return {
+        "truth": record.truth[..., 0], "local": record.local[..., 0], "fused": record.fused[..., 0],
+        "granted": record.granted[..., 0].astype(np.int64), "square": (errors**2).mean(-1),
+        "bound": np.moveaxis(np.diagonal(bounds, axis1=1, axis2=2), 1, 0),
+        "each": halves((errors**2).mean(0), n, 1), "filled": np.array(filled),
+        "power": halves((record.truth**2).mean(0), n, 0), "steady": np.array(steady),
+        "within": float((record.square <= high)[silent].mean()),
+        "rho_range": [
+            float(np.diff(rho, axis=0).min()),
+            float((rho / low).min()),
+            float((rho / high).max()),
+        ],
+        "settled": (rho < 0.99 * limit).sum(0).max(0).astype(float), "radius": nodes.tables.radius,
+    }  # fmt: skip
+
+
+def _summarise_filters(data: Data) -> Data:
+    """The page's numbers by example, in :data:`EXAMPLES`, and the verdicts."""
+    examples = [_summarise_example(data, example) for example in EXAMPLES]
+    columns = ("rate in %", "MSE of the states", "MSE of the inputs")
+    rows = {
+        f"{NAMES[e]}, {lane}": (100.0 * data[f"{e}_rates"][i].mean(0), *data[f"{e}_mse"][i])
+        for e in EXAMPLES
+        for i, lane in enumerate(data["lanes"])
+    }
+    better = [
+        below(item["each"][0, block], node)
+        for item in examples
+        for block in range(len(KINDS))
+        for node in item["each"][1:, block]
+    ]
+    return {
+        "examples": examples, "columns": columns, "tables": {"settings": grid(columns, rows)},
+        "level": float(np.sqrt(data[f"{PRINTED}_bound"][-1, 0, 2:].sum())),
+        "tracked_below": _TRACKED,
+        "tracked": [verdict([estimate(r).high < _TRACKED]) for r in examples[0]["relative"]],
+        "below_trace": verdict(item["under"] == 1.0 for item in examples),
+        "node_bound": verdict(item["nodes"] <= 1.0 for item in examples),
+        "consistent": verdict(item["fused_fill"] <= 1.0 for item in examples),
+        "mean_square": verdict(
+            [estimate(item["growth"]).low <= _GROWN for item in examples]
+            + [item["radius"] < 1.0 for item in examples]
+        ),
+        "monotone": verdict(
+            least >= 0.0 and low >= 1.0 and high <= 1.0
+            for least, low, high in (item["rho_range"] for item in examples)
+        ),
+        "within_limit": verdict(item["within"] == 1.0 for item in examples), "better": better,
+        "improves": verdict(better),
+        "reduces": verdict(estimate(rate).high < _FEW for rate in examples[0]["rates"]),
+    }  # fmt: skip
+
+
+def _summarise_example(data: Data, example: str) -> Data:
+    start = f"{example}_"
+    part = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
+    ours, fixed, walk = (data["lanes"].index(name) for name in (OURS, FIXED, WALK))
+    power, mse = part["power"].mean(-1), part["mse"]
+    tops = [[estimate(sample).high for sample in place] for place in part["filled"]]
+    states = [entry for entry, _ in _STATES[example]]
+    slack = (part["bound"][:, 0] / part["square"][:, 0]).mean(0)
+    return part | {
+        "name": NAMES[example], "power": power, "relative": mse[ours] / power[:, None],
+        "walk": mse[walk] / power[:, None],
+        "under": float((part["square"] <= part["bound"]).mean()),
+        "nodes": max(max(place) for place in tops[1:]), "fused_fill": max(tops[0]),
+        "radius": float(part["radius"].max()),
+        "growth": part["steady"][1] / part["steady"][0].mean(),
+        "best": [nodes[nodes.mean(-1).argmin()] for nodes in part["each"][1:].swapaxes(0, 1)],
+        "rates": part["rates"][ours], "average": 100.0 * part["rates"][ours].mean(0),
+        "fixed": 100.0 * part["rates"][fixed].mean(0),
+        "root": np.sqrt(part["each"][0].mean(-1)) / np.sqrt(power),  # fused over the quantity's own
+        "slack": slack[states],
+    }  # fmt: skip
+
+
+# --- the printed recursion ------------------------------------------------------------------------
+
+
+def simulate_printed(episodes: int, seed: int, settings: Settings) -> Data:
+    """Readings of the printed example, the gain (20) on the carts, Theorem 1 for a small ρ̄.
+
+    ``node`` (readings, l, 2, E): mean squared errors of state and input; ``trace``
+    (readings, l, E): the mean trace of (18); ``hidden`` (readings, l): the largest residual of
+    (14); ``power`` (2, E): the mean squares of state and input themselves. ``excess``
+    (examples, E) of (18) over its least, ``sent`` and ``silent`` (l, E) traces of Ξ_x on the
+    printed example, ``negative``: the share of silent instants with an indefinite Ξ_x.
+    """
+    data: Data = {"readings": list(recursion.UNKNOWN_INPUT_READINGS)}
+    node, trace, hidden = [], [], []
+    for reading in recursion.UNKNOWN_INPUT_READINGS.values():
+        options, policy = reading.get("options", {}), reading.get("policy", TRIGGER)
+        cutoff = reading.get("cutoff", EXACT_CUTOFF)
+        record, every = _recursion(PRINTED, policy, episodes, seed, cutoff, **options)
+        estimates = [np.moveaxis(each["estimate"], 1, 2) for each in every]
+        errors = record.truth[:, None] - np.stack(estimates, axis=1)
+        node.append(halves((errors**2).mean(0), 2, 1))
+        trace.append([each["trace"].mean(0) for each in every])
+        hidden.append([float(each["hidden"].max()) for each in every])
+    data |= {"node": np.array(node), "trace": np.array(trace), "hidden": hidden}
+    data["power"] = halves((record.truth**2).mean(0), 2, 0)
+    runs = [_recursion(example, TRIGGER, episodes, seed) for example in EXAMPLES]
+    excess = [np.mean([each["excess"].mean(0) for each in every], axis=0) for _, every in runs]
+    record, every = runs[0]
+    traces, granted = np.stack([each["trace"] for each in every], axis=1), record.granted
+    for name, where in (("silent", ~granted), ("sent", granted)):
+        data[name] = np.nanmean(np.where(where, traces, np.nan), axis=0)
+    small = _SMALL * 0.001
+    record, every = _recursion(PRINTED, TRIGGER, episodes, seed, rho_bar=small, rho_initial=small)
+    least = np.stack([each["least"] for each in every], axis=1)
+    paper = make_example(example=PRINTED, filter="paper")[1]
+    every_step = make_example(example=PRINTED, filter="paper", sampling_period=1)[1]
+    negative = float((least[~record.granted] < 0.0).mean())
+    data |= {"excess": np.array(excess), "negative": negative, "small": small}
+    return data | recursion.decoupling(paper, every_step)
+
+
+def _recursion(
+    example: str,
+    policy: str,
+    episodes: int,
+    seed: int,
+    cutoff: float = EXACT_CUTOFF,
+    **options: Any,
+) -> tuple[Record, list[dict[str, Array]]]:
+    """A run, and the printed filter of each node on what the trigger delivered."""
+    task, system = make_example(example=example, filter="paper", **options)
+    usual = make_example(example=example, filter="paper")[0]
+    rho_bar = options.get("rho_bar", float(np.max(usual.policy_defaults[TRIGGER]["rho_bar"])))
+    record = record_run(task, policy, episodes, seed)
+    return record, [
+        recursion.run(model, record.held[:, i], record.granted[:, i], cutoff)
+        for i, model in enumerate(recursion.models(system, _FACTOR[example], rho_bar))
+    ]
+
+
+def _summarise_printed(data: Data) -> Data:
+    node, readings = data["node"], data["readings"]
+    exact = readings.index(recursion.EXACT)
+    state, trace = node[exact, :, 0], data["trace"][exact]
+    power = data["power"].mean(-1)
+    share = node.mean(-1) / power[:, None].T
+    inverted, partly, small = recursion.INVERTED, recursion.PARTLY, recursion.DEVIATIONS
+    selected = {"inverted": inverted, "partly": partly, "small": small}
+    least = share[:, :, 1].min(1)
+    columns = [f"node {i + 1}, {kind}" for kind in KINDS for i in range(node.shape[1])]
+    return {
+        "tables": {
+            "readings": [
+                Number.of(f"{reading}: node {i + 1}, {kind}", node[place, i, block])
+                for place, reading in enumerate(readings)
+                for block, kind in enumerate(KINDS)
+                for i in range(node.shape[1])
+            ]
+        },
+        "columns": columns, "power": power, "residual": max(data["hidden"][exact]),
+        "below_trace": list(zip(state.mean(-1), trace.mean(-1), strict=True)),
+        "tighter": 100.0 * (data["silent"].mean(-1) / data["sent"].mean(-1) - 1.0),
+        "excess": 100.0 * data["excess"].mean(-1), "floor": np.sqrt(np.array(data["floor"])),
+        "share": {name: share[readings.index(selected[name]), :, 0] for name in selected},
+        "partly": data["hidden"][readings.index(partly)][0], "best": least.min(),
+        "where": readings[least.argmin()],
+        "decouples": "holds" if data["rank"] == data["columns"] else "does not hold",
+        "hides": verdict([max(data["hidden"][exact]) < 1e-6]),
+        "bounds": verdict(
+            [*(below(own, claim) for own, claim in zip(state, trace, strict=True)),
+             data["negative"] == 0.0]
+        ),
+        "minimises": verdict(abs(each) < 1e-6 for each in data["excess"].mean(-1)),
+        "input_columns": data["columns"],
+    }  # fmt: skip
+
+
+# --- figures --------------------------------------------------------------------------------------
+
+Entries = Mapping[str, Sequence[tuple[int, str]]]
+# Entries of [x; d] that stand for the paper's: what each is called, and its unit.
+_STATES: Entries = {
+    PRINTED: ((0, "$x^1$"), (1, "$x^2$")),
+    CARTS: ((0, "cart 1 (m)"), (2, "cart 2 (m)")),
+}
+_INPUTS: Entries = {PRINTED: ((2, "$d^1$"), (3, "$d^2$")), CARTS: ((4, "force (N)"),)}
+_TITLES = {PRINTED: "printed example", CARTS: "two carts"}
+_WALK = "Kalman filter, random-walk input"
+
+
+def _time(data: Data) -> NDArray[np.int64]:
+    return np.arange(1, len(data[f"{PRINTED}_truth"]) + 1)
+
+
+def _curves(axis: Any, data: Data, example: str, entry: int) -> None:
+    """Truth, nodes, fused estimate and the Kalman filter; the fused and true values fill it."""
+    time = _time(data)
+    truth, fused = (data[f"{example}_{name}"][:, entry] for name in ("truth", "fused"))
+    local = data[f"{example}_local"][:, :, entry]
+    axis.plot(time, truth, color=palette.TRUTH, lw=3.2, label="true value")
+    for node in range(local.shape[1]):
+        colour, label = palette.SENSORS[node], f"node {node + 1}"
+        axis.plot(time, local[:, node], color=colour, lw=0.9, label=label)
+    axis.plot(time, fused, color=palette.FUSED, lw=1.8, label="fused")
+    walk = data[f"{example}_walk"][:, entry]
+    axis.plot(time, walk, color=palette.GREEN, lw=1.3, label=_WALK)
+    every = np.concatenate((truth, fused, walk))
+    room = 0.15 * np.ptp(every)
+    axis.set_ylim(every.min() - room, every.max() + room)
+
+
+def _grid(figure: Any, data: Data, rows: int) -> Any:
+    axes = figure.subplots(rows, 2, sharex=True, squeeze=False)
+    for column, example in enumerate(EXAMPLES):
+        axes[0, column].set_title(_TITLES[example], loc="left")
+        axes[-1, column].set_xlabel("sampling instant k")
+        axes[-1, column].set_xlim(0, len(_time(data)))
+    return axes
+
+
+def _legend(figure: Any, axes: Any, columns: int) -> None:
+    """Over all axes, each label once: the truth, the fused estimate, the nodes, the rest."""
+    entries: dict[str, Any] = {}
+    for axis in np.asarray(axes).ravel():
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    ranks = {"true value": 0, "fused": 1}
+    order = sorted(entries, key=lambda label: ranks.get(label, 2 if label[:4] == "node" else 3))
+    handles = [entries[label] for label in order]
+    figure.legend(
+        handles, order, loc="outside upper center", ncols=columns, fontsize=9, columnspacing=1.0
+    )
+
+
+def _draw_estimates(figure: Any, data: Data, entries: Entries) -> None:
+    axes = _grid(figure, data, 2)
+    for column, example in enumerate(EXAMPLES):
+        for row, (entry, label) in enumerate(entries[example]):
+            _curves(axes[row, column], data, example, entry)
+            axes[row, column].set_ylabel(label)
+    if len(entries[CARTS]) == 1:
+        axes[1, 1].remove()
+        axes[0, 1].tick_params(labelbottom=True)
+        axes[0, 1].set_xlabel("sampling instant k")
+        axes = [*axes[:, 0].tolist(), axes[0, 1]]
+    _legend(figure, axes, 6)
+
+
+def _labels(data: Data, example: str) -> list[tuple[str, str]]:
+    nodes = data[f"{example}_square"].shape[1] - 1
+    own = [(f"node {i + 1}", palette.SENSORS[i]) for i in range(nodes)]
+    return [("fused", palette.FUSED), *own]
+
+
+def _draw_bounds(figure: Any, data: Data, entries: Entries, label: str, unit: str) -> None:
+    """Bounds solid, mean squared errors dotted, summed over the entries."""
+    axes = _grid(figure, data, 1)
+    for column, example in enumerate(EXAMPLES):
+        axis, places = axes[0, column], [entry for entry, _ in entries[example]]
+        bound, square = (data[f"{example}_{n}"][..., places].sum(-1) for n in ("bound", "square"))
+        for place, (name, colour) in enumerate(_labels(data, example)):
+            width = 2.2 if place == 0 else 1.3
+            axis.plot(_time(data), bound[:, place], color=colour, lw=width, label=name)
+            axis.plot(_time(data), square[:, place], ":", color=colour, lw=width)
+        axis.set_yscale("log")
+        text = label.format(entries[example][0][1].replace(" (m)", ""))
+        axis.set_ylabel(text + (unit if example == CARTS else ""))
+    axis.plot([], [], "-", color=palette.INK, label="upper bound")
+    axis.plot([], [], ":", color=palette.INK, label="MSE")
+    _legend(figure, axes, 7)
+
+
+def _draw_state_bound(figure: Any, data: Data, place: int) -> None:
+    entries = {example: _STATES[example][place : place + 1] for example in EXAMPLES}
+    _draw_bounds(figure, data, entries, "{}: squared error", " (m²)")
+
+
+def _draw_input_bounds(figure: Any, data: Data) -> None:
+    axes = _grid(figure, data, 1)
+    for column, example in enumerate(EXAMPLES):
+        axis, bound = axes[0, column], data[f"{example}_bound"]
+        for (entry, name), style in zip(_INPUTS[example], ("-", "--"), strict=False):
+            for place, (label, colour) in enumerate(_labels(data, example)):
+                axis.plot(
+                    _time(data), bound[:, place, entry], style, color=colour,
+                    lw=2.2 if place == 0 else 1.3, label=label if style == "-" else None,
+                )  # fmt: skip
+            if example == PRINTED:
+                axis.plot([], [], style, color=palette.INK, label=name)
+        axis.set_yscale("log")
+        axis.set_ylabel("bound" + (" (N²)" if example == CARTS else ""))
+    axes[0, 1].yaxis.set_major_locator(FixedLocator([5.0, 7.0, 10.0, 14.0]))
+    axes[0, 1].yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    axes[0, 1].yaxis.set_minor_locator(NullLocator())
+    _legend(figure, axes, 7)
+
+
+def _draw_instants(figure: Any, data: Data) -> None:
+    axes = _grid(figure, data, 1)
+    for column, example in enumerate(EXAMPLES):
+        axis, granted = axes[0, column], data[f"{example}_granted"].astype(bool)
+        nodes = granted.shape[1]
+        for node in range(nodes):
+            when = _time(data)[granted[:, node]]
+            axis.plot(when, np.full(len(when), node), "|", color=palette.SENSORS[node], ms=16)
+        axis.set_yticks(range(nodes), [f"sensor {node + 1}" for node in range(nodes)])
+        axis.set_ylim(-0.6, nodes - 0.4)
+        axis.grid(False, axis="y")
+
+
+def _figure(draw: Any, height: float, *lanes: str) -> PaperFigure:
+    return PaperFigure("filters", draw, (7.6, height), {"lanes": (OURS, *lanes)})
+
+
+PAPER = Paper(
+    "unknown_input",
+    (
+        Piece("filters", simulate_filters, _summarise_filters, 20.0),
+        Piece("printed", simulate_printed, _summarise_printed, 60.0, 500),
+    ),
+    {
+        "figure_1": _figure(partial(_draw_estimates, entries=_STATES), 5.0, WALK),
+        "figure_2": _figure(partial(_draw_estimates, entries=_INPUTS), 5.0, WALK),
+        "figure_3": _figure(partial(_draw_state_bound, place=0), 3.6),
+        "figure_4": _figure(partial(_draw_state_bound, place=1), 3.6),
+        "figure_5": _figure(_draw_input_bounds, 3.6), "figure_6": _figure(
+            partial(_draw_bounds, entries=_INPUTS, label="trace", unit=" (N²)"), 3.6
+        ),
+        "figure_7": _figure(_draw_instants, 2.6),
+    },
+    "fusion_gym/UnknownInput-v0",
+    {"policy": Parameter(TRIGGER, policy_of(TRIGGER))},
+    ("horizon", "rho_bar", "rho_initial", "adaptation"),
+)  # fmt: skip

@@ -1,1 +1,0 @@
-"""The simulation sections of the five papers, made anew: figures, tables, claims, verdicts."""
