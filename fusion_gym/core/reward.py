@@ -153,7 +153,15 @@ class Reward:
         if self.error == "maximum":
             return np.asarray((self.state_weights * (error * error)).max(0))
         assert not isinstance(self.error, str)
-        values = np.asarray(self.error(error, covariance), dtype=np.float64)
+        try:
+            values = np.asarray(self.error(error, covariance), dtype=np.float64)
+        except TypeError as reason:
+            if reason.__traceback__ is None or reason.__traceback__.tb_next is not None:
+                raise  # from within the function
+            raise ConfigurationError(
+                f"error = {name_of(self.error)!r} is not allowed: it must take errors (n, N) and "
+                f"covariances (n, n, N), and return numbers: {reason}"
+            ) from None
         if values.shape != error.shape[1:] or not np.all(values >= 0.0):
             raise ConfigurationError(
                 f"error = {name_of(self.error)!r} is not allowed: of errors {error.shape} it must "
