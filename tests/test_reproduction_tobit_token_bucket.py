@@ -4,24 +4,16 @@ import numpy as np
 import pytest
 
 import fusion_gym
+from fusion_gym.agents.papers import tobit_token_bucket_runs as runs
 from fusion_gym.agents.papers.numbers import below, cite, percent, verdict
-from fusion_gym.agents.papers.tobit_token_bucket_runs import (
-    TRIGGER,
-    Failing,
-    claimed,
-    perturbed,
-    record_history,
-    scheme,
-    terms,
-)
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.evaluation.intervals import Interval
 
 
 def test_recorded_episodes_are_those_of_the_evaluation() -> None:
-    task = scheme()
-    result = record_history(task, 5, 3)
-    results = run_episodes(task, fusion_gym.make_policy(TRIGGER, task), 5, 3)
+    task = runs.scheme()
+    result = runs.record_history(task, 5, 3)
+    results = run_episodes(task, fusion_gym.make_policy(runs.TRIGGER, task), 5, 3)
     np.testing.assert_allclose(result.fused_error.mean(0), results.mse, rtol=1e-12)
     np.testing.assert_allclose(result.fused_trace.mean(0), results.bound_trace, rtol=1e-12)
     np.testing.assert_array_equal(result.granted.mean(0).T, results.rate)
@@ -31,20 +23,22 @@ def test_recorded_episodes_are_those_of_the_evaluation() -> None:
 
 
 def test_a_failed_sensor_never_sends() -> None:
-    task = scheme()
-    requests = record_history(task, 3, 0, Failing(fusion_gym.make_policy(TRIGGER, task), 1))
+    task = runs.scheme()
+    requests = runs.record_history(
+        task, 3, 0, runs.Failing(fusion_gym.make_policy(runs.TRIGGER, task), 1)
+    )
     assert not requests.requested[:, 1].any()
     assert requests.granted[:, [0, 2]].any()
 
 
 def test_a_wrong_gain_is_reported_from_the_best() -> None:
-    task = scheme()
-    history = record_history(task, 3, 0)
-    results = terms(task, history)
+    task = runs.scheme()
+    history = runs.record_history(task, 3, 0)
+    results = runs.terms(task, history)
     least = results.bound(results.gain)
     assert np.all(results.bound(1.01 * results.gain) > least)
     assert np.all(results.bound(np.zeros_like(results.gain)) > least)
-    result = perturbed(results, history, 0)
+    result = runs.perturbed(results, history, 0)
     assert result["larger"] == pytest.approx(np.ones(3))
     assert result["difference"].max() < 1e-9
 
@@ -55,7 +49,7 @@ def test_a_bound_that_is_too_small_is_found() -> None:
     error = (root @ rng.normal(size=(2, 20_000)))[None]
     bound = np.broadcast_to((root @ root.T)[None, :, :, None], (1, 2, 2, 20_000))
     for factor in (0.5, 1.0, 2.0):
-        value, deviation = claimed(error, factor * bound)
+        value, deviation = runs.claimed(error, factor * bound)
         assert value[0] == pytest.approx(1.0 / factor, abs=5.0 * deviation[0] + 0.02 / factor)
         assert 0.0 < deviation[0] < 0.03 / factor
 

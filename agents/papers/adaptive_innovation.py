@@ -101,7 +101,7 @@ def _readings() -> dict[str, Lane]:
 def simulate_rates(
     episodes: int, seed: int, settings: Settings, readings: Sequence[str] = tuple(_readings())
 ) -> Data:
-    """Rates (readings, sensors, E) of every reading; innovations and requests of the first.
+    """Return rates (readings, sensors, E) of every reading; innovations and requests of the first.
 
     ``changes`` (2, E): shares of the steps after a request, then after silence, in which a
     threshold differs from the step before. ``levels`` (H, sensors) are the thresholds in force.
@@ -205,7 +205,7 @@ def simulate_fusion(
     lanes: Sequence[str] = ("bounds", "scales", "others"),
     fusions: Sequence[str] = FUSIONS,
 ) -> Data:
-    """Everything that Figures 4 to 9 and their claims need, by fusion rule.
+    """Return everything that Figures 4 to 9 and their claims need, by fusion rule.
 
     See :class:`ErrorRecord`. ``lanes`` are groups: the trigger at the bounds of the variances, at
     every noise scale or at the first alone, and two other policies at the bounds.

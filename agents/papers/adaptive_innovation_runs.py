@@ -39,11 +39,6 @@ class Lane(NamedTuple):
     known_start: bool = False
 
 
-def always(signals: Signals, event: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Every sensor, at every step."""
-    return np.ones_like(event)
-
-
 @dataclass(frozen=True, kw_only=True)
 class SideBySide(CorrelatedTrackingSystem):
     """The system with a noise scale for each run, (N,), and runs that begin at the mean, (N,)."""
@@ -55,7 +50,7 @@ class SideBySide(CorrelatedTrackingSystem):
         return self.scales
 
     def start(self, noise: Array) -> CorrelatedTrackingState:
-        """Time 0, as in the system itself but for the runs that begin at the mean."""
+        """Return time 0, as in the system itself but for the runs that begin at the mean."""
         state = super().start(noise)
         truth = np.where(self.known_start, state.mean[0], state.truth)
         return replace(state, truth=truth)
@@ -240,6 +235,6 @@ def _whitened(error: Array, claimed: Array) -> Array:
 
 
 def top(whitened: Array) -> Array:
-    """The sample (E,) along the leading eigenvector of the mean of (n, n, E)."""
+    """Return the sample (E,) along the leading eigenvector of the mean of (n, n, E)."""
     direction = np.linalg.eigh(whitened.mean(-1))[1][:, -1]
     return np.einsum("i,ijk,j->k", direction, whitened, direction)

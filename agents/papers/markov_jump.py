@@ -102,7 +102,7 @@ def run_markov_jump(task: Task, policy: str, episodes: int, seed: int) -> Run:
 
 
 def simulate_schedule(episodes: int, seed: int, settings: Settings) -> Data:
-    """Schedules and traces of one run, for none depends on the data."""
+    """Return schedules and traces of one run, for none depends on the data."""
     lanes, options = _lanes(settings), settings["options"]
     task = example(**({"horizon": _LONG} | options))
     short = example(**({"horizon": _SHOWN} | options))
@@ -133,7 +133,7 @@ def simulate_schedule(episodes: int, seed: int, settings: Settings) -> Data:
 
 
 def period_of(values: Array) -> int | None:
-    """After how many steps values (H,) repeat themselves at their end; None if they do not."""
+    """Return the period of values (H,) at their end; None if they do not repeat themselves."""
     last = values[-_LAST:]
     for period in range(1, _LAST // 3):
         if np.abs(last[period:] - last[:-period]).max() <= _SETTLED * np.abs(last).max():
@@ -182,7 +182,7 @@ def _summarise_schedule(data: Data) -> Data:
 
 
 def simulate_tracking(episodes: int, seed: int, settings: Settings) -> Data:
-    """Estimates of one episode and root mean square errors at every threshold."""
+    """Return estimates of one episode and root mean square errors at every threshold."""
     task, lanes = example(**settings["options"]), _lanes(settings)
     runs = (run_markov_jump(task, policy, episodes, seed) for policy in lanes.values())
     rows = []
@@ -224,7 +224,7 @@ def _summarise_tracking(data: Data) -> Data:
 
 
 def simulate_theorems(episodes: int, seed: int, settings: Settings) -> Data:
-    """Actual and claimed covariances of nodes and centre; the printed recursion beside ours.
+    """Return actual and claimed covariances of nodes and centre; the printed recursion beside ours.
 
     The first threshold must be 0, where all is sent.
     """
@@ -292,7 +292,7 @@ def _summarise_theorems(data: Data) -> Data:
 
 
 def simulate_others(episodes: int, seed: int, settings: Settings) -> Data:
-    """Mean squared errors of random requests and the best schedules at the trigger's packets."""
+    """Return errors of random requests and of the best schedules at the trigger's packets."""
     task = example()
     paper, chance, rates, packets, best = [], [], [], [], []
 

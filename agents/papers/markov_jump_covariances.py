@@ -14,7 +14,7 @@ from fusion_gym.arrays import Array
 
 
 def covariances(system: Any, sent: NDArray[np.bool_], swapped: bool) -> Array:
-    """Σ(k) (H + 1, l n, l n) at k = 0..H, where ``sent`` (H, l) is what was sent at k = 1..H.
+    """Return Σ(k) (H + 1, l n, l n) at k = 0..H; ``sent`` (H, l) is what was sent at k = 1..H.
 
     ``swapped`` takes the third term of (46) as it is printed, with the indices i and j of the
     first; otherwise it is the transposed second term of the pair (j, i), as its derivation wants.

@@ -58,7 +58,7 @@ def _oscillator(settings: Settings, **options: Any) -> Task:
 
 
 def simulate_oscillator(episodes: int, seed: int, settings: Settings) -> Data:
-    """One run, what its estimators hold by (4), and the RMSE of both filters."""
+    """Return one run, what its estimators hold by (4), and the RMSE of both filters."""
     tasks = {name: _oscillator(settings, **options) for name, options in _BOTH.items()}
     result = _curves(tasks, episodes, seed, settings)
     for name, task in tasks.items():
@@ -74,7 +74,7 @@ def simulate_oscillator(episodes: int, seed: int, settings: Settings) -> Data:
 
 
 def simulate_target(episodes: int, seed: int, settings: Settings) -> Data:
-    """The RMSE of both filters."""
+    """Return the RMSE of both filters."""
     env, options = runs.TRACKING, settings["options"]
     tasks = {name: fusion_gym.make_task(env, **own, **options) for name, own in _BOTH.items()}
     return _curves(tasks, episodes, seed, settings) | {"floor": runs.floor(env, **options)}
@@ -147,7 +147,7 @@ def _summarise_target(data: Data) -> Data:
 
 
 def simulate_nodes(episodes: int, seed: int, settings: Settings) -> Data:
-    """Local filters of a single sensor, and as nodes to which the fused estimate is fed back."""
+    """Return errors of local filters: of a single sensor, and as nodes of the fused estimate."""
     task = _oscillator(settings)
     policy = make_policy(settings["policy"], task)
     fused, local = runs.node_squares(task, policy, episodes, seed)
@@ -208,7 +208,7 @@ def _summarise_nodes(data: Data) -> Data:
 def simulate_tables(
     episodes: int, seed: int, settings: Settings, tables: Sequence[str] = ("table_2", "table_3")
 ) -> Data:
-    """The rows of both tables, by the paper's filter and by the assumed-density filter.
+    """Return the rows of both tables, by the paper's filter and by the assumed-density filter.
 
     Both begin with the first interval and the first variance.
     """
@@ -338,7 +338,7 @@ def _moves(rows: list[Data], end: str, sign: float) -> Data:
 
 
 def simulate_tobit_readings(episodes: int, seed: int, settings: Settings) -> Data:
-    """ARMSE of every reading at the widest and the narrowest interval."""
+    """Return ARMSE of every reading at the widest and the narrowest interval."""
     data: Data = {}
     for reading in runs.ROUND_ROBIN_READINGS:
         for limit in (5.0, 0.5):

@@ -51,12 +51,12 @@ class SingleSensor:
 
 
 def round_robin(task: Task) -> Policy:
-    """The policy that the paper runs."""
+    """Return the policy that the paper runs."""
     return fusion_gym.make_policy("round_robin", task)
 
 
 def censored(task: Task) -> CensoredSystem:
-    """The task's system, known for what it is."""
+    """Return the task's system, known for what it is."""
     assert isinstance(task.system, CensoredSystem)
     return task.system
 
@@ -86,7 +86,7 @@ def walk(
 
 
 def squares(task: Task, policy: Policy, episodes: int, seed: int) -> Array:
-    """Squared errors (episodes, H, states) of the fused estimate."""
+    """Return squared errors (episodes, H, states) of the fused estimate."""
     values = np.empty((episodes, task.horizon, STATES))
 
     def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
@@ -97,7 +97,7 @@ def squares(task: Task, policy: Policy, episodes: int, seed: int) -> Array:
 
 
 def node_squares(task: Task, policy: Policy, episodes: int, seed: int) -> tuple[Array, Array]:
-    """Squared errors of the fused estimate, and (episodes, H, sensors, states) of the nodes."""
+    """Return squared errors, fused and (episodes, H, sensors, states) of the nodes."""
     fused = np.empty((episodes, task.horizon, STATES))
     local = np.empty((episodes, task.horizon, task.sensors, STATES))
 
@@ -111,14 +111,14 @@ def node_squares(task: Task, policy: Policy, episodes: int, seed: int) -> tuple[
 
 
 def held_values(task: Task, policy: Policy, seed: int) -> Array:
-    """What the estimators hold (H, sensors) in the first run, by equation (4)."""
+    """Return what the estimators hold (H, sensors) in the first run, by equation (4)."""
     rows: list[Array] = []
     walk(task, policy, 1, seed, lambda batch, *_: rows.append(batch.delivered.held[:, 0, 0].copy()))
     return np.array(rows)
 
 
 def resampled(episodes: int, seed: int = 0) -> Array:
-    """Weights (resamples, episodes) with sum 1 of bootstrap samples of the episodes."""
+    """Return weights (resamples, episodes) with sum 1 of bootstrap samples of the episodes."""
     drawn = np.random.default_rng(seed).multinomial(
         episodes, np.full(episodes, 1.0 / episodes), size=_RESAMPLES
     )
@@ -126,7 +126,7 @@ def resampled(episodes: int, seed: int = 0) -> Array:
 
 
 def armse(squared: Array) -> dict[str, list[float]]:
-    """The paper's ARMSE a state: mean over time of the root of the mean over runs.
+    """Return the paper's ARMSE a state: mean over time of the root of the mean over runs.
 
     ``mean``, ``low`` and ``high`` of the 95 % bootstrap interval over episodes, and ``spread``, the
     standard deviation of what so many runs as the paper's would give.
@@ -142,7 +142,7 @@ def armse(squared: Array) -> dict[str, list[float]]:
 
 
 def increase(before: Array, after: Array) -> dict[str, list[float]]:
-    """How far :func:`armse` rises a state, from one filter to another on the same seeds.
+    """Return how far :func:`armse` rises a state, from one filter to another on the same seeds.
 
     ``mean``, ``low`` and ``high`` of the 95 % bootstrap interval of the paired difference.
     """
@@ -152,7 +152,7 @@ def increase(before: Array, after: Array) -> dict[str, list[float]]:
 
 
 def medians(squared: Array, state: int = 0) -> tuple[float, Array]:
-    """Median over runs of a run's RMSE of a state, and (resamples,) of bootstrap samples."""
+    """Return median over runs of a run's RMSE of a state, and (resamples,) of bootstrap samples."""
     roots = np.sqrt(squared[..., state].mean(1))
     order = np.argsort(roots)
     reached = np.cumsum(resampled(len(roots))[:, order], axis=1) >= 0.5
@@ -169,26 +169,26 @@ def _drawn(squared: Array) -> Array:
 def armse_number(
     what: str, lists: dict[str, list[float]], state: int, printed: float | None, unit: str = ""
 ) -> Number:
-    """One entry of :func:`armse` beside the printed one."""
+    """Return one entry of :func:`armse` beside the printed one."""
     mean, low, high, spread = (lists[key][state] for key in ("mean", "low", "high", "spread"))
     return Number(what, mean, low, high, printed, spread, unit)
 
 
 def error_curve(squared: Array) -> Array:
-    """RMSE over time with its 95 % interval: (3, H, states), the root mean, its low, its high."""
+    """Return RMSE over time (3, H, states): the root mean, and its 95 % interval."""
     mean = squared.mean(0)
     half = 1.96 * squared.std(0, ddof=1) / np.sqrt(len(squared))
     return np.sqrt(np.stack([mean, np.maximum(mean - half, 0.0), mean + half]))
 
 
 def paired_increase(ours: Array, others: Array) -> Array:
-    """Paired difference of squared errors over time: (2, H, states), mean and standard error."""
+    """Return the paired difference of squared errors (2, H, states): mean, standard error."""
     difference = ours - others
     return np.stack([difference.mean(0), difference.std(0, ddof=1) / np.sqrt(len(difference))])
 
 
 def floor(env: str, **options: Any) -> list[float]:
-    """ARMSE that no filter beats: Kalman's, on the same packets without censoring.
+    """Return ARMSE that no filter beats: Kalman's, on the same packets without censoring.
 
     The system without censoring is linear and Gaussian, so its covariances are the least there
     are, and a clipped packet says no more than the whole one. They follow from the matrices alone.
@@ -216,7 +216,7 @@ class Comparison(NamedTuple):
 
 
 def always_below(difference: Array) -> Comparison:
-    """Whether one curve lies below another at every step, and how often it does.
+    """Return whether one curve lies below another at every step, and how often it does.
 
     ``difference`` (2, H, …) is the mean of the paired differences of squared errors with its
     standard error. It holds if no point has the other order by more than chance and more than half
@@ -233,7 +233,7 @@ def always_below(difference: Array) -> Comparison:
 
 
 def explained(armse: Sequence[float], silent: Sequence[float]) -> list[float]:
-    """Shares of the open-loop variance that an estimate explains, a state each."""
+    """Return shares of the open-loop variance that an estimate explains, a state each."""
     return [1.0 - (first / none) ** 2 for first, none in zip(armse, silent, strict=True)]
 
 
@@ -293,7 +293,7 @@ ROUND_ROBIN_READINGS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
 
 
 def reading_task(reading: str, **options: Any) -> Task:
-    """The oscillator in a reading of :data:`ROUND_ROBIN_READINGS`."""
+    """Return the oscillator in a reading of :data:`ROUND_ROBIN_READINGS`."""
     printed, changed = ROUND_ROBIN_READINGS[reading]
     task = fusion_gym.make_task(OSCILLATOR, **(dict(changed) | options))
     if not printed:

@@ -59,7 +59,7 @@ SHARE = 0.5  # ε of a node, the paper's 1/p
 
 
 def simulate_theory(episodes: int, seed: int, settings: Settings) -> Data:
-    """What the claims of Lemma 1, Theorems 1 and 2 and the remarks are judged by."""
+    """Return what the claims of Lemma 1, Theorems 1 and 2 and the remarks are judged by."""
     return {
         **_lemma(episodes, seed),
         **{
@@ -206,7 +206,7 @@ class BoundRecursion:
     value: Array = field(default_factory=lambda: np.zeros(0), init=False)
 
     def moved(self, stored: Array, share: Array | float = 1.0) -> Array:
-        """A ``stored`` Aᵀ and the process covariance, of which the lower bound may take a share."""
+        """Return A ``stored`` Aᵀ and a ``share`` of the process covariance."""
         model = censored(self.task).model
         process = model.process_covariance * self.inflation
         return linalg.congruence(model.transition, stored) + share * process
@@ -264,7 +264,7 @@ class Lower(BoundRecursion):
 def failures(
     task: Task, policy: Policy, episodes: int, seed: int, bounds: Sequence[Upper | Lower]
 ) -> tuple[Array, Array]:
-    """Shares of an episode's steps in which a bound fails.
+    """Return shares of an episode's steps in which a bound fails.
 
     Of Theorem 4, (bounds, episodes); of Theorem 5, (pairs, episodes), for pairs of bounds of both
     sensors in the order in which they stand.
@@ -309,7 +309,7 @@ def _seen(task: Task, batch: EpisodeBatch, sensor: int) -> Censoring:
 
 
 def matrix_below(first: Array, second: Array) -> NDArray[np.bool_]:
-    """Whether (N,) ``first`` ≤ ``second``, both (n, n, N), up to rounding; NaN bounds nothing."""
+    """Return whether (N,) ``first`` ≤ ``second`` (n, n, N) but for rounding; NaN bounds nothing."""
     scale = np.maximum(linalg.trace(np.abs(first)), linalg.trace(np.abs(second)))
     gap = linalg.add_diagonal(second - first, np.broadcast_to(1e-9 * scale, second.shape[1:]))
     return np.asarray(np.isfinite(linalg.cholesky(gap)).all((0, 1)))
@@ -321,7 +321,7 @@ def _joined(parts: list[Array]) -> Array:
 
 
 def simulate_bounds(episodes: int, seed: int, settings: Settings) -> Data:
-    """Failures of the bounds of Theorems 4 and 5 in both examples, and in the narrow interval.
+    """Return failures of the bounds of Theorems 4 and 5, also in the narrow interval.
 
     Shares of failures (episodes,) by example, theorem, end, reading and sensor.
     """

@@ -49,7 +49,7 @@ def _record(episodes: int, seed: int, settings: Settings, **options: Any) -> His
 
 
 def simulate_network(episodes: int, seed: int, settings: Settings) -> Data:
-    """Tokens, events, grants, and the measurements before and after the protocol."""
+    """Return tokens, events, grants, and the measurements before and after the protocol."""
     bucket = scheme(**settings["options"]).bucket
     result = _record(episodes, seed, settings)
     free = _record(episodes, seed, settings, tokens="unlimited")
@@ -104,7 +104,7 @@ def _summarise_network(data: Data) -> Data:
 def simulate_estimates(
     episodes: int, seed: int, settings: Settings, singles: Sequence[int] = _NODES
 ) -> Data:
-    """States, local and fused estimates, and how far they fluctuate from step to step.
+    """Return states, local and fused estimates, and how far they fluctuate from step to step.
 
     ``singles`` are the sensors whose filters also run without the others.
     """
@@ -156,7 +156,7 @@ def _summarise_estimates(data: Data) -> Data:
 
 
 def simulate_errors(episodes: int, seed: int, settings: Settings) -> Data:
-    """Squared errors and traces of the bounds, local and fused."""
+    """Return squared errors and traces of the bounds, local and fused."""
     history = _record(episodes, seed, settings)
     result: Data = {}
     for name in _CURVES:
@@ -201,7 +201,7 @@ def _summarise_errors(data: Data) -> Data:
 
 
 def simulate_bucket_theorems(episodes: int, seed: int, settings: Settings) -> Data:
-    """Bounds, gains and condition (42) on recorded episodes; long runs, starved runs, failures."""
+    """Return bounds, gains and condition (42); errors of long runs, starved runs, failures."""
     task, few = scheme(), max(2, episodes // 10)
     result = record_history(task, episodes, seed)
     gaps = [result.truth - result.mean, *(result.truth - result.local_mean[:, m] for m in _NODES)]
@@ -274,7 +274,7 @@ def _summarise_bucket_theorems(data: Data) -> Data:
 
 
 def simulate_bucket_readings(episodes: int, seed: int, settings: Settings) -> Data:
-    """Local and fused squared errors under every reading."""
+    """Return local and fused squared errors under every reading."""
     local, fused, share = [], [], []
     for options in READINGS.values():
         result = record_history(scheme(**options), episodes, seed)

@@ -91,7 +91,7 @@ class Failing:
 
 
 def scheme(**options: Any) -> Task:
-    """The paper's example with other ``options`` where they are named."""
+    """Return the paper's example with other ``options`` where they are named."""
     return fusion_gym.make_task(TobitOscillatorOptions(**options))
 
 
@@ -156,7 +156,7 @@ class Terms(NamedTuple):
         return cross @ (inverse - turned / size @ _transposed(turned))
 
     def bound(self, gain: Array) -> Array:
-        """Trace of (30) for any K q."""
+        """Return trace of (30) for any K q."""
         keep = np.eye(self.prior.shape[-1]) - gain @ self.matrix
         pinned = gain @ self.pinned[..., None]
         return _trace(
@@ -173,7 +173,7 @@ class Terms(NamedTuple):
 
 
 def terms(task: Task, history: History) -> Terms:
-    """The terms of (30) in every recorded step of the paper's filter, thresholds zero."""
+    """Return the terms of (30) in every recorded step of the paper's filter, thresholds zero."""
     system: Any = task.system
     centre = system.centre
     sensors, constants = centre.sensors, centre.filter.constants
@@ -205,7 +205,7 @@ def terms(task: Task, history: History) -> Terms:
 
 
 def perturbed(value: Terms, history: History, seed: int) -> dict[str, Array]:
-    """Theorem 2 by trial: other gains, and the library's bound beside (30).
+    """Return Theorem 2 by trial: other gains, and the library's bound beside (30).
 
     Per episode (E,), over its steps with q of at least 0.01: ``larger``, the share of gains K + ΔK
     whose bound has the larger trace, ΔK random and of relative size 10⁻³ to 1; ``difference``, the
@@ -231,7 +231,7 @@ def perturbed(value: Terms, history: History, seed: int) -> dict[str, Array]:
 
 
 def conditioned(value: Terms) -> dict[str, Array]:
-    """Condition (42) by episode (E,): the share of steps in which it holds, of each kind."""
+    """Return condition (42) by episode (E,): the share of steps in which it holds, of each kind."""
     holds = value.contraction < 1.0
     silent = value.silent
     return {
@@ -242,7 +242,7 @@ def conditioned(value: Terms) -> dict[str, Array]:
 
 
 def claimed(error: Array, bound: Array) -> tuple[Array, Array]:
-    """Largest eigenvalue (H,) of E[z zᵀ], z = P^(-1/2) e, and its standard error.
+    """Return largest eigenvalue (H,) of E[z zᵀ], z = P^(-1/2) e, and its standard error.
 
     At most 1 if the bound holds on average. ``error`` (H, n, E), ``bound`` (H, n, n, E).
     """

@@ -95,13 +95,13 @@ def record_run(task: Task, policy: str, episodes: int, seed: int) -> Record:
 
 
 def halves(value: Array, states: int, axis: int) -> Array:
-    """Sums over the states and over the inputs, stacked along ``axis`` in the place of both."""
+    """Return sums over the states and over the inputs, stacked along ``axis``."""
     first, last = np.split(value, [states], axis=axis)
     return np.stack((first.sum(axis), last.sum(axis)), axis=axis)
 
 
 def leading(errors: Array, bounds: Array) -> Array:
-    """How far errors (H, n, E) fill their bounds (n, n, H): sample (E,) in the worst direction.
+    """Return how far errors (H, n, E) fill bounds (n, n, H): (E,) in the worst direction.
 
     The errors are whitened with the bounds, 1 is what a bound allows; the direction is that in
     which they are largest over all times and episodes.
@@ -119,7 +119,7 @@ def leading(errors: Array, bounds: Array) -> Array:
 def simulate_filters(
     episodes: int, seed: int, settings: Settings, lanes: tuple[str, ...] = tuple(LANES)
 ) -> Data:
-    """Everything by example; ``mse`` (lanes, 2, E) and ``rates`` (lanes, l, E) by lane."""
+    """Return all by example, ``mse`` (lanes, 2, E) and ``rates`` (lanes, l, E) by lane too."""
     data: Data = {"lanes": list(lanes)}
     for example in EXAMPLES:
         result = _example(example, episodes, seed, settings, lanes)
@@ -262,7 +262,7 @@ def _summarise_example(data: Data, example: str) -> Data:
 
 
 def simulate_printed(episodes: int, seed: int, settings: Settings) -> Data:
-    """Readings of the printed example, the gain (20) on the carts, Theorem 1 for a small ρ̄.
+    """Return readings of the printed example, the gain (20) on the carts, Theorem 1 for a small ρ̄.
 
     ``node`` (readings, l, 2, E): mean squared errors of state and input; ``trace``
     (readings, l, E): the mean trace of (18); ``hidden`` (readings, l): the largest residual of

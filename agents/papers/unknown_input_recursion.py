@@ -43,7 +43,7 @@ class Model(NamedTuple):
 
 
 def models(system: UnknownInputSystem, factor: float, rho_bar: float) -> list[Model]:
-    """Of every node."""
+    """Return the model of every node."""
     model, sensors, plant = system.nodes.model, system.nodes.sensors, system.plant
     n = plant.size
     lifted = (plant.transition, plant.input_matrix, plant.process_covariance)
@@ -54,7 +54,7 @@ def models(system: UnknownInputSystem, factor: float, rho_bar: float) -> list[Mo
 
 
 def gains(model: Model, bound: Array, silent: NDArray[np.bool_], cutoff: float) -> dict[str, Array]:
-    """L, N, Ξ_d and Ξ_x of (17)-(20) from Ξ_x (E, n, n) of the last time, where δ is ``silent``.
+    """Return L, N, Ξ_d, Ξ_x of (17)-(20) from Ξ_x (E, n, n) of the last time; δ is ``silent``.
 
     ``best`` is the gain that minimises the same bound (18) among all that meet (14).
     """
@@ -95,7 +95,7 @@ def _pseudo_inverse(matrix: Array, cutoff: float) -> Array:
 
 
 def run(model: Model, held: Array, granted: NDArray[np.bool_], cutoff: float) -> dict[str, Array]:
-    """A node's filter (8) on held measurements (H, m, E); times first, episodes second.
+    """Run a node's filter (8) on held measurements (H, m, E); times first, episodes second.
 
     ``estimate`` (H, E, s), ``trace`` (H, E) of Ξ_x, ``least`` (H, E) the smallest eigenvalue of
     Ξ_x, ``hidden`` (H, E) the largest entry of ℬ - N C ℬ (14), and ``excess`` (H, E) how much
