@@ -207,8 +207,11 @@ def test_two_trainings_in_one_folder_are_refused(
     tried: list[str] = []
 
     def watch(_: Any) -> bool:
-        for resume in (False, True):
-            with pytest.raises(ConfigurationError, match="is in use by another process") as caught:
+        for resume, message in (
+            (False, "holds a training already"),
+            (True, "is in use by another"),
+        ):
+            with pytest.raises(ConfigurationError, match=message) as caught:
                 run.train(experiment, quiet=True, resume=resume)
             tried.append(str(caught.value))
         return False

@@ -46,14 +46,6 @@ def ranged(values: Sequence[int]) -> str:
     return f"{low:,}" if low == high else f"{low:,} to {high:,}"
 
 
-def table_markup(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """A table and the empty line behind it; nothing without rows."""
-    if not rows:
-        return []
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
-    return [*lines, *(f"| {' | '.join(row)} |" for row in rows), ""]
-
-
 def page_of(text: str, folder: Path, title: str) -> str:
     """The Markdown as one HTML page with the folder's figures inside; HTML in it is text."""
     renderer = markdown.Markdown(extensions=["tables", "toc"])

@@ -62,7 +62,8 @@ def owner_of(policy: Policy) -> Owner | None:
 
 def refused_signals(policy: Policy, task: Task) -> dict[str, str]:
     """Return the signals outside a policy's declared knowledge, and why each is refused."""
-    knower = deprecation.current("knowledge", getattr(policy, "knowledge", KNOWLEDGE[-1]))
+    declared = getattr(policy, "knowledge", None) or KNOWLEDGE[-1]  # without one it reads all
+    knower = deprecation.current("knowledge", declared)
     least = {signal.name: signal for signal in task.system.signals}
     if not task.memory and covers(knower, "own"):
         knower = least_covering((knower, "own_memory"))  # beliefs of the new measurements alone
