@@ -125,6 +125,7 @@ KINDS = "it must be one of 'squared', 'trace', 'maximum', a function, or 'module
      "price_range = 'low' is not allowed: it must be an array of numbers"),
     ({"cost_weight": 0.5, "price_range": SPAN},
      "cost_weight = 0.5 is not allowed: it must lie in price_range = [0.001, 0.1]"),
+    ({"error": np.zeros(0)}, f"error = [] is not allowed: {KINDS}"),
     ({"error": "cubed"}, f"error = 'cubed' is not allowed: {KINDS}"),
     ({"error": lambda error, covariance: 0.0 * error[0] - 1.0},
      "error = 'test_price:<lambda>' is not allowed: of errors (2, 3) it must return numbers "

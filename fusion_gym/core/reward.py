@@ -63,7 +63,7 @@ def _cost(error: str | Cost) -> str | Cost:
         ConfigurationError: neither, or a function that cannot be imported.
     """
     own = import_named("error", error) if isinstance(error, str) and ":" in error else error
-    if own not in ERROR_KINDS and (isinstance(own, str) or not callable(own)):
+    if own not in ERROR_KINDS if isinstance(own, str) else not callable(own):
         listed = ", ".join(repr(kind) for kind in ERROR_KINDS)
         near = validation.nearest(own, ERROR_KINDS) if isinstance(own, str) else None
         hint = f" (did you mean {near!r}?)" if near else ""
