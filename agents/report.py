@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from fusion_gym.validation import read_text
+
 from .command_line import Command
 from .experiments.figures import draw_overview, draw_setting, report_text
 from .experiments.report import read_results, update_pages
-from .input.files import read_text
 from .input.options import OutputFolder
 from .output.files import write_text
 from .output.markup import page_of

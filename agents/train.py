@@ -64,7 +64,7 @@ class Train(Long):
         Raises:
             ConfigurationError: a config or a value that is not allowed.
         """
-        return self._described().changed(
+        return self._base_experiment().changed(
             self.output,
             parse_settings("option", list(chain(*self.options))),
             timesteps=self.timesteps,
@@ -72,7 +72,7 @@ class Train(Long):
             target_rate=self.target_rate,
         )
 
-    def _described(self) -> Experiment:
+    def _base_experiment(self) -> Experiment:
         """Return the config, or one of ``env`` and ``algorithm`` with defaults."""
         if (self.config is None) == (self.env is None):
             raise ConfigurationError(

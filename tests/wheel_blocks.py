@@ -68,7 +68,7 @@ from fusion_gym.agents.__main__ import load
 from fusion_gym.agents.command_line import read_command
 from fusion_gym.agents.input.options import check_options
 from fusion_gym.agents.training.checked import config_path
-from fusion_gym.agents.input.files import read_text
+from fusion_gym.validation import read_text
 for place, folder, (program, name, *words) in json.loads(sys.stdin.read()):
     os.chdir(folder)
     sys.argv, said = [program, *words], io.StringIO()

@@ -18,7 +18,7 @@ LEFT = 0.04  # of the rate that always transmitting gets: where the figure begin
 DEEPEST = 0.3
 WIDEST = 0.4  # of the relative differences that are drawn
 MIXED = "found before"  # no family of one rule
-HEARS = {"none": "hear nothing", "estimate": "hear estimate", "packets": "hear packets"}
+BROADCAST_LABELS = {"none": "hear nothing", "estimate": "hear estimate", "packets": "hear packets"}
 
 
 def report_text(settings: Mapping[str, SettingResults], command: str) -> str:
@@ -65,7 +65,11 @@ def panels_of(results: SettingResults) -> tuple[Panel, list[Panel]]:
 def _title(mode: str, broadcast: str, packet: str) -> str:
     if packet == "estimate":
         return "scheduler,\nsends estimate"
-    return "centre,\nsees no signal" if mode == "centre" else f"sensors alone,\n{HEARS[broadcast]}"
+    return (
+        "centre,\nsees no signal"
+        if mode == "centre"
+        else f"sensors alone,\n{BROADCAST_LABELS[broadcast]}"
+    )
 
 
 def limits_of(results: SettingResults, panels: Sequence[Panel]) -> Limits:

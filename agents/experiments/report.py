@@ -315,7 +315,7 @@ def count_above(settings: Sequence[SettingResults]) -> tuple[int, int]:
 
 
 def knowing_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
-    """Return what knowing more is worth to rules and to agents."""
+    """Return the effect of more knowledge on rules and agents."""
     return pd.DataFrame(
         {"setting": plain_text(item.label), "of": who}
         | {
@@ -343,7 +343,7 @@ def learning_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
 
 
 def headline_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
-    """Return the front page's table: what memory is worth to rules, and what learning is."""
+    """Return the front page's table: the effects of memory on rules and of learning."""
     frame, knowing = learning_frame(settings), knowing_frame(settings)
     memory = knowing[knowing["of"] == "rules"][KNOWING["memory"]].to_numpy()
     frame.insert(1, "rules of a scheduler: memory", memory)

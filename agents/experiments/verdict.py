@@ -326,7 +326,7 @@ def _kind(more: Class, less: Class) -> str | None:
     if more.mode == less.mode and same and more.broadcast == less.broadcast:
         return "memory" if more.memory and not less.memory else None
     if more.memory == less.memory and more.mode == less.mode == "local":
-        return "hearing" if _hears(more) > _hears(less) else None
+        return "hearing" if _broadcast_level(more) > _broadcast_level(less) else None
     if more.memory == less.memory and more.mode == less.mode == "sensors":
         return "packets that hold the estimate" if more.packet == "estimate" and not same else None
     if more.memory == less.memory and same and more.mode == "sensors":
@@ -337,7 +337,7 @@ def _kind(more: Class, less: Class) -> str | None:
     return None
 
 
-def _hears(of: Class) -> int:
+def _broadcast_level(of: Class) -> int:
     return -1 if of.broadcast is None else HEARD.index(of.broadcast)
 
 

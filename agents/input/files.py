@@ -6,7 +6,6 @@ import pydantic
 
 from fusion_gym.errors import display
 from fusion_gym.validation import ConfigurationError
-from fusion_gym.validation import read_text as read_text
 
 Shape = TypeVar("Shape")
 

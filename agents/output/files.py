@@ -14,9 +14,7 @@ from typing import Any
 import numpy as np
 
 from fusion_gym.evaluation.episodes import EpisodeResults
-from fusion_gym.validation import ConfigurationError
-
-from ..input.files import read_text
+from fusion_gym.validation import ConfigurationError, read_text
 
 FIELDS = tuple(EpisodeResults.__dataclass_fields__)
 # What reading a damaged archive raises; RuntimeError where a part says that it is encrypted.

@@ -10,7 +10,7 @@ import pydantic
 from fusion_gym import validation
 from fusion_gym.yaml_text import parsed
 
-from ..input.files import checked, read_text
+from ..input.files import checked
 
 # Beside the folder of the commands, in a clone as in an installed package.
 SHIPPED = Path(__file__).parents[2] / "configs"
@@ -82,7 +82,7 @@ def read_yaml(name: str | Path, option: str = "config") -> Any:
     Raises:
         ConfigurationError: no such file, or no YAML.
     """
-    text = read_text(option, config_path(name, option), str(name))
+    text = validation.read_text(option, config_path(name, option), str(name))
     return parsed(text, f"{option} {str(name)!r}")
 
 

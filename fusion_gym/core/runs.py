@@ -191,7 +191,7 @@ class Runs:
         the steps taken in the episode, ``start`` (N,) bool, ``admitted`` and
         ``grantable`` (sensors, N) bool, ``observation`` (N, entries), and ``model``, the system's
         state without what no policy may know, for policies that plan with the system's own moves;
-        and what is believed (:mod:`fusion_gym.core.signals`).
+        and the beliefs (:mod:`fusion_gym.core.signals`).
         """
         system, state = self.task.system, self.state
         values = dict(system.read(state))
