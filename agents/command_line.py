@@ -33,6 +33,13 @@ PolicyNames = Annotated[
 _Kind = TypeVar("_Kind", bound="Command")
 
 
+def program_of(kind: type[Any]) -> str:
+    """Return the words that run a command."""
+    maintained = ".maintenance." in kind.__module__
+    program = "python -m fusion_gym.agents.maintenance" if maintained else "fusion-gym"
+    return f"{program} {kind.__name__.lower()}"
+
+
 @dataclass(frozen=True)
 class Command(ABC):
     """A command: its fields are its options, its docstring and theirs are its help."""
@@ -94,7 +101,7 @@ class Long(Command):
         """
         more = [*added, *(["--resume"] if "resume" in {item.name for item in fields(self)} else [])]
         words = [word for word in sys.argv[1:] if word not in (*more, *without)]
-        return shlex.join(["fusion-gym", type(self).__name__.lower(), *words, *more])
+        return f"{program_of(type(self))} {shlex.join([*words, *more])}"
 
 
 @dataclass(frozen=True)
@@ -151,7 +158,7 @@ def read_command(kind: type[_Kind]) -> _Kind:
         with contextlib.redirect_stderr(output):
             return tyro.cli(
                 kind,
-                prog=f"fusion-gym {kind.__name__.lower()}",
+                prog=program_of(kind),
                 description=plain_marks(inspect.getmodule(kind).__doc__ or ""),
                 registry=_REGISTRY,
                 config=(tyro.conf.FlagCreatePairsOff,),

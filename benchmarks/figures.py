@@ -74,7 +74,7 @@ def evaluate(env: str, options: Content, names: list[str], episodes: int, folder
 
 
 def reproduce(config: Path, episodes: int, folder: Path) -> bytes:
-    """The table that ``fusion-gym table`` prints."""
+    """The table that the maintainers' command ``table`` prints."""
     words = ("--config", str(config), "--episodes", str(episodes), "--markdown")
     return command("table", *words).encode()
 

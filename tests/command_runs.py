@@ -48,7 +48,7 @@ def call(command: str, words: list[str], seconds: float = 60.0, limit: int | Non
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, longest[1]))
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            everything.main()
+            everything.main(everything.COMMANDS | everything.MAINTENANCE)
     except SystemExit as end:
         status = end.code if isinstance(end.code, int) else 1
         if isinstance(end.code, str):

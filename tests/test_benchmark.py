@@ -19,13 +19,14 @@ from training_configs import small_config
 
 import fusion_gym
 from fusion_gym.agents import __main__ as everything
-from fusion_gym.agents import benchmark, report, solved, tune, zoo
+from fusion_gym.agents import benchmark, report, tune
 from fusion_gym.agents.experiments import training as jobs
 from fusion_gym.agents.experiments.classes import classes_of, trained_classes
 from fusion_gym.agents.experiments.config import load_suite
 from fusion_gym.agents.experiments.references import read_envelopes, searches_of
 from fusion_gym.agents.experiments.report import read_results, read_verdict
 from fusion_gym.agents.experiments.tables import read_frame, read_rows, write_rows
+from fusion_gym.agents.maintenance import solved, zoo
 from fusion_gym.agents.output.files import load_results, save_results
 from fusion_gym.agents.output.markup import code, page_of
 from fusion_gym.agents.training.checked import load_checked

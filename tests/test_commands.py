@@ -1,7 +1,6 @@
 """How commands are called: options, help, errors in one line, configs by their name."""
 
 import dataclasses
-import re
 import subprocess
 import sys
 import typing
@@ -26,7 +25,7 @@ from fusion_gym.validation import ConfigurationError
 ROOT = Path(__file__).parent.parent
 
 
-@pytest.mark.parametrize("name", everything.COMMANDS)
+@pytest.mark.parametrize("name", [*everything.COMMANDS, *everything.MAINTENANCE])
 def test_help_shows_every_option(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -35,10 +34,11 @@ def test_help_shows_every_option(
         everything.load(name).main()
     assert caught.value.code == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert text.startswith(f"usage: fusion-gym {name} ")
-    assert re.search(rf" (fusion-gym|python -m fusion_gym.agents) {name}\b", text[10:]), (
-        "no example"
-    )
+    program = "fusion-gym"
+    if name in everything.MAINTENANCE:
+        program = "python -m fusion_gym.agents.maintenance"
+    assert text.startswith(f"usage: {program} {name} ")
+    assert f" {program} {name} " in text[10:], "no example"
     assert "{None}" not in text
     kind = everything.load(name)
     options = {field.name: field for field in dataclasses.fields(kind)}
@@ -64,13 +64,15 @@ def test_lists_flags_and_negative_numbers_are_read(monkeypatch: pytest.MonkeyPat
 
 
 def test_all_commands_under_one_name() -> None:
-    def run(*words: str) -> subprocess.CompletedProcess[str]:
-        line = [sys.executable, "-m", "fusion_gym.agents", *words]
+    def run(*words: str, package: str = "fusion_gym.agents") -> subprocess.CompletedProcess[str]:
+        line = [sys.executable, "-m", package, *words]
         return subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
 
     assert run("--version").stdout == f"{fusion_gym.__version__}\n"
     listed = run().stdout
     assert all(f"\n  {name} " in listed for name in everything.COMMANDS)
+    assert "\n  bound " not in listed
+    assert "\n  bound " in run(package="fusion_gym.agents.maintenance").stdout
     unknown = run("trian")
     assert unknown.returncode == 2
     assert "did you mean 'train'?" in unknown.stderr

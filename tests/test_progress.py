@@ -22,7 +22,8 @@ EVALUATE = [
     *("--env", "fusion_gym/TobitOscillator-v0", "--set", "horizon=20"),
     *("--policies", "always", "never", "--episodes", "3"),
 ]
-LONG = [name for name in everything.COMMANDS if issubclass(everything.load(name), Long)]
+EVERY = [*everything.COMMANDS, *everything.MAINTENANCE]
+LONG = [name for name in EVERY if issubclass(everything.load(name), Long)]
 
 
 class Clock:
@@ -76,7 +77,7 @@ def test_where_nobody_watches_a_line_is_printed_now_and_then(
 
 
 def test_every_long_command_can_be_quiet() -> None:
-    assert set(everything.COMMANDS) - set(LONG) <= {"report", "export", "reproduce", "list", "info"}
+    assert set(EVERY) - set(LONG) <= {"report", "export", "reproduce", "list", "info"}
 
 
 @pytest.mark.parametrize("name", LONG)
@@ -86,14 +87,15 @@ def test_the_command_that_goes_on_is_one(name: str, monkeypatch: pytest.MonkeyPa
     kind = everything.load(name)
     monkeypatch.setattr(sys, "argv", [f"agents/{name}.py", *words])
     command = command_line.read_command(kind)
-    program, *again = shlex.split(command.again())
-    assert (program, again[0]) == ("fusion-gym", name)
+    program = command_line.program_of(kind)
+    assert command.again().startswith(f"{program} ")
+    again = shlex.split(command.again().removeprefix(program))
     resumes = "resume" in {field.name for field in dataclasses.fields(kind)}
-    assert again[1:] == [*words, *(["--resume"] if resumes else [])]
-    monkeypatch.setattr(sys, "argv", [f"agents/{name}.py", *again[1:]])
+    assert again == [*words, *(["--resume"] if resumes else [])]
+    monkeypatch.setattr(sys, "argv", [f"agents/{name}.py", *again])
     read = command_line.read_command(kind)
     assert read == (dataclasses.replace(command, resume=True) if resumes else command)
-    assert shlex.split(read.again()) == [program, *again]
+    assert read.again() == command.again()
 
 
 def test_an_interrupted_evaluation_says_how_to_go_on(

@@ -121,7 +121,7 @@ def test_the_zoo_takes_a_choice_and_removes_what_is_not_in_it(
         ended = call("zoo", [*words, *wrong])
         assert (ended.status, ended.trace) == (1, "")
         assert message in ended.err
-    monkeypatch.setattr("fusion_gym.agents.zoo.MOST", 200)
+    monkeypatch.setattr("fusion_gym.agents.maintenance.zoo.MOST", 200)
     ended = call("zoo", words)
     assert (ended.status, ended.trace) == (1, "")
     assert "all together must have at most 200; name fewer" in ended.err

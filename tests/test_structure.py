@@ -93,7 +93,7 @@ def test_there_are_no_circles() -> None:
 
 
 # Each part of the agents may import from the parts before its own, and from itself.
-PARTS = ("input", "output", "training", "experiments", "reproduction", "commands")
+PARTS = ("input", "output", "training", "experiments", "papers", "commands")
 
 
 def part_of(path: Path) -> int:

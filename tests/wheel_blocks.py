@@ -27,6 +27,7 @@ from wheel_smoke import copy
 ROOT = Path(__file__).parent.parent
 LIMIT = 60.0  # seconds of the processor for a block; what takes longer belongs into the list
 PATIENCE = 600.0  # seconds until it is ended
+MAINTENANCE = "python -m fusion_gym.agents.maintenance"
 
 
 @dataclass(frozen=True)
@@ -50,10 +51,10 @@ LISTED = (
     Listed("fusion-gym train ", "minutes", "--timesteps 1024"),
     Listed("fusion-gym compare ", "minutes, for more than a hundred policies"),
     Listed("fusion-gym evaluate --env fusion_gym/RemoteEstimation-v0", "minutes", "--episodes 4"),
-    Listed("fusion-gym table ", "minutes, for policies that search for their schedules"),
-    Listed("fusion-gym mismatch ", "half a minute", "--episodes 20"),
+    Listed(f"{MAINTENANCE} table ", "minutes, for policies that search for their schedules"),
+    Listed(f"{MAINTENANCE} mismatch ", "half a minute", "--episodes 20"),
     Listed("fusion-gym watch ", "half a minute, for a film of all of an episode", "--steps 10"),
-    Listed("fusion-gym bound ", "minutes", "--set horizon=20 --episodes 8 --accuracy 0.3"),
+    Listed(f"{MAINTENANCE} bound ", "minutes", "--set horizon=20 --episodes 8 --accuracy 0.3"),
     Listed("fusion-gym envelope", "an hour"),
     Listed("fusion-gym benchmark", "hours, and a cluster that is not here"),
     Listed("fusion-gym report", "draws what hours of fusion-gym benchmark have written"),
@@ -146,8 +147,9 @@ class Pages:
                 text = self._wrong_words(words, environment)
                 if text is not None:
                     return text
-                if words[0] == "fusion-gym":
-                    self.unread.append((block.place, str(folder), words))
+                if words[0] == "fusion-gym" or line.startswith(MAINTENANCE):
+                    own = words if words[0] == "fusion-gym" else words[2:]
+                    self.unread.append((block.place, str(folder), own))
         script = "\n".join(["set -euo pipefail", *lines])
         return _wrong(["bash", "-c", script], environment, folder) if lines else None
 
@@ -168,8 +170,9 @@ class Pages:
             extras = {name for part in text for name in part.split(",")}
             return None if extras <= set(self.wheel.extras) else f"no extras {extras}"
         if words[0] == "python" and words[2] != "pytest":
-            file = Path(*words[2].split(".")).with_suffix(".py")
-            return None if (ROOT / file).exists() else f"no module {words[2]}"
+            path = ROOT.joinpath(*words[2].split("."))
+            there = path.is_dir() or path.with_suffix(".py").exists()
+            return None if there else f"no module {words[2]}"
         there = (environment.programs / words[0]).exists()
         return None if there else f"no program {words[0]}"
 

@@ -66,13 +66,14 @@ assert len(fusion_gym.zoo.names()) > 10
 """
 HELP = """
 import contextlib, io, sys
-from fusion_gym.agents.__main__ import COMMANDS, main
-for name in COMMANDS:
-    sys.argv = ["fusion-gym", name, "--help"]
-    said = io.StringIO()
-    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(said):
-        main()
-    assert said.getvalue().startswith(f"usage: fusion-gym {name} "), said.getvalue()
+from fusion_gym.agents.__main__ import COMMANDS, MAINTENANCE, main
+for commands in COMMANDS, MAINTENANCE:
+    for name in commands:
+        sys.argv = ["fusion-gym", name, "--help"]
+        said = io.StringIO()
+        with contextlib.suppress(SystemExit), contextlib.redirect_stdout(said):
+            main(commands)
+        assert f" {name} [-h] " in said.getvalue().splitlines()[0], said.getvalue()
 """
 WITHOUT_EXTRA = """
 import sys

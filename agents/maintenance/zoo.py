@@ -1,7 +1,6 @@
 """Put the benchmark's best agents into the model zoo, with their cards.
 
-    fusion-gym zoo [--envs NAME …] [--classes NAME …] [--results results]
-                         [--work runs/benchmark/full]
+    python -m fusion_gym.agents.maintenance zoo [--envs NAME …] [--classes NAME …]
 
 For each setting and chosen class the training seed with the best validation return goes into
 ``fusion_gym/zoo``; validation has seeds of its own, so the test numbers stay honest. Agents that
@@ -18,14 +17,14 @@ from typing import Annotated, Any
 from fusion_gym import zoo
 from fusion_gym.validation import ConfigurationError, choice
 
-from .command_line import Long
-from .experiments.classes import HEARD, KNOWS
-from .experiments.config import Mode
-from .experiments.tables import group_by, read_rows
-from .input.options import InputFolder, OutputFolder
-from .output.files import read_json, replacing, write
-from .output.progress import writing
-from .output.small_model import small_model
+from ..command_line import Long
+from ..experiments.classes import HEARD, KNOWS
+from ..experiments.config import Mode
+from ..experiments.tables import group_by, read_rows
+from ..input.options import InputFolder, OutputFolder
+from ..output.files import read_json, replacing, write
+from ..output.progress import writing
+from ..output.small_model import small_model
 
 LARGEST = 300_000  # bytes of a model
 MOST = 4_000_000  # bytes of all of them

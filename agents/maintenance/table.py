@@ -1,6 +1,6 @@
 """Print the documentation's table of filters, triggers and buckets.
 
-    fusion-gym table --config configs/tobit_oscillator_reproduce.yaml
+    python -m fusion_gym.agents.maintenance table --config configs/tobit_oscillator_reproduce.yaml
 
 Every row runs on the same seeds. ``--markdown`` prints the table as the documentation holds it.
 """
@@ -14,12 +14,12 @@ from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.registry import make_policy
 
-from .command_line import Long
-from .experiments.config import SweepSettings
-from .input.options import Episodes, Seed
-from .output import tables
-from .output.progress import progress_bar
-from .training.checked import load_checked
+from ..command_line import Long
+from ..experiments.config import SweepSettings
+from ..input.options import Episodes, Seed
+from ..output import tables
+from ..output.progress import progress_bar
+from ..training.checked import load_checked
 
 COLUMNS = ("setting", "requests", "rate", "MSE", "median", "ARMSE", "trace P", "NEES")
 

@@ -1,6 +1,6 @@
 """Train agents in the solved case and print what they cost above the optimum.
 
-    fusion-gym solved --config configs/remote_estimation_ppo.yaml --seeds 0 1 2
+    python -m fusion_gym.agents.maintenance solved --seeds 0 1 2
 
 Trainings go into ``runs/solved``; a finished one is not repeated, an interrupted one is gone on
 with. Costs are compared on the same test seeds, paired.
@@ -16,16 +16,16 @@ from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Long
-from .experiments.verdict import excess
-from .input.options import Episodes, OutputFolder, Seed, TrainingSeeds
-from .output import tables
-from .output.files import read_json, write
-from .output.folders import fingerprint
-from .output.progress import progress_bar, writing
-from .training.checked import load_checked
-from .training.config import Experiment
-from .training.run import holds_training, train
+from ..command_line import Long
+from ..experiments.verdict import excess
+from ..input.options import Episodes, OutputFolder, Seed, TrainingSeeds
+from ..output import tables
+from ..output.files import read_json, write
+from ..output.folders import fingerprint
+from ..output.progress import progress_bar, writing
+from ..training.checked import load_checked
+from ..training.config import Experiment
+from ..training.run import holds_training, train
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Print what no policy can undercut: floors, and a proven lower bound of the error at each rate.
 
-    fusion-gym bound --env fusion_gym/TobitOscillator-v0 \\
+    python -m fusion_gym.agents.maintenance bound --env fusion_gym/TobitOscillator-v0 \\
         --set filter=tobit random_start=true token_rate=2 --filters tobit adf --rates 0.03 0.1
 
 Rates are transmissions a sensor and step; ``docs/bounds.md`` has the proof and says where it does
@@ -21,12 +21,12 @@ from fusion_gym.policies.settings import parse_settings
 from fusion_gym.solvers.silence import SilenceBound, silence_bound, silence_model
 from fusion_gym.validation import choice
 
-from .command_line import Long, SetOptions
-from .experiments.tables import write_rows
-from .input.options import Between, Episodes, OutputFile, OutputFolder, Seed, Whole
-from .output import tables as terminal
-from .output.files import write
-from .output.progress import progress_bar, writing
+from ..command_line import Long, SetOptions
+from ..experiments.tables import write_rows
+from ..input.options import Between, Episodes, OutputFile, OutputFolder, Seed, Whole
+from ..output import tables as terminal
+from ..output.files import write
+from ..output.progress import progress_bar, writing
 
 _WEIGHTS = ("mse", "reward")
 

@@ -1,7 +1,9 @@
 """Measure whether a training may take the mismatch for the error: the cross term, in a setting.
 
-    fusion-gym mismatch --env fusion_gym/UnknownInput-v0 --set token_rate=2
-    fusion-gym mismatch --config correlated_tracking_front --episodes 2000
+    python -m fusion_gym.agents.maintenance mismatch \\
+        --env fusion_gym/UnknownInput-v0 --set token_rate=2
+    python -m fusion_gym.agents.maintenance mismatch \\
+        --config correlated_tracking_front --episodes 2000
 
 The error ‖x - x̂‖² of the centre's estimate x̂ is a floor ‖x - x*‖², a mismatch ‖x* - x̂‖² and a
 cross term, with x* the estimate that takes in every measurement. ``training.error: mismatch`` is
@@ -20,12 +22,12 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.cross_term import CrossTerm, cross_terms, usual_policies, worst
 from fusion_gym.policies.registry import make_policy
 
-from .command_line import Long, PolicyNames, SetOptions
-from .input.options import OutputFile, Seed, Whole
-from .output import tables
-from .output.files import write
-from .output.progress import progress_bar, writing
-from .training.environment import environment_of
+from ..command_line import Long, PolicyNames, SetOptions
+from ..input.options import OutputFile, Seed, Whole
+from ..output import tables
+from ..output.files import write
+from ..output.progress import progress_bar, writing
+from ..training.environment import environment_of
 
 
 @dataclass(frozen=True)

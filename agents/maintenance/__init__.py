@@ -1,0 +1,1 @@
+"""Commands of the maintainers: what makes tables and models of the documentation."""
