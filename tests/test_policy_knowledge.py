@@ -211,6 +211,12 @@ LIARS: dict[str, tuple[Liar, str]] = {
         Liar("own_memory", lambda s: s["transmission_value"] - 0.1, "scheduler"),
         OTHERS,
     ),
+    "plans_with_the_model": (Liar("centre", lambda s: s["model"].age), MEASUREMENTS),
+    "believes_for_others": (
+        Liar("own_memory", lambda s: s["beliefs"].value(), "scheduler"),
+        OTHERS,
+    ),
+    "is_shown_rows": (Liar("clock", lambda s: s["observation"].T[:2]), ANYTHING),
     "knows_the_truth": (Liar("scheduler", lambda s: dug_up(s, "truth")), HIDDEN),
     "knows_losses": (Liar("scheduler_memory", lambda s: dug_up(s, "lost")), HIDDEN),
 }
@@ -223,6 +229,9 @@ REFUSED = {
     "keeps_what_it_measured": "own_value",
     "keeps_what_all_measured": "transmission_value",
     "remembers_with_all": "transmission_value",
+    "plans_with_the_model": "model",
+    "believes_for_others": "beliefs",
+    "is_shown_rows": "observation",
 }
 
 

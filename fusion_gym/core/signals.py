@@ -23,7 +23,12 @@ MEMORY_SIGNALS = (
     Signal("own_difference", "own_memory", "(sensors, n, N)", "the same as each sensor knows it"),
     Signal("own_value", "own_memory", "(sensors, N)", "the same as each sensor knows it"),
 )
-
+# For policies that plan, and for saved agents.
+PLANNING_SIGNALS = (
+    Signal("model", "scheduler", "a state", "the system's state without what no policy may know"),
+    Signal("beliefs", "scheduler_memory", "beliefs", "what the scheduler believes of the state"),
+    Signal("own_beliefs", "own_memory", "beliefs", "what each sensor believes of the state"),
+)
 
 _OWN = ("own_beliefs", "own_difference", "own_value")
 _EVERY = ("beliefs", "belief_difference", "transmission_value")

@@ -14,7 +14,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.beliefs import Beliefs, Estimate
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Policy, owner_of
+from fusion_gym.policies.base import Policy, owner_of, refused_signals
 from fusion_gym.validation import ConfigurationError
 
 Runs = NDArray[np.int64]
@@ -57,10 +57,14 @@ def run_beside(task: Task, policies: Sequence[Policy], episodes: int, seed: int)
     for policy in policies:
         policy.reset(episodes, seed)
     parts = np.arange(runs).reshape(len(policies), episodes)
+    refused = [refused_signals(policy, task) for policy in policies]
     mse, rate = np.zeros(runs), np.zeros(runs)
     for _ in range(task.horizon):
         signals = _Whole(batch.signals())
-        request = [policy(signals.part(part)) for policy, part in zip(policies, parts, strict=True)]
+        request = [
+            policy(signals.part(part).limit(withheld))
+            for policy, part, withheld in zip(policies, parts, refused, strict=True)
+        ]
         outcome = batch.step(np.concatenate(request, axis=-1))
         mse += outcome.squared_error.sum(0)
         rate += outcome.granted.mean(0)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from fusion_gym import deprecation, linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.memory import Owner
-from fusion_gym.core.signals import MEMORY_SIGNALS
-from fusion_gym.core.system import KNOWLEDGE, Knowledge, Signals, covers, least_covering
+from fusion_gym.core.signals import MEMORY_SIGNALS, PLANNING_SIGNALS
+from fusion_gym.core.system import KNOWLEDGE, Knowledge, Signal, Signals, covers, least_covering
 from fusion_gym.core.task import Task
 
 Requests = NDArray[np.bool_]
@@ -67,7 +67,9 @@ def refused_signals(policy: Policy, task: Task) -> dict[str, str]:
     least = {signal.name: signal for signal in task.system.signals}
     if not task.memory and covers(knower, "own"):
         knower = least_covering((knower, "own_memory"))  # beliefs of the new measurements alone
-    least |= {signal.name: signal for signal in MEMORY_SIGNALS}
+    least |= {signal.name: signal for signal in (*MEMORY_SIGNALS, *PLANNING_SIGNALS)}
+    node: Knowledge = "own" if covers(task.knowledge, "own") else task.knowledge
+    least["observation"] = Signal("observation", node, "(N, entries)", "rows of every class")
     return {
         name: f"signal {name!r} belongs to the class {signal.knowledge!r}, and the policy "
         f"{type(policy).__name__} declares knowledge = {policy.knowledge!r}: declare a class that "
