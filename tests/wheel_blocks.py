@@ -15,7 +15,9 @@ import shlex
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -25,7 +27,7 @@ from wheel_environments import Absent, Environment, Wheel, build
 from wheel_smoke import copy
 
 ROOT = Path(__file__).parent.parent
-LIMIT = 60.0  # seconds of the processor for a block; what takes longer belongs into the list
+LIMIT = 60.0  # seconds for a block; what takes longer belongs into the list
 PATIENCE = 600.0  # seconds until it is ended
 MAINTENANCE = "python -m fusion_gym.agents.maintenance"
 
@@ -103,9 +105,9 @@ class Pages:
         stray = stray_commands(page, text)
         self.failed += [f"{item}: a command outside of a shell block" for item in stray]
         for place, block in enumerate(blocks):
-            began = seconds()
+            began = time.monotonic()
             output = self._run(block, blocks[place + 1 :], folder)
-            taken = seconds() - began
+            taken = time.monotonic() - began
             if output is None and taken > LIMIT:
                 output = f"takes {taken:.0f} s: it belongs into LISTED of {Path(__file__).name}"
             if output is not None:
@@ -177,11 +179,6 @@ class Pages:
         return None if there else f"no program {words[0]}"
 
 
-def seconds() -> float:
-    """Of the processor, of this process and of what has ended."""
-    return sum(os.times()[:4])
-
-
 def _wrong(words: list[str], environment: Environment, folder: Path) -> str | None:
     """What a program said, if it did not end well."""
     try:
@@ -230,14 +227,17 @@ def run_pages(pages: Sequence[Path], wheel: Path | None) -> None:
         folder = Path(place)
         file = wheel or build(copy(folder / "source"), folder / "built")
         run = Pages(Wheel(file, folder), (ROOT / "Makefile").read_text())
-        for number, page in enumerate(selection):
+
+        def run_page(number: int, page: Path) -> None:
             own = page.resolve().is_relative_to(ROOT)
             label = page.resolve().relative_to(ROOT) if own else page
             run.run(label, page.read_text(), folder / f"page_{number}" / label.stem)
+
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(run_page, range(len(selection)), selection))
         run.read()
     for text in run.left:
         print(f"left to make integrations: {text}")
-    print(f"{seconds():.0f} s of the processor")
     useless = [item.begins for item in LISTED if item not in run.used] if not pages else []
     wrong = [*run.failed, *(f"LISTED: no page shows {begins!r}" for begins in useless)]
     if wrong:

@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 import sysconfig
+import threading
 import venv
 import zipfile
 from collections import defaultdict
@@ -22,6 +23,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 OWN = "fusion-gym"
+_ALONE = threading.Lock()
 _SCRIPT = """#!{python}
 import sys
 from {module} import {first}
@@ -80,13 +82,17 @@ class Wheel:
         """Names of its extras."""
         return self.metadata["Provides-Extra"]
 
-    @functools.cache  # noqa: B019 - one wheel a run
     def environment(self, extras: frozenset[str]) -> Environment:
-        """The environment with these extras.
+        """The environment with these extras, which one thread makes once.
 
         Raises:
             Absent: something that they need is not installed here.
         """
+        with _ALONE:
+            return self._environment(extras)
+
+    @functools.cache  # noqa: B019 - one wheel a run
+    def _environment(self, extras: frozenset[str]) -> Environment:
         needed = closure(map(Requirement, self.metadata["Requires-Dist"]), extras)
         environment = Environment(self.folder / "_".join(["wheel", *sorted(extras)]))
         venv.create(environment.folder, with_pip=False)
