@@ -19,6 +19,7 @@ OSCILLATOR = "fusion_gym/TobitOscillator-v0"
 TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "paper": (OSCILLATOR, {"horizon": 6}),
     "starved": (OSCILLATOR, {"token_rate": 2.0, "initial_tokens": 3.0, "sharing": "rotating"}),
+    "queue": (OSCILLATOR, {"token_rate": 2.0, "initial_tokens": 3.0, "sharing": "turns"}),
     "memory": (OSCILLATOR, {"filter": "tobit", "memory": True, "horizon": 5}),
     "estimates": (OSCILLATOR, {"filter": "tobit", "memory": True, "packet": "estimate"}),
     "heard": (OSCILLATOR, {"filter": "tobit", "memory": True, "broadcast": "packets"}),
@@ -49,7 +50,7 @@ def build_parts(name: str) -> Task:
 
 def contents(runs: Any) -> list[bytes]:
     """Everything that runs show of themselves."""
-    parts = [runs.observe(), runs.tokens, runs.price, runs.steps, runs.admitted()]
+    parts = [runs.observe(), runs.tokens, runs.price, runs.steps, runs.admitted(), runs.queue]
     return [np.ascontiguousarray(part).tobytes() for part in parts]
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 
 import fusion_gym
-from fusion_gym.core.access import first_request
+from fusion_gym.core.access import first_request, rotation
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
@@ -226,7 +226,7 @@ def test_two_sided_sensors_clip_and_tell() -> None:
 @given(bits=st.lists(st.booleans(), min_size=1, max_size=6), step=st.integers(0, 20))
 def test_single_access_lets_one_request_through(bits: list[bool], step: int) -> None:
     requests = np.array(bits)[:, None]
-    passed = first_request(requests, np.array([step]))
+    passed = first_request(requests, rotation(requests, np.array([step])))
     assert passed.sum() == min(1, requests.sum())
     assert not np.any(passed & ~requests)
     if passed.any():

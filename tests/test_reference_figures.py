@@ -125,7 +125,7 @@ def walk(
             }
         )
         request = policy(signals) if requests is None else requests[step]
-        granted, _, tokens = task.bucket.grant(tokens, request, steps)
+        granted, _, tokens, _ = task.bucket.grant(tokens, request, steps)
         state = system.deliver(state, granted)
         mean, covariance = system.fused(state)
         for run, entry in enumerate(record):

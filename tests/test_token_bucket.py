@@ -22,8 +22,12 @@ def scalar_step(
     capacity: float,
     sharing: str,
     step: int,
+    queue: list[int],
 ) -> tuple[list[bool], float, float]:
-    """(16)-(18), and the two rules that serve one sensor after another, in plain Python."""
+    """(16)-(18), and the rules that serve one sensor after another, in plain Python.
+
+    ``queue`` holds the sensors in the order of their turns, and is moved.
+    """
     sensors = len(costs)
     granted = [False] * sensors
     if sharing == "equal":
@@ -35,10 +39,13 @@ def scalar_step(
             turn = step % sensors
             order = order[turn:] + order[:turn]
         left = tokens
-        for m in order:
+        for m in list(queue) if sharing == "turns" else order:
             if requests[m] and costs[m] <= left:
                 granted[m] = True
                 left -= costs[m]
+                queue.append(queue.pop(queue.index(m)))
+            elif requests[m] and sharing == "turns":
+                break
     spent = math.fsum(cost for cost, grant in zip(costs, granted, strict=True) if grant)
     return granted, spent, min(tokens + rate - spent, capacity)
 
@@ -48,8 +55,8 @@ eighths = st.integers(1, 80).map(lambda number: number / 8)
 
 
 @st.composite
-def buckets(draw: st.DrawFn, unlimited: bool = False) -> TokenBucket:
-    sensors = draw(st.integers(1, 5))
+def buckets(draw: st.DrawFn, sharing: str | None = None, unlimited: bool = False) -> TokenBucket:
+    sensors = draw(st.integers(1 if sharing is None else 2, 5))
     costs = draw(st.lists(eighths, min_size=sensors, max_size=sensors))
     capacity = sensors * max(costs) + draw(eighths)
     return TokenBucket.create(
@@ -58,7 +65,7 @@ def buckets(draw: st.DrawFn, unlimited: bool = False) -> TokenBucket:
         initial=draw(st.integers(0, int(8 * capacity))) / 8,
         cost=costs,
         sensors=sensors,
-        sharing=draw(st.sampled_from(SHARING_RULES)),
+        sharing=draw(st.sampled_from(SHARING_RULES if sharing is None else [sharing])),
         unlimited=unlimited,
     )
 
@@ -75,8 +82,10 @@ def test_random_buckets_agree_with_the_scalar_loop(bucket: TokenBucket, seed: in
     requests = random_requests(bucket, 3, 12, seed)
     tokens = bucket.start(3)
     costs = bucket.cost[:, 0].tolist()
+    queues = [list(range(len(costs))) for _ in range(3)]
+    queue = bucket.start_queue(3)
     for number, request in enumerate(requests):
-        answer = bucket.grant(tokens, request, np.full(3, number))
+        answer = bucket.grant(tokens, request, np.full(3, number), queue)
         for run in range(3):
             granted, spent, left = scalar_step(
                 tokens[run],
@@ -86,10 +95,28 @@ def test_random_buckets_agree_with_the_scalar_loop(bucket: TokenBucket, seed: in
                 bucket.capacity,
                 bucket.sharing,
                 number,
+                queues[run],
             )
             assert answer.granted[:, run].tolist() == granted
+            if bucket.sharing == "turns":
+                assert answer.queue[:, run].tolist() == np.argsort(queues[run]).tolist()
             assert (answer.spent[run], answer.tokens[run]) == (spent, left)
-        tokens = answer.tokens
+        tokens, queue = answer.tokens, answer.queue
+
+
+@given(bucket=buckets("turns"), seed=st.integers(0, 2**31), steps=st.integers(1, 120))
+@settings(max_examples=2000, deadline=None)
+def test_turns_favour_nobody_who_requests_alike(bucket: TokenBucket, seed: int, steps: int) -> None:
+    """In every window two sensors that request alike differ by at most one grant."""
+    requests = random_requests(bucket, 1, steps, seed)
+    requests[:, 1] = requests[:, 0]
+    tokens, queue, grants = bucket.start(1), bucket.start_queue(1), []
+    for number, request in enumerate(requests):
+        answer = bucket.grant(tokens, request, np.full(1, number), queue)
+        tokens, queue = answer.tokens, answer.queue
+        grants.append(answer.granted[:2, 0])
+    ahead = np.cumsum([0, *(int(a) - int(b) for a, b in grants)])
+    assert ahead.max() - ahead.min() <= 1
 
 
 @given(
@@ -230,9 +257,9 @@ def test_tokens_that_add_up_pay_for_a_transmission(sharing: str) -> None:
     )
     tokens, step = bucket.start(1), np.zeros(1, dtype=np.int64)
     for _ in range(10):
-        granted, spent, tokens = bucket.grant(tokens, np.zeros((1, 1), dtype=np.bool_), step)
+        granted, spent, tokens, _ = bucket.grant(tokens, np.zeros((1, 1), dtype=np.bool_), step)
         assert not granted.any()
         assert spent[0] == 0.0
-    granted, spent, tokens = bucket.grant(tokens, np.ones((1, 1), dtype=np.bool_), step)
+    granted, spent, tokens, _ = bucket.grant(tokens, np.ones((1, 1), dtype=np.bool_), step)
     assert granted.all()
     assert tokens[0] >= 0.0

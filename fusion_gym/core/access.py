@@ -32,9 +32,12 @@ def access_mask(
     return np.arange(sensors)[:, None] == turn
 
 
-def first_request(requests: NDArray[np.bool_], step: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """At most one of the requests (sensors, N): the first, in an order that rotates by ``step``."""
-    sensors = len(requests)
-    place = (np.arange(sensors)[:, None] - step) % sensors
-    first = np.argmin(np.where(requests, place, sensors), axis=0)
-    return requests & (np.arange(sensors)[:, None] == first)
+def first_request(requests: NDArray[np.bool_], place: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """At most one of the requests (sensors, N): that of the sensor with the lowest place."""
+    first = np.argmin(np.where(requests, place, len(requests)), axis=0)
+    return requests & (np.arange(len(requests))[:, None] == first)
+
+
+def rotation(requests: NDArray[np.bool_], step: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Places (sensors, N) in an order whose first is one sensor later in each step (N,)."""
+    return (np.arange(len(requests))[:, None] - step) % len(requests)

@@ -58,6 +58,7 @@ class EpisodeBatch(Runs):
         )
         self._beside: Any = None  # the reference's state, after sensing
         self.tokens = task.bucket.start(num_envs)
+        self.queue = task.bucket.start_queue(num_envs)
         self.price = task.reward.price.draw(np.zeros(num_envs))
         self.steps = np.zeros(num_envs, dtype=np.int64)
         self.finished = np.ones(num_envs, dtype=np.bool_)
@@ -124,6 +125,7 @@ class EpisodeBatch(Runs):
         fresh = system.sense(fresh, row)
         self.state = fresh if everyone else merge_runs(self.state, fresh, runs)
         self.tokens = merge_runs(self.tokens, self.task.bucket.start(len(runs)), runs)
+        self.queue = merge_runs(self.queue, self.task.bucket.start_queue(len(runs)), runs)
         self.steps[runs] = 0
         self.finished[runs] = False
         horizon = self.task.horizon

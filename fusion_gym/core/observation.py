@@ -15,6 +15,7 @@ from fusion_gym.core.beliefs import Beliefs
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.system import Block, Knowledge, covers, numbered
 from fusion_gym.core.task import Task
+from fusion_gym.core.token_bucket import Queue
 from fusion_gym.validation import ConfigurationError
 
 # What is believed is shown by odd functions that tell small differences apart and never saturate
@@ -25,12 +26,13 @@ _VALUE, _VALUE_LIMIT = 2.0, 20.0
 
 class NetworkState(NamedTuple):
     """The network's side of an observation: ``tokens`` and ``price`` (N,), ``admitted()``
-    (sensors, N) bool, and the ``left`` steps of the episode (N,)."""
+    (sensors, N) bool, the ``left`` steps of the episode (N,), and the ``queue`` (sensors, N)."""
 
     tokens: Array
     admitted: Callable[[], NDArray[np.bool_]]
     price: Array
     left: Array
+    queue: Queue
 
 
 class ObservationEntry(NamedTuple):
@@ -64,6 +66,14 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
         (numbered(task.sensors),),
         node="own",
     )
+    queue = Block(
+        "queue",
+        "the sensor's place in the bucket's queue over the number of sensors",
+        lambda net: net.queue / task.sensors,
+        (numbered(task.sensors),),
+        node="own",
+        constants={"sensors": task.sensors},
+    )
     left = Block(
         "time_left",
         "steps left of the episode over the horizon",
@@ -83,6 +93,7 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
     return (
         tokens,
         *((admitted,) if decides else ()),
+        *((queue,) if task.bucket.sharing == "turns" else ()),
         *((left,) if task.clock else ()),
         *((block,) if price.span is not None else ()),
     )

@@ -18,7 +18,7 @@ from fusion_gym.importing import name_of
 
 AccessRule = Literal["any", "single", "round_robin", "random"]
 Tokens = Literal["limited", "unlimited"]
-SharingRule = Literal["equal", "fixed", "rotating"]
+SharingRule = Literal["equal", "fixed", "rotating", "turns"]
 ErrorKind = Literal["squared", "trace", "maximum"]
 Broadcast = Literal["none", "estimate", "packets"]
 Feature = Literal["difference", "value"]
@@ -57,7 +57,9 @@ class CommonOptions:
     sharing: SharingRule = "rotating"
     """How simultaneous requests share the tokens. ``"equal"`` gives each sensor the same share: ξ/l
     ≥ c (tobit_token_bucket, equations (16) and (18)). ``"fixed"`` grants in the order of the
-    sensors while tokens last. ``"rotating"`` starts that order one sensor later in each step."""
+    sensors while tokens last. ``"rotating"`` starts that order one sensor later in each step.
+    ``"turns"`` keeps a queue: a sensor that is granted goes to its end, and a head that the tokens
+    do not pay for blocks those behind it."""
     packet: Literal["measurement", "estimate"] = "measurement"
     """Content of a packet: the sensor's measurement as in the paper, or the centralised scheduler's
     estimate with its covariance. ``"estimate"`` needs ``memory=True``."""

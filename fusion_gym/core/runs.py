@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, take_runs
-from fusion_gym.core.access import access_mask, first_request
+from fusion_gym.core.access import access_mask, first_request, rotation
 from fusion_gym.core.beliefs import Beliefs, Estimate
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import NetworkState, ObservationLayout
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
-from fusion_gym.core.token_bucket import Grants
+from fusion_gym.core.token_bucket import Grants, Queue
 
 
 class Outcome(NamedTuple):
@@ -48,7 +48,8 @@ class Position(NamedTuple):
     """Where N runs are, after sensing: all that moves with them.
 
     The system's ``state``, ``tokens`` and ``price`` (N,), ``steps`` taken and the ``limit`` at
-    which the episode ends (N,), and who is ``admitted`` in the coming step (sensors, N) bool.
+    which the episode ends (N,), the bucket's ``queue`` (sensors, N), and who is ``admitted`` in the
+    coming step (sensors, N) bool.
     """
 
     state: Any
@@ -56,6 +57,7 @@ class Position(NamedTuple):
     price: Array
     steps: NDArray[np.int64]
     limit: NDArray[np.int64]
+    queue: Queue
     admitted: NDArray[np.bool_]
 
 
@@ -64,13 +66,14 @@ class Runs:
 
     ``state`` is the system's after sensing, ``delivered`` its state after the last delivery,
     for metrics and figures; ``memory`` moves along beside them; ``tokens``, ``price`` of a token
-    and ``steps`` taken are (N,).
+    and ``steps`` taken are (N,); ``queue`` (sensors, N) is that of the token bucket.
     """
 
     state: Any
     tokens: Array
     price: Array
     steps: NDArray[np.int64]
+    queue: Queue
     _limit: NDArray[np.int64]
 
     def __init__(self, task: Task, memory: Memory, layout: ObservationLayout) -> None:
@@ -85,7 +88,7 @@ class Runs:
     def deliver(self, requests: NDArray[np.bool_]) -> Outcome:
         """The first half of a step: answer the requests (sensors, N), update, fuse, reward."""
         task, system = self.task, self.task.system
-        granted, spent, tokens = self.answer(requests)
+        granted, spent, tokens, self.queue = self.answer(requests)
         state = self.memory.deliver(self.state, system.deliver(self.state, granted), granted)
         mean, covariance = system.fused(state)
         error = system.truth(state) - mean
@@ -109,12 +112,13 @@ class Runs:
         self, requests: NDArray[np.bool_], runs: NDArray[np.int64] | slice = slice(None)
     ) -> Grants:
         """The network's answer to requests (sensors, R), each of one of the R ``runs``."""
-        steps = self.steps[runs]
+        steps, queue = self.steps[runs], self.queue[:, runs]
         if self.task.access == "single":
-            requests = first_request(requests, steps)
+            turns = self.task.bucket.sharing == "turns"
+            requests = first_request(requests, queue if turns else rotation(requests, steps))
         elif self.task.access in ("round_robin", "random"):
             requests = requests & self.admitted()[:, runs]
-        return self.task.bucket.grant(self.tokens[runs], requests, steps)
+        return self.task.bucket.grant(self.tokens[runs], requests, steps, queue)
 
     def sense(self, noise: Array) -> None:
         """The second half: the plant moves, the sensors measure, with noise (channels, N)."""
@@ -148,6 +152,7 @@ class Runs:
                 self.price.copy(),
                 self.steps.copy(),
                 self._limit.copy(),
+                self.queue,
                 self.admitted(),
             )
         return Position(
@@ -156,13 +161,14 @@ class Runs:
             self.price[runs],
             self.steps[runs],
             self._limit[runs],
+            self.queue[:, runs],
             self.admitted()[:, runs],
         )
 
     def observe(self) -> NDArray[np.float32]:
         """Observations (N, entries) of all runs, a fresh array."""
         left = (self._limit - self.steps).astype(np.float64)
-        network = NetworkState(self.tokens, self.admitted, self.price, left)
+        network = NetworkState(self.tokens, self.admitted, self.price, left, self.queue)
         return self.layout.encode(self.state, network, self.beliefs)
 
     def beliefs(self) -> Beliefs:
@@ -175,20 +181,21 @@ class Runs:
 
     def grantable(self) -> NDArray[np.bool_]:
         """The sensors (sensors, N) whose request alone the network would grant now."""
-        admitted = self.admitted()
+        admitted, bucket = self.admitted(), self.task.bucket
         result = np.zeros_like(admitted)
         for sensor in range(self.task.sensors):
             single = np.zeros_like(admitted)
             single[sensor] = admitted[sensor]
-            result[sensor] = self.task.bucket.grant(self.tokens, single, self.steps).granted[sensor]
+            granted = bucket.grant(self.tokens, single, self.steps, self.queue).granted
+            result[sensor] = granted[sensor]
         return result
 
     def signals(self) -> Signals:
         """The signals of all runs, without what the information mode withholds.
 
         To the system's own it adds ``tokens`` (N,), ``token_cost`` (sensors, 1), ``price`` (N,) of
-        a token, ``step`` (N,),
-        the steps taken in the episode, ``start`` (N,) bool, ``admitted`` and
+        a token, ``step`` (N,), the steps taken in the episode, ``queue`` (sensors, N), each
+        sensor's place in the bucket's queue, ``start`` (N,) bool, ``admitted`` and
         ``grantable`` (sensors, N) bool, ``observation`` (N, entries), and ``model``, the system's
         state without what no policy may know, for policies that plan with the system's own moves;
         and the beliefs (:mod:`fusion_gym.core.signals`).
@@ -200,6 +207,7 @@ class Runs:
             "token_cost": self.task.bucket.cost,
             "price": self.price,
             "step": self.steps,
+            "queue": self.queue,
             "start": self.steps == 0,
             "admitted": self.admitted,
             "grantable": self.grantable,
@@ -229,7 +237,7 @@ class Branch(Runs):
     ) -> None:
         super().__init__(task, memory, layout)
         self.state, self.tokens, self.price = position[:3]
-        self.steps, self._limit, self._admitted = position[3:]
+        self.steps, self._limit, self.queue, self._admitted = position[3:]
 
     def step(
         self, requests: NDArray[np.bool_], noise: Array, best: Estimate | None = None

@@ -14,15 +14,21 @@ from fusion_gym.core.options import SharingRule
 from fusion_gym.validation import ConfigurationError
 
 SHARING_RULES: tuple[str, ...] = get_args(SharingRule)
+Queue = NDArray[np.int64]
 _ROUNDING = 1e-9  # tokens: ten times 0.1 pays for a transmission that costs 1
 
 
 class Grants(NamedTuple):
-    """What the network answered: ``granted`` (sensors, N) bool, ``spent`` and ``tokens`` (N,)."""
+    """What the network answered.
+
+    ``granted`` (sensors, N) bool, ``spent`` and ``tokens`` (N,), and ``queue`` (sensors, N), each
+    sensor's place among those to be served next, 0 first.
+    """
 
     granted: NDArray[np.bool_]
     spent: Array
     tokens: Array
+    queue: Queue
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,9 @@ class TokenBucket:
       nothing. It looks at the tokens before this step's spending.
     - ``"fixed"``: requests are granted in the order of the sensors while tokens last.
     - ``"rotating"``: the same, the first in the order moving on by one sensor each step.
+    - ``"turns"``: the same in the order of a queue. Who is granted goes to its end in the order of
+      service, and a head that the tokens do not pay for blocks those behind it. Of two sensors
+      that request alike neither gets more than one grant more than the other, in any window.
 
     ``unlimited`` grants everything; tokens spent are still counted, the level stays full.
 
@@ -101,33 +110,59 @@ class TokenBucket:
         """Tokens at the start of an episode, shape (num_envs,)."""
         return np.full(num_envs, self.capacity if self.unlimited else self.initial)
 
-    def grant(self, tokens: Array, requests: NDArray[np.bool_], step: NDArray[np.int64]) -> Grants:
-        """Answer the requests (sensors, N) with the tokens (N,); ``step`` (N,) turns the order.
+    def start_queue(self, num_envs: int) -> Queue:
+        """The queue at the start of an episode, sensor 0 first, shape (sensors, num_envs)."""
+        return np.repeat(np.arange(len(self.cost))[:, None], num_envs, axis=1)
+
+    def grant(
+        self,
+        tokens: Array,
+        requests: NDArray[np.bool_],
+        step: NDArray[np.int64],
+        queue: Queue | None = None,
+    ) -> Grants:
+        """Answer the requests (sensors, N) with the tokens (N,).
+
+        ``step`` (N,) turns the order of ``"rotating"``, ``queue`` (sensors, N) is that of
+        ``"turns"``; by default sensor 0 is first.
 
         Source: tobit_token_bucket, equations (16)-(18).
         """
+        queue = self.start_queue(len(tokens)) if queue is None else queue
         if self.unlimited:
-            return Grants(requests.copy(), (requests * self.cost).sum(0), tokens)
+            return Grants(requests.copy(), (requests * self.cost).sum(0), tokens, queue)
         if self.sharing == "equal":
             granted = requests & (self.cost * len(self.cost) <= tokens + _ROUNDING)
             spent = (granted * self.cost).sum(0)
         else:
-            granted, spent = self._grant_in_order(tokens, requests, step)
+            granted, spent, queue = self._grant_in_order(tokens, requests, step, queue)
         left = np.maximum(tokens + self.rate - spent, 0.0)
-        return Grants(granted, spent, np.minimum(left, self.capacity))
+        return Grants(granted, spent, np.minimum(left, self.capacity), queue)
 
     def _grant_in_order(
-        self, tokens: Array, requests: NDArray[np.bool_], step: NDArray[np.int64]
-    ) -> tuple[NDArray[np.bool_], Array]:
-        sensors, runs = requests.shape
+        self, tokens: Array, requests: NDArray[np.bool_], step: NDArray[np.int64], queue: Queue
+    ) -> tuple[NDArray[np.bool_], Array, Queue]:
+        runs, turns = np.arange(len(tokens)), self.sharing == "turns"
         granted = np.zeros_like(requests)
-        spent = np.zeros(runs)
-        lanes = np.arange(runs)
-        first = step % sensors if self.sharing == "rotating" else np.zeros(runs, dtype=np.int64)
-        for place in range(sensors):
-            sensor = (first + place) % sensors
+        spent, blocked = np.zeros(len(runs)), np.zeros(len(runs), dtype=np.bool_)
+        for sensor in self._order(step, queue):
             cost = self.cost[sensor, 0]
-            answer = requests[sensor, lanes] & (spent + cost <= tokens + _ROUNDING)
-            granted[sensor, lanes] = answer
+            paid = spent + cost <= tokens + _ROUNDING
+            answer = requests[sensor, runs] & paid & ~blocked
+            if turns:
+                blocked |= requests[sensor, runs] & ~paid
+            granted[sensor, runs] = answer
             spent += answer * cost
-        return granted, spent
+        return granted, spent, move_to_end(queue, granted) if turns else queue
+
+    def _order(self, step: NDArray[np.int64], queue: Queue) -> NDArray[np.int64]:
+        """The sensors (places, N) in the order in which they are served."""
+        if self.sharing == "turns":
+            return np.argsort(queue, axis=0)
+        first = step if self.sharing == "rotating" else np.zeros_like(step)
+        return (np.arange(len(queue))[:, None] + first) % len(queue)
+
+
+def move_to_end(queue: Queue, granted: NDArray[np.bool_]) -> Queue:
+    """Return the queue after these grants: who was served is last, in the order of service."""
+    return np.argsort(np.argsort(queue + len(queue) * granted, axis=0), axis=0)

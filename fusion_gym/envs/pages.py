@@ -81,6 +81,7 @@ environment takes.
 # Blocks of the network that not every task has, and when they are there.
 _NETWORK = {
     "admitted": 'only with `access="round_robin"` or `"random"`',
+    "queue": 'only with `sharing="turns"`',
     "time_left": "only with `clock=True`",
     "price": "only with a `price_range`",
 }
@@ -154,7 +155,9 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
             rows[block.name] = _row(task, block, "" if visible else condition)
     always = [block.name for block in network_blocks(task)]
     price = replace(task.reward, price=Price(None, (0.01, 1.0)))
-    for block in network_blocks(replace(task, access="round_robin", clock=True, reward=price)):
+    turns = replace(task.bucket, sharing="turns")
+    network = replace(task, access="round_robin", bucket=turns, clock=True, reward=price)
+    for block in network_blocks(network):
         rows[block.name] = _row(task, block, "" if block.name in always else _NETWORK[block.name])
     return table(("entries", "range", "a sensor sees", "meaning"), rows.values())
 

@@ -164,8 +164,10 @@ class _Search:
         admitted = self._admitted[step].take(candidates.episode, axis=-1)
         steps = np.full(len(candidates.cost), step, dtype=np.int64)
         for number, pattern in enumerate(self._patterns[:, :, None]):
-            granted, spent, tokens = task.bucket.grant(candidates.tokens, pattern & admitted, steps)
-            # What the network would deny is no choice of its own.
+            granted, spent, tokens, _ = task.bucket.grant(
+                candidates.tokens, pattern & admitted, steps
+            )
+            # What the network would deny is no choice of its own, whatever the queue.
             parent = np.flatnonzero((granted == pattern).all(0))
             if len(parent) == 0:
                 continue

@@ -63,6 +63,7 @@ class Imagination:
             signals["price"][runs],
             steps,
             np.full_like(steps, task.horizon),
+            signals["queue"][:, runs],
             signals["admitted"][:, runs],
         )
         branch = Branch(task, self._memory.with_states(states), self._layout, position)

@@ -139,7 +139,7 @@ class Lookahead:
             for sensor in range(sensors):
                 added = selected.copy()
                 added[sensor] = True
-                granted, paid[sensor], _ = model.grant(added)
+                granted, paid[sensor], *_ = model.grant(added)
                 after[sensor] = self._error(model, added, best)
                 gain = arrival[sensor] * (error - after[sensor])
                 gain -= self.price * (paid[sensor] - spent)

@@ -47,6 +47,7 @@ class PlanningModel:
     def __init__(self, task: Task, signals: Signals) -> None:
         self._task, self._state, self._step = task, signals["model"], signals["step"]
         self._tokens, self._admitted = signals["tokens"], signals["admitted"]
+        self._queue = signals["queue"]
         self._beliefs = beliefs_of(signals, own=False) if task.memory else None
         system = task.system
         self.arrival: Array | None = None
@@ -63,7 +64,8 @@ class PlanningModel:
 
         With ``access="single"`` there must be at most one a run.
         """
-        return self._task.bucket.grant(self._tokens, requests & self._admitted, self._step)
+        admitted = requests & self._admitted
+        return self._task.bucket.grant(self._tokens, admitted, self._step, self._queue)
 
     def fused_means(self, arriving: NDArray[np.bool_], steps: int) -> Array:
         """Fused means (steps, n, N) if these packets (sensors, N) arrive now.

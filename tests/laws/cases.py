@@ -42,6 +42,7 @@ COMMON: list[Options] = [
     {"memory": True} | SCARCE | DRAWN,
     {"memory": True, "broadcast": "packets", "action": "discrete", "access": "any"},
     {"access": "single", "error": "trace"},
+    {"memory": True, "access": "any", "tokens": "limited", "sharing": "turns"} | SCARCE,
     {"access": "round_robin", "broadcast": "estimate", "belief_features": "value"},
     {"access": "random", "error": "maximum", "error_weight": 2.0},
 ]

@@ -91,7 +91,7 @@ def test_a_branch_takes_the_step_that_would_have_been(case: Case, owner: Any) ->
 
 def contents(runs: Any) -> list[bytes]:
     """All that is shown of runs."""
-    observation = [runs.observe(), runs.tokens, runs.price, runs.steps, runs.admitted()]
+    observation = [runs.observe(), runs.tokens, runs.price, runs.steps, runs.admitted(), runs.queue]
     observation += [runs.beliefs().best.mean, runs.beliefs().value()]
     return [np.ascontiguousarray(part).tobytes() for part in observation]
 
@@ -132,6 +132,7 @@ FORMULAS: dict[str, Callable[[EpisodeBatch, Signals], Array]] = {
     "uncensored_probability": lambda b, s: s["uncensored_probability"],
     "tokens": lambda b, s: b.tokens / b.task.settings["token_capacity"],
     "admitted": lambda b, s: b.admitted(),
+    "queue": lambda b, s: b.queue / b.task.sensors,
     "time_left": lambda b, s: 1.0 - b.steps / b.task.horizon,
     "price": lambda b, s: place(b.price, *b.task.settings["price_range"]),
 }
