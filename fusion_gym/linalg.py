@@ -5,8 +5,9 @@ A quantity of shape S for N runs is an array of shape ``(*S, N)``: a matrix is
 batch axis of length 1 broadcast as in NumPy, so a constant matrix is kept as ``(n, m, 1)``.
 
 Every routine is a short sequence of element-wise NumPy operations written out along the two
-small axes. Each lane therefore sees exactly the same floating-point operations whatever the
-number of lanes, and a lane's result is bitwise the same alone and in a batch.
+small axes; products and inverses of large matrices are BLAS's and LAPACK's, lane by lane. Each lane
+therefore sees exactly the same floating-point operations whatever the number of lanes, and a lane's
+result is bitwise the same alone and in a batch.
 
 The routines for symmetric positive definite matrices (`cholesky`, `solve`, `solve_vector`,
 `inverse`) read only the diagonal and the lower triangle. They first
@@ -17,11 +18,15 @@ not positive definite comes back filled with NaN; the other lanes are unaffected
 raised and no NumPy warning is issued.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 _MANY = 8  # rows from which on it is worth to look whether a matrix is diagonal
+_LARGE = 16  # rows from which on BLAS and LAPACK are faster than element-wise operations
+_CHUNK = 64  # lanes that are transposed at a time and so stay in the cache
 
 
 def identity(size: int) -> FloatArray:
@@ -80,17 +85,44 @@ def _require_equal_lengths(operation: str, left: int, right: int) -> None:
 def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
     """Matrix product: ``(..., n, k, N)`` times ``(..., k, m, N)`` to ``(..., n, m, N)``.
 
-    Accumulated over k in ascending order, in ``2 k - 1`` array operations.
+    Accumulated over k in ascending order, in ``2 k - 1`` array operations; by BLAS where all three
+    axes are large.
 
     Raises:
         ValueError: the two axes of length k differ.
     """
     length = a.shape[-2]
     _require_equal_lengths("matmul", length, b.shape[-3])
+    if min(a.shape[-3], length, b.shape[-2]) >= _LARGE:
+        return _by_lane(np.matmul, a, b)
     result: FloatArray = a[..., 0:1, :] * b[..., 0:1, :, :]
     for k in range(1, length):
         result += a[..., k : k + 1, :] * b[..., k : k + 1, :, :]
     return result
+
+
+def _by_lane(function: Callable[..., FloatArray], *matrices: FloatArray) -> FloatArray:
+    """Apply a function of stacks ``(..., lanes, n, m)``, which takes each lane by itself."""
+    lanes = max(matrix.shape[-1] for matrix in matrices)
+    parts = []
+    for first in range(0, lanes, _CHUNK):
+        chunk = slice(first, first + _CHUNK)
+        stacks = (m if m.shape[-1] == 1 else m[..., chunk] for m in matrices)
+        stacks = (np.ascontiguousarray(np.moveaxis(stack, -1, -3)) for stack in stacks)
+        parts.append(np.moveaxis(function(*stacks), -3, -1))
+    return np.concatenate(parts, axis=-1)
+
+
+def _inverse_of_stack(stack: FloatArray) -> FloatArray:
+    """L^-T L^-1 of a stack ``(..., n, n)`` with the Cholesky factor L; NaN where there is none."""
+    try:
+        root = np.linalg.cholesky(stack)
+    except np.linalg.LinAlgError:
+        if stack.ndim == 2:
+            return np.full_like(stack, np.nan)
+        return np.array([_inverse_of_stack(part) for part in stack])
+    inverse_root = np.linalg.inv(root)
+    return np.matmul(inverse_root.swapaxes(-1, -2), inverse_root)
 
 
 def matvec(a: FloatArray, v: FloatArray) -> FloatArray:
@@ -325,8 +357,8 @@ def _solve_diagonal(d: FloatArray, v: FloatArray) -> FloatArray:
 def inverse(a: FloatArray) -> FloatArray:
     """Inverse of symmetric positive definite matrices, ``(..., n, n, N)`` to the same shape.
 
-    Size 2 uses its closed form and larger ones ``L^-T L^-1`` with L the Cholesky factor; both
-    give an exactly symmetric result.
+    Size 2 uses its closed form and larger ones ``L^-T L^-1`` with L the Cholesky factor, LAPACK's
+    for large ones; all give an exactly symmetric result.
 
     Args:
         a: symmetric positive definite; only the lower triangle is read.
@@ -345,6 +377,9 @@ def inverse(a: FloatArray) -> FloatArray:
         result[..., 1, 0, :] = off_diagonal
         return result
     work, scale = _equilibrate(a)
+    if size >= _LARGE:
+        result = symmetrise(_by_lane(_inverse_of_stack, work))
+        return result * outer(scale, scale)
     # Rows n and up turn from the scales into diag(scale) L^-T, which is upper triangular.
     stack = np.zeros((*a.shape[:-3], 2 * size, size, a.shape[-1]))
     stack[..., :size, :, :] = work
