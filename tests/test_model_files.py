@@ -24,7 +24,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 import fusion_gym
-from fusion_gym.agents import compare, evaluate, table
+from fusion_gym.agents import compare, evaluate
+from fusion_gym.agents.maintenance import table
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.policies import archive
