@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 import fusion_gym
 from fusion_gym.arrays import Array
-from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingOptions
 
@@ -23,6 +22,7 @@ from ..output.palette import BLACK, BLUE, GREEN, ORANGE, PURPLE, SENSORS, SKY, T
 from .markov_jump_covariances import covariances
 from .numbers import Number, below, grid, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_list
+from .walk import walk
 
 STATES = ("position", "velocity")
 UNITS = ("m", "m/s")
@@ -82,13 +82,9 @@ class Run(NamedTuple):
 
 def run_markov_jump(task: Task, policy: str, episodes: int, seed: int) -> Run:
     """Run episodes with the seeds ``seed``, ``seed + 1``, …"""
-    rule = fusion_gym.make_policy(policy, task)
-    batch = EpisodeBatch.seeded(task, episodes, seed)
-    rule.reset(episodes, seed)
     rows: list[tuple[Any, ...]] = []
-    for _ in range(task.horizon):
-        outcome = batch.step(rule(batch.signals()))
-        state = batch.delivered
+    for batch, requests in walk(task, policy, episodes, seed):
+        outcome, state = batch.step(requests), batch.delivered
         mean, covariance = task.system.fused(state)
         truth = task.system.truth(state)
         local = task.system.local_means(state) if hasattr(state, "node_mean") else mean[None]

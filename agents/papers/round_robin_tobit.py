@@ -66,8 +66,7 @@ def simulate_oscillator(episodes: int, seed: int, settings: Settings) -> Data:
         result |= {"truth": run.truth, f"{name}_mean": run.mean}
     for name, options in (("whole", runs.FREE), ("clipped", {})):
         task = _oscillator(settings, **options)
-        policy = make_policy(settings["policy"], task)
-        result[f"held_{name}"] = runs.held_values(task, policy, seed)
+        result[f"held_{name}"] = runs.held_values(task, settings["policy"], seed)
     variance = {"measurement_variance": settings["variance"][0]}
     least = runs.floor(runs.OSCILLATOR, **(variance | settings["options"]))
     return result | {"interval": settings["interval"][0], "floor": least}
@@ -82,11 +81,10 @@ def simulate_target(episodes: int, seed: int, settings: Settings) -> Data:
 
 def _curves(tasks: dict[str, Task], episodes: int, seed: int, settings: Settings) -> Data:
     errors = {
-        name: runs.squares(task, make_policy(settings["policy"], task), episodes, seed)
-        for name, task in tasks.items()
+        name: runs.squares(task, settings["policy"], episodes, seed) for name, task in tasks.items()
     }
     aware = tasks["aware"]
-    never = runs.squares(aware, make_policy("never", aware), episodes, seed)
+    never = runs.squares(aware, "never", episodes, seed)
     return {
         **{f"{name}_rmse": runs.error_curve(error) for name, error in errors.items()},
         **{f"{name}_armse": runs.armse(error) for name, error in errors.items()},
@@ -230,8 +228,7 @@ def simulate_tables(
             errors = {}
             for filter_ in _FILTERS:
                 task = _oscillator(settings, filter=filter_, **_options(interval, variance))
-                policy = make_policy(settings["policy"], task)
-                result = runs.squares(task, policy, episodes, seed)
+                result = runs.squares(task, settings["policy"], episodes, seed)
                 rise = _rise(before.get(filter_, result), result)
                 row[filter_] = runs.armse(result) | _median(result) | {"rise": rise}
                 errors[filter_] = result
@@ -243,7 +240,7 @@ def simulate_tables(
             first = first or {"row": row, "errors": errors}
         data[name] = rows
     task = _oscillator(settings)
-    never = runs.squares(task, make_policy("never", task), episodes, seed)
+    never = runs.squares(task, "never", episodes, seed)
     return data | {"silent": runs.armse(never), "bias_deviation": _bias_deviation(task)}
 
 
@@ -344,7 +341,7 @@ def simulate_tobit_readings(episodes: int, seed: int, settings: Settings) -> Dat
         for limit in (5.0, 0.5):
             task = runs.reading_task(reading, censoring_threshold=-limit, censoring_upper=limit)
             name = "always" if task.access == "any" else "round_robin"
-            errors = runs.squares(task, make_policy(name, task), episodes, seed)
+            errors = runs.squares(task, name, episodes, seed)
             roots = np.sqrt(errors.mean((1, 2)))
             far = mean_interval((roots > 10.0).astype(float))
             data[f"{reading} {limit:g}"] = runs.armse(errors) | {"far": list(far)}

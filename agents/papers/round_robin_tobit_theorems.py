@@ -11,7 +11,6 @@ import fusion_gym
 from fusion_gym import gaussian, linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.base import Policy
@@ -28,6 +27,7 @@ from .round_robin_tobit_runs import (
     SingleSensor,
     censored,
 )
+from .walk import walk_in_parts
 
 PLACES = (-7.0, -5.0, -4.0, 0.0, 4.5, 5.0, 6.0)  # true x1 at which Lemma 1 is tried
 _DRAWS = 200  # measurements an episode, at each of them
@@ -105,7 +105,7 @@ def _errors(env: str, episodes: int, seed: int) -> dict[str, Any]:
     values = {name: np.zeros(episodes) for name in names}
     last = np.zeros((episodes, 3))
 
-    def before(batch: EpisodeBatch, step: int, runs: slice) -> None:
+    for step, runs, batch, requests in walk_in_parts(task, "round_robin", episodes, seed):
         error = batch.state.truth - batch.state.prior_mean
         if step:
             earlier = last[runs].T
@@ -122,14 +122,11 @@ def _errors(env: str, episodes: int, seed: int) -> dict[str, Any]:
         values["uncensored"][runs] += free
         values["sure"][runs] += np.where(sure, inside, 0.0)
         values["surprised"][runs] += sure & free
-
-    def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
-        assert np.all(np.argmax(outcome.granted, axis=0) == step % task.sensors)
+        outcome = batch.step(requests)
+        assert np.all(np.argmax(outcome.granted, axis=0) == sensor)
         mean, covariance = task.system.fused(batch.delivered)
         error = task.system.truth(batch.delivered) - mean
         values["nees"][runs] += linalg.dot(error, linalg.solve_vector(covariance, error)) / 3.0
-
-    measures.walk(task, measures.round_robin(task), episodes, seed, look, before)
     for name in ("nees", "predicted", "uncensored"):
         values[name] /= task.horizon
     return values
@@ -158,11 +155,9 @@ def _fusion(episodes: int, seed: int) -> dict[str, Any]:
 
 def _means(task: Any, episodes: int, seed: int, policy: str = "round_robin") -> Array:
     values = np.empty((task.horizon, 3, episodes))
-
-    def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
+    for step, runs, batch, requests in walk_in_parts(task, policy, episodes, seed):
+        batch.step(requests)
         values[step, :, runs] = task.system.fused(batch.delivered)[0]
-
-    measures.walk(task, fusion_gym.make_policy(policy, task), episodes, seed, look)
     return values
 
 
@@ -175,7 +170,7 @@ def _worth(episodes: int, seed: int) -> dict[str, Any]:
     data: dict[str, Any] = {}
     for name, options in settings.items():
         task = fusion_gym.make_task(OSCILLATOR, **options)
-        errors = measures.squares(task, measures.round_robin(task), episodes, seed)
+        errors = measures.squares(task, "round_robin", episodes, seed)
         data[f"mse_{name}"] = errors.sum(2).mean(1)
         data[f"armse_{name}"] = measures.armse(errors)["mean"]
     return data
@@ -262,7 +257,7 @@ class Lower(BoundRecursion):
 
 
 def failures(
-    task: Task, policy: Policy, episodes: int, seed: int, bounds: Sequence[Upper | Lower]
+    task: Task, policy: Policy | str, episodes: int, seed: int, bounds: Sequence[Upper | Lower]
 ) -> tuple[Array, Array]:
     """Return shares of an episode's steps in which a bound fails.
 
@@ -272,7 +267,7 @@ def failures(
     pairs = [bounds[i : i + 2] for i in range(0, len(bounds) - 1, 2)]
     local, fused = np.zeros((len(bounds), episodes)), np.zeros((len(pairs), episodes))
 
-    def before(batch: EpisodeBatch, step: int, runs: slice) -> None:
+    for step, runs, batch, requests in walk_in_parts(task, policy, episodes, seed):
         covariance = batch.state.prior_covariance
         observed = [_seen(task, batch, sensor) for sensor in range(task.sensors)]
         for place, bound in enumerate(bounds):
@@ -287,8 +282,7 @@ def failures(
         for bound in bounds:
             turn = step % task.sensors == bound.sensor
             bound.advance(covariance * bound.inflation, observed[bound.sensor], turn)
-
-    measures.walk(task, policy, episodes, seed, lambda *_: None, before)
+        batch.step(requests)
     return local / (task.horizon - 1), fused / (task.horizon - 1)
 
 
@@ -330,13 +324,13 @@ def simulate_bounds(episodes: int, seed: int, settings: Settings) -> Data:
         task = fusion_gym.make_task(env, **options)
         for sensor in range(2):
             single = _of(task, sensor, 1.0)
-            policy = SingleSensor(measures.round_robin(task), sensor)
+            policy = SingleSensor(fusion_gym.make_policy("round_robin", task), sensor)
             local, _ = failures(task, policy, episodes, seed, list(single.values()))
             for name, sample in zip(single, local, strict=True):
                 data[f"{example}:4/{name}/{sensor}"] = sample
         nodes = [_of(task, sensor, 1.0 / SHARE) for sensor in range(2)]
         bounds = [node[name] for name in nodes[0] for node in nodes]
-        _, fused = failures(task, measures.round_robin(task), episodes, seed, bounds)
+        _, fused = failures(task, "round_robin", episodes, seed, bounds)
         for name, sample in zip(nodes[0], fused, strict=True):
             data[f"{example}:5/{name}"] = sample
     return data

@@ -41,8 +41,9 @@ READINGS: dict[str, dict[str, Any]] = {
 
 
 def _record(episodes: int, seed: int, settings: Settings, **options: Any) -> History:
-    task = scheme(**(settings["options"] | options))
-    return record_history(task, episodes, seed, make_policy(settings["policy"], task))
+    return record_history(
+        scheme(**(settings["options"] | options)), episodes, seed, settings["policy"]
+    )
 
 
 # --- tokens, events and measurements --------------------------------------------------------------
@@ -209,7 +210,7 @@ def simulate_bucket_theorems(episodes: int, seed: int, settings: Settings) -> Da
     eigenvalues, deviations = zip(*map(runs.claimed, gaps, bounds), strict=True)
     recorded = record_history(task, few, seed)
     parts = runs.terms(task, recorded)
-    never = record_history(task, few, seed, make_policy("never", task))
+    never = record_history(task, few, seed, "never")
     long = record_history(scheme(horizon=_LONG), few, seed)
     windows, traces = (
         values.reshape(-1, _WINDOW, few).mean(1) for values in (long.fused_error, long.fused_trace)
@@ -218,7 +219,7 @@ def simulate_bucket_theorems(episodes: int, seed: int, settings: Settings) -> Da
         record_history(task, episodes, seed, runs.Failing(make_policy(TRIGGER, task), m))
         for m in _NODES
     ]
-    silent = record_history(task, episodes, seed, make_policy("never", task))
+    silent = record_history(task, episodes, seed, "never")
     gains = runs.perturbed(parts, recorded, seed)
     return {
         "eigenvalue": np.array(eigenvalues), "eigenvalue_error": np.array(deviations),

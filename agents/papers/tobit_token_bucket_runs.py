@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 import fusion_gym
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy, Requests
 from fusion_gym.policies.rules.dynamic_event import DynamicEvent
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
+
+from .walk import walk
 
 TRIGGER = "dynamic_event"
 SENSORS = 3
@@ -107,15 +108,12 @@ def single_sensor(sensor: int) -> Task:
     )  # fmt: skip
 
 
-def record_history(task: Task, episodes: int, seed: int, policy: Policy | None = None) -> History:
+def record_history(task: Task, episodes: int, seed: int, policy: Policy | str = TRIGGER) -> History:
     """Run the paper's trigger, or another policy, and keep everything."""
-    policy = fusion_gym.make_policy(TRIGGER, task) if policy is None else policy
-    batch = EpisodeBatch.seeded(task, episodes, seed)
-    policy.reset(episodes, seed)
     rows = []
-    for _ in range(task.horizon):
+    for batch, requests in walk(task, policy, episodes, seed):
         before, tokens = batch.state, batch.tokens
-        outcome = batch.step(policy(batch.signals()))
+        outcome = batch.step(requests)
         state, granted = batch.delivered, outcome.granted
         planned, expected = state.prediction.outcomes, state.prediction.expectation
         bounds = (planned.delivered_covariance, planned.silent_covariance)

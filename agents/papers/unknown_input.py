@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 import fusion_gym
 from fusion_gym.arrays import Array
-from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
 from fusion_gym.systems.unknown_input.environment import UnknownInputOptions
@@ -25,6 +24,7 @@ from . import unknown_input_recursion as recursion
 from .numbers import Number, below, estimate, grid, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
 from .unknown_input_recursion import EXACT_CUTOFF
+from .walk import walk
 
 PRINTED, CARTS = "paper", "two_carts"
 EXAMPLES = (PRINTED, CARTS)
@@ -80,14 +80,10 @@ def make_example(**options: Any) -> tuple[Task, UnknownInputSystem]:
 
 def record_run(task: Task, policy: str, episodes: int, seed: int) -> Record:
     """Run a policy and record what the figures show."""
-    rule = fusion_gym.make_policy(policy, task)
-    batch = EpisodeBatch.seeded(task, episodes, seed)
-    rule.reset(episodes, seed)
     rows = []
-    for _ in range(task.horizon):
+    for batch, requests in walk(task, policy, episodes, seed):
         apart = batch.state.measurement - batch.state.held
-        outcome = batch.step(rule(batch.signals()))
-        state = batch.delivered
+        outcome, state = batch.step(requests), batch.delivered
         means = state.estimates.mean, state.estimates.fused_mean
         values = (state.truth, *means, state.held, (apart**2).sum(1), outcome.granted)
         rows.append([np.array(value) for value in values])
