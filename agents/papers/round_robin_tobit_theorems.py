@@ -188,76 +188,62 @@ class Censoring(NamedTuple):
 
 
 @dataclass
-class BoundRecursion:
+class Bound:
     """A bound (states, states, N) of a sensor, beside the covariance P⁻ that it is to bound.
 
-    ``inflation`` is 1 for a single filter and ε⁻¹ for a node, whose process covariance is
-    Q/ε by (27).
+    P^u or P^l of Theorem 4, in a ``reading`` of :data:`UPPER` or :data:`LOWER`. ``inflation`` is 1
+    for a single filter and ε⁻¹ for a node, whose process covariance is Q/ε by (27).
     """
 
     task: Task
     sensor: int
     inflation: float
+    upper: bool
+    reading: tuple[Any, bool]
     value: Array = field(default_factory=lambda: np.zeros(0), init=False)
 
-    def moved(self, stored: Array, share: Array | float = 1.0) -> Array:
-        """Return A ``stored`` Aᵀ and a ``share`` of the process covariance."""
-        model = censored(self.task).model
-        process = model.process_covariance * self.inflation
-        return linalg.congruence(model.transition, stored) + share * process
-
-
-@dataclass
-class Upper(BoundRecursion):
-    """P^u of Theorem 4, in a reading of :data:`UPPER`."""
-
-    sign: float
-    own: bool
-
     def begin(self, covariance: Array) -> None:
-        """At the first step: P^u = P⁻, as the proof has it."""
-        self.value = covariance.copy()
+        """At the first step: P^u = P⁻ and P^l = 0, as the proof has it."""
+        self.value = covariance.copy() if self.upper else np.zeros_like(covariance)
 
     def holds(self, covariance: Array) -> NDArray[np.bool_]:
         """Return whether (N,) it bounds P⁻."""
-        return matrix_below(covariance, self.value)
+        least, most = (covariance, self.value) if self.upper else (self.value, covariance)
+        return matrix_below(least, most)
 
     def advance(self, covariance: Array, observed: Censoring, turn: bool) -> None:
         """Go to the next step, from P⁻, what is expected, and whether it is this sensor's turn."""
-        sensors, stored = censored(self.task).centre.sensors, self.value
-        if turn:
-            row = sensors.measurement_matrix[self.sensor, 0]
-            cross = linalg.matvec(self.value if self.own else covariance, row)
-            noise = sensors.variance[self.sensor, 0] * (1.0 + self.sign * observed.narrowing)
-            weight = (1.0 - observed.left) ** 2
-            innovation = weight * linalg.dot(row, cross) + noise
-            stored = stored - linalg.outer(cross, cross) * weight / innovation
-        self.value = self.moved(stored)
+        system = censored(self.task)
+        stored, share = (self._updated_upper if self.upper else self._updated_lower)(
+            covariance, observed, turn
+        )
+        process = system.model.process_covariance * self.inflation
+        self.value = linalg.congruence(system.model.transition, stored) + share * process
 
+    def _updated_upper(
+        self, covariance: Array, observed: Censoring, turn: bool
+    ) -> tuple[Array, Array | float]:
+        sign, own = self.reading
+        sensors = censored(self.task).centre.sensors
+        if not turn:
+            return self.value, 1.0
+        row = sensors.measurement_matrix[self.sensor, 0]
+        cross = linalg.matvec(self.value if own else covariance, row)
+        noise = sensors.variance[self.sensor, 0] * (1.0 + sign * observed.narrowing)
+        weight = (1.0 - observed.left) ** 2
+        innovation = weight * linalg.dot(row, cross) + noise
+        return self.value - linalg.outer(cross, cross) * weight / innovation, 1.0
 
-@dataclass
-class Lower(BoundRecursion):
-    """P^l of Theorem 4, in a reading of :data:`LOWER`."""
-
-    turns: bool
-    part: bool
-
-    def begin(self, covariance: Array) -> None:
-        """At the first step: P^l = 0, as the proof has it."""
-        self.value = np.zeros_like(covariance)
-
-    def holds(self, covariance: Array) -> NDArray[np.bool_]:
-        """Return whether (N,) it bounds P⁻."""
-        return matrix_below(self.value, covariance)
-
-    def advance(self, covariance: Array, observed: Censoring, turn: bool) -> None:
-        """Go to the next step, from P⁻, what is expected, and whether it is this sensor's turn."""
-        inside = observed.inside**2 if turn or not self.turns else np.zeros_like(observed.inside)
-        self.value = self.moved((1.0 - inside) * self.value, inside if self.part else 1.0)
+    def _updated_lower(
+        self, covariance: Array, observed: Censoring, turn: bool
+    ) -> tuple[Array, Array | float]:
+        turns, part = self.reading
+        inside = observed.inside**2 if turn or not turns else np.zeros_like(observed.inside)
+        return (1.0 - inside) * self.value, inside if part else 1.0
 
 
 def failures(
-    task: Task, policy: Policy | str, episodes: int, seed: int, bounds: Sequence[Upper | Lower]
+    task: Task, policy: Policy | str, episodes: int, seed: int, bounds: Sequence[Bound]
 ) -> tuple[Array, Array]:
     """Return shares of an episode's steps in which a bound fails.
 
@@ -277,7 +263,7 @@ def failures(
             local[place, runs] += ~bound.holds(own)
         for place, pair in enumerate(pairs if step else []):
             ends = _joined([item.value for item in pair]), covariance[:2, :2]
-            low, high = ends if isinstance(pair[0], Lower) else ends[::-1]
+            low, high = ends[::-1] if pair[0].upper else ends
             fused[place, runs] += ~matrix_below(low, high)
         for bound in bounds:
             turn = step % task.sensors == bound.sensor
@@ -286,11 +272,13 @@ def failures(
     return local / (task.horizon - 1), fused / (task.horizon - 1)
 
 
-def _of(task: Task, sensor: int, inflation: float) -> dict[str, Upper | Lower]:
+def _of(task: Task, sensor: int, inflation: float) -> dict[str, Bound]:
     """Both bounds of a sensor in all their readings."""
-    uppers = {f"upper/{name}": Upper(task, sensor, inflation, *how) for name, how in UPPER.items()}
-    lowers = {f"lower/{name}": Lower(task, sensor, inflation, *how) for name, how in LOWER.items()}
-    return {**uppers, **lowers}
+    return {
+        f"{end}/{name}": Bound(task, sensor, inflation, end == "upper", reading)
+        for end, readings in (("upper", UPPER), ("lower", LOWER))
+        for name, reading in readings.items()
+    }
 
 
 def _seen(task: Task, batch: EpisodeBatch, sensor: int) -> Censoring:
