@@ -1,5 +1,6 @@
 """Runs of the tracking example side by side, and what is recorded of their errors."""
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -124,7 +125,7 @@ class ErrorRecord:
         self.sums: dict[str, Array] = {}
         self.most: dict[str, Array] = {}
         self.compared = 0
-        self.rows: dict[str, list[Array]] = {}
+        self.rows: defaultdict[str, list[Array]] = defaultdict(list)
         self.stored: dict[str, Array] = {}
 
     def arrays(self) -> dict[str, Array]:
@@ -159,14 +160,13 @@ class ErrorRecord:
         )  # fmt: skip
         self._most(worst=largest)
         for name, value in zip(("mse", "actual", "conservative"), (mse, *traces), strict=True):
-            self._row(f"{name}_steps", self._lanes(value).mean(-1))
-        for name, value in (
-            ("truth", state.truth),
-            ("mean", state.mean[0]),
-            ("actual_deviation", deviation),
-            ("conservative_deviation", bound),
-        ):
-            self._row(name, self._lanes(value)[..., 0])
+            self.rows[f"{name}_steps"].append(self._lanes(value).mean(-1))
+        first = {
+            "truth": state.truth, "mean": state.mean[0], "actual_deviation": deviation,
+            "conservative_deviation": bound,
+        }  # fmt: skip
+        for name, value in first.items():
+            self.rows[name].append(self._lanes(value)[..., 0])
         if self.with_nodes:
             self._add(node_mse=((state.truth - state.mean[1:]) ** 2).sum(1))
         if step.number % _EVERY == 0:
@@ -199,16 +199,12 @@ class ErrorRecord:
 
     def _add(self, **values: NDArray[Any]) -> None:
         for name, value in values.items():
-            result = self._lanes(value).astype(float)
-            self.sums[name] = self.sums[name] + result if name in self.sums else result
+            self.sums[name] = self.sums.get(name, 0.0) + self._lanes(value).astype(float)
 
     def _most(self, **values: Array) -> None:
         for name, value in values.items():
             result = self._lanes(value)
             self.most[name] = np.maximum(self.most.get(name, result), result)
-
-    def _row(self, name: str, value: Array) -> None:
-        self.rows.setdefault(name, []).append(value)
 
 
 def _first(covariance: Array) -> NDArray[np.float64]:

@@ -3,8 +3,10 @@
 Source: round_robin_tobit, Section IV.
 """
 
+import functools
 from collections.abc import Sequence
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -211,34 +213,33 @@ def simulate_tables(
     Both begin with the first interval and the first variance.
     """
     intervals, variances = settings["interval"], settings["variance"]
-    first: Data = {}
-    data: Data = {}
-    for name in tables:
-        rows: list[Data] = []
-        before: dict[str, Array] = {}
-        for interval, variance in (
-            [(limit, variances[0]) for limit in intervals]
-            if name == "table_2"
-            else [(intervals[0], variance) for variance in variances]
-        ):
-            if not rows and first:
-                rows, before = [first["row"]], first["errors"]
-                continue
-            row: Data = {"interval": interval, "variance": variance}
-            errors = {}
-            for filter_ in _FILTERS:
-                task = _oscillator(settings, filter=filter_, **_options(interval, variance))
-                result = runs.squares(task, settings["policy"], episodes, seed)
-                rise = _rise(before.get(filter_, result), result)
-                row[filter_] = runs.armse(result) | _median(result) | {"rise": rise}
-                errors[filter_] = result
-            own = {"measurement_variance": variance} | settings["options"]
-            row["floor"] = runs.floor(runs.OSCILLATOR, **own)
-            row["floor_all"] = runs.floor(runs.OSCILLATOR, access="any", **own)
-            rows.append(row)
-            before = errors
-            first = first or {"row": row, "errors": errors}
-        data[name] = rows
+    pairs = {
+        "table_2": [(interval, variances[0]) for interval in intervals],
+        "table_3": [(intervals[0], variance) for variance in variances],
+    }
+
+    @functools.cache
+    def errors(pair: tuple[float, float]) -> dict[str, Array]:
+        tasks = {name: _oscillator(settings, filter=name, **_options(*pair)) for name in _FILTERS}
+        policy = settings["policy"]
+        return {name: runs.squares(task, policy, episodes, seed) for name, task in tasks.items()}
+
+    @functools.cache
+    def row(before: tuple[float, float], pair: tuple[float, float]) -> Data:
+        own = {"measurement_variance": pair[1]} | settings["options"]
+        floors = {
+            "floor": runs.floor(runs.OSCILLATOR, **own),
+            "floor_all": runs.floor(runs.OSCILLATOR, access="any", **own),
+        }
+        return {"interval": pair[0], "variance": pair[1]} | floors | {
+            name: runs.armse(result) | _median(result)
+            | {"rise": _rise(errors(before)[name], result)}
+            for name, result in errors(pair).items()
+        }  # fmt: skip
+
+    data: Data = {
+        name: [row(*each) for each in pairwise([pairs[name][0], *pairs[name]])] for name in tables
+    }
     task = _oscillator(settings)
     never = runs.squares(task, "never", episodes, seed)
     return data | {"silent": runs.armse(never), "bias_deviation": _bias_deviation(task)}

@@ -97,13 +97,8 @@ def armse(squared: Array) -> dict[str, list[float]]:
     standard deviation of what so many runs as the paper's would give.
     """
     drawn = _drawn(squared)
-    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
     spread = drawn.std(0) * np.sqrt(len(squared) / PAPER_RUNS)
-    mean = np.sqrt(squared.mean(0)).mean(0)
-    return {
-        "mean": mean.tolist(), "low": low.tolist(), "high": high.tolist(),
-        "spread": spread.tolist(),
-    }  # fmt: skip
+    return _with_ends(np.sqrt(squared.mean(0)), drawn) | {"spread": spread.tolist()}
 
 
 def increase(before: Array, after: Array) -> dict[str, list[float]]:
@@ -111,9 +106,13 @@ def increase(before: Array, after: Array) -> dict[str, list[float]]:
 
     ``mean``, ``low`` and ``high`` of the 95 % bootstrap interval of the paired difference.
     """
-    low, high = np.quantile(_drawn(after) - _drawn(before), [0.025, 0.975], axis=0)
-    mean = (np.sqrt(after.mean(0)) - np.sqrt(before.mean(0))).mean(0)
-    return {"mean": mean.tolist(), "low": low.tolist(), "high": high.tolist()}
+    rise = np.sqrt(after.mean(0)) - np.sqrt(before.mean(0))
+    return _with_ends(rise, _drawn(after) - _drawn(before))
+
+
+def _with_ends(curve: Array, drawn: Array) -> dict[str, list[float]]:
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+    return {"mean": curve.mean(0).tolist(), "low": low.tolist(), "high": high.tolist()}
 
 
 def medians(squared: Array, state: int = 0) -> tuple[float, Array]:
