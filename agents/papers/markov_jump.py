@@ -19,6 +19,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingOptions
 
 from ..output.palette import BLACK, BLUE, GREEN, ORANGE, PURPLE, SENSORS, SKY, TRUTH, VERMILLION
+from .drawing import legend_of
 from .markov_jump_covariances import covariances
 from .numbers import Number, below, grid, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_list
@@ -400,7 +401,7 @@ def _draw_tracking(figure: Any, data: Data) -> None:
         handles += _curves(axis, data, data["means"][..., state])
         _title(axis, state, STATES[state])
     axes[-1].set_xlabel(_TIME)
-    _legend(figure, handles)
+    legend_of(figure, handles, len(handles), 1.8)
 
 
 def _draw_errors(figure: Any, data: Data) -> None:
@@ -412,7 +413,7 @@ def _draw_errors(figure: Any, data: Data) -> None:
         axis.set_ylim(bottom=0.0)
         _title(axis, state, f"RMSE of {STATES[state]}")
     axes[-1].set_xlabel(_TIME)
-    _legend(figure, handles)
+    legend_of(figure, handles, len(handles), 1.8)
 
 
 def _draw_traces(figure: Any, data: Data) -> None:
@@ -421,7 +422,7 @@ def _draw_traces(figure: Any, data: Data) -> None:
     axis.set_ylabel("trace of $P_0$ (m² and m²/s²)")
     axis.set_ylim(bottom=0.0)
     axis.set_xlabel(_TIME)
-    _legend(figure, handles)
+    legend_of(figure, handles, len(handles), 1.8)
 
 
 def _title(axis: Any, state: int, what: str) -> None:
@@ -440,13 +441,6 @@ def _curves(axis: Any, data: Data, values: Array, width: float = 1.4, alpha: flo
             label=label,
         )  # fmt: skip
     return handles
-
-
-def _legend(figure: Any, handles: Any) -> None:
-    figure.legend(
-        handles=handles, loc="outside upper center", ncols=len(handles), handlelength=1.8,
-        columnspacing=1.2, handletextpad=0.5,
-    )  # fmt: skip
 
 
 PAPER = Paper(

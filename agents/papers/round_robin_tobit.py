@@ -21,6 +21,7 @@ from fusion_gym.policies.registry import make_policy
 from ..output import palette
 from . import round_robin_tobit_runs as runs
 from . import round_robin_tobit_theorems as theorems
+from .drawing import legend
 from .numbers import Number, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_of
 
@@ -415,18 +416,7 @@ def _draw_curves(
         if kind == "rmse":
             axis.set_ylim(bottom=0.0)
     axes[-1].set_xlabel(step)
-    _legend(figure, axes)
-
-
-def _legend(figure: Any, axes: Sequence[Any]) -> None:
-    """Below the axes, each name once."""
-    entries: dict[str, Any] = {}
-    for axis in axes:
-        handles, labels = axis.get_legend_handles_labels()
-        entries.update(zip(labels, handles, strict=True))
-    figure.legend(
-        entries.values(), entries.keys(), loc="outside lower center", ncols=min(4, len(entries))
-    )
+    legend(figure, axes, 4, "lower")
 
 
 def _draw_measurements(figure: Any, data: Data) -> None:
@@ -446,7 +436,7 @@ def _draw_measurements(figure: Any, data: Data) -> None:
         axis.set_ylabel(f"measurement\nof x{number + 1} (sensor {number + 1})")
         axis.margins(x=0.01)
     axes[-1].set_xlabel(_STEP)
-    _legend(figure, axes)
+    legend(figure, axes, 4, "lower")
 
 
 def _draw_table(figure: Any, data: Data, name: str) -> None:
@@ -484,7 +474,7 @@ def _draw_table(figure: Any, data: Data, name: str) -> None:
         axis.set_title(f"ARMSE{state + 1} (of {('x1', 'x2', 'b')[state]})")
         axis.set_ylim(bottom=0.0)
         axis.set_xlim(-0.6, len(rows) - 0.4)
-    _legend(figure, axes)
+    legend(figure, axes, 4, "lower")
 
 
 def _curves_of(

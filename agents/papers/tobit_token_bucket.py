@@ -17,6 +17,7 @@ from fusion_gym.policies.registry import make_policy
 from ..output.palette import FUSED, INK, MEASURED, TRUTH
 from ..output.palette import SENSORS as COLOURS
 from . import tobit_token_bucket_runs as runs
+from .drawing import legend_of
 from .numbers import below, estimate, grid, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
 from .tobit_token_bucket_runs import SENSORS, TRIGGER, History, record_history, scheme
@@ -321,13 +322,6 @@ _CENSORED = "#e4e6ea"  # opaque, so that grid and palette leave it as it is
 _TIME = "time t (steps)"
 
 
-def _legend(figure: Any, handles: Sequence[Any], columns: int) -> None:
-    figure.legend(
-        handles=handles, loc="outside upper center", ncols=columns, handlelength=1.6,
-        columnspacing=1.2, handletextpad=0.5,
-    )  # fmt: skip
-
-
 def _draw_tokens(figure: Any, data: Data) -> None:
     level, requested, granted = (data[name] for name in ("level", "requested", "granted"))
     requested, granted = requested.astype(bool), granted.astype(bool)
@@ -356,7 +350,7 @@ def _draw_tokens(figure: Any, data: Data) -> None:
     lower.grid(axis="y", visible=False)
     lower.set_xlabel(_TIME)
     (line,) = upper.plot([], [], color=INK, lw=1.6, label="tokens")
-    _legend(figure, [line, least, sent, refused], 4)
+    legend_of(figure, [line, least, sent, refused], 4)
 
 
 def _draw_measurements(figure: Any, data: Data, component: int) -> None:
@@ -375,7 +369,7 @@ def _draw_measurements(figure: Any, data: Data, component: int) -> None:
     axes[-1].set_xlabel(_TIME)
     label = "after: held by the filter, " + r"$\bar{y}$"
     (after,) = axes[0].plot([], [], color=INK, lw=1.7, label=label)
-    _legend(figure, [before, after], 1)
+    legend_of(figure, [before, after], 1)
 
 
 def _draw_states(figure: Any, data: Data, sensor: int) -> None:
@@ -398,7 +392,7 @@ def _draw_states(figure: Any, data: Data, sensor: int) -> None:
         axis.set_ylabel(f"$x_{state + 1}$ (no unit)")
     axes[-1].set_xlabel(_TIME)
     handles.append(Patch(color=_CENSORED, lw=0, label="censored"))
-    _legend(figure, handles, 4)
+    legend_of(figure, handles, 4)
 
 
 def _draw_errors(figure: Any, data: Data, sensor: int) -> None:
@@ -425,7 +419,7 @@ def _draw_errors(figure: Any, data: Data, sensor: int) -> None:
         axis.set_title(title, loc="left")
         axis.set_ylabel("lg (no unit)")
     axes[-1].set_xlabel(_TIME)
-    _legend(figure, handles, 2)
+    legend_of(figure, handles, 2)
 
 
 _SIZE, _TALL = (7.2, 4.4), (7.2, 4.8)

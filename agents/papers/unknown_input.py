@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullLocator
 from numpy.typing import NDArray
 
 import fusion_gym
@@ -21,6 +20,7 @@ from fusion_gym.systems.unknown_input.system import UnknownInputSystem
 
 from ..output import palette
 from . import unknown_input_recursion as recursion
+from .drawing import legend, set_ticks
 from .numbers import Number, below, estimate, grid, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
 from .unknown_input_recursion import EXACT_CUTOFF
@@ -394,18 +394,12 @@ def _grid(figure: Any, data: Data, rows: int) -> Any:
     return axes
 
 
-def _legend(figure: Any, axes: Any, columns: int) -> None:
-    """Over all axes, each label once: the truth, the fused estimate, the nodes, the rest."""
-    entries: dict[str, Any] = {}
-    for axis in np.asarray(axes).ravel():
-        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
-    ranks = {"true value": 0, "fused": 1}
-    order = sorted(entries, key=lambda label: ranks.get(label, 2 if label[:4] == "node" else 3))
-    handles = [entries[label] for label in order]
-    figure.legend(
-        handles, order, loc="outside upper center", ncols=columns, fontsize=9, columnspacing=1.0
-    )
+def _rank(label: str) -> int:
+    """The truth, the fused estimate, the nodes, the rest."""
+    return {"true value": 0, "fused": 1}.get(label, 2 if label.startswith("node") else 3)
+
+
+_legend = partial(legend, rank=_rank, fontsize=9, columnspacing=1.0)
 
 
 def _draw_estimates(figure: Any, data: Data, entries: Entries) -> None:
@@ -465,9 +459,7 @@ def _draw_input_bounds(figure: Any, data: Data) -> None:
                 axis.plot([], [], style, color=palette.INK, label=name)
         axis.set_yscale("log")
         axis.set_ylabel("bound" + (" (N²)" if example == CARTS else ""))
-    axes[0, 1].yaxis.set_major_locator(FixedLocator([5.0, 7.0, 10.0, 14.0]))
-    axes[0, 1].yaxis.set_major_formatter(FormatStrFormatter("%g"))
-    axes[0, 1].yaxis.set_minor_locator(NullLocator())
+    set_ticks(axes[0, 1], [5.0, 7.0, 10.0, 14.0])
     _legend(figure, axes, 7)
 
 
