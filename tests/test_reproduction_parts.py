@@ -16,7 +16,7 @@ from fusion_gym.agents.papers.adaptive_innovation_runs import _largest, _whitene
 from fusion_gym.agents.papers.markov_jump import example, period_of, run_markov_jump, trigger
 from fusion_gym.agents.papers.markov_jump_covariances import covariances
 from fusion_gym.agents.papers.numbers import below, cite, percent, verdict
-from fusion_gym.agents.papers.round_robin_tobit_theorems import Bound, Censoring, matrix_below
+from fusion_gym.agents.papers.round_robin_tobit_theorems import Censoring, MatrixBound, matrix_below
 from fusion_gym.agents.papers.unknown_input_recursion import gains, models
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation import run_episodes
@@ -211,8 +211,8 @@ def test_bounds_of_a_filter_that_is_never_censored() -> None:
     task = fusion_gym.make_task(biased.TRACKING)
     system = biased.censored(task)
     covariance = system.plant.initial_covariance.copy()
-    upper = Bound(task, 0, 1.0, True, (-1.0, True))
-    lower = Bound(task, 0, 1.0, False, (False, False))
+    upper = MatrixBound(task, 0, 1.0, True, (-1.0, True))
+    lower = MatrixBound(task, 0, 1.0, False, (False, False))
     observed = Censoring(np.zeros(1), np.ones(1), np.zeros(1))
     upper.begin(covariance)
     lower.begin(covariance)

@@ -188,7 +188,7 @@ class Censoring(NamedTuple):
 
 
 @dataclass
-class Bound:
+class MatrixBound:
     """A bound (states, states, N) of a sensor, beside the covariance P⁻ that it is to bound.
 
     P^u or P^l of Theorem 4, in a ``reading`` of :data:`UPPER` or :data:`LOWER`. ``inflation`` is 1
@@ -243,7 +243,7 @@ class Bound:
 
 
 def failures(
-    task: Task, policy: Policy | str, episodes: int, seed: int, bounds: Sequence[Bound]
+    task: Task, policy: Policy | str, episodes: int, seed: int, bounds: Sequence[MatrixBound]
 ) -> tuple[Array, Array]:
     """Return shares of an episode's steps in which a bound fails.
 
@@ -272,10 +272,10 @@ def failures(
     return local / (task.horizon - 1), fused / (task.horizon - 1)
 
 
-def _of(task: Task, sensor: int, inflation: float) -> dict[str, Bound]:
+def _of(task: Task, sensor: int, inflation: float) -> dict[str, MatrixBound]:
     """Both bounds of a sensor in all their readings."""
     return {
-        f"{end}/{name}": Bound(task, sensor, inflation, end == "upper", reading)
+        f"{end}/{name}": MatrixBound(task, sensor, inflation, end == "upper", reading)
         for end, readings in (("upper", UPPER), ("lower", LOWER))
         for name, reading in readings.items()
     }
