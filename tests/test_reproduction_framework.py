@@ -189,21 +189,6 @@ def test_a_verdict_has_its_edge_where_it_says() -> None:
     assert Number("x", 2.0, 2.0, 2.0, 2.001).verdict == "differs"
 
 
-@pytest.mark.parametrize(("runs", "episodes"), [(1, 1000), (1000, 100)])
-def test_true_reprints_agree_in_95_of_100(runs: int, episodes: int) -> None:
-    """Gaussian papers with known deviation: the coverage is 95 %, 4.5 errors of 5,000 papers."""
-    rng, count, deviation = np.random.default_rng(runs), 5_000, 1.7
-    ours = rng.normal(scale=deviation / np.sqrt(episodes), size=count)
-    theirs = rng.normal(scale=deviation / np.sqrt(runs), size=count)
-    half, spread = 1.96 * deviation / np.sqrt(episodes), deviation / np.sqrt(runs)
-    numbers = [
-        Number("x", our, our - half, our + half, other, spread)
-        for our, other in zip(ours, theirs, strict=True)
-    ]
-    agreed = np.mean([number.verdict == "agrees" for number in numbers])
-    assert agreed == pytest.approx(0.95, abs=4.5 * np.sqrt(0.95 * 0.05 / count))
-
-
 def test_numbers_of_a_sample_have_its_moments() -> None:
     sample = np.random.default_rng(0).normal(3.0, 2.0, size=2000)
     number = Number.of("x", sample, 3.0, 25, "m")

@@ -15,7 +15,7 @@ from fusion_gym.agents.papers import unknown_input
 from fusion_gym.agents.papers.adaptive_innovation_runs import _largest, _whitened
 from fusion_gym.agents.papers.markov_jump import example, period_of, run_markov_jump, trigger
 from fusion_gym.agents.papers.markov_jump_covariances import covariances
-from fusion_gym.agents.papers.numbers import below, cite, percent, verdict
+from fusion_gym.agents.papers.numbers import cite, percent, verdict
 from fusion_gym.agents.papers.round_robin_tobit_theorems import Censoring, MatrixBound, matrix_below
 from fusion_gym.agents.papers.unknown_input_recursion import gains, models
 from fusion_gym.core.task import Task
@@ -95,10 +95,6 @@ def test_verdicts_and_their_words() -> None:
     assert cite(Interval(0.7, 0.6991, 100.0)) == "0.700 [0.699, 100]"
     assert percent((0.0, 0.4567, 0.9996, 1.0)) == "0 %, 46 %, 99.96 %, 100 %"
     assert percent(0.0004) == "0.04 %"
-    sample = np.random.default_rng(1).normal(size=200)
-    assert below(sample, sample + 0.1)
-    assert not below(sample, sample)
-    assert not below(sample, np.random.default_rng(2).normal(size=200) + 0.001)
 
 
 # --- the biased oscillator ----------------------------------------------------------------------
@@ -157,12 +153,10 @@ def test_a_paired_increase_is_reported_from_none() -> None:
     assert values["high"][2] < 0.0
 
 
-def test_curves_are_judged_by_what_is_clear() -> None:
+def test_one_point_above_is_told_from_all_below() -> None:
     error = np.full((100, 2), 1.0)
-    assert biased.always_below(np.stack([-5 * error, error]))[0] == "holds"
     one_above = np.where(np.arange(100)[:, None] == 3, 5.0, -5.0) * error
     assert biased.always_below(np.stack([one_above, error]))[0] == "holds partly"
-    assert biased.always_below(np.stack([0.5 * error, error]))[0] == "does not hold"
     assert biased.always_below(np.stack([5 * error, error]))[0] == "does not hold"
     assert biased.explained([1.0, 3.0], [2.0, 3.0]) == pytest.approx([0.75, 0.0])
 

@@ -104,7 +104,7 @@ class ErrorRecord:
     the share of steps in which the actual deviation is at most the conservative one, ``bounded``
     the share in which P - P̄ is positive semidefinite, ``whitened`` (L, n, n, E) the mean of
     L⁻¹ e eᵀ L⁻ᵀ with P = L Lᵀ; ``worst`` is the largest generalised eigenvalue of P̄ against P in
-    any step, ``rate`` (L, sensors, E). ``square`` (L, n, E) and ``level`` (L, n, E): mean squares
+    any step. ``square`` (L, n, E) and ``level`` (L, n, E): mean squares
     of the fused errors, and of the states about their start. ``beats`` (L, sensors, E): the share
     of steps in which the fused conservative trace is the smaller, ``encloses`` (L, sensors, E) in
     which a node's conservative covariance is at least the fused one, ``encloses_plane`` of
@@ -153,7 +153,7 @@ class ErrorRecord:
         largest = _largest(actual, claimed)
         start = state.truth - np.array(CorrelatedTrackingOptions().initial_mean)[:, None]
         self._add(
-            rate=step.outcome.requested, mse=mse, actual=traces[0], conservative=traces[1],
+            mse=mse, actual=traces[0], conservative=traces[1],
             inside=np.abs(error) <= 3.0 * deviation, ordered=deviation <= bound * (1.0 + _ROUNDING),
             bounded=largest <= 1.0 + _ROUNDING, whitened=_whitened(error, claimed), square=error**2,
             level=start**2, beats=traces[1] <= linalg.trace(state.covariance[1:]),
