@@ -126,11 +126,11 @@ class Reproduce(Command):
         cache = Cache(self.work)
         if not self.resume:
             for job in jobs:
-                cache.drop(job.piece.simulate, job.inputs)
-        absent = [job for job in jobs if not cache.holds(job.piece.simulate, job.inputs)]
+                cache.drop(*job.key)
+        absent = [job for job in jobs if not cache.holds(*job.key)]
         work = [Call(job.weight, job.simulate, (cache,)) for job in absent]
         side_by_side(work, Pool(self.workers), "reproducing")
-        return [cache.read(job.piece.simulate, job.inputs) for job in jobs]
+        return [cache.read(*job.key) for job in jobs]
 
     def interrupted(self) -> str:
         """Finished simulations are kept."""

@@ -18,6 +18,7 @@ from fusion_gym.agents.papers.markov_jump_covariances import covariances
 from fusion_gym.agents.papers.numbers import cite, percent, verdict
 from fusion_gym.agents.papers.round_robin_tobit_theorems import Censoring, MatrixBound, matrix_below
 from fusion_gym.agents.papers.unknown_input_recursion import gains, models
+from fusion_gym.agents.papers.walk import SomeSensors
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.evaluation.intervals import Interval
@@ -57,14 +58,6 @@ def test_recorded_episodes_are_those_of_the_evaluation(paper: str) -> None:
 # --- the token bucket ---------------------------------------------------------------------------
 
 
-def test_a_failed_sensor_never_sends() -> None:
-    task = runs.scheme()
-    policy = runs.Failing(fusion_gym.make_policy(runs.TRIGGER, task), 1)
-    requests = runs.record_history(task, 3, 0, policy)
-    assert not requests.requested[:, 1].any()
-    assert requests.granted[:, [0, 2]].any()
-
-
 def test_a_wrong_gain_is_reported_from_the_best() -> None:
     task = runs.scheme()
     history = runs.record_history(task, 3, 0)
@@ -100,13 +93,14 @@ def test_verdicts_and_their_words() -> None:
 # --- the biased oscillator ----------------------------------------------------------------------
 
 
-def test_a_single_sensor_transmits_at_its_turns_alone() -> None:
+@pytest.mark.parametrize("sensors", [{0}, {1}, {0, 1}])
+def test_some_sensors_transmit_as_in_the_whole_policy_and_the_others_never(
+    sensors: set[int],
+) -> None:
     task = fusion_gym.make_task(biased.OSCILLATOR)
-    for sensor in range(2):
-        rate = run_episodes(
-            task, biased.SingleSensor(fusion_gym.make_policy("round_robin", task), sensor), 2, 0
-        ).rate
-        np.testing.assert_allclose(rate.mean(0), np.eye(2)[sensor] / 2)
+    policy = SomeSensors(fusion_gym.make_policy("round_robin", task), sensors)
+    rate = run_episodes(task, policy, 2, 0).rate
+    np.testing.assert_allclose(rate, [[0.5 * (sensor in sensors) for sensor in range(2)]] * 2)
 
 
 def test_no_filter_is_below_the_floor() -> None:

@@ -378,16 +378,14 @@ def _draw_instants(figure: Any, data: Data) -> None:
             axis.plot(
                 time[~there], 0.0 * time[~there] + base, "o", ms=2.6, mfc="none", color=colour
             )
+            axis.text(
+                1.01, (base + 1.0) / (_LANE * count + 0.3), f"node {sensor + 1}",
+                transform=axis.transAxes, va="center", color=colour,
+            )  # fmt: skip
         ticks = [_LANE * lane + up for lane in range(count) for up in (0, 1)]
         axis.set_yticks(ticks, ["0", "1"] * count)
         axis.set_ylim(-0.5, _LANE * count - 0.2)
         axis.set_title(f"({chr(ord('a') + place)}) {label}", loc="left")
-        for sensor in range(count):
-            height = (_LANE * (count - 1 - sensor) + 1.0) / (_LANE * count + 0.3)
-            axis.text(
-                1.01, height, f"node {sensor + 1}", transform=axis.transAxes, va="center",
-                color=SENSORS[sensor],
-            )  # fmt: skip
     axes[len(lanes) // 2].set_ylabel("received (1) or not (0)")
     axes[-1].set_xlabel(_TIME)
 

@@ -56,9 +56,10 @@ class PieceJob(NamedTuple):
         return {"episodes": self.episodes, "seed": self.seed}
 
     @property
-    def inputs(self) -> Data:
-        """All that the data depend on beside the code."""
-        return self.counts | {"settings": self.settings, "restriction": self.restriction}
+    def key(self) -> tuple[Callable[..., Data], Data]:
+        """The function, and all that the data depend on beside the code."""
+        inputs = self.counts | {"settings": self.settings, "restriction": self.restriction}
+        return self.piece.simulate, inputs
 
     @property
     def weight(self) -> float:
@@ -67,10 +68,7 @@ class PieceJob(NamedTuple):
 
     def simulate(self, cache: Cache) -> Data:
         """Return the data of the piece, from the cache or simulated now."""
-        function, inputs = self.piece.simulate, self.inputs
-        return cache.call(
-            function, inputs, self.episodes, self.seed, self.settings, **self.restriction
-        )
+        return cache.call(*self.key, self.episodes, self.seed, self.settings, **self.restriction)
 
 
 class PaperFigure(NamedTuple):

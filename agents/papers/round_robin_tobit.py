@@ -24,6 +24,7 @@ from . import round_robin_tobit_theorems as theorems
 from .drawing import legend
 from .numbers import Number, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_of
+from .walk import SomeSensors
 
 # Tables II and III of the paper: ARMSE1, ARMSE2, ARMSE3 by interval and by variance.
 TABLE_II = {
@@ -158,7 +159,7 @@ def simulate_nodes(episodes: int, seed: int, settings: Settings) -> Data:
         "fused_armse": runs.armse(fused),
     }  # fmt: skip
     for sensor in range(2):
-        single = runs.SingleSensor(policy, sensor)
+        single = SomeSensors(policy, {sensor})
         errors = runs.squares(task, single, episodes, seed)
         data[f"single_{sensor}_mean"] = record_episode(task, single, seed).mean
         data[f"node_{sensor}_mean"] = run.local_mean[:, sensor]

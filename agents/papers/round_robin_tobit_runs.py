@@ -9,9 +9,8 @@ import numpy as np
 import fusion_gym
 from fusion_gym import gaussian
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Policy, Requests
+from fusion_gym.policies.base import Policy
 from fusion_gym.systems.tobit.centre import FeedbackCentre
 from fusion_gym.systems.tobit.filters import Expectation
 from fusion_gym.systems.tobit.system import CensoredSystem
@@ -28,24 +27,6 @@ _RESAMPLES = 500
 _CLEAR = 4.0  # standard errors: of 200 comparisons without a difference none is likely to reach it
 _MOST = 0.5  # share of the points
 FREE = {"censoring_threshold": -np.inf, "censoring_upper": np.inf}
-
-
-@dataclass
-class SingleSensor:
-    """Another policy's requests of one sensor; the others never transmit."""
-
-    policy: Policy
-    sensor: int
-    knowledge: Any = "clock"
-
-    def reset(self, runs: int, seed: int = 0) -> None:
-        """Forget everything."""
-        self.policy.reset(runs, seed)
-
-    def __call__(self, signals: Signals) -> Requests:
-        """Return the requests (sensors, N)."""
-        requests = self.policy(signals)
-        return requests & (np.arange(len(requests))[:, None] == self.sensor)
 
 
 def censored(task: Task) -> CensoredSystem:

@@ -24,10 +24,9 @@ from .round_robin_tobit_runs import (
     OSCILLATOR,
     TRACKING,
     PrintedTobitFilter,
-    SingleSensor,
     censored,
 )
-from .walk import walk_in_parts
+from .walk import SomeSensors, walk_in_parts
 
 PLACES = (-7.0, -5.0, -4.0, 0.0, 4.5, 5.0, 6.0)  # true x1 at which Lemma 1 is tried
 _DRAWS = 200  # measurements an episode, at each of them
@@ -312,7 +311,7 @@ def simulate_bounds(episodes: int, seed: int, settings: Settings) -> Data:
         task = fusion_gym.make_task(env, **options)
         for sensor in range(2):
             single = _of(task, sensor, 1.0)
-            policy = SingleSensor(fusion_gym.make_policy("round_robin", task), sensor)
+            policy = SomeSensors(fusion_gym.make_policy("round_robin", task), {sensor})
             local, _ = failures(task, policy, episodes, seed, list(single.values()))
             for name, sample in zip(single, local, strict=True):
                 data[f"{example}:4/{name}/{sensor}"] = sample

@@ -21,6 +21,7 @@ from .drawing import legend_of
 from .numbers import below, estimate, grid, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
 from .tobit_token_bucket_runs import SENSORS, TRIGGER, History, record_history, scheme
+from .walk import SomeSensors
 
 _NODES = range(SENSORS)
 _NODE_NAMES = tuple(f"node {m + 1}" for m in _NODES)
@@ -217,7 +218,9 @@ def simulate_bucket_theorems(episodes: int, seed: int, settings: Settings) -> Da
         values.reshape(-1, _WINDOW, few).mean(1) for values in (long.fused_error, long.fused_trace)
     )
     failed = [
-        record_history(task, episodes, seed, runs.Failing(make_policy(TRIGGER, task), m))
+        record_history(
+            task, episodes, seed, SomeSensors(make_policy(TRIGGER, task), {*_NODES} - {m})
+        )
         for m in _NODES
     ]
     silent = record_history(task, episodes, seed, "never")

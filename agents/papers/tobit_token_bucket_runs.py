@@ -1,6 +1,5 @@
 """Recorded episodes of the token-bucket paper, and its theorems computed on them."""
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,9 +8,8 @@ from numpy.typing import NDArray
 import fusion_gym
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Policy, Requests
+from fusion_gym.policies.base import Policy
 from fusion_gym.policies.rules.dynamic_event import DynamicEvent
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
 
@@ -70,25 +68,6 @@ class History(NamedTuple):
     def fused_trace(self) -> Array:
         """Trace (H, E) of the fused bound."""
         return np.trace(self.bound, axis1=1, axis2=2)
-
-
-@dataclass
-class Failing:
-    """The paper's trigger, but one sensor never sends: it has failed."""
-
-    policy: Policy
-    sensor: int
-    knowledge: Any = "own_memory"
-
-    def reset(self, runs: int, seed: int = 0) -> None:
-        """Forget everything."""
-        self.policy.reset(runs, seed)
-
-    def __call__(self, signals: Signals) -> Requests:
-        """Return the trigger's requests, none of the failed sensor."""
-        requests = self.policy(signals).copy()
-        requests[self.sensor] = False
-        return requests
 
 
 def scheme(**options: Any) -> Task:

@@ -440,11 +440,6 @@ def _draw_bounds(figure: Any, data: Data, entries: Entries, label: str, unit: st
     _legend(figure, axes, 7)
 
 
-def _draw_state_bound(figure: Any, data: Data, place: int) -> None:
-    entries = {example: _STATES[example][place : place + 1] for example in EXAMPLES}
-    _draw_bounds(figure, data, entries, "{}: squared error", " (m²)")
-
-
 def _draw_input_bounds(figure: Any, data: Data) -> None:
     axes = _grid(figure, data, 1)
     for column, example in enumerate(EXAMPLES):
@@ -489,8 +484,16 @@ PAPER = Paper(
     {
         "figure_1": _figure(partial(_draw_estimates, entries=_STATES), 5.0, WALK),
         "figure_2": _figure(partial(_draw_estimates, entries=_INPUTS), 5.0, WALK),
-        "figure_3": _figure(partial(_draw_state_bound, place=0), 3.6),
-        "figure_4": _figure(partial(_draw_state_bound, place=1), 3.6),
+        **{
+            f"figure_{3 + place}": _figure(
+                partial(
+                    _draw_bounds, label="{}: squared error", unit=" (m²)",
+                    entries={name: states[place : place + 1] for name, states in _STATES.items()},
+                ),
+                3.6,
+            )
+            for place in range(2)
+        },
         "figure_5": _figure(_draw_input_bounds, 3.6), "figure_6": _figure(
             partial(_draw_bounds, entries=_INPUTS, label="trace", unit=" (N²)"), 3.6
         ),

@@ -1,9 +1,14 @@
-"""The loop over the steps of episodes, which every paper's recordings share."""
+"""The loop over the steps of episodes that all papers share, and policies of some sensors alone."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import BATCH
 from fusion_gym.policies.base import Policy, Requests
@@ -35,3 +40,21 @@ def walk_in_parts(
         count = min(BATCH, episodes - first)
         for step, (batch, requests) in enumerate(walk(task, policy, count, seed + first)):
             yield step, slice(first, first + count), batch, requests
+
+
+@dataclass
+class SomeSensors:
+    """Another policy's requests of some sensors; the others never transmit."""
+
+    policy: Policy
+    sensors: Collection[int]
+    knowledge: Any = "own_memory"
+
+    def reset(self, runs: int, seed: int = 0) -> None:
+        """Forget everything."""
+        self.policy.reset(runs, seed)
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Return the requests (sensors, N)."""
+        requests = self.policy(signals)
+        return requests & np.isin(np.arange(len(requests)), list(self.sensors))[:, None]
