@@ -19,7 +19,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.metrics import METRICS, paired_difference, robust_summary, summarise
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, refusal
 
 from .command_line import Long, PolicyNames, SetOptions
 from .input.files import checked
@@ -113,10 +113,7 @@ def evaluate(command: Evaluate) -> dict[str, Any]:
     if not names:
         raise ConfigurationError("policies = [] is not allowed: give --policies NAME …")
     if command.reference is not None and command.reference not in names:
-        raise ConfigurationError(
-            f"reference = {command.reference!r} is not allowed: it must be one of the policies "
-            f"{names}"
-        )
+        raise refusal("reference", command.reference, f"one of the policies {names}")
     if command.resume and command.reference:
         raise ConfigurationError(
             f"resume = True is not allowed with reference = {command.reference!r}: paired "

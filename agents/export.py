@@ -16,7 +16,7 @@ from fusion_gym import zoo
 from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.settings import parse_settings
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, refusal
 
 from .command_line import Command, SetOptions
 from .input.options import OutputFile
@@ -99,9 +99,7 @@ def spec(text: str) -> str:
         return text
     if text.partition(",")[0].endswith(".zip"):
         return f"model:{text}"
-    raise ConfigurationError(
-        f"model = {text!r} is not allowed: it must be zoo:NAME, model:PATH or the path of a .zip"
-    )
+    raise refusal("model", text, "zoo:NAME, model:PATH or the path of a .zip")
 
 
 def _environment(command: Export, kind: str, name: str) -> tuple[str, dict[str, Any]]:

@@ -31,7 +31,7 @@ from optuna.exceptions import ExperimentalWarning, StorageInternalError
 from optuna.trial import TrialState
 from sqlalchemy.exc import IntegrityError, OperationalError, SQLAlchemyError
 
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, refusal
 
 from .command_line import Long
 from .input.options import OutputFolder, Steps, Whole
@@ -223,9 +223,7 @@ def shared_study(experiment: Experiment, storage: str) -> optuna.Study:
         result = _opened(storage)
     except (SQLAlchemyError, ImportError) as error:
         reason = str(error).splitlines()[0]
-        raise ConfigurationError(
-            f"storage = {storage!r} is not allowed: it must be a database's URL ({reason})"
-        ) from None
+        raise refusal("storage", storage, f"a database's URL ({reason})") from None
     study = optuna.create_study(
         study_name=f"tune_{fingerprint(inputs)[:16]}",
         storage=result,

@@ -69,9 +69,7 @@ def _check_estimates(scenario: Scenario, remembers: bool) -> None:
     elif scenario.system.offers("arriving") or not scenario.system.offers("adopt"):
         reason = reason or "this system's centre cannot go on from an estimate that is sent to it"
     if reason is not None:
-        raise ConfigurationError(
-            f"packet = 'estimate' is not allowed here: it must be 'measurement', for {reason}"
-        )
+        raise validation.refusal("packet", "estimate", f"'measurement', for {reason}", "here")
 
 
 def _broadcast(scenario: Scenario) -> str:

@@ -234,9 +234,7 @@ def refuse_vector_reward(task: Task, where: str) -> None:
         ConfigurationError: the task's reward has two.
     """
     if task.vector_reward:
-        raise validation.ConfigurationError(
-            f"reward = 'vector' is not allowed {where}: it must be 'scalar'"
-        )
+        raise validation.refusal("reward", "vector", "'scalar'", where)
 
 
 def reward_space() -> Box:

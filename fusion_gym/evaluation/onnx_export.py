@@ -9,7 +9,7 @@ from fusion_gym.policies.base import Policy
 from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.policies.onnx_card import onnx_card
 from fusion_gym.policies.onnx_graph import DecisionGraph, Shapes, require_onnx, save_graph
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, refusal
 
 
 class Exported(NamedTuple):
@@ -40,9 +40,7 @@ def export_onnx(
     """
     require_onnx("onnx")
     if not isinstance(agent, ModelPolicy):
-        raise ConfigurationError(
-            f"agent = {agent!r} is not allowed: it must be a saved agent, zoo:NAME or model:PATH"
-        )
+        raise refusal("agent", agent, "a saved agent, zoo:NAME or model:PATH")
     path, graph = Path(path), DecisionGraph(agent)
     save_graph(graph, path, onnx_card(agent, graph, environment, model))
     result = onnx_agreement(agent, graph, path, task)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.fusion.rules import Fused, FusionRule, own_covariances
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import refusal
 
 _ORTHOGONAL = 1e-13  # cosine below which two rows count as orthogonal
 _SWEEPS = 30  # cap of the rotations; sizes up to 6 need fewer than 10 sweeps
@@ -321,9 +321,8 @@ class SequentialIntersection(FusionRule):
         )
         if not whole or not value or sorted(value) != list(range(count or len(value))):
             last = "l - 1" if count is None else f"{count - 1}"
-            raise ConfigurationError(
-                f"order = {value!r} is not allowed: it must be a tuple that holds each of the "
-                f"estimates 0 to {last} exactly once"
+            raise refusal(
+                "order", value, f"a tuple that holds each of the estimates 0 to {last} exactly once"
             )
 
 

@@ -93,9 +93,7 @@ def register_policy(name: str, maker: Maker, kind: Kind = "rule") -> None:
         ConfigurationError: a name that exists or cannot be written, or no callable.
     """
     if not isinstance(name, str) or not name.isidentifier():
-        raise ConfigurationError(
-            f"name = {name!r} is not allowed: it must be a word of letters, digits and '_'"
-        )
+        raise refusal("name", name, "a word of letters, digits and '_'")
     if name in _ROWS:
         raise ConfigurationError(f"name = {name!r} is not allowed: there is a policy of that name")
     choice("kind", kind, get_args(Kind))

@@ -62,15 +62,10 @@ class SourceProblem:
         """
         matrix = validation.array("transition", transition, (None, None))
         if matrix.shape[0] != matrix.shape[1] or not np.allclose(matrix.sum(1), 1.0):
-            raise ConfigurationError(
-                f"transition = {matrix.tolist()} is not allowed: it must be a square matrix whose "
-                "rows sum to 1"
-            )
+            raise validation.refusal("transition", matrix, "a square matrix whose rows sum to 1")
         loss = validation.not_negative("drop", drop, matrix.shape[:1])
         if np.any(loss > 1.0):
-            raise ConfigurationError(
-                f"drop = {loss.tolist()} is not allowed: it must be at most 1 everywhere"
-            )
+            raise validation.refusal("drop", loss, "at most 1 everywhere")
         if bucket is None:
             bucket = TokenBucket.create(1.0, 1.0, 1.0, 1.0, sensors=1, unlimited=True)
         return cls(
@@ -132,9 +127,7 @@ def _initial_law(transition: Array, values: ArrayLike | None) -> Array:
             "initial", validation.array("initial", values, (states,)), (states,)
         )
         if not np.isclose(law.sum(), 1.0, rtol=0.0, atol=1e-9):
-            raise ConfigurationError(
-                f"initial = {law.tolist()} is not allowed: it must be probabilities that sum to 1"
-            )
+            raise validation.refusal("initial", law, "probabilities that sum to 1")
         return law
     balance = np.vstack((transition.T - np.eye(states), np.ones(states)))
     law, _, rank, _ = np.linalg.lstsq(balance, np.append(np.zeros(states), 1.0))

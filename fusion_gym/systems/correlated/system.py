@@ -32,7 +32,7 @@ from fusion_gym.systems.correlated.filters import (
     RobustOutcomes,
 )
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import refusal
 
 _RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
 RANDOM_SCALE = (0.4, 1.0)  # range of an episode's noise scale where it is drawn
@@ -300,9 +300,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
             ConfigurationError: they are not tracked.
         """
         if state.joint is None:
-            raise ConfigurationError(
-                "track_actual = False is not allowed here: it must be True for actual covariances"
-            )
+            raise refusal("track_actual", False, "True for actual covariances", "here")
         return state.joint
 
     def with_actual_covariance(self) -> CorrelatedTrackingSystem:

@@ -259,10 +259,7 @@ def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> InputSig
     if not isinstance(kind, str):
         for name, value in shape.items():
             if value is not None:
-                raise ConfigurationError(
-                    f"{name} = {validation.display(value)} is not allowed with an array as "
-                    "input_signal: it must be None"
-                )
+                raise validation.refusal(name, value, "None", "with an array as input_signal")
         return ArrayInput.create(inputs, kind, horizon)
     amplitude, period, phase = shape.values()
     if kind == "sinusoids":

@@ -87,10 +87,7 @@ class Sinusoids:
         """
         random = isinstance(phase, str)
         if random and phase != "random":
-            raise ConfigurationError(
-                f"input_phase = {validation.display(phase)} is not allowed: it must be 'random' "
-                "or radians"
-            )
+            raise validation.refusal("input_phase", phase, "'random' or radians")
         shape = (size, _terms(amplitude, period, 0.0 if random else phase))
         return cls(
             amplitude=validation.spread("input_amplitude", amplitude, shape)[..., None],
