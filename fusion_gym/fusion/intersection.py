@@ -159,11 +159,16 @@ def covariance_intersection(
     Source: adaptive_innovation, equations (37), (38) and (42); S. J. Julier and J. K. Uhlmann, "A
     non-divergent estimation algorithm in the presence of unknown correlations", 1997.
     """
+    pair, weight, total = _intersect(covariance_a, covariance_b)
+    return _join(mean_a, mean_b, pair, pair.ratio / total, (1.0 - weight) / total, weight)
+
+
+def _intersect(covariance_a: Array, covariance_b: Array) -> tuple[DiagonalPair, Array, Array]:
+    """The pair, the weight ω of the smallest trace, and ω d + 1 - ω."""
     pair = diagonalise(covariance_a, covariance_b)
     d = pair.ratio
     weight = best_weight(pair.power * d, np.ones_like(d), d)
-    total = weight * d + (1.0 - weight)
-    return _join(mean_a, mean_b, pair, d / total, (1.0 - weight) / total, weight)
+    return pair, weight, weight * d + (1.0 - weight)
 
 
 def best_of_pair(covariances: Array, selected: NDArray[np.bool_]) -> tuple[Array, Array]:
@@ -177,10 +182,8 @@ def best_of_pair(covariances: Array, selected: NDArray[np.bool_]) -> tuple[Array
     a, b = (
         np.take_along_axis(covariances, which[None, None, None], 0)[0] for which in (first, second)
     )
-    pair = diagonalise(a, b)
-    d = pair.ratio
-    share = best_weight(pair.power * d, np.ones_like(d), d)
-    scaled = pair.basis * np.sqrt(d / (share * d + (1.0 - share)))[:, None]
+    pair, share, total = _intersect(a, b)
+    scaled = pair.basis * np.sqrt(pair.ratio / total)[:, None]
     weights = np.zeros(selected.shape)
     inside = np.arange(selected.shape[-1])
     weights[first, inside], weights[second, inside] = share, 1.0 - share

@@ -15,9 +15,9 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 
 from fusion_gym import validation
-from fusion_gym.arrays import Array
 from fusion_gym.core.options import AccessRule, Scenario, Tokens
 from fusion_gym.core.reward import equal_weights
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
@@ -191,9 +191,8 @@ def _augmented(options: BiasedOscillatorOptions, aware: bool) -> tuple[LinearPla
 
     A filter that ignores the bias believes that it has no effect on x.
     """
-    transition = validation.array("transition", options.transition, (None, None))
+    transition = validation.square("transition", options.transition)
     states = len(transition)
-    transition = validation.array("transition", options.transition, (states, states))
     gain = validation.array("bias_gain", options.bias_gain, (states, None))
     biases = gain.shape[1]
     process = validation.covariance("process_covariance", options.process_covariance, states)
@@ -210,15 +209,8 @@ def _augmented(options: BiasedOscillatorOptions, aware: bool) -> tuple[LinearPla
     joint = np.block([[transition, gain if aware else 0.0 * gain], [np.zeros_like(gain.T), inner]])
     plant = LinearPlant.create(
         joint,
-        _diagonal(process, noise),
+        block_diag(process, noise),
         np.concatenate([mean, bias_mean]),
-        _diagonal(start, bias_start),
+        block_diag(start, bias_start),
     )
     return plant, states
-
-
-def _diagonal(first: Array, second: Array) -> Array:
-    size = len(first)
-    result = np.zeros((size + len(second),) * 2)
-    result[:size, :size], result[size:, size:] = first, second
-    return result
