@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,8 +15,19 @@ from fusion_gym.solvers.grid import ErrorGrid, default_reach
 from fusion_gym.solvers.tokens import TokenLevels
 from fusion_gym.validation import ConfigurationError
 
-_FINEST, _COARSEST = 40.0, 5.0  # points of the default grid a deviation of the noise
-_POINTS = 600  # that it has about, between these; half of them where tokens are limited
+
+class Resolution(NamedTuple):
+    """What a default grid has: from ``coarsest`` to ``finest`` points a deviation of the noise,
+    between these about so many ``points``; it leaves out a ``negligible`` probability."""
+
+    finest: float
+    coarsest: float
+    points: int
+    negligible: float
+
+
+_RESOLUTION = Resolution(finest=40.0, coarsest=5.0, points=600, negligible=1e-10)
+_RESOLUTION_TOKENS = _RESOLUTION._replace(points=300)  # where tokens are limited
 
 
 @dataclass(frozen=True)
@@ -94,28 +106,40 @@ class SourceProblem:
         return max(1.0, float(tokens.spent[1]) / max(rate, 1e-12))
 
     def grid(
-        self, horizon: int | None = None, reach: float | None = None, step: float | None = None
+        self,
+        horizon: int | None = None,
+        reach: float | None = None,
+        step: float | None = None,
+        wait: float | None = None,
+        resolution: Resolution | None = None,
     ) -> ErrorGrid:
         """A grid of errors up to ``reach`` in steps of ``step``.
 
         The default goes beyond what is reached with a probability of 1e-10, in about 600 points
         (300 with limited tokens), but at most 40 and at least 5 a deviation of the noise.
+        ``wait`` and ``resolution`` are those of sources that share the network.
         """
+        if resolution is None:
+            resolution = _RESOLUTION if len(self.tokens.level) == 1 else _RESOLUTION_TOKENS
         if reach is None:
-            threshold = max(self.scale, self.deviation * float(np.sqrt(self.wait)))
+            wait = self.wait if wait is None else wait
+            threshold = max(self.scale, self.deviation * float(np.sqrt(wait)))
             reach = default_reach(
                 self.coefficient,
                 self.deviation,
                 threshold,
                 self.transition,
                 self.drop,
-                self.wait,
+                wait,
                 horizon,
+                resolution.negligible,
             )
         if step is None:
-            finest, coarsest = self.deviation / _FINEST, self.deviation / _COARSEST
-            points = _POINTS if len(self.tokens.level) == 1 else _POINTS / 2
-            step = min(max(reach / points, finest), coarsest)
+            finest, coarsest = (
+                self.deviation / resolution.finest,
+                self.deviation / resolution.coarsest,
+            )
+            step = min(max(reach / resolution.points, finest), coarsest)
         return ErrorGrid.create(self.coefficient, self.deviation, reach, step)
 
 
