@@ -18,7 +18,7 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError, refusal
 
-from .command_line import Command, SetOptions
+from .command_line import Command, EnvironmentOptions
 from .input.options import OutputFile
 from .output.files import replacing
 from .training.environment import environment_of
@@ -27,19 +27,13 @@ _KINDS = ("zoo", "model")
 
 
 @dataclass(frozen=True)
-class Export(Command):
-    """Export a saved agent as an ONNX file."""
+class Export(EnvironmentOptions, Command):
+    """Export a saved agent as an ONNX file, by default for the environment of its training."""
 
     model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
     """An agent: zoo:NAME, model:PATH or the path of a .zip, with ,price=PRICE for one price."""
     onnx: Annotated[Path, OutputFile()]
     """The file to write."""
-    env: str | None = None
-    """Id of a registered environment, instead of the one that the agent was trained in."""
-    config: str | None = None
-    """Take environment and options from a training's YAML, or from a shipped config by its name."""
-    options: SetOptions = ()
-    """Options of gym.make for the environment; they go before all others."""
     trust: bool = False
     """Run code of files: what they name as module:name, and what model:PATH holds besides data."""
 
