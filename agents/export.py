@@ -14,6 +14,7 @@ import tyro
 
 from fusion_gym import zoo
 from fusion_gym.envs.registration import make_task
+from fusion_gym.importing import require
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.validation import ConfigurationError, refusal
@@ -56,11 +57,10 @@ def export(command: Export) -> list[str]:
     """
     kind, _, rest = spec(command.model).partition(":")
     env_id, options = _environment(command, kind, rest.partition(",")[0])
+    require("onnx", "onnx", "onnx", "onnxruntime")
     # Here, for it needs torch, which takes seconds to load.
     from fusion_gym.evaluation.onnx_export import export_onnx
-    from fusion_gym.policies.onnx_graph import require_onnx
 
-    require_onnx("onnx")
     task = make_task(env_id, **options)
     agent = make_policy(f"{kind}:{rest}", task)
     try:
