@@ -13,10 +13,11 @@ import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
@@ -49,16 +50,6 @@ STYLES = {
     "value of information, own": (VERMILLION, "D", "-."),
 }
 PARTS = tuple(STYLES)
-
-
-class Cost(NamedTuple):
-    """Microseconds of a part for one step of one run."""
-
-    env: str
-    sensors: int
-    states: int
-    part: str
-    microseconds: float
 
 
 def linear(sensors: int, states: int) -> Task:
@@ -118,88 +109,75 @@ def cost(task: Task, part: str, seconds: float) -> float:
     return 1e6 * spent / (steps * RUNS)
 
 
-def measured(sensors: Sequence[int], states: Sequence[int], seconds: float) -> list[Cost]:
-    """Every part at every size, each the least of several turns through all of them."""
-    turns = [list(_turn(sensors, states, seconds)) for _ in range(TURNS)]
-    return [min(same, key=lambda item: item.microseconds) for same in zip(*turns, strict=True)]
+def measured(sensors: Sequence[int], states: Sequence[int], seconds: float) -> pd.DataFrame:
+    """Microseconds of every part at every size, each the least of several turns through all."""
+    turns = [row for _ in range(TURNS) for row in _turn(sensors, states, seconds)]
+    columns = ["env", "sensors", "states", "part", "microseconds"]
+    return (
+        pd.DataFrame(turns, columns=columns).groupby(columns[:-1], sort=False).min().reset_index()
+    )
 
 
-def _turn(sensors: Sequence[int], states: Sequence[int], seconds: float) -> Iterator[Cost]:
+def _turn(
+    sensors: Sequence[int], states: Sequence[int], seconds: float
+) -> Iterator[tuple[str, int, int, str, float]]:
     for count in sensors:
-        for size in states:
-            task = linear(count, size)
+        for env, size in [*((LINEAR, size) for size in states), (REMOTE, count)]:
+            task = remote(count) if env == REMOTE else linear(count, size)
             for part in PARTS:
-                yield Cost(LINEAR, count, size, part, cost(task, part, seconds))
-        task = remote(count)
-        for part in PARTS:
-            yield Cost(REMOTE, count, count, part, cost(task, part, seconds))
+                yield env, count, size, part, cost(task, part, seconds)
 
 
-def exponents(costs: Sequence[Cost]) -> dict[str, dict[str, dict[str, float]]]:
+def exponents(costs: pd.DataFrame) -> dict[str, dict[str, dict[str, float]]]:
     """By environment and part: p and q of c ∝ sensors^p states^q, by least squares of logarithms.
 
     Over sizes from :data:`LARGE` on, and of one state a sensor p alone.
     """
     result: dict[str, dict[str, dict[str, float]]] = {}
-    for env in dict.fromkeys(item.env for item in costs):
-        apart = env == LINEAR
-        for part in PARTS:
-            large = [
-                item
-                for item in costs
-                if (item.env, item.part) == (env, part)
-                and item.sensors >= LARGE["sensors"]
-                and item.states >= LARGE["states"]
-            ]
-            names = ["sensors", "states"] if apart else ["sensors"]
-            columns = [np.log([getattr(item, name) for item in large]) for name in names]
-            rows = np.stack([*columns, np.ones(len(large))], axis=1)
-            slopes = np.linalg.lstsq(rows, np.log([item.microseconds for item in large]))[0]
-            values = dict(zip(names, map(float, slopes), strict=False))
-            result.setdefault(env, {})[part] = values
+    large = costs[(costs.sensors >= LARGE["sensors"]) & (costs.states >= LARGE["states"])]
+    for (env, part), group in large.groupby(["env", "part"], sort=False):
+        names = ["sensors", "states"] if env == LINEAR else ["sensors"]
+        rows = np.column_stack([np.log(group[names]), np.ones(len(group))])
+        slopes = np.linalg.lstsq(rows, np.log(group.microseconds))[0]
+        values = dict(zip(names, map(float, slopes), strict=False))
+        result.setdefault(env, {})[part] = values
     return result
 
 
-def table(costs: Sequence[Cost], fitted: dict[str, dict[str, dict[str, float]]]) -> Table:
+def table(costs: pd.DataFrame, fitted: dict[str, dict[str, dict[str, float]]]) -> Table:
     """A row a size, and below the exponents."""
     heads = ("environment", "sensors", "states", *PARTS)
-    result = tables.table_tables("CPU microseconds of a step of one run", heads)
-    rows: dict[tuple[str, int, int], list[str]] = {}
-    for item in sorted(costs, key=lambda item: (item.env, item.states, item.sensors)):
-        place = (item.env, item.sensors, 0 if item.env == REMOTE else item.states)
-        rows.setdefault(place, []).append(f"{item.microseconds:.3g}")
-    for (env, count, size), values in rows.items():
-        result.add_row(env, str(count), str(size or count), *values)
+    sizes = costs.assign(order=costs.states.where(costs.env == LINEAR, 0)).pivot(
+        index=["env", "order", "sensors", "states"], columns="part", values="microseconds"
+    )
+    rows = [
+        [env, str(count), str(size), *(f"{value:.3g}" for value in values)]
+        for (env, _, count, size), *values in sizes[list(PARTS)].sort_index().itertuples()
+    ]
     for env, parts in fitted.items():
-        for name in ("sensors", "states"):
-            if all(name in values for values in parts.values()):
-                cells = (f"{parts[part][name]:.2f}" for part in PARTS)
-                result.add_row(env, f"exponent, {name}", "", *cells)
-    return result
+        for name in parts[PARTS[0]]:
+            cells = (f"{parts[part][name]:.2f}" for part in PARTS)
+            rows.append([env, f"exponent, {name}", "", *cells])
+    return tables.table_tables("CPU microseconds of a step of one run", heads, rows)
 
 
-def figure(costs: Sequence[Cost], *paths: Path) -> None:
+def figure(costs: pd.DataFrame, *paths: Path) -> None:
     """Cost against sensors and against states of the one, against sensors of the other."""
     size, count = MIDDLE["states"], MIDDLE["sensors"]
-    panels: tuple[tuple[str, str, str, dict[str, int]], ...] = (
-        (f"{LINEAR}, {size} states", LINEAR, "sensors", {"states": size}),
-        (f"{LINEAR}, {count} sensors", LINEAR, "states", {"sensors": count}),
-        (f"{REMOTE}, a state a sensor", REMOTE, "sensors", {}),
+    env = costs.env
+    panels = (
+        (f"{LINEAR}, {size} states", "sensors", (env == LINEAR) & (costs.states == size)),
+        (f"{LINEAR}, {count} sensors", "states", (env == LINEAR) & (costs.sensors == count)),
+        (f"{REMOTE}, a state a sensor", "sensors", env == REMOTE),
     )
     drawn, axes = plt.subplots(1, 3, figsize=(11.5, 4.0), sharey=True, constrained_layout=True)
-    for panel, (title, env, along, fixed) in zip(axes, panels, strict=True):
+    for panel, (title, along, selection) in zip(axes, panels, strict=True):
         for part, (colour, marker, line) in STYLES.items():
-            points = [
-                (getattr(item, along), item.microseconds)
-                for item in costs
-                if (item.env, item.part) == (env, part)
-                and all(getattr(item, name) == value for name, value in fixed.items())
-            ]
-            if points:
-                panel.loglog(
-                    *zip(*sorted(points), strict=True), line, marker=marker, ms=4.5, lw=1.2,
-                    color=colour, label=part,
-                )  # fmt: skip
+            points = costs[selection & (costs.part == part)].sort_values(along)
+            panel.loglog(
+                points[along], points.microseconds, line, marker=marker, ms=4.5, lw=1.2,
+                color=colour, label=part,
+            )  # fmt: skip
         panel.set_title(title, loc="left", fontsize=9)
         panel.set_xlabel(along)
         ticks = SENSORS if along == "sensors" else STATES
@@ -227,7 +205,7 @@ def main() -> None:
             "runs": RUNS,
             "turns": TURNS,
             "seconds": arguments.seconds,
-            "costs": [item._asdict() for item in costs],
+            "costs": costs.to_dict("records"),
             "fitted_from": LARGE,
             "exponents": fitted,
         }
