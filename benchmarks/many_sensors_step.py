@@ -140,7 +140,7 @@ def exponents(costs: pd.DataFrame) -> dict[str, dict[str, dict[str, float]]]:
         rows = np.column_stack([np.log(group[names]), np.ones(len(group))])
         slopes = np.linalg.lstsq(rows, np.log(group.microseconds))[0]
         values = dict(zip(names, map(float, slopes), strict=False))
-        result.setdefault(env, {})[part] = values
+        result.setdefault(str(env), {})[str(part)] = values
     return result
 
 
