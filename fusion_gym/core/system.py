@@ -198,10 +198,10 @@ def age_block(sensors: tuple[str, ...]) -> Block:
 
 
 def sensed(prediction: PredictionT | None) -> PredictionT:
-    """What a state has once it is sensed.
+    """Return the prediction of a state, which it has after :meth:`System.sense`.
 
     Raises:
-        RuntimeError: the state is that of a start.
+        RuntimeError: the state was never sensed.
     """
     if prediction is None:
         raise RuntimeError("the state has no measurements yet: call sense first")
@@ -209,7 +209,10 @@ def sensed(prediction: PredictionT | None) -> PredictionT:
 
 
 def log_deviation(covariance: Array, reference: Array) -> Array:
-    """ln √(variance/reference) (..., n, N) of covariances (..., n, n, N), by variances (n,)."""
+    """Return ln √(variance/reference) (..., n, N) of covariances (..., n, n, N).
+
+    ``reference`` (n,) are variances.
+    """
     return 0.5 * np.log(linalg.diagonal(covariance) / reference[:, None])
 
 

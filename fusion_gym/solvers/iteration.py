@@ -20,7 +20,7 @@ def iterate_values(
 ) -> tuple[float, float, ChoiceT]:
     """Return bounds of the least average cost that are that close relatively, and the choice.
 
-    ``decide`` takes values one step ahead to those of now and the choice that brings them;
+    ``decide`` takes the values of the next step, and returns the present values and the choice;
     ``laziness`` is the share of the old values that is kept.
 
     Raises:

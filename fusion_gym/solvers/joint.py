@@ -67,7 +67,7 @@ class JointProblem:
         return self.tokens.affordable & small
 
     def grids(self, horizon: int | None = None) -> tuple[ErrorGrid, ErrorGrid]:
-        """A grid for each source's error, coarser than that of one source alone."""
+        """Return a grid for each source's error, coarser than the grid of one source."""
         tokens = self.tokens
         wait = 2.0 / self.at_most
         if len(tokens.level) > 1:

@@ -117,7 +117,7 @@ class SourceProblem:
 
         The default goes beyond what is reached with a probability of 1e-10, in about 600 points
         (300 with limited tokens), but at most 40 and at least 5 a deviation of the noise.
-        ``wait`` and ``resolution`` are those of sources that share the network.
+        Sources that share the network give their own ``wait`` and ``resolution``.
         """
         if resolution is None:
             resolution = _RESOLUTION if len(self.tokens.level) == 1 else _RESOLUTION_TOKENS
