@@ -20,19 +20,18 @@ from scipy.linalg import block_diag
 from fusion_gym import validation
 from fusion_gym.core.options import AccessRule, Scenario, Tokens
 from fusion_gym.core.reward import equal_weights
-from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
+from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.options import (
     FILTERS,
     FeedbackOptions,
     at_the_nodes,
     classes,
     make_centre,
+    make_system,
     memory_filter_system,
     stochastic_defaults,
-    true_nature,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
-from fusion_gym.systems.tobit.system import CensoredSystem
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 _ANGLE = 0.052 * math.pi
@@ -163,17 +162,11 @@ def _build(options: BiasedOscillatorOptions) -> Scenario:
         options.censoring_upper,
     )
     biases = plant.size - states
-    system = CensoredSystem(
-        plant=plant,
-        model=model,
-        centre=make_centre(options.filter, _FILTERS, options, sensors),
-        random_start=options.random_start,
-        state_names=tuple(f"x{i + 1}" for i in range(states))
-        + (("b",) if biases == 1 else tuple(f"b{i + 1}" for i in range(biases))),
-        scale=typical_magnitude(plant, horizon, options.random_start),
-        reference=plant.open_loop(min(horizon, _REFERENCE_HORIZON)),
-        nature=true_nature(options, plant, sensors, horizon),
-    )
+    centre = make_centre(options.filter, _FILTERS, options, sensors)
+    names = [f"x{i + 1}" for i in range(states)]
+    names += ["b"] if biases == 1 else [f"b{i + 1}" for i in range(biases)]
+    random = options.random_start
+    system = make_system(options, plant, centre, tuple(names), _REFERENCE_HORIZON, model, random)
     weights = equal_weights(system.open_loop(horizon))
     remembering = memory_filter_system(system, options.memory_filter, _FILTERS, options, sensors)
     return Scenario(
