@@ -105,6 +105,18 @@ class Long(Command):
 
 
 @dataclass(frozen=True)
+class EnvironmentOptions:
+    """The options of a command about one environment."""
+
+    env: str | None = field(default=None, kw_only=True)
+    """Id of a registered environment."""
+    config: str | None = field(default=None, kw_only=True)
+    """Take environment and options from a training's YAML, or from a shipped config by its name."""
+    options: SetOptions = field(default=(), kw_only=True)
+    """Options of gym.make for the environment; they go before all others."""
+
+
+@dataclass(frozen=True)
 class SuiteCommand(Long):
     """A command over the settings and classes of the benchmark."""
 

@@ -7,10 +7,11 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
+from rules import make_rule
 
 from fusion_gym import ConfigurationError, make_sb3_vec_env, make_task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.registry import make_policy, make_rule
+from fusion_gym.policies.registry import make_policy
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
 

@@ -19,7 +19,7 @@ from fusion_gym.agents.training.algorithms import TABLE
 from fusion_gym.agents.training.catalogue import catalogue
 from fusion_gym.agents.training.checked import config_path, load_checked, parse
 from fusion_gym.agents.training.config import Experiment
-from fusion_gym.policies.model import ALGORITHMS
+from fusion_gym.policies.card import ALGORITHMS
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rules import make_rule
 
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import Signals
 from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.base import Policy
-from fusion_gym.policies.registry import make_rule
 from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
 
 build = partial(make_task, "fusion_gym/CorrelatedTracking-v0")

@@ -5,12 +5,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rules import make_rule
 
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import Signals
 from fusion_gym.envs.registration import make_task
-from fusion_gym.policies.registry import make_policy, make_rule
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.random import Random
 from fusion_gym.validation import ConfigurationError
 

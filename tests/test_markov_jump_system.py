@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from reference_markov_jump import PAPER, Run, options, random_model
+from rules import make_rule
 
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import Signals
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.registry import make_rule
 from fusion_gym.policies.rules.centre_variance import CentreVariance
 from fusion_gym.policies.rules.local_variance import LocalVariance
 from fusion_gym.policies.rules.random import Random

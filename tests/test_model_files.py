@@ -29,7 +29,8 @@ from fusion_gym.agents.maintenance import table
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.policies import archive
-from fusion_gym.policies.model import ALGORITHMS, tag_model
+from fusion_gym.policies.card import ALGORITHMS
+from fusion_gym.policies.model import tag_model
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 

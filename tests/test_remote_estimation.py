@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rules import make_rule
 
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.channel import Channel
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.optimal import OptimalPolicy
-from fusion_gym.policies.registry import make_rule
 from fusion_gym.solvers.joint import JointProblem, solve_joint_average
 from fusion_gym.solvers.single import SourceProblem, solve_average
 from fusion_gym.solvers.task import solve_task, source_problems

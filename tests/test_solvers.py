@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from rules import make_rule
 from scipy.optimize import minimize_scalar
 
 from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.registry import make_rule
 from fusion_gym.solvers.ages import solve_ages
 from fusion_gym.solvers.bounds import lagrangian_bound
 from fusion_gym.solvers.grid import ErrorGrid, gaussian_rows

@@ -7,12 +7,13 @@ import pytest
 from filter_problems import outcomes, random_problem
 from filterpy.kalman import KalmanFilter as FilterPyFilter
 from numpy.typing import NDArray
+from rules import make_rule
 
 from fusion_gym import ConfigurationError, make_task
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.policies.registry import make_policy, make_rule
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.stochastic_event import StochasticEvent
 from fusion_gym.systems.tobit.filters import KalmanFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors

@@ -10,11 +10,12 @@ import gymnasium
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rules import make_rule
 
 from fusion_gym import ConfigurationError, make_task
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import covers
-from fusion_gym.policies.registry import make_policy, make_rule, policy_names
+from fusion_gym.policies.registry import make_policy, policy_names
 from fusion_gym.policies.settings import parse_value
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"

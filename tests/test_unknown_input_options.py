@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rules import make_rule
 
 from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import make_task
-from fusion_gym.policies.registry import make_rule
 from fusion_gym.validation import ConfigurationError
 
 build = partial(make_task, "fusion_gym/UnknownInput-v0")

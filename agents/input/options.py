@@ -16,7 +16,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
-from fusion_gym.validation import ConfigurationError, integer, number
+from fusion_gym.validation import integer, number, refusal
 
 
 class Mark(ABC):
@@ -140,9 +140,7 @@ def _try_out(option: str, path: Path, allowed: str, write: Callable[[], object])
         write()
     except (OSError, ValueError) as error:  # a ValueError of a path that no system knows
         reason = getattr(error, "strerror", None) or str(error)
-        raise ConfigurationError(
-            f"{option} = {str(path)!r} is not allowed: it must be {allowed} ({reason})"
-        ) from None
+        raise refusal(option, str(path), f"{allowed} ({reason})") from None
 
 
 def _write_in(folder: Path) -> None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from cases import FREE, Array, Case, each_case, each_id, requests
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.communication import BROADCASTS
+from fusion_gym.core.options import Broadcast
 from fusion_gym.core.runs import Runs
 from fusion_gym.core.system import SignalError, Signals, covers
 from fusion_gym.core.task import Task
@@ -196,7 +196,7 @@ class Beside:
             other.step(sent(granted))
 
 
-@pytest.mark.parametrize("broadcast", BROADCASTS)
+@pytest.mark.parametrize("broadcast", get_args(Broadcast))
 @each_id
 def test_a_sensor_believes_by_what_it_measured_and_received(env_id: str, broadcast: str) -> None:
     """x*, x̂ and x̂(s) are estimates of runs in which just that is delivered."""
