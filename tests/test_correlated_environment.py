@@ -64,18 +64,6 @@ def test_memory_of_one_run_restarts_alone_and_reset_forgets() -> None:
     assert not trigger(signals(small, False)).any()
 
 
-def test_special_cases_of_the_trigger() -> None:
-    draw = np.random.default_rng(2)
-    fixed, always = AdaptiveInnovation(0.7, 0.3, 0.0), AdaptiveInnovation(threshold=0.0)
-    for step in range(20):
-        innovation = draw.normal(size=(3, 2, 4))
-        size = (innovation**2).sum(1)
-        np.testing.assert_array_equal(
-            fixed(signals(innovation, step == 0)), size >= 0.7 * math.exp(-0.3)
-        )
-        assert always(signals(0.0 * innovation, step == 0)).all()
-
-
 @pytest.mark.parametrize("name", ["threshold", "offset", "sensitivity"])
 @pytest.mark.parametrize("value", [-1.0, float("nan"), "high", (1.0, -2.0)])
 def test_parameters_of_the_trigger_are_checked(name: str, value: Any) -> None:
@@ -84,32 +72,6 @@ def test_parameters_of_the_trigger_are_checked(name: str, value: Any) -> None:
 
 
 # --- the environment -----------------------------------------------------------------------------
-
-
-def test_variance_signals_are_what_a_delivery_brings() -> None:
-    for fusion in ("sici", "sci", "ci"):
-        task = build(fusion=fusion)
-        weights = task.reward.state_weights[:, 0]
-        batch = EpisodeBatch(task, 4)
-        batch.seed(np.arange(4), [1, 2, 3, 4])
-        batch.reset()
-        policy = Random(0.4)
-        policy.reset(4)
-        for step in range(12):
-            offered = batch.signals()
-            silent, gain = offered["silent_variance"], offered["variance_reduction"]
-            requests = policy(offered)
-            if step % 4 < 3:  # this sensor alone
-                requests = np.zeros((3, 4), dtype=bool)
-                requests[step % 4] = True
-            batch.step(requests)
-            claimed = batch.delivered.covariance[0]
-            trace = np.einsum("i,iir->r", weights, claimed)
-            if step % 4 < 3:
-                np.testing.assert_allclose(silent - gain[step % 4], trace, rtol=1e-10)
-        batch.step(np.zeros((3, 4), dtype=bool))
-        prior = batch.delivered.prior_covariance[0]
-        np.testing.assert_array_equal(batch.delivered.covariance[0], prior)
 
 
 def test_actual_covariance_is_on_demand_and_changes_nothing() -> None:
@@ -141,16 +103,6 @@ def test_noise_scale_is_drawn_for_each_episode() -> None:
     np.testing.assert_array_equal(batch.state.scale, first)
     batch.reset()
     assert (batch.state.scale != first).all()
-
-
-def test_smaller_noises_are_the_same_noises_scaled() -> None:
-    paths = []
-    for scale in (1.0, 0.25):
-        batch = EpisodeBatch(build(noise_scale=scale, initial_mean=(0.0, 0.0, 0.0)), 2)
-        batch.seed(np.arange(2), [1, 2])
-        batch.reset()
-        paths.append(np.concatenate((batch.state.truth, batch.state.measurement[:, 0])))
-    np.testing.assert_allclose(paths[1], 0.5 * paths[0], rtol=1e-12)
 
 
 @pytest.mark.parametrize(

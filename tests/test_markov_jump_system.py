@@ -8,7 +8,6 @@ import pytest
 from numpy.typing import NDArray
 from reference_markov_jump import PAPER, Run, options, random_model
 
-from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import Signals
 from fusion_gym.envs.registration import make_task
@@ -77,47 +76,6 @@ def test_copies_are_predicted_and_replaced() -> None:
         deviation = after["innovation_deviation"][1]
         assert (deviation > 0.0).all()
         assert (deviation.max() < 1e-6) == (not after["sampled"][1, 0])
-
-
-def test_variance_signals_are_what_a_delivery_brings() -> None:
-    for fusion in ("matrix", "ci"):
-        task = build(fusion=fusion)
-        weights = task.reward.state_weights[:, 0]
-        np.testing.assert_allclose(weights, 1.0 / (2 * task.system.open_loop(task.horizon)))
-        batch = EpisodeBatch(task, 5)
-        batch.reset()
-        policy = Random(0.3)
-        policy.reset(5)
-        for step in range(20):
-            offered = batch.signals()
-            silent, gain = offered["silent_variance"], offered["variance_reduction"]
-            plain, greedy = offered["centre_variance"], offered["greedy_variance"]
-            local = offered["local_variance"]
-            order = np.argsort(-greedy, axis=0)
-            kind, sent = step % 5, policy(offered)
-            if kind < 3:
-                sent = np.zeros((3, 5), dtype=bool)
-                sent[kind] = True
-            elif kind == 3:  # the first two of the greedy order
-                sent = np.zeros((3, 5), dtype=bool)
-                np.put_along_axis(sent, order[:2], True, axis=0)
-            batch.step(sent)
-            covariance = task.system.fused(batch.delivered)[1]
-            weighted = np.einsum("i,iir->r", weights, covariance)
-            if kind < 3:
-                np.testing.assert_allclose(silent - gain[kind], weighted, rtol=1e-9)
-                other = np.delete(greedy.max(0), 0)
-                np.testing.assert_allclose(other, plain[1:], rtol=1e-12)
-            elif kind == 3:
-                third = np.take_along_axis(greedy, order[2:], axis=0)[0]
-                np.testing.assert_allclose(third, linalg.trace(covariance), rtol=1e-9)
-            assert (linalg.trace(covariance) <= local.max(0) * 3).all()
-        before = batch.signals()
-        batch.step(np.zeros((3, 5), dtype=bool))
-        mean, covariance = task.system.fused(batch.delivered)
-        np.testing.assert_array_equal(before["prior_mean"], mean)
-        np.testing.assert_array_equal(before["prior_covariance"], covariance)
-        np.testing.assert_allclose(before["centre_variance"], linalg.trace(covariance))
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.special import ndtr
 
-from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
@@ -155,28 +154,6 @@ def test_there_is_something_to_learn(kind: str) -> None:
         rate[sensor] = 1.0
         single = run_episodes(task, Random(tuple(rate)), 60, 0).returns.mean()
         assert never.returns.mean() * 0.6 < single < always.returns.mean() * 1.1
-
-
-def test_variance_reduction_is_what_a_delivery_brings() -> None:
-    """Whatever is measured; the signals' traces have the reward's weights."""
-    for options in ({"fusion": "exact_ci"}, {"fusion": "sci", "hold_variance": 0.1}):
-        task = build(**options)
-        batch = EpisodeBatch(task, 5)
-        batch.seed(np.arange(5), list(range(5)))
-        batch.reset()
-        for _ in range(10):
-            batch.step(np.random.default_rng(1).random((3, 5)) < 0.4)
-        read = batch.signals()
-        weights = task.reward.state_weights
-        for sensor in (None, 0, 1, 2):
-            granted = np.zeros((3, 5), dtype=np.bool_)
-            predicted = read["silent_variance"]
-            if sensor is not None:
-                granted[sensor] = True
-                predicted = predicted - read["variance_reduction"][sensor]
-            fused = task.system.fused(task.system.deliver(batch.state, granted))[1]
-            trace = (weights * linalg.diagonal(fused)).sum(0)
-            np.testing.assert_allclose(predicted, trace, rtol=1e-9)
 
 
 def test_predicted_innovation_deviation_is_the_actual_one() -> None:

@@ -2,11 +2,12 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
-from cases import FREE, Array, Case, each_case, each_id, requests
+from cases import FREE, Array, Case, each_case, each_id, read, requests
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
@@ -167,6 +168,59 @@ def after(system: Any, state: Any, *sensors: int) -> tuple[Array, Array]:
     granted[list(sensors)] = True
     result: tuple[Array, Array] = system.fused(system.deliver(state, granted))
     return result
+
+
+def check_greedy(greedy: Array, trace: Callable[..., Array]) -> None:
+    """Each run's values fall to the traces before each packet; those without a sample are zero."""
+    for run, order in enumerate(np.argsort(-greedy, axis=0).T):
+        for place, sensor in enumerate(order):
+            if greedy[sensor, run] > 0.0:
+                assert greedy[sensor, run] == pytest.approx(trace(*order[:place])[run], rel=1e-7)
+
+
+def foreseen(case: Case) -> bool:
+    """Whether covariances do not depend on what is measured, lost, or was fused before."""
+    settings = case.task().settings
+    return (
+        "Biased" not in case.env_id
+        and settings.get("filter") not in ("adf", "imm")
+        and settings.get("channel", "perfect") == "perfect"
+        and not ("UnknownInput" in case.env_id and settings["fusion"] == "ci")
+    )
+
+
+@each_case
+def test_variance_signals_are_what_a_delivery_brings(case: Case) -> None:
+    """The traces if nobody delivers, if one sensor does, and those before it in greedy order."""
+    batch = case.batch(**FREE)
+    system: Any = batch.task.system
+    if not foreseen(case) or "variance_reduction" not in read(batch):
+        return
+    for request in requests(batch.task, 3, 2 * STEPS):
+        signals = read(batch)
+
+        def trace(weights: Array, *sensors: int, state: Any = batch.state) -> Array:
+            return np.asarray(
+                weights.ravel() @ np.einsum("iir->ir", after(system, state, *sensors)[1])
+            )
+
+        weights, silent = system.state_weights, signals["silent_variance"]
+        assert (weights == 1.0).all() or (
+            weights.ravel() == batch.task.reward.state_weights.T
+        ).all()
+        np.testing.assert_allclose(silent, trace(weights), rtol=1e-9)
+        each = np.array([trace(weights, sensor) for sensor in range(batch.task.sensors)])
+        np.testing.assert_allclose(signals["variance_reduction"], silent - each, 1e-7, 1e-9)
+        if "greedy_variance" in signals:
+            prior = signals["prior_covariance"]
+            np.testing.assert_array_equal(prior, after(system, batch.state)[1])
+            check_greedy(
+                np.array(signals["greedy_variance"]), partial(trace, np.ones_like(weights))
+            )
+            np.testing.assert_allclose(
+                np.max(signals["greedy_variance"], 0), signals["centre_variance"], rtol=1e-9
+            )
+        batch.step(request)
 
 
 def joined(item: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
