@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.special import ndtr
 
-from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.fusion.several import covariance_intersection_many
@@ -154,23 +153,6 @@ def test_there_is_something_to_learn(kind: str) -> None:
         rate[sensor] = 1.0
         single = run_episodes(task, Random(tuple(rate)), 60, 0).returns.mean()
         assert never.returns.mean() * 0.6 < single < always.returns.mean() * 1.1
-
-
-def test_predicted_innovation_deviation_is_the_actual_one() -> None:
-    """Under the filter's own model of the input: a walk with its memory and its variance."""
-    model = {"input_memory": float(np.exp(-0.1)), "input_change": 0.7 * (1 - np.exp(-0.2)) ** 0.5}
-    task = build(input_signal="random_walk", input_amplitude=0.7, input_period=10.0, **model)
-    batch, policy = EpisodeBatch(task, 400), Random(0.4)
-    batch.seed(np.arange(400), list(range(400)))
-    batch.reset()
-    policy.reset(400, 1)
-    squares = []
-    for step in range(60):
-        read = batch.signals()
-        if step > 5:
-            squares.append((read["innovation"] / read["innovation_deviation"]) ** 2)
-        batch.step(policy(read))
-    np.testing.assert_allclose(np.mean(squares, axis=(0, 3)), 1.0, atol=0.04)
 
 
 # --- reward and scales ---------------------------------------------------------------------------

@@ -223,6 +223,42 @@ def test_variance_signals_are_what_a_delivery_brings(case: Case) -> None:
         batch.step(request)
 
 
+# Filters that are exact, or nearly: the input of the second is one that its filter knows.
+EXACT: list[tuple[str, dict[str, Any]]] = [
+    ("TobitOscillator", {"filter": "kalman", "censoring_threshold": -np.inf}),
+    (
+        "UnknownInput",
+        {"input_signal": "random_walk", "input_amplitude": 0.7, "input_period": 10.0}
+        | {"input_memory": np.exp(-0.1), "input_change": 0.7 * (1.0 - np.exp(-0.2)) ** 0.5}
+        | {"input_deviation": 0.7},
+    ),
+    ("CorrelatedTracking", {}),
+    *(("MarkovJumpTracking", {"filter": kind}) for kind in ("local", "centralised", "imm")),
+    ("BiasedOscillator", {"filter": "adf"}),
+    ("BiasedTracking", {}),
+    ("LinearFusion", {}),
+    ("RemoteEstimation", {}),
+]
+
+
+@pytest.mark.parametrize(("name", "options"), EXACT)
+def test_innovations_have_the_variance_that_is_claimed(name: str, options: dict[str, Any]) -> None:
+    """Under random requests: the mean square of each channel that is sampled at a step is 1."""
+    task = fusion_gym.make_task(f"fusion_gym/{name}-v0", **options)
+    batch, squares = EpisodeBatch.seeded(task, 8000, 0), []
+    for request in requests(task, 8000, 12, rate=0.3):
+        signals = read(batch)
+        deviation = np.broadcast_to(signals["innovation_deviation"], signals["innovation"].shape)
+        unknown = (deviation < 1e-6) | ~np.array(signals.get("sampled", request | True))[:, None]
+        assert np.abs(signals["innovation"][deviation < 1e-9]).max(initial=0.0) < 1e-6
+        whitened = np.ma.array(signals["innovation"] / np.maximum(deviation, 1e-9), mask=unknown)
+        squares.append((whitened**2).mean(-1).compressed())
+        batch.step(request)
+    every = np.concatenate(squares)
+    np.testing.assert_allclose(every, 1.0, atol=0.07)  # a standard error is about 0.016
+    assert every.mean() == pytest.approx(1.0, abs=0.015)
+
+
 def joined(item: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
     """By covariance intersection."""
     fused = covariance_intersection(*item, *other)
