@@ -2,7 +2,6 @@
 
 import math
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from fusion_gym.validation import ConfigurationError
 build = partial(make_task, "fusion_gym/CorrelatedTracking-v0")
 
 Array = NDArray[np.float64]
-ROOT = Path(__file__).parent.parent
 
 
 # --- the trigger ---------------------------------------------------------------------------------

@@ -239,29 +239,6 @@ def test_figures_of_the_papers_trigger(scale: float) -> None:
     ).mean() > 0.97
 
 
-@pytest.mark.parametrize(
-    ("fusion", "event", "always", "at_random"),
-    [
-        pytest.param("sci", 0.374, 0.310, 0.510, marks=pytest.mark.slow),
-        ("sici", 0.288, 0.250, 0.413),
-    ],
-)
-def test_figures_of_event_always_and_random(
-    fusion: str, event: float, always: float, at_random: float
-) -> None:
-    spread = f"random:rate={'/'.join(map(str, RATES))}"
-    for policy, printed in (("event", event), ("always", always), (spread, at_random)):
-        assert_figure(policy, run(policy, fusion=fusion).mse, printed)
-
-
-@pytest.mark.slow
-def test_figures_of_the_reversed_order() -> None:
-    for fusion, printed in (("sci", 0.355), ("sici", 0.274)):
-        results = run(fusion=fusion, order=(2, 1, 0))
-        assert_figure(fusion, results.mse, printed)
-        assert results.conservative.mean() < run(fusion=fusion).conservative.mean() - 0.01
-
-
 # --- consistency ---------------------------------------------------------------------------------
 
 

@@ -194,22 +194,6 @@ reals = st.floats(-60.0, 60.0)
 widths = st.floats(-4.0, 2.0).map(lambda exponent: 10.0**exponent)
 
 
-@given(z=st.floats(-1e8, 1e8))
-def test_truncated_variance_within_bounds(z: float) -> None:
-    hazard, excess = gaussian.hazard(z), excess_beyond(z)
-    assert 0.0 < gaussian.truncated_variance(z) <= 1.0
-    assert excess > 0.0
-    assert hazard >= max(z, 0.0)
-
-
-@given(z=st.floats(-37.0, 1e6), step=st.floats(1e-3, 10.0))
-def test_monotone(z: float, step: float) -> None:
-    assert gaussian.hazard(z + step) > gaussian.hazard(z)
-    assert excess_beyond(z + step) < excess_beyond(z)
-    assert gaussian.truncated_variance(z + step) <= gaussian.truncated_variance(z)
-    assert gaussian.upper_tail(z + step) <= gaussian.upper_tail(z)
-
-
 @given(low=reals, width=widths)
 def test_interval_moments_are_moments(low: float, width: float) -> None:
     high = low + width

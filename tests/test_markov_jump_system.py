@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from reference_markov_jump import PAPER, Run, options, random_model
 
 from fusion_gym.core.batch import EpisodeBatch
@@ -18,8 +17,6 @@ from fusion_gym.policies.rules.local_variance import LocalVariance
 from fusion_gym.validation import ConfigurationError
 
 build = partial(make_task, "fusion_gym/MarkovJumpTracking-v0")
-
-Array = NDArray[np.float64]
 
 
 # --- the system ----------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """The solved optimum of remote estimation: published costs, integral equations, closed forms."""
 
 import math
-from functools import cache
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from fusion_gym.solvers.bounds import lagrangian_bound
 from fusion_gym.solvers.grid import ErrorGrid, gaussian_rows
 from fusion_gym.solvers.joint import JointProblem, solve_joint_average, solve_joint_finite
 from fusion_gym.solvers.single import (
-    AverageSolution,
     solve_average,
     solve_discounted,
     solve_finite,
@@ -68,25 +66,6 @@ def test_published_costs(chain: tuple[float, float]) -> None:
     solution = solve_discounted(published_problem(*chain), 0.9)
     assert solution.cost[0] == pytest.approx(PUBLISHED[chain], rel=0.002)
     assert solution.ordered
-
-
-def test_discounted_cost_of_its_thresholds_by_simulation() -> None:
-    """A loop written out for the order of events: error, decision, channel, loss, cost."""
-    problem = published_problem(0.7, 0.1)
-    solution = solve_discounted(problem, 0.9)
-    draw, runs = np.random.default_rng(0), 40_000
-    error, channel = np.zeros(runs), np.zeros(runs, dtype=int)
-    total = np.zeros(runs)
-    for step in range(120):
-        error = error + draw.standard_normal(runs)
-        asks = np.abs(error) >= solution.threshold[channel, 0]
-        channel = (draw.random(runs) >= problem.transition[channel, 0]).astype(int)
-        arrives = asks & (draw.random(runs) >= problem.drop[channel])
-        error = np.where(arrives, 0.0, error)
-        total += 0.1 * 0.9**step * (error**2 + 100.0 * asks)
-    room = 4.0 * total.std() / math.sqrt(runs)
-    assert abs(total.mean() - solution.cost[0]) < room
-    assert room < 0.02 * solution.cost[0]
 
 
 # --- a perfect channel: the integral equations of a renewal cycle --------------------------------
@@ -239,38 +218,6 @@ def test_levels_of_a_bucket() -> None:
     awkward = TokenBucket.create(math.sqrt(0.5), 600.0, 0.0, 1.0, sensors=1)
     with pytest.raises(ConfigurationError, match="levels"):
         TokenLevels.create(awkward)
-
-
-@cache
-def limited(price: float = 0.0, capacity: float = 3.0) -> AverageSolution:
-    bucket = TokenBucket.create(0.25, capacity, 1.0, 1.0, sensors=1)
-    return solve_average(SourceProblem.create(price=price, bucket=bucket), tolerance=1e-5)
-
-
-@pytest.mark.slow
-def test_tokens_that_are_scarce_have_a_higher_threshold() -> None:
-    solution = limited()
-    threshold = solution.threshold[0]
-    assert solution.ordered
-    assert np.isinf(threshold[:3]).all()  # 0.25, 0.5, 0.75
-    assert (np.diff(threshold[3:]) < 0).all()
-    assert solution.rate <= 0.25 + 1e-6
-    assert (limited(5.0).threshold[0, 3:] > threshold[3:]).all()
-
-
-@pytest.mark.slow
-def test_limited_tokens_cost_more_than_the_dual_bound_and_less_than_a_period() -> None:
-    free = SourceProblem.create(price=0.0)
-    bound = lagrangian_bound((free,), (1.0,), 0.25)
-    assert bound.cost < limited().cost < 0.75 * 1.5  # every fourth step: (0 + 1 + 2 + 3)/4
-    # A larger bucket comes closer to the bound, which allows for any sequence of transmissions.
-    large = limited(capacity=8.0).cost
-    assert bound.cost < large < 1.15 * bound.cost
-    assert limited().cost > 1.15 * large
-    # At the best multiplier the source spends what there is.
-    dearer = solve_average(SourceProblem.create(price=bound.multiplier))
-    assert dearer.rate == pytest.approx(0.25, rel=0.01)
-    assert bound.cost == pytest.approx(dearer.error, rel=0.01)
 
 
 def test_tokens_in_plenty_do_not_bind() -> None:

@@ -1,7 +1,6 @@
 """The unknown-input environment: against a plain loop, its options, its errors, its invariances."""
 
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from fusion_gym.systems.unknown_input.examples import EXAMPLES, two_carts
 build = partial(make_task, "fusion_gym/UnknownInput-v0")
 
 Array = NDArray[np.float64]
-ROOT = Path(__file__).parents[1]
 CARTS = EXAMPLES["two_carts"]
 
 
@@ -153,6 +151,3 @@ def test_there_is_something_to_learn(kind: str) -> None:
         rate[sensor] = 1.0
         single = run_episodes(task, Random(tuple(rate)), 60, 0).returns.mean()
         assert never.returns.mean() * 0.6 < single < always.returns.mean() * 1.1
-
-
-# --- reward and scales ---------------------------------------------------------------------------
