@@ -171,11 +171,13 @@ def after(system: Any, state: Any, *sensors: int) -> tuple[Array, Array]:
 
 
 def check_greedy(greedy: Array, trace: Callable[..., Array]) -> None:
-    """Each run's values fall to the traces before each packet; those without a sample are zero."""
+    """The best sensors come first, with the trace before each; those without a sample are zero."""
     for run, order in enumerate(np.argsort(-greedy, axis=0).T):
         for place, sensor in enumerate(order):
             if greedy[sensor, run] > 0.0:
                 assert greedy[sensor, run] == pytest.approx(trace(*order[:place])[run], rel=1e-7)
+                each = [trace(*order[:place], other)[run] for other in order[place:]]
+                assert each[0] == pytest.approx(min(each), rel=1e-7)
 
 
 def foreseen(case: Case) -> bool:
