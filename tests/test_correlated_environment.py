@@ -62,13 +62,6 @@ def test_memory_of_one_run_restarts_alone_and_reset_forgets() -> None:
     assert not trigger(signals(small, False)).any()
 
 
-@pytest.mark.parametrize("name", ["threshold", "offset", "sensitivity"])
-@pytest.mark.parametrize("value", [-1.0, float("nan"), "high", (1.0, -2.0)])
-def test_parameters_of_the_trigger_are_checked(name: str, value: Any) -> None:
-    with pytest.raises(ConfigurationError, match=name):
-        AdaptiveInnovation(**{name: value})
-
-
 # --- the environment -----------------------------------------------------------------------------
 
 
@@ -108,32 +101,15 @@ def test_noise_scale_is_drawn_for_each_episode() -> None:
     [
         ({"noise_scale": 0.0}, r"noise_scale = 0.0 .* > 0"),
         ({"noise_scale": 1.5}, r"noise_scale = 1.5 .* <= 1"),
-        ({"noise_scale": "often"}, r"noise_scale = 'often' .* 'random'"),
-        ({"noise_scale": True}, "noise_scale = True"),
-        ({"noise_scale": None}, "noise_scale = None"),
         ({"fusion": "information"}, r"fusion = 'information' .* process noise"),
         ({"fusion": "federated"}, r"fusion = 'federated' .* 'sici'"),
         ({"fusion": "scii"}, r"did you mean 'sci"),
-        ({"fusion": 3}, r"fusion = 3 .* 'sici'"),
         ({"fusion": "ci", "order": (0, 1, 2)}, r"order = .* fusion='ci'"),
-        ({"order": (0, 1)}, "order"),
         ({"order": (0, 1, 1)}, r"order = \(0, 1, 1\) .* once"),
         ({"order": (1, 2, 3)}, "order"),
-        ({"order": "first"}, "order"),
-        ({"track_actual": 1}, "track_actual = 1"),
         ({"transition": ((1.0, 0.1),)}, "transition"),
-        ({"process_gain": (1.0, 1.0, 1.0)}, "process_gain"),
         ({"process_variance": 0.0}, "process_variance"),
-        ({"initial_mean": (0.0, 0.0)}, "initial_mean"),
         ({"initial_covariance": -np.eye(3)}, "initial_covariance"),
-        ({"measurement_variance": -1.0}, "measurement_variance"),
-        ({"noise_coupling": (0.1, 0.2)}, "noise_coupling"),
-        ({"trigger_threshold": -0.1}, "trigger_threshold"),
-        ({"trigger_offset": (0.1, 0.2)}, "trigger_offset"),
-        ({"trigger_sensitivity": "high"}, "trigger_sensitivity"),
-        ({"tokens": "many"}, "tokens = 'many'"),
-        ({"horizon": 0}, "horizon = 0"),
-        ({"state_weights": (1.0, 1.0)}, "state_weights"),
         ({"thresholds": 1.0}, "unknown option .*trigger_threshold"),
     ],
 )

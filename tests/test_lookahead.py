@@ -123,22 +123,6 @@ def test_what_cannot_be_is_refused() -> None:
         played(centre).signals()["model"]
 
 
-def test_with_memory_it_aims_at_what_was_never_sent() -> None:
-    """Paired episodes at one price: no more error, for less than half the packets."""
-    options: dict[str, Any] = {"filter": "tobit", "random_start": True, "token_rate": 2.0}
-    results = []
-    for memory, price in ((False, 0.015), (True, 0.03)):
-        task = fusion_gym.make_task(TOBIT, **options, memory=memory, horizon=60, cost_weight=0.03)
-        policy = make_policy(f"lookahead:steps=2,price={price}", task)
-        assert policy.knowledge == ("scheduler_memory" if memory else "scheduler")
-        results.append(run_episodes(task, policy, 40, seed=0))
-    forgets, remembers = results
-    better = remembers.returns - forgets.returns
-    assert better.mean() > 4.0 * better.std() / np.sqrt(40)
-    assert remembers.mse.mean() < forgets.mse.mean()
-    assert remembers.rate.mean() < 0.5 * forgets.rate.mean()
-
-
 def test_a_packet_with_an_estimate_leaves_nothing_to_a_second_one() -> None:
     """Any packet brings x*, so one is enough; it goes where the distance outweighs the price."""
     options: dict[str, Any] = {"filter": "kalman", "access": "any", "tokens": "unlimited"}

@@ -4,7 +4,6 @@ Expected figures are of an independent implementation, 1,000 runs of 100 steps: 
 standard error of about 0.5 %, ours of half that, so 2.2 % are four standard errors of a difference.
 """
 
-import itertools
 from functools import partial
 from typing import Any
 
@@ -40,13 +39,6 @@ def test_references_that_know_all_measurements(where: str, errors: tuple[float, 
     np.testing.assert_allclose(np.sqrt(results.squared_error.mean(0)), errors, rtol=0.022)
     if where == "centralised":
         assert results.bound_trace.mean() == pytest.approx(1.0346, abs=1e-4)
-
-
-def test_the_more_a_filter_knows_the_better() -> None:
-    results = [run_episodes(build(filter=f), Always(), 1500, 7) for f in ("local", *FILTERS)]
-    for worse, better in itertools.pairwise(results):
-        gain = worse.mse - better.mse  # paired: the same noise
-        assert gain.mean() > 4 * gain.std() / np.sqrt(1500)
 
 
 @pytest.mark.parametrize("seed", [None, 1, 2])

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from fusion_gym.systems.correlated.filters import JointErrorCovariance, RobustKalmanFilter
 from fusion_gym.systems.correlated.sensors import CorrelatedSensors
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]
 T = 0.01
@@ -264,24 +263,3 @@ def test_conservative_covariance_is_actual_at_the_bounds_and_above_it_below() ->
             np.testing.assert_allclose(own, conservative[node], rtol=1e-7, atol=1e-9)
             gap = np.linalg.eigvalsh(conservative[node] - smaller[node + 1, node + 1])
             assert gap[0] > 0.0
-
-
-# --- bad input -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"matrices": np.eye(3)}, "measurement_matrices"),
-        ({"variance": [[1.0], [2.0, 3.0]]}, "measurement_variance"),
-        ({"coupling": float("nan")}, "noise_coupling"),
-    ],
-)
-def test_what_cannot_be_used_is_refused(change: dict[str, Any], message: str) -> None:
-    arguments: dict[str, Any] = {
-        "matrices": np.eye(3)[:, None],
-        "variance": ETA,
-        "coupling": BETA,
-    }
-    with pytest.raises(ConfigurationError, match=message):
-        parts(PHI, GAMMA, np.array([0.16]), **(arguments | change))

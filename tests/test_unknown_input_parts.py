@@ -307,7 +307,6 @@ def test_adaptive_threshold_is_the_papers_recursion_and_keeps_its_promise() -> N
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"rho_bar": 1.5}, "rho_bar = 1.5"),
         ({"rho_bar": 0.05, "rho_initial": 0.06}, r"rho_initial = 0.06 .* <= rho_bar = 0.05"),
         ({"rho_bar": (0.1, 0.2), "rho_initial": (0.1, 0.1, 0.1)}, "rho_initial"),
     ],

@@ -9,10 +9,7 @@ from scipy.linalg import null_space
 from scipy.special import ndtr
 
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.fusion.several import covariance_intersection_many
-from fusion_gym.policies.rules.constant import Always, Never
-from fusion_gym.policies.rules.random import Random
 from fusion_gym.systems.unknown_input.examples import EXAMPLES, two_carts
 
 build = partial(make_task, "fusion_gym/UnknownInput-v0")
@@ -125,29 +122,4 @@ def test_library_and_plain_loop_walk_the_same_trajectories(kind: str, hold: floa
         np.testing.assert_allclose(fused_covariances[:, 4, 4, run], least, rtol=1e-6)
 
 
-def test_tracked_weights_stay_near_the_best() -> None:
-    """The default fusion against the search for the best weights, along the same episodes."""
-    claimed, errors = [], []
-    for fusion in ("ci", "exact_ci"):
-        results = run_episodes(build(fusion=fusion), Random(0.3), 40, 0)
-        claimed.append(results.bound_trace.mean())
-        errors.append(results.mse.mean())
-    assert 1.0 <= claimed[0] / claimed[1] < 1.03
-    assert abs(errors[0] / errors[1] - 1.0) < 0.05
-
-
 # --- policies ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", ["random_walk", "predict"])
-def test_there_is_something_to_learn(kind: str) -> None:
-    """Never costs 1 a step and 5 times always, and every sensor helps."""
-    task = build(filter=kind, cost_weight=0.0)
-    always, never = (run_episodes(task, policy, 60, 0) for policy in (Always(), Never()))
-    assert -never.returns.mean() / 100 == pytest.approx(1.0, abs=0.12)
-    assert never.returns.mean() < 5 * always.returns.mean()
-    for sensor in range(3):
-        rate = [0.0, 0.0, 0.0]
-        rate[sensor] = 1.0
-        single = run_episodes(task, Random(tuple(rate)), 60, 0).returns.mean()
-        assert never.returns.mean() * 0.6 < single < always.returns.mean() * 1.1
