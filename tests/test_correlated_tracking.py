@@ -25,7 +25,6 @@ from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
 build = partial(make_task, "fusion_gym/CorrelatedTracking-v0")
 
 Array = NDArray[np.float64]
-RATES = (0.581, 0.463, 0.635)
 EVENT = AdaptiveInnovation()
 
 
@@ -260,15 +259,3 @@ def test_inverse_covariance_intersection_does_not() -> None:
     assert results.worst[1:].min() > -1e-9
     assert results.worst[0].min() < -0.01
     assert (results.actual < results.conservative).all()
-
-
-@pytest.mark.parametrize(
-    "fusion", ["ci", *(pytest.param(rule, marks=pytest.mark.slow) for rule in ("sci", "sici"))]
-)
-def test_squared_error_is_the_actual_trace_under_random_requests_only(fusion: str) -> None:
-    spread = f"random:rate={'/'.join(map(str, RATES))}"
-    for policy, equal in ((spread, True), ("event", False)):
-        results = run(policy, 80, 200 if fusion == "ci" else 600, fusion=fusion)
-        difference = results.mse - results.actual
-        error = difference.std(ddof=1) / math.sqrt(len(difference))
-        assert (abs(difference.mean()) <= 4 * error) == equal
