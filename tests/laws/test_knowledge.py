@@ -239,7 +239,7 @@ EXACT: list[tuple[str, dict[str, Any]]] = [
     ("BiasedOscillator", {"filter": "adf"}),
     ("BiasedTracking", {}),
     ("LinearFusion", {}),
-    ("RemoteEstimation", {}),
+    ("RemoteEstimation", {"coefficient": 0.9, "initial_deviation": 3.0}),
 ]
 
 
