@@ -191,9 +191,7 @@ def test_validation_counts_episodes_by_their_price(tmp_path: Path) -> None:
     train.train(load_checked(Experiment, path), quiet=True)
     record = read_records(tmp_path / "run")[-1]
     task = fusion_gym.make_task(ENV, **content["environment"]["options"])
-    batch = EpisodeBatch(task, 4)
-    batch.seed(np.arange(4), [500_000_000 + place for place in range(4)])
-    batch.reset()
+    batch = EpisodeBatch.seeded(task, 4, 500_000_000)
     price = batch.price.copy()
     final = make_policy(f"model:{tmp_path / 'run' / 'final_model.zip'}", task)
     results = run_episodes(task, final, 4, 500_000_000)

@@ -11,7 +11,6 @@ from scipy import integrate, stats
 import fusion_gym
 from fusion_gym.core.access import first_request
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -86,7 +85,7 @@ def test_federation_is_the_centralised_tobit_filter() -> None:
     """Against a plain loop over the scheduled sensor, per run, on the same measurements."""
     task = fusion_gym.make_task(OSCILLATOR)
     system, policy = task.system, make_policy("round_robin", task)
-    batch = started(task, 4)
+    batch = EpisodeBatch.seeded(task, 4, 0)
     policy.reset(4)
     plant = system.plant
     transition, process = plant.transition[..., 0], plant.process_covariance[..., 0]
@@ -118,13 +117,6 @@ def tobit_update(mean: Any, covariance: Any, sensor: int, value: float) -> tuple
     cross = p * covariance @ row
     gain = cross / (p**2 * row @ covariance @ row + 0.6 * inside.var())
     return mean + gain * (value - expected), covariance - np.outer(gain, cross)
-
-
-def started(task: Task, runs: int) -> EpisodeBatch:
-    batch = EpisodeBatch(task, runs)
-    batch.seed(np.arange(runs), list(range(runs)))
-    batch.reset()
-    return batch
 
 
 # --- assumed-density filter ---------------------------------------------------------------------
@@ -169,7 +161,7 @@ def test_assumed_density_moments_are_those_of_the_posterior(
 def test_expected_reduction_is_the_mean_over_the_measurements() -> None:
     """Against the mean of the posterior covariance over drawn measurements, 4 deviations."""
     task = fusion_gym.make_task(OSCILLATOR, filter="adf", access="any")
-    batch = started(task, 1)
+    batch = EpisodeBatch.seeded(task, 1, 0)
     batch.step(np.ones((2, 1), dtype=np.bool_))
     state, centre = batch.state, task.system.centre
     draws = 200_000

@@ -66,10 +66,8 @@ def test_memory_of_one_run_restarts_alone_and_reset_forgets() -> None:
 
 
 def test_actual_covariance_is_on_demand_and_changes_nothing() -> None:
-    plain, tracked = (EpisodeBatch(build(track_actual=on), 3) for on in (False, True))
+    plain, tracked = (EpisodeBatch.seeded(build(track_actual=on), 3, 5) for on in (False, True))
     for batch in (plain, tracked):
-        batch.seed(np.arange(3), [5, 6, 7])
-        batch.reset()
         policy = Random(0.5)
         policy.reset(3, 9)
         for _ in range(20):
@@ -83,9 +81,7 @@ def test_actual_covariance_is_on_demand_and_changes_nothing() -> None:
 
 
 def test_noise_scale_is_drawn_for_each_episode() -> None:
-    batch = EpisodeBatch(build(noise_scale="random", horizon=3), 4000)
-    batch.seed(np.arange(4000), list(range(4000)))
-    batch.reset()
+    batch = EpisodeBatch.seeded(build(noise_scale="random", horizon=3), 4000, 0)
     first = batch.state.scale.copy()
     assert 0.4 <= first.min() < 0.41
     assert 0.99 < first.max() <= 1.0

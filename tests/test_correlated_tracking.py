@@ -177,9 +177,7 @@ class Run:
 def run(policy: str = "event", episodes: int = 80, horizon: int = 600, **options: Any) -> Run:
     task = build(horizon=horizon, track_actual=True, **options)
     rule: Policy = EVENT if policy == "event" else make_rule(policy)
-    batch = EpisodeBatch(task, episodes)
-    batch.seed(np.arange(episodes), list(range(9000, 9000 + episodes)))
-    batch.reset()
+    batch = EpisodeBatch.seeded(task, episodes, 9000)
     rule.reset(episodes, 1)
     sums = {name: [] for name in ("mse", "actual", "conservative", "rate", "worst", "inside")}
     for _ in range(horizon):

@@ -104,9 +104,7 @@ def test_each_episode_has_a_search_of_its_own() -> None:
 def test_in_the_solved_case_a_small_beam_reaches_the_optimum() -> None:
     """One source is where it was last sent: the best schedule follows from T(T + 1)/2 stretches."""
     task, price, horizon = fusion_gym.make_task(REMOTE, max_episode_steps=60), 5.0, 60
-    batch = EpisodeBatch(task, 8)
-    batch.seed(np.arange(8), list(range(8)))
-    batch.reset()
+    batch = EpisodeBatch.seeded(task, 8, 0)
     path = np.zeros((horizon + 1, 8))
     for step in range(horizon):
         path[step + 1] = batch.state.truth[0]

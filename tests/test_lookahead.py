@@ -20,9 +20,7 @@ TRACKING = "fusion_gym/BiasedTracking-v0"
 
 
 def played(task: Task, runs: int = 30, steps: int = 5) -> EpisodeBatch:
-    batch = EpisodeBatch(task, runs)
-    batch.seed(np.arange(runs), list(range(runs)))
-    batch.reset()
+    batch = EpisodeBatch.seeded(task, runs, 0)
     generator = np.random.default_rng(1)
     for _ in range(steps):
         batch.step(generator.random((task.sensors, runs)) < 0.3)

@@ -73,9 +73,7 @@ def test_simple_channels_and_certain_starts() -> None:
 def test_library_and_plain_loop_walk_the_same_trajectories(options: dict[str, Any]) -> None:
     task = build(horizon=60, cost_weight=3.0, **options)
     sensors, system = task.sensors, task.system
-    batch, runs = EpisodeBatch(task, 4), 4
-    batch.seed(np.arange(runs), [7, 8, 9, 10])
-    batch.reset()
+    batch, runs = EpisodeBatch.seeded(task, 4, 7), 4
     ask = np.random.default_rng(3).random((60, sensors, runs)) < 0.3
     a = np.broadcast_to(task.settings["coefficient"], sensors)
     estimate, age = np.zeros((sensors, runs)), np.zeros((sensors, runs))
@@ -116,9 +114,7 @@ def test_library_and_plain_loop_walk_the_same_trajectories(options: dict[str, An
 
 def test_knowledge_of_the_channel_is_one_step_late() -> None:
     task = build(**LOSSY, initial_channel="bad", horizon=200)
-    batch = EpisodeBatch(task, 400)
-    batch.seed(np.arange(400), list(range(400)))
-    batch.reset()
+    batch = EpisodeBatch.seeded(task, 400, 0)
     names = list(batch.layout.names)
     assert names == ["error[0]", "age[0]", "channel[0,bad]", "channel[0,good]", "tokens"]
     assert (batch.signals()["channel_state"] == 0).all()

@@ -73,13 +73,6 @@ def deviations(values: Array) -> float:
     return float(values.mean() / (values.std() / np.sqrt(len(values))))
 
 
-def started(task: Task, runs: int) -> EpisodeBatch:
-    batch = EpisodeBatch(task, runs)
-    batch.seed(np.arange(runs), list(range(runs)))
-    batch.reset()
-    return batch
-
-
 # --- exactness ----------------------------------------------------------------------------------
 
 
@@ -148,7 +141,7 @@ def test_federation_is_one_filter_that_takes_silence_as_a_measurement() -> None:
         other.F, other.Q = plant.transition[..., 0], plant.process_covariance[..., 0]
         other.H = sensors.measurement_matrix[..., 0].reshape(6, 2)
         filters.append(other)
-    generator, batch = np.random.default_rng(2), started(task, runs)
+    generator, batch = np.random.default_rng(2), EpisodeBatch.seeded(task, runs, 0)
     for _ in range(25):
         granted = generator.random((3, runs)) < 0.4
         measurement = batch.signals()["measurement"].copy()

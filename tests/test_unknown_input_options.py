@@ -48,9 +48,7 @@ def shape(n: int, q: int, sensors: int, m: int) -> dict[str, Any]:
 )
 def test_other_sizes_signals_filters_and_fusions_run(options: dict[str, Any]) -> None:
     task = build(**options)
-    batch = EpisodeBatch(task, 5)
-    batch.seed(np.arange(5), list(range(5)))
-    batch.reset()
+    batch = EpisodeBatch.seeded(task, 5, 0)
     policy = make_rule("random:rate=0.4", task.policy_defaults)
     policy.reset(5, 1)
     for _ in range(task.horizon + 3):  # and beyond the end, as finished runs go
