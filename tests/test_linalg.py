@@ -161,6 +161,15 @@ def test_badly_scaled_matrices_keep_full_precision(seed: int, n: int) -> None:
     assert np.isfinite(linalg.cholesky(scaled)).all()
 
 
+def test_nearly_singular_pair() -> None:
+    gap = 2.0**-40
+    a = np.array([[1.0, 1.0 - gap], [1.0 - gap, 1.0]])[:, :, None]
+    determinant = gap * (2.0 - gap)
+    expected = np.array([[1.0, gap - 1.0], [gap - 1.0, 1.0]]) / determinant
+    np.testing.assert_allclose(linalg.inverse(a)[..., 0], expected, rtol=1e-14)
+    assert np.isfinite(linalg.cholesky(a)).all()
+
+
 def indefinite(n: int) -> dict[str, Array]:
     """Matrices that are not positive definite, each failing at another place."""
     cases = {

@@ -112,6 +112,7 @@ def test_cost_scales_with_the_units(sigma: float, weight: float, price: float) -
     )
     assert other.cost == pytest.approx(plain.cost * unit, rel=1e-3)
     assert other.threshold[0, 0] == pytest.approx(plain.threshold[0, 0] * sigma, rel=1e-3)
+    assert other.error == pytest.approx(plain.error * sigma**2, rel=1e-2)
 
 
 @settings(max_examples=30, deadline=None)
