@@ -287,6 +287,7 @@ SIGNED |= {"coefficient", "input_phase", "input_amplitude"}
 @each_id
 @pytest.mark.parametrize("value", ["no such word", float("nan"), {}, ((1.0,), (2.0, 3.0)), -1.0])
 def test_what_an_option_cannot_be_is_refused_by_name(env_id: str, value: Any) -> None:
+    """Where the library checks the options."""
     for option in (field.name for field in fields(options_of(env_id))):
         if env_id != OWN_ID and not (value == -1.0 and option in SIGNED):
             with pytest.raises(ConfigurationError, match=rf"^{option}(\[\d\])? = ") as caught:

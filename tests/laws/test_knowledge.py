@@ -157,7 +157,7 @@ def differs(value: Array, base: Any) -> Array:
     return np.asarray(apart.reshape(len(value), -1, value.shape[-1]).any(1))
 
 
-# --- what is believed -----------------------------------------------------------------------------
+# --- what a delivery brings -----------------------------------------------------------------------
 
 
 def after(system: Any, state: Any, *sensors: int) -> tuple[Array, Array]:
@@ -170,6 +170,12 @@ def after(system: Any, state: Any, *sensors: int) -> tuple[Array, Array]:
     return result
 
 
+def fused_trace(batch: EpisodeBatch, weights: Array, *sensors: int) -> Array:
+    """The weighted trace (N,) after these packets."""
+    variances = np.einsum("iir->ir", after(batch.task.system, batch.state, *sensors)[1])
+    return np.asarray((weights.reshape(-1, 1) * variances).sum(0))
+
+
 def check_greedy(greedy: Array, trace: Callable[..., Array]) -> None:
     """The best sensors come first, with the trace before each; those without a sample are zero."""
     for run, order in enumerate(np.argsort(-greedy, axis=0).T):
@@ -180,7 +186,7 @@ def check_greedy(greedy: Array, trace: Callable[..., Array]) -> None:
                 assert each[0] == pytest.approx(min(each), rel=1e-7)
 
 
-def foreseen(case: Case) -> bool:
+def deterministic_variance(case: Case) -> bool:
     """Whether covariances do not depend on what is measured, lost, or was fused before."""
     settings = case.task().settings
     return (
@@ -196,32 +202,20 @@ def test_variance_signals_are_what_a_delivery_brings(case: Case) -> None:
     """The traces if nobody delivers, if one sensor does, and those before it in greedy order."""
     batch = case.batch(**FREE)
     system: Any = batch.task.system
-    if not foreseen(case) or "variance_reduction" not in read(batch):
+    if not deterministic_variance(case) or "variance_reduction" not in read(batch):
         return
     for request in requests(batch.task, 3, 2 * STEPS):
-        signals = read(batch)
-
-        def trace(weights: Array, *sensors: int, state: Any = batch.state) -> Array:
-            return np.asarray(
-                weights.ravel() @ np.einsum("iir->ir", after(system, state, *sensors)[1])
-            )
-
-        weights, silent = system.state_weights, signals["silent_variance"]
-        assert (weights == 1.0).all() or (
-            weights.ravel() == batch.task.reward.state_weights.T
-        ).all()
-        np.testing.assert_allclose(silent, trace(weights), rtol=1e-9)
-        each = np.array([trace(weights, sensor) for sensor in range(batch.task.sensors)])
+        signals, weights = read(batch), system.state_weights
+        assert (weights == 1.0).all() or np.all(weights == batch.task.reward.state_weights.ravel())
+        silent = signals["silent_variance"]
+        np.testing.assert_allclose(silent, fused_trace(batch, weights), rtol=1e-9)
+        each = [fused_trace(batch, weights, sensor) for sensor in range(batch.task.sensors)]
         np.testing.assert_allclose(signals["variance_reduction"], silent - each, 1e-7, 1e-9)
         if "greedy_variance" in signals:
-            prior = signals["prior_covariance"]
+            prior, greedy = signals["prior_covariance"], np.array(signals["greedy_variance"])
             np.testing.assert_array_equal(prior, after(system, batch.state)[1])
-            check_greedy(
-                np.array(signals["greedy_variance"]), partial(trace, np.ones_like(weights))
-            )
-            np.testing.assert_allclose(
-                np.max(signals["greedy_variance"], 0), signals["centre_variance"], rtol=1e-9
-            )
+            np.testing.assert_allclose(greedy.max(0), signals["centre_variance"], rtol=1e-9)
+            check_greedy(greedy, partial(fused_trace, batch, np.ones_like(weights)))
         batch.step(request)
 
 
@@ -259,6 +253,9 @@ def test_innovations_have_the_variance_that_is_claimed(name: str, options: dict[
     every = np.concatenate(squares)
     np.testing.assert_allclose(every, 1.0, atol=0.07)  # a standard error is about 0.016
     assert every.mean() == pytest.approx(1.0, abs=0.015)
+
+
+# --- what is believed -----------------------------------------------------------------------------
 
 
 def joined(item: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
