@@ -32,7 +32,7 @@ from typing import Any
 import torch
 import yaml
 
-from fusion_gym.agents.experiments.references import read_envelopes
+from fusion_gym.agents.experiments.envelopes import read_envelopes
 from fusion_gym.agents.experiments.tables import read_frame
 
 TIMESTEPS = 100_000

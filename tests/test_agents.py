@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from fusion_gym.agents.experiments.references import CommittedRules, Trials
 from stable_baselines3 import PPO
 from training_configs import ENV, SMALL, read_records, small_config
 
@@ -23,7 +24,6 @@ import fusion_gym
 from fusion_gym.agents import demo, evaluate
 from fusion_gym.agents.command_line import read_command
 from fusion_gym.agents.experiments.config import Suite, Sweep, SweepSettings
-from fusion_gym.agents.experiments.references import CommittedRules, Trials
 from fusion_gym.agents.experiments.workers import Pool
 from fusion_gym.agents.training import run as train
 from fusion_gym.agents.training.algorithms import TABLE

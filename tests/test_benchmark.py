@@ -19,11 +19,12 @@ from training_configs import small_config
 
 import fusion_gym
 from fusion_gym.agents import __main__ as everything
-from fusion_gym.agents import benchmark, report, solved, tune, zoo
+from fusion_gym.agents import benchmark, solved, tune, zoo
 from fusion_gym.agents.experiments import training as jobs
 from fusion_gym.agents.experiments.classes import classes_of, trained_classes
 from fusion_gym.agents.experiments.config import load_suite
-from fusion_gym.agents.experiments.references import read_envelopes, searches_of
+from fusion_gym.agents.experiments.envelopes import envelope_task, read_envelopes, searches_of
+from fusion_gym.agents.experiments.figures import report_text
 from fusion_gym.agents.experiments.report import read_results, read_verdict
 from fusion_gym.agents.experiments.tables import read_frame, read_rows, write_rows
 from fusion_gym.agents.output.files import load_results, save_results
@@ -58,15 +59,15 @@ def test_from_tuning_to_report_and_zoo(
     folder = work / "small"
     first = read_verdict(results / "small")
     assert first["classes"]["sensors"]["seeds"] == 1
-    stamp = (folder / "agent_sensors_0.json").stat().st_mtime_ns
+    stamp = (folder / "sensors_0" / "latest.zip").stat().st_mtime_ns
     with pytest.raises(SystemExit, match="--resume"):
         run_main(monkeypatch, benchmark, *arguments)
     run_main(monkeypatch, benchmark, *arguments, "--resume")
-    assert (folder / "agent_sensors_0.json").stat().st_mtime_ns == stamp
+    assert (folder / "sensors_0" / "latest.zip").stat().st_mtime_ns == stamp
     (tmp_path / "other").mkdir()
     other = small_suite(tmp_path / "other", episodes=13)
     for option, value, message in (
-        ("--timesteps", "512", "training.training.timesteps = 512 differs"),
+        ("--timesteps", "512", "training.timesteps = 512 differs"),
         ("--config", str(other), "episodes = 13 differs"),
     ):
         with pytest.raises(SystemExit, match=message) as caught:
@@ -91,18 +92,18 @@ def test_from_tuning_to_report_and_zoo(
     assert stored == {"class": "local_estimate", "sha256": front["sha256"]}
     in_local = {point["name"] for point in verdict["classes"]["local_estimate"]["envelope"]}
     assert not any(name.startswith("information_gain") for name in in_local)
-    agent = json.loads((folder / "agent_local_estimate_1.json").read_text())
-    assert agent["training"]["environment"]["local"]
-    assert len(agent["points"]) == 3
+    training = json.loads(runs["inputs"]["agent_local_estimate_1"])["training"]
+    assert training["environment"]["local"]
+    agent = policies[policies["run"] == "agent_local_estimate_1"]
+    assert len(agent) == 3
     # The written numbers are those that the saved model reaches on the test seeds.
     visible = ["difference", "value"]  # as rules without memory look at it
     task = fusion_gym.make_task(ENV, filter="tobit", horizon=10, belief_features=visible)
     path = work / "small" / "local_estimate_1" / "best_model.zip"
-    model = f"model:{path},price={agent['prices'][1]!r}"
+    model = f"model:{path},price={float(agent['price'].iloc[1])!r}"
     again = run_episodes(task, make_policy(model, task), 12, seed=0)
-    assert agent["points"][1]["mse"]["mean"] == pytest.approx(again.mse.mean())
+    assert agent["mse"].iloc[1] == pytest.approx(again.mse.mean())
 
-    run_main(monkeypatch, report, "--results", str(results))
     text = (results / "README.md").read_text()
     assert "| local_packets_memory | 2 |" in text
     assert "Agents of a class: 2 training seeds." in text
@@ -145,14 +146,14 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
 
     def task_of(setting: Any, options: Any = ()) -> Any:
         name = f"{setting.name} {options}"
-        tasks[name] = tasks.get(name) or jobs.envelope_task(setting, options)
+        tasks[name] = tasks.get(name) or envelope_task(setting, options)
         return tasks[name]
 
-    monkeypatch.setattr("fusion_gym.agents.experiments.references.envelope_task", task_of)
+    monkeypatch.setattr("fusion_gym.agents.experiments.envelopes.envelope_task", task_of)
     suite = load_suite(ROOT / "configs" / "benchmark.yaml")
     assert load_suite(ROOT / "configs" / "benchmark.yaml", quick=True).settings == suite.settings
     for setting in suite.settings:
-        task = jobs.envelope_task(setting)
+        task = envelope_task(setting)
         optima = [name for name in setting.informed if name.startswith("optimal:")]
         for name in (*setting.points, *setting.informed, *setting.references):
             if name not in optima[1:]:
@@ -269,7 +270,7 @@ def test_the_report_shows_what_it_is_reported_as_text(tmp_path: Path) -> None:
     verdict["title"] = title + "\n\n<script>alert(3)</script>"
     verdict["env"] = "a`<script>alert(4)</script>|b"
     write_rows(folder, "verdict", [verdict])
-    text = report.report_text(read_results(tmp_path), "one")
+    text = report_text(read_results(tmp_path))
     text += "\n\n<script>alert(5)</script> <b onclick='f'>g</b>\n"
     page = page_of(text, tmp_path, "<script>alert(6)</script>")
     assert "<title>&lt;script&gt;alert(6)&lt;/script&gt;</title>" in page

@@ -29,11 +29,7 @@ DAMAGES: dict[str, Callable[[bytes, bytes], bytes]] = {
 READ: dict[str, tuple[str, ...]] = {
     "train": ("run/latest.zip",),
     "tune": ("study/study.db",),
-    "benchmark": tuple(
-        f"work/small/{name}.{suffix}"
-        for suffix in ("json", "npz")
-        for name in ("baselines", "informed", "references", "hindsight", "agent_sensors_0")
-    ),
+    "benchmark": ("results/small/classes.csv", "results/small/vertices.csv"),
     "evaluate": ("result.json",),
 }
 # Those that it writes anew.
@@ -46,7 +42,10 @@ WRITTEN = {
         )
     ),
     "tune": ("study/best.yaml", "study/trial_0/latest.zip", "study/trial_0/config.yaml"),
-    "benchmark": ("results/small/verdict.csv", "work/small/sensors_0/latest.zip"),
+    "benchmark": (
+        *("results/small/verdict.csv", "work/small/sensors_0/latest.zip"),
+        *(f"work/pieces/{place}" for place in range(3)),
+    ),
     "evaluate": (),
 }
 
@@ -59,7 +58,7 @@ def arguments(command: str, folder: Path, seed: int = 0) -> list[str]:
     if command == "benchmark":
         config = small_suite(folder, training_seeds=1, classes=["sensors"], seed=seed)
         places = ["--results", str(folder / "results"), "--work", str(folder / "work")]
-        return ["--config", str(config), *places, "--workers", "1"]
+        return ["--config", str(config), *places, "--workers", "1", "--parts", "agents"]
     training = {"timesteps": 256, "num_envs": 8, "seed": seed}
     every = {"every": 128, "episodes": 2}
     config = small_config(folder, training=training, validation=every)
@@ -100,7 +99,7 @@ def cases() -> Iterator[Any]:
     for command, read in READ.items():
         for file in (*read, *WRITTEN[command]):
             for kind in kinds:
-                quick = kind == kinds[turn % len(kinds)] and not file.endswith("d/references.npz")
+                quick = kind == kinds[turn % len(kinds)] and "vertices" not in file
                 marks = () if quick else (pytest.mark.slow,)
                 yield pytest.param(command, file, kind, marks=marks, id=f"{command}-{file}-{kind}")
             turn += 1

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from small_suite import small_suite
 
-from fusion_gym.agents.experiments import references as envelopes
+from fusion_gym.agents.experiments import envelopes
 from fusion_gym.agents.experiments.classes import classes_of
 from fusion_gym.agents.experiments.config import load_suite
 from fusion_gym.agents.experiments.report import robustness_frame
+from fusion_gym.agents.output.cache import Cache
 from fusion_gym.agents.papers.numbers import below
 from fusion_gym.agents.papers.round_robin_tobit_runs import always_below
 from fusion_gym.evaluation.envelope import best_mse
@@ -71,8 +72,10 @@ def test_vertices_are_those_of_the_tuning_episodes(
         for name, (rate, mse) in (TUNED | {"d": (0.5, 0.8)}).items()
     }
     monkeypatch.setattr(envelopes, "candidates_of", lambda *_: (candidates, 4))
-    monkeypatch.setattr(envelopes.Test, "read", lambda test, work: RESULTS[test.policy])
+    monkeypatch.setattr(
+        envelopes, "read_tests", lambda tests, _: {t.name: RESULTS[t.policy] for t in tests}
+    )
     of = next(iter(classes_of(suite.settings[0])))
-    result = envelopes.content_of(suite, suite.settings[0], of, [], tmp_path)
+    result = envelopes.content_of(suite, suite.settings[0], of, [], Cache(tmp_path))
     assert [vertex["policy"] for vertex in result["vertices"]] == ["a", "b", "c"]
     assert [vertex["convex"] for vertex in result["vertices"]] == [True, False, True]

@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from command_runs import call
+from command_runs import Ended, call
 from hostile_folder import contents
 from hypothesis import given
 from hypothesis import strategies as st
@@ -27,6 +27,11 @@ from fusion_gym.evaluation.intervals import Interval
 from fusion_gym.policies.registry import make_policy
 
 ABSENT = "ABSENT"
+
+
+def report(results: Path) -> Ended:
+    """Write the pages of the results."""
+    return call("benchmark", ["--parts", "report", "--results", str(results)])
 
 
 def change(file: Path, column: str, value: str) -> None:
@@ -57,7 +62,7 @@ def test_results_of_another_shape(
     setting = small_results(tmp_path / "results")
     change(setting / f"{table}.csv", column, value)
     before = contents(setting)
-    ended = call("report", ["--results", str(setting.parent)])
+    ended = report(setting.parent)
     assert (ended.status, ended.trace, ended.err.count("\n")) == (1, "", 1)
     assert contents(setting) == before
     assert ended.err.startswith("error: results = ")
@@ -67,7 +72,7 @@ def test_results_of_another_shape(
 def test_json_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
     (tmp_path / SETTING).mkdir()
     (tmp_path / SETTING / "verdict.json").write_text("{}")
-    ended = call("report", ["--results", str(tmp_path)])
+    ended = report(tmp_path)
     assert (ended.status, "and not JSON of an earlier version" in ended.err) == (1, True)
 
 
@@ -133,7 +138,7 @@ def test_what_is_not_there_yet_is_said(tmp_path: Path) -> None:
     folder = small_results(tmp_path, classes=[])
     policies = read_rows(folder, "policies")
     write_rows(folder, "policies", [row for row in policies if row["run"] != "informed"])
-    assert call("report", ["--results", str(tmp_path)]).status == 0
+    assert report(tmp_path).status == 0
     text = (tmp_path / "README.md").read_text()
     assert "Agents of a class: none so far." in text
     assert "nothing to remember" in text

@@ -12,7 +12,6 @@ from typing import Any
 import jinja2
 import numpy as np
 import pandas as pd
-from rich.markdown import Markdown
 from rich.table import Table
 
 from fusion_gym.evaluation.envelope import EnvelopePoint, height
@@ -20,8 +19,8 @@ from fusion_gym.validation import ConfigurationError, choice
 
 from ..output.markup import NONE, code, markup_number, plain_text, ranged, share
 from ..output.tables import table_tables
-from .config import NOMINAL, SOLVED, load_suite
-from .references import at_least, bound_of, hull_of, path_of, read_envelopes, rollout_of
+from .config import NOMINAL, SOLVED
+from .envelopes import at_least, bound_of, hull_of, path_of, read_envelopes, rollout_of
 from .tables import VERDICT, Row, group_by, read_rows
 from .verdict import MIDDLE, RATES, SHARES, is_gain, read_cases
 
@@ -424,16 +423,13 @@ def rates_frame(results: SettingResults) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def text_of(
-    results: Mapping[str, SettingResults], command: str, panels: Mapping[str, Sequence[str]]
-) -> str:
+def text_of(results: Mapping[str, SettingResults], panels: Mapping[str, Sequence[str]]) -> str:
     """Return the report in Markdown; ``panels`` has the small panels of each setting's figure."""
     settings = list(results.values())
     fronts = [front for item in settings for front in item.classes.values()]
     return _render(
         "report.md",
         settings=settings,
-        command=command,
         panels=panels,
         trained=[front["seeds"] for front in fronts],
         tuned=[item.envelopes["inputs"]["tuning"] for item in settings if item.envelopes],
@@ -450,17 +446,19 @@ def _render(template: str, **values: Any) -> str:
 # Parts of other pages.
 
 
-def update_pages(text: str, settings: Mapping[str, SettingResults], results: Path) -> str:
+def update_pages(
+    text: str, settings: Mapping[str, SettingResults], results: Path, titles: Mapping[str, str]
+) -> str:
     """Return the text with all its marked parts made again.
 
     ``<!-- results: SETTING -->`` to ``<!-- end -->`` holds what was found in a setting, with
     ``headline`` in its place the table of all settings and how many points lie above envelopes,
-    and with ``robustness`` what the folder ``results`` has of perturbed cases.
+    and with ``robustness`` what the folder ``results`` has of perturbed cases. ``titles`` are those
+    of the benchmark's settings by name.
 
     Raises:
         ConfigurationError: a setting that neither the results nor the benchmark has.
     """
-    titles = {setting.name: setting.title for setting in load_suite("benchmark").settings}
 
     def part(match: re.Match[str]) -> str:
         choice("results", match[2], dict.fromkeys(["headline", "robustness", *settings, *titles]))
@@ -485,15 +483,14 @@ def robustness_frame(reports: Sequence[Row], titles: Mapping[str, str]) -> pd.Da
     """Return in how many cases agents are ahead of the rules; ``titles`` of settings by name."""
     rows = []
     for report in reports:
-        choice("setting", report["setting"], titles)
         cases = report["cases"]
         for kind, name in (("agents", "as they are"), ("trained", "trained over draws")):
-            if kind not in cases[NOMINAL]:
+            if kind not in cases[NOMINAL.name]:
                 continue
             result = {
                 row["title"]: row[kind]["middle"]
                 for case, row in cases.items()
-                if case != NOMINAL and "middle" in row.get(kind, {})
+                if case != NOMINAL.name and "middle" in row.get(kind, {})
             }
             better = sum(is_gain(middle) for middle in result.values())
             worse = sum(middle["low"] > 0.0 for middle in result.values())
@@ -502,7 +499,7 @@ def robustness_frame(reports: Sequence[Row], titles: Mapping[str, str]) -> pd.Da
                 {
                     "setting": plain_text(titles[report["setting"]].partition(",")[0]),
                     "agents": name,
-                    "as assumed": share(cases[NOMINAL][kind].get("middle")),
+                    "as assumed": share(cases[NOMINAL.name][kind].get("middle")),
                     "better": better,
                     "undecided": len(result) - better - worse,
                     "worse": worse,
@@ -512,22 +509,17 @@ def robustness_frame(reports: Sequence[Row], titles: Mapping[str, str]) -> pd.Da
     return pd.DataFrame(rows)
 
 
-def robustness_text(results: Path, titles: Mapping[str, str], command: str) -> str:
-    """Return the page of perturbed cases of the settings with these titles.
-
-    Raises:
-        ConfigurationError: a table that cannot be read or is of another shape.
-    """
-    reports = read_cases(results, list(titles))
-    of = {name: [r for r in reports if r["class"] == name] for name in
-          sorted({report["class"] for report in reports})}  # fmt: skip
-    return _render("robustness.md", reports=reports, by_class=of, titles=titles, command=command)
+def robustness_text(reports: Sequence[Row], titles: Mapping[str, str]) -> str:
+    """Return the page of perturbed cases of the settings with these titles."""
+    by_class = {name: [r for r in reports if r["class"] == name] for name in
+                sorted({report["class"] for report in reports})}  # fmt: skip
+    return _render("robustness.md", reports=reports, by_class=by_class, titles=titles)
 
 
 # Committed envelopes.
 
 
-def envelopes_text(results: Path, command: str) -> str:
+def envelopes_text(results: Path) -> str:
     """Return the page of the committed rules.
 
     Raises:
@@ -536,7 +528,7 @@ def envelopes_text(results: Path, command: str) -> str:
     folders = [path.parent for path in sorted(results.glob("*/classes.csv"))]
     content = {folder.name: read_envelopes(folder) for folder in folders}
     rows = pd.concat([envelopes_frame(results / name, item) for name, item in content.items()])
-    return _render("envelopes.md", command=command, rows=rows, settings=content)
+    return _render("envelopes.md", rows=rows, settings=content)
 
 
 def envelopes_frame(folder: Path, envelopes: Row) -> pd.DataFrame:
@@ -570,15 +562,9 @@ def envelopes_frame(folder: Path, envelopes: Row) -> pd.DataFrame:
 # How fast agents learn.
 
 
-def learning_text(studies: Sequence[Row], command: str) -> str:
+def learning_text(courses: Sequence[Row]) -> str:
     """Return the page of how fast agents learn."""
-    return _render("learning.md", studies=studies, command=command, SOLVED=SOLVED)
-
-
-def learning_table(studies: Sequence[Row]) -> Markdown:
-    """Return its first table for the terminal."""
-    rows = TEMPLATES.get_template("learning_rows.md").make_module(globals())
-    return Markdown(str(rows.overview(studies)))  # type: ignore[attr-defined]
+    return _render("learning.md", courses=courses, SOLVED=SOLVED)
 
 
 # The quick benchmark beside the full one.

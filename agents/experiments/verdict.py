@@ -342,7 +342,7 @@ def _broadcast_level(of: Class) -> int:
 
 
 ROBUSTNESS = "robustness"  # of the page for readers in that of the results, and a table's name
-KINDS = {"agents": "agent_", "trained": "trained_"}  # what their labels begin with
+KINDS = ("agents", "trained")  # agents as they are, and trained over draws
 Report = Mapping[str, Any]
 
 
