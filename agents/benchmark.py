@@ -72,8 +72,8 @@ class Benchmark(Long):
     timesteps: Steps = None
     """Steps of each training, instead of the config's."""
     agents: tuple[str, ...] = ()
-    """Files of agents for robustness, patterns with {setting} and {class}; none stands for those of
-    the work folder, and of the zoo."""
+    """Files of agents for robustness, patterns with {setting} and {class}; none stands for agents
+    of the work folder, and of the zoo."""
     trained: bool = False
     """Train agents over draws of the perturbations as well, for robustness."""
     pages: tuple[Path, ...] = ()

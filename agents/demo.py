@@ -2,15 +2,14 @@
 
     fusion-gym demo [--output runs/demo] [--episodes 1000] [--fresh]
 
-In the Tobit oscillator's benchmark setting it trains an agent for a scheduler and one for sensors
-by themselves, side by side; both see the price of a token. It runs them at seven prices, and on the
+In the Tobit oscillator's benchmark setting it trains an agent for a scheduler and one for local
+sensors, side by side; both see the price of a token. It runs them at seven prices, and on the
 same test episodes the rules of the committed envelopes that know as much, without memory and with
 it; and it draws the agents over the rules. What is finished in the output folder is not done again,
 and an interrupted training is gone on with.
 """
 
 import hashlib
-import itertools
 import shutil
 import time
 from collections.abc import Mapping
@@ -33,6 +32,7 @@ from .experiments.config import Course, load_suite
 from .experiments.envelopes import (
     SHIPPED,
     EnvelopeStore,
+    Test,
     at_least,
     bound_of,
     envelope_task,
@@ -54,56 +54,50 @@ from .training.run import earlier, holds_training
 
 SETTING = "tobit_oscillator"
 TEAM = Pool(2)
-# A course beside the one of the setting: its rules are those of sensors, and its agent is local.
+# Beside the course of the setting, a scheduler's: sensors that decide locally.
 LOCAL = Course(
     front="tobit_oscillator_front_local",
     memoryless="local_estimate",
     against="local_estimate_memory",
 )
+TITLES = {
+    "scheduler": "A scheduler that sees all new measurements",
+    "alone": "Sensors by themselves, which hear the centre's estimate",
+}
 
 
 class Learner(NamedTuple):
-    """A course of the demo: its name, its title, and its files.
-
-    ``bounded`` where the proven bound and the rollout are for: a scheduler.
-    """
+    """A course of the demo, with its training."""
 
     name: str
-    title: str
     setup: LearningSetup
-    timesteps: int | None
-    bounded: bool = False
+    experiment: Experiment
 
     @property
     def folder(self) -> Path:
         """Where its files are."""
-        return self.setup.folders.work
-
-    @property
-    def experiment(self) -> Experiment:
-        """Its training."""
-        return self.setup.front.changed(self.folder / "agent", timesteps=self.timesteps)
+        return self.setup.folders.results
 
     @property
     def classes(self) -> dict[str, str]:
-        """The classes of rules beside it, without memory and with it."""
+        """The classes of rules beside the agent, without memory and with it."""
         course = self.setup.course
         return {"without": str(course.memoryless), "with": course.against}
 
-    def rules(self, name: str) -> dict[str, EpisodeResults]:
-        """Return what the rules of a class do on the test episodes."""
-        return read_tests(self.setup.rules(name), self.setup.folders.cache)
-
     @property
-    def model(self) -> Path:
-        """Its finished agent."""
-        return self.folder / "agent" / "best_model.zip"
+    def agents(self) -> list[Test]:
+        """The tests of the finished agent at each price."""
+        return self.setup.agents(Path(self.experiment.output) / "best_model.zip")
+
+    def rules(self, which: str) -> dict[str, EpisodeResults]:
+        """Return what the rules without memory, or with it, do on the test episodes."""
+        tests = self.setup.rules(self.classes[which])
+        return read_tests(tests, self.setup.folders.cache)
 
     def calls(self) -> list[Call]:
         """Return the tests of its agent and of its rules that were not run before."""
         rules = [test for name in self.classes.values() for test in self.setup.rules(name)]
-        every = [*self.setup.agents(self.model), *rules]
-        return missing(run_test, every, self.setup.folders.cache)
+        return missing(run_test, [*self.agents, *rules], self.setup.folders.cache)
 
 
 def learners_of(output: Path, episodes: int, timesteps: int | None) -> list[Learner]:
@@ -116,23 +110,15 @@ def learners_of(output: Path, episodes: int, timesteps: int | None) -> list[Lear
     store = EnvelopeStore(suite, SHIPPED)
     setting = next(setting for setting in suite.settings if setting.name == SETTING)
     suite = suite.model_copy(update={"episodes": episodes})
-
-    def learner(name: str, title: str, course: Course | None, **more: Any) -> Learner:
-        assert course is not None
-        folder = output / name
-        setup = LearningSetup(suite, setting, course, store, Folders(folder, folder))
+    assert setting.course is not None
+    result = []
+    for name, course in zip(TITLES, (setting.course, LOCAL), strict=True):
+        folders = Folders(output / name, output / name)
+        setup = LearningSetup(suite, setting, course, store, folders)
         setup.check()
-        return Learner(name, title, setup, timesteps, **more)
-
-    return [
-        learner(
-            "scheduler",
-            "A scheduler that sees all new measurements",
-            setting.course,
-            bounded=True,
-        ),
-        learner("alone", "Sensors by themselves, which hear the centre's estimate", LOCAL),
-    ]
+        experiment = setup.front.changed(output / name / "agent", timesteps=timesteps)
+        result.append(Learner(name, setup, experiment))
+    return result
 
 
 @dataclass(frozen=True)
@@ -157,19 +143,15 @@ class Demo(Long):
             for learner in learners if self.fresh else ():
                 shutil.rmtree(learner.folder, ignore_errors=True)
             writing(("models, figures and tables", self.output))
-            times = [time.perf_counter()]
-            side_by_side(
-                [Call(1.0, run_training, (learner.experiment,)) for learner in learners],
-                TEAM,
-                "trainings",
-            )
-            times.append(time.perf_counter())
-            side_by_side([call for item in learners for call in item.calls()], TEAM, "tests")
-            times.append(time.perf_counter())
+            began = time.perf_counter()
+            calls = [Call(1.0, run_training, (learner.experiment,)) for learner in learners]
+            side_by_side(calls, TEAM, "trainings")
+            trained = time.perf_counter()
+            side_by_side([call for learner in learners for call in learner.calls()], TEAM, "tests")
+            tested = time.perf_counter()
             for learner in learners:
                 _conclude(learner)
-            times.append(time.perf_counter())
-        seconds = [later - earlier for earlier, later in itertools.pairwise(times)]
+        seconds = (trained - began, tested - trained, time.perf_counter() - tested)
         parts = "trainings {:.0f} s, tests {:.0f} s, tables and figures {:.0f} s".format(*seconds)
         print(f"figures, tables and models are in {self.output}; {sum(seconds):.0f} s: {parts}")
 
@@ -179,10 +161,10 @@ class Demo(Long):
         Raises:
             ConfigurationError: it holds another training, or something else than a demo.
         """
-        folder, begun = learner.folder, holds_training(learner.folder / "agent")
+        folder, training = learner.folder, Path(learner.experiment.output)
         if not self.fresh:
-            earlier(learner.experiment, folder / "agent", begun)
-        elif folder.exists() and any(folder.iterdir()) and not begun:
+            earlier(learner.experiment, training, holds_training(training))
+        elif folder.exists() and any(folder.iterdir()) and not holds_training(training):
             raise ConfigurationError(
                 f"fresh = True is not allowed: {str(folder)!r} holds no results of a demo, and is "
                 "kept"
@@ -207,42 +189,39 @@ def report_of(learner: Learner) -> dict[str, Any]:
 
     A point has ``price``, ``rate``, ``mse`` and of each class the rules' ``mse`` and the paired
     ``difference`` to it, as a share of it, with its 95 % interval over episodes; nothing of a
-    class whose rules all transmit more. ``mean`` is that of the differences at all prices.
+    class whose rules all transmit more. ``mean`` is the mean of the differences at all prices.
     """
     setup = learner.setup
-    results = list(read_tests(setup.agents(learner.model), setup.folders.cache).values())
-    points: list[dict[str, Any]] = [
-        {
-            "price": price,
-            "rate": float(value.rate.mean()),
-            "mse": mean_interval(value.mse)._asdict(),
-            "rules": {},
-        }
-        for price, value in zip(setup.prices, results, strict=True)
-    ]
-    means = {}
-    for name in learner.classes.values():
-        rules, shares = learner.rules(name), []
-        for point, value in zip(points, results, strict=True):
-            below = best_mse(rules, point["rate"])
+    points: list[dict[str, Any]] = []
+    shares: dict[str, list[Any]] = {name: [] for name in learner.classes.values()}
+    results = read_tests(learner.agents, setup.folders.cache).values()
+    rules = {name: learner.rules(which) for which, name in learner.classes.items()}
+    for price, value in zip(setup.prices, results, strict=True):
+        rate = float(value.rate.mean())
+        point = {"price": price, "rate": rate, "mse": mean_interval(value.mse)._asdict()}
+        points.append(point | {"rules": {}})
+        for name, own in rules.items():
+            below = best_mse(own, rate)
             if below is not None:
-                shares.append((value.mse - below) / below.mean())
-                point["rules"][name] = {
-                    "mse": float(below.mean()),
-                    "difference": mean_interval(shares[-1])._asdict(),
-                }
-        if len(shares) == len(points):
-            means[name] = mean_interval(np.mean(shares, axis=0))._asdict()
+                shares[name].append((value.mse - below) / below.mean())
+                difference = mean_interval(shares[name][-1])._asdict()
+                beside = {"mse": float(below.mean()), "difference": difference}
+                points[-1]["rules"][name] = beside
+    model = Path(learner.experiment.output) / "best_model.zip"
     return {
         "setting": setup.setting.name,
         "env": setup.setting.environment.id,
         "options": setup.setting.environment.options,
         "episodes": setup.suite.episodes,
         "seed": setup.suite.seed,
-        "model": hashlib.sha256(learner.model.read_bytes()).hexdigest(),
-        "classes": {name: setup.envelope(name)["sha256"] for name in learner.classes.values()},
+        "model": hashlib.sha256(model.read_bytes()).hexdigest(),
+        "classes": {name: setup.envelope(name)["sha256"] for name in shares},
         "points": points,
-        "mean": means,
+        "mean": {
+            name: mean_interval(np.mean(own, axis=0))._asdict()
+            for name, own in shares.items()
+            if len(own) == len(points)
+        },
     }
 
 
@@ -284,21 +263,24 @@ def title_of(learner: Learner, report: Mapping[str, Any]) -> str:
         if name in report["mean"]
         for mean in [report["mean"][name]["mean"]]
     ]
-    return f"{learner.title}:\n" + (", ".join(lies) or "left of the rules at some price")
+    return f"{TITLES[learner.name]}:\n" + (", ".join(lies) or "left of the rules at some price")
 
 
 def draw_front(learner: Learner, report: Mapping[str, Any]) -> None:
-    """The agent's front over everything that is known of its classes."""
-    plain, remembering = (learner.rules(name) for name in learner.classes.values())
+    """The agent's front over everything that is known of its classes.
+
+    The proven bound and the rollout are a scheduler's.
+    """
+    plain, remembering = learner.rules("without"), learner.rules("with")
     agent = [(point["rate"], Interval(**point["mse"])) for point in report["points"]]
     rates = np.linspace(0.0, 1.2 * max(rate for rate, _ in agent), 200)
-    store, setting = learner.setup.store, learner.setup.setting
-    bound = bound_of(store.results / setting.name) if learner.bounded else None
+    scheduler = not learner.experiment.environment.local
+    bound = bound_of(SHIPPED / SETTING) if scheduler else None
     layers = front_figure.Layers(
         single=single_rules(learner),
         plain=[(point.rate, point.mse) for point in points_of(plain)],
         with_memory=[(point.rate, point.mse) for point in points_of(remembering)],
-        rollout=simulations(learner, remembering) if learner.bounded else [],
+        rollout=simulations(remembering, report["episodes"]) if scheduler else [],
         bound=[(rate, at_least(bound, rate)) for rate in rates] if bound else [],
         agent=agent,
     )
@@ -313,8 +295,8 @@ def draw_front(learner: Learner, report: Mapping[str, Any]) -> None:
 def single_rules(learner: Learner) -> list[tuple[float, float]]:
     """Return rate and error of every tuned rule without memory.
 
-    Each is as far from its envelope as on tuning episodes, which are easier or harder than those of
-    the test.
+    Each is as far from its envelope as on tuning episodes, which are easier or harder than the
+    test's.
     """
     content = learner.setup.envelope(learner.classes["without"])
     vertices = sorted(content["vertices"], key=lambda vertex: vertex["tuning_rate"])
@@ -327,32 +309,30 @@ def single_rules(learner: Learner) -> list[tuple[float, float]]:
     ]
 
 
-def simulations(learner: Learner, rules: Mapping[str, EpisodeResults]) -> list[tuple[float, float]]:
+def simulations(rules: Mapping[str, EpisodeResults], episodes: int) -> list[tuple[float, float]]:
     """Return rate and error of the rollout, its error as a share of the rules' on its episodes.
 
     Its few episodes are easier or harder than all of them by more than what it brings.
     """
-    store, setting = learner.setup.store, learner.setup.setting
-    rollout, episodes = rollout_of(store.results / setting.name)
-    result = []
-    for point in rollout if episodes <= learner.setup.suite.episodes else ():
-        below = best_mse(rules, point.rate)
-        if below is not None:
-            share = point.mse / below[:episodes].mean()
-            result.append((point.rate, share * below.mean()))
-    return result
+    rollout, own = rollout_of(SHIPPED / SETTING)
+    errors = [(p, best_mse(rules, p.rate)) for p in rollout if own <= episodes]
+    return [
+        (p.rate, p.mse / below[:own].mean() * below.mean())
+        for p, below in errors
+        if below is not None
+    ]
 
 
 def draw_episodes(learner: Learner) -> None:
     """One episode of the agent at its middle price, and of the rule whose rate is nearest."""
     setup, name = learner.setup, learner.classes["with"]
-    place = len(setup.prices) // 2
-    agent, rules = setup.agents(learner.model)[place], learner.rules(name)
+    place, rules = len(setup.prices) // 2, learner.rules("with")
+    agent = learner.agents[place]
     (result,) = read_tests([agent], setup.folders.cache).values()
     nearest = min(rules, key=lambda rule: abs(rules[rule].rate.mean() - result.rate.mean()))
+    rule = next(test for test in setup.rules(name) if test.name == nearest)
     options = setup.envelope(name)["options"].items()
     who = policy_with_options(f"agent at price {setup.prices[place]:.4g}", options)
-    rule = next(test for test in setup.rules(name) if test.name == nearest)
     for kind, test, label in (("agent", agent, who), ("rule", rule, rule.name)):
         task = test.task()
         trajectory = record_episode(task, make_policy(test.policy, task), test.seed)

@@ -1,4 +1,4 @@
-"""Measure this machine's steps per second in the settings with a course, for the tables of learning.
+"""Measure this machine's steps per second in settings with a course, for the tables of learning.
 
     python -m benchmarks.learning [SETTING …] [--work runs/benchmark/full]
 

@@ -38,7 +38,7 @@ BROADCAST_LABELS = {"none": "hear nothing", "estimate": "hear estimate", "packet
 def write_report(results: Path, titles: Mapping[str, str], pages: Mapping[Path, str]) -> None:
     """Write the pages and figures of all tables in the folder, and the marked parts of ``pages``.
 
-    ``titles`` are those of the benchmark's settings, by name.
+    ``titles`` has the title of each of the benchmark's settings.
 
     Raises:
         ConfigurationError: there are no tables, or one that cannot be read.

@@ -1,4 +1,4 @@
-"""Who does the work, and where its files are: processes of this machine, or a cluster that is there already.
+"""Who does the work, and where its files are: processes of this machine, or a cluster.
 
 joblib hands it out, through its own processes (``loky``) or a dask scheduler; a ray cluster does it
 as ray's tasks, for joblib's backend of it gives nothing back before all is done. On other machines
@@ -39,7 +39,7 @@ _PATIENCE = 30.0  # seconds until a scheduler that does not answer is given up
 
 @dataclass(frozen=True)
 class Pool:
-    """``workers`` processes here, or all those of the cluster at ``address``.
+    """``workers`` processes here, or all of the cluster at ``address``.
 
     With ``dask`` or ``ray`` and without an address a cluster of so many workers is begun here.
 
@@ -137,7 +137,7 @@ class Folders(NamedTuple):
 
     @classmethod
     def create(cls, results: Path | None, work: Path | None, quick: bool) -> Folders:
-        """Return the folders of a command line, or those of the full or the quick benchmark.
+        """Return the folders of a command line, or the usual ones of the full or the quick benchmark.
 
         Raises:
             ConfigurationError: the work folder is one of an earlier version.
@@ -149,8 +149,8 @@ class Folders(NamedTuple):
         for name in ("tuned", "tested", "baselines.json"):
             for path in folders.work.glob(f"*/{name}"):
                 raise ConfigurationError(
-                    f"work = {str(folders.work)!r} is of an earlier version, it holds {str(path)!r}: "
-                    "give another --work, or remove all there but the trainings, SETTING/CLASS_SEED"
+                    f"work = {str(folders.work)!r} holds {str(path)!r} of an earlier version: give "
+                    "another --work, or remove all there but the trainings, SETTING/CLASS_SEED"
                 )
         return folders
 
@@ -213,7 +213,7 @@ class Call(NamedTuple):
     arguments: tuple[Any, ...]
 
 
-class Piece(Protocol):
+class WorkPiece(Protocol):
     """A piece of work: all that its result depends on, and its time in seconds on one core."""
 
     @property
@@ -222,7 +222,9 @@ class Piece(Protocol):
     def weight(self) -> float: ...
 
 
-def missing(function: Callable[[Any], Any], pieces: Iterable[Piece], cache: Cache) -> list[Call]:
+def missing(
+    function: Callable[[Any], Any], pieces: Iterable[WorkPiece], cache: Cache
+) -> list[Call]:
     """Return the calls that put the results of these pieces into the cache, each once."""
     every = {fingerprint(piece.inputs): piece for piece in pieces}
     return [
@@ -232,7 +234,7 @@ def missing(function: Callable[[Any], Any], pieces: Iterable[Piece], cache: Cach
     ]
 
 
-def _fill(cache: Cache, function: Callable[[Any], Any], piece: Piece) -> None:
+def _fill(cache: Cache, function: Callable[[Any], Any], piece: WorkPiece) -> None:
     cache.call(function, piece.inputs, piece)
 
 
