@@ -25,7 +25,7 @@ from fusion_gym.agents.experiments.classes import classes_of, trained_classes
 from fusion_gym.agents.experiments.config import load_suite
 from fusion_gym.agents.experiments.envelopes import envelope_task, read_envelopes, searches_of
 from fusion_gym.agents.experiments.figures import report_text
-from fusion_gym.agents.experiments.report import read_results, read_verdict
+from fusion_gym.agents.experiments.report import SettingResults, read_results
 from fusion_gym.agents.experiments.tables import read_frame, read_rows, write_rows
 from fusion_gym.agents.output.files import load_results, save_results
 from fusion_gym.agents.output.markup import code, page_of
@@ -57,8 +57,7 @@ def test_from_tuning_to_report_and_zoo(
     ]  # fmt: skip
     run_main(monkeypatch, benchmark, *arguments, "--seeds", "1", "--classes", "sensors")
     folder = work / "small"
-    first = read_verdict(results / "small")
-    assert first["classes"]["sensors"]["seeds"] == 1
+    assert SettingResults(results / "small").classes["sensors"]["seeds"] == 1
     stamp = (folder / "sensors_0" / "latest.zip").stat().st_mtime_ns
     with pytest.raises(SystemExit, match="--resume"):
         run_main(monkeypatch, benchmark, *arguments)
@@ -73,8 +72,8 @@ def test_from_tuning_to_report_and_zoo(
         with pytest.raises(SystemExit, match=message) as caught:
             run_main(monkeypatch, benchmark, *arguments, "--resume", option, value)
         assert "\n" not in str(caught.value)
-    verdict = read_verdict(results / "small")
-    assert {name: front["seeds"] for name, front in verdict["classes"].items()} == {
+    classes = SettingResults(results / "small").classes
+    assert {name: front["seeds"] for name, front in classes.items()} == {
         "centre": 2, "local_estimate": 2, "local_packets_memory": 2, "sensors": 2,
     }  # fmt: skip
     policies = read_frame(results / "small", "policies")
@@ -86,11 +85,11 @@ def test_from_tuning_to_report_and_zoo(
     assert dear["hindsight at price 0.1"] < dear["hindsight at price 0.001"]
     # The envelope that an agent was compared with, and that it is one of the agent's inputs.
     committed = read_envelopes(results / "small")["classes"]
-    front = verdict["classes"]["local_estimate"]
+    front = classes["local_estimate"]
     assert front["sha256"] == committed["local_estimate"]["sha256"]
     stored = json.loads(runs["inputs"]["agent_local_estimate_1"])["envelope"]
     assert stored == {"class": "local_estimate", "sha256": front["sha256"]}
-    in_local = {point["name"] for point in verdict["classes"]["local_estimate"]["envelope"]}
+    in_local = {point["name"] for point in classes["local_estimate"]["envelope"]}
     assert not any(name.startswith("information_gain") for name in in_local)
     training = json.loads(runs["inputs"]["agent_local_estimate_1"])["training"]
     assert training["environment"]["local"]

@@ -208,7 +208,7 @@ def rule_tests(
 
 
 def searches_of(suite: Suite, setting: Setting, classes: Sequence[Class]) -> list[Search]:
-    """What is to be tuned for these classes: their families, and the families of all within them."""
+    """What is to be tuned for these classes, and for all classes within them."""
     tuning = suite.tuning_of(setting)
     points = [Family(label=name, policy=name, parameters={}) for name in setting.points]
     within = [c for c in classes_of(setting) if any(item.contains(c) for item in classes)]

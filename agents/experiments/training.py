@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -44,6 +45,7 @@ from .workers import (
 )
 
 VALIDATIONS = 2  # of a training
+_METRICS = ("mse", "return", "rate", "denied", "tokens", "nees")  # of each policy
 
 
 def agent_options(setting: Setting, of: Class) -> dict[str, Any]:
@@ -154,11 +156,6 @@ class HindsightSearch(NamedTuple):
         return 0.6 * self.suite.hindsight_episodes
 
     @property
-    def episodes(self) -> int:
-        """The number of these episodes."""
-        return min(self.suite.hindsight_episodes, self.suite.episodes)
-
-    @property
     def inputs(self) -> dict[str, Any]:
         """All that its results depend on."""
         assert self.setting.hindsight is not None
@@ -167,14 +164,15 @@ class HindsightSearch(NamedTuple):
         return tested_inputs(self.suite, self.setting) | {"hindsight": hindsight}
 
 
-def run_search_in_hindsight(search: HindsightSearch) -> dict[str, EpisodeResults]:
+def search_in_hindsight(search: HindsightSearch) -> dict[str, EpisodeResults]:
     """Return what a clairvoyant reaches at each price."""
     torch.set_num_threads(1)
-    task, hindsight = envelope_task(search.setting), search.setting.hindsight
+    suite, hindsight = search.suite, search.setting.hindsight
+    task, episodes = envelope_task(search.setting), min(suite.hindsight_episodes, suite.episodes)
     assert hindsight is not None
     return {
         f"hindsight at price {price:g}": run_hindsight(
-            task, price, hindsight.width, search.episodes, search.suite.seed
+            task, price, hindsight.width, episodes, suite.seed
         )
         for price in hindsight.prices
     }
@@ -187,6 +185,15 @@ def tested_inputs(suite: Suite, setting: Setting) -> dict[str, Any]:
         "episodes": suite.episodes,
         "seed": suite.seed,
     }
+
+
+class Run(NamedTuple):
+    """Policies that were tested together: their results by name, and the run's other columns."""
+
+    name: str
+    inputs: dict[str, Any]
+    results: Mapping[str, EpisodeResults]
+    columns: Row
 
 
 class SettingWork(NamedTuple):
@@ -215,22 +222,28 @@ class SettingWork(NamedTuple):
         return self.store.vertices(self.setting, names)
 
     def tests(self) -> dict[str, list[Test]]:
-        """Return the tests by the run that they are reported as."""
-        setting, seed = self.setting, self.suite.seed
+        """Return the tests of rules and references by the run that reports them."""
+        setting, suite = self.setting, self.suite
 
-        def single(policies: Sequence[str]) -> list[Test]:
-            return [Test(setting, (), policy, self.suite.episodes, seed) for policy in policies]
+        def single(policies: Sequence[str], options: dict[str, Any] | None = None) -> list[Test]:
+            rules = [{"policy": policy, "options": options or {}} for policy in policies]
+            return rule_tests(setting, rules, suite.episodes, suite.seed)
 
-        genie = setting.genie.options if setting.genie else {}
-        free = Test(setting, tuple(genie.items()), "always", self.suite.episodes, seed)
-        result = {
-            "baselines": rule_tests(setting, self.vertices, self.suite.episodes, seed)
-            + single(setting.points),
-            "genie": [free] if setting.genie else [],
-            "informed": single(setting.informed),
-            "references": single(setting.references),
-        }
+        rules = rule_tests(setting, self.vertices, suite.episodes, suite.seed)
+        result = {"baselines": rules + single(setting.points)}
+        if setting.genie:
+            result["genie"] = single(["always"], setting.genie.options)
+        result |= {run: single(getattr(setting, run)) for run in ("informed", "references")}
         return {run: tests for run, tests in result.items() if tests}
+
+    def inputs(self, run: str) -> dict[str, Any]:
+        """Return all that the results of a run of rules or references depend on."""
+        result = tested_inputs(self.suite, self.setting)
+        if run != "baselines":
+            return result | {run: list(getattr(self.setting, run) or ())}
+        genie = self.setting.genie and self.setting.genie.model_dump(mode="json")
+        points = list(self.setting.points)
+        return result | {"envelopes": self.hashes, "points": points, "genie": genie}
 
     def hindsight(self) -> list[HindsightSearch]:
         """Return the search in hindsight, if there is one."""
@@ -255,21 +268,35 @@ class SettingWork(NamedTuple):
         left = [a for a in self.agents() if not cache.holds(run_agent, a.inputs)]
         for agent in left:
             check_training(agent.experiment)
-        tests = [test for tests in self.tests().values() for test in tests]
         return [
-            *missing(run_test, tests, cache),
-            *missing(run_search_in_hindsight, self.hindsight(), cache),
+            *missing(run_test, itertools.chain(*self.tests().values()), cache),
+            *missing(search_in_hindsight, self.hindsight(), cache),
             *missing(run_agent, [agent for agent in left if agent.of.name in classes], cache),
         ]
 
-    def inputs(self, run: str) -> dict[str, Any]:
-        """Return all that the results of a run of policies depend on."""
-        result = tested_inputs(self.suite, self.setting)
-        if run != "baselines":
-            return result | {run: list(getattr(self.setting, run))}
-        genie = self.setting.genie and self.setting.genie.model_dump(mode="json")
-        points = list(self.setting.points)
-        return result | {"envelopes": self.hashes, "points": points, "genie": genie}
+    def runs(self) -> list[Run]:
+        """Return all runs, with the agents that are finished."""
+        cache = self.folders.cache
+        result = [
+            Run(name, self.inputs(name), read_tests(tests, cache), {})
+            for name, tests in self.tests().items()
+        ]
+        for search in self.hindsight():
+            tested = cache.call(search_in_hindsight, search.inputs, search)
+            episodes = {"episodes": len(next(iter(tested.values())).mse)}
+            result.append(Run("hindsight", search.inputs, tested, episodes))
+        for agent in self.agents():
+            if cache.holds(run_agent, agent.inputs):
+                content = cache.call(run_agent, agent.inputs, agent)
+                names = [f"price={price!r}" for price in agent.prices]
+                own = {
+                    "class": agent.of.name,
+                    "class_options": agent.of.information | self.setting.agent_options,
+                    "training_seed": agent.seed,
+                }
+                tested = dict(zip(names, content.pop("results"), strict=True))
+                result.append(Run(agent.name, agent.inputs, tested, own | content))
+        return result
 
 
 def run_benchmark(every: Sequence[SettingWork], classes: Sequence[str], pool: Pool) -> None:
@@ -284,28 +311,19 @@ def judge_setting(work: SettingWork) -> None:
     Raises:
         ConfigurationError: a rule does other than its committed envelope says.
     """
-    suite, setting, store, cache = work.suite, work.setting, work.store, work.folders.cache
-    result = {run: read_tests(tests, cache) for run, tests in work.tests().items()}
+    suite, setting, store, runs = work.suite, work.setting, work.store, work.runs()
+    result = {run.name: run.results for run in runs}
     rules, known = result["baselines"], result.get("references", {})
     if suite.episodes == store.suite.episodes and suite.seed == store.suite.seed:
         for vertex in work.vertices:
             check_vertex(vertex, rules[vertex["name"]])
-    for search in work.hindsight():
-        if cache.holds(run_search_in_hindsight, search.inputs):
-            hindsight = cache.call(run_search_in_hindsight, search.inputs, search)
-            result["hindsight"] = hindsight
-    finished = [
-        (agent, cache.call(run_agent, agent.inputs, agent))
-        for agent in work.agents()
-        if cache.holds(run_agent, agent.inputs)
-    ]
-    references = {"sensors": result.get("informed", {}) | known, "centre": known, "local": {}}
+    references = {"sensors": {**result.get("informed", {}), **known}, "centre": known, "local": {}}
     always = float(rules["always"].rate.mean())
     committed, tested, classes = store.classes(setting), {}, {}
     for of in trained_classes(suite, setting):
         own = committed[of.name]
         envelope = {vertex["name"]: rules[vertex["name"]] for vertex in own["vertices"]}
-        agents = [content["results"] for agent, content in finished if agent.of == of]
+        agents = [list(r.results.values()) for r in runs if r.columns.get("class") == of.name]
         tested[of.name] = ClassTests(of, envelope, agents, own["searches"])
         if agents:
             measured = of.packet == "measurement"
@@ -332,71 +350,41 @@ def judge_setting(work: SettingWork) -> None:
         "classes": classes,
         "worth": worths(tested, always),
     }
-    runs, policies = rows_of(work, result, finished)
-    write_verdict(work.folders.results / setting.name, verdict, runs, policies)
+    common = {"horizon": envelope_task(setting).horizon, "episodes": suite.episodes}
+    rows = [
+        common
+        | {"run": run.name, "inputs": run.inputs, "made_from": fingerprint(run.inputs)}
+        | run.columns
+        for run in runs
+        if run.name != "genie"
+    ]
+    write_verdict(work.folders.results / setting.name, verdict, rows, policies_of(work, runs))
 
 
-def rows_of(
-    work: SettingWork,
-    result: Mapping[str, Mapping[str, EpisodeResults]],
-    finished: Sequence[tuple[Agent, Row]],
-) -> tuple[list[Row], list[Row]]:
-    """Return a row for each run, and one for each policy that it has tested."""
-    setting, families = work.setting, families_of(work)
-    horizon = envelope_task(setting).horizon
-    runs: list[Row] = []
-    policies: list[Row] = []
-
-    def add(run: str, inputs: dict[str, Any], **more: Any) -> None:
-        row = {"run": run, "inputs": inputs, "made_from": fingerprint(inputs), "horizon": horizon}
-        runs.append(row | {"episodes": work.suite.episodes} | more)
-
-    for run, tested in result.items():
-        if run == "genie":
-            assert setting.genie is not None
-            policies.append(
-                {"run": run, "name": setting.genie.assumes} | _summary(*tested.values())
-            )
-            continue
-        if run == "hindsight":
-            (search,) = work.hindsight()
-            add(run, search.inputs, episodes=search.episodes)
-        else:
-            add(run, work.inputs(run))
-        policies += [
-            {"run": run, "name": name} | families.get(name, {}) | _summary(results)
-            for name, results in tested.items()
-        ]
-    for agent, content in finished:
-        told = {key: content[key] for key in ("seconds", "best_validation")}
-        options = agent.of.information | setting.agent_options
-        own = {"class": agent.of.name, "class_options": options, "training_seed": agent.seed}
-        add(agent.name, agent.inputs, **told, **own)
-        policies += [
-            {"run": agent.name, "name": f"price={price!r}", "price": price} | _summary(results)
-            for price, results in zip(agent.prices, content["results"], strict=True)
-        ]
-    return runs, policies
-
-
-def families_of(work: SettingWork) -> dict[str, Row]:
-    """Return the family of each tested rule by its name, and what all rules of it need to know."""
-    task, families = envelope_task(work.setting), dict[str, list[Row]]()
-    for vertex in work.vertices:
-        families.setdefault(vertex["family"], []).append(vertex)
-    result = {
-        vertex["name"]: {
-            "family": family,
-            "knows": least_covering([replace_value(item["knows"]) for item in vertices]),
-        }
-        for family, vertices in families.items()
-        if family not in work.setting.points
-        for vertex in vertices
-    }
-    return result | {
-        name: {"family": name, "knows": make_policy(name, task).knowledge}
-        for name in work.setting.points
-    }
+def policies_of(work: SettingWork, runs: Sequence[Run]) -> list[Row]:
+    """Return a row for each policy of the runs; rules have their family and what it must know."""
+    task, vertices, genie = envelope_task(work.setting), work.vertices, work.setting.genie
+    families: dict[str, Row] = {}
+    for vertex in vertices:
+        own = [replace_value(v["knows"]) for v in vertices if v["family"] == vertex["family"]]
+        if vertex["family"] not in work.setting.points:
+            families[vertex["name"]] = {"family": vertex["family"], "knows": least_covering(own)}
+    for name in work.setting.points:
+        families[name] = {"family": name, "knows": make_policy(name, task).knowledge}
+    result = []
+    for run in runs:
+        for name, results in run.results.items():
+            row: Row = {"run": run.name, "name": name}
+            if run.name == "baselines":
+                row |= families.get(name, {})
+            elif run.name == "genie" and genie:
+                row["name"] = genie.assumes
+            elif "class" in run.columns:
+                row["price"] = float(name.removeprefix("price="))
+            summary = summarise(results)
+            row |= {key: summary[key] for key in _METRICS}
+            result.append(row | {"median": robust_summary(results)["median"]})
+    return result
 
 
 def write_verdict(
@@ -416,9 +404,3 @@ def write_verdict(
     }
     for table, rows in tables.items():
         write_rows(folder, table, rows)
-
-
-def _summary(results: EpisodeResults) -> dict[str, Any]:
-    summary = summarise(results)
-    stored = {key: summary[key] for key in ("mse", "return", "rate", "denied", "tokens", "nees")}
-    return stored | {"median": robust_summary(results)["median"]}

@@ -137,7 +137,7 @@ class Folders(NamedTuple):
 
     @classmethod
     def create(cls, results: Path | None, work: Path | None, quick: bool) -> Folders:
-        """Return the folders of a command line, or the usual ones of the full or the quick benchmark.
+        """Return the folders of a command line, or the usual ones.
 
         Raises:
             ConfigurationError: the work folder is one of an earlier version.
