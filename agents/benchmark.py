@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+from rich.markdown import Markdown
+
 from fusion_gym.validation import ConfigurationError, choice, read_text
 
 from .command_line import Long
@@ -26,7 +28,7 @@ from .experiments.config import Setting, Suite, load_suite
 from .experiments.envelopes import SHIPPED, EnvelopeStore
 from .experiments.figures import write_report
 from .experiments.learning import LearningSetup, learn
-from .experiments.report import agreement_table
+from .experiments.report import agreement_text
 from .experiments.robustness import RobustTrial, try_cases, usual_class
 from .experiments.training import SettingWork, run_benchmark
 from .experiments.workers import BackendName, Folders, Pool
@@ -166,9 +168,8 @@ class Benchmark(Long):
             if setups:
                 learn(setups, pool)
         if self.quick and "agents" in self.parts:
-            beside = agreement_table(folders.results, USUAL, [setting.name for setting in settings])
-            if beside is not None:
-                console().print(beside)
+            text = agreement_text(folders.results, USUAL, [setting.name for setting in settings])
+            console().print(Markdown(text))
 
     def _tuned(self, suite: Suite, setting: Setting) -> list[str]:
         """Return the classes whose rules the parts tune where they are missing."""

@@ -11,7 +11,7 @@ from small_suite import small_suite
 from fusion_gym.agents.experiments import envelopes
 from fusion_gym.agents.experiments.classes import classes_of
 from fusion_gym.agents.experiments.config import load_suite
-from fusion_gym.agents.experiments.report import robustness_frame
+from fusion_gym.agents.experiments.report import robustness_rows
 from fusion_gym.agents.output.cache import Cache
 from fusion_gym.agents.papers.numbers import below
 from fusion_gym.agents.papers.round_robin_tobit_runs import always_below
@@ -41,8 +41,7 @@ def test_cases_are_counted_by_their_intervals_and_the_worst_is_named() -> None:
         "worse": interval(0.2, 0.1, 0.3),
     }
     cases = {name: {"title": name, "agents": {"middle": item}} for name, item in result.items()}
-    frame = robustness_frame([{"setting": "small", "cases": cases}], {"small": "a setting"})
-    (row,) = frame.to_dict("records")
+    (row,) = robustness_rows([{"setting": "small", "cases": cases}], {"small": "a setting"})
     assert [row[name] for name in ("better", "undecided", "worse")] == [1, 1, 1]
     assert row["at worst"].endswith("worse")
     assert "+20" in row["at worst"]

@@ -237,6 +237,7 @@ class Suite(Strict):
     """The whole benchmark; ``classes`` are those in which agents are trained, by name (all).
 
     Settings name ``cases``, in each of which a policy runs ``robustness_episodes`` episodes.
+    ``quick`` has what the quick version changes.
     """
 
     episodes: Positive = 1000
@@ -256,6 +257,7 @@ class Suite(Strict):
     families: tuple[Family, ...]
     cases: tuple[Case, ...] = ()
     learning: Learning = Learning()
+    quick: dict[str, Any] = pydantic.Field(default_factory=dict)
     settings: tuple[Setting, ...]
 
     def algorithm_of(self, setting: Setting, mode: Mode) -> AlgorithmConfig:
@@ -324,25 +326,6 @@ class Suite(Strict):
         return self
 
 
-# What --quick changes: the same work, less of it. The benchmark's trainings are as long as in the
-# full one, for agents of shorter ones are others.
-QUICK: dict[str, Any] = {
-    "episodes": 200,
-    "training_seeds": 1,
-    "prices": 5,
-    "hindsight_episodes": 10,
-    "robustness_episodes": 50,
-    "classes": ["local_estimate_memory", "sensors", "sensors_memory"],
-    "tuning": {"trials": 4, "prices": 4, "refined": 1, "episodes": 32, "seeds": 2},
-    "learning": {
-        "timesteps": 50_000,
-        "every": 25_000,
-        "episodes": 32,
-        "plain": {"every": 25_000},
-    },
-}
-
-
 def load_suite(path: str | Path, quick: bool = False, **changes: Any) -> Suite:
     """Return the benchmark's description or its quick version, with ``changes`` of its entries.
 
@@ -351,8 +334,13 @@ def load_suite(path: str | Path, quick: bool = False, **changes: Any) -> Suite:
     """
     content = read_yaml(path)
     if isinstance(content, dict):  # all else is refused
-        content = _merge(content, QUICK if quick else {}) | changes
-    return parse(Suite, content, str(path))
+        content |= changes
+    suite = parse(Suite, content, str(path))
+    if quick and not suite.quick:
+        raise ConfigurationError(
+            f"quick = True is not allowed with config {str(path)!r}, which has no quick"
+        )
+    return parse(Suite, _merge(content, suite.quick) | changes, str(path)) if quick else suite
 
 
 def _merge(content: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

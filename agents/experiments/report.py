@@ -12,14 +12,11 @@ from typing import Any
 
 import jinja2
 import numpy as np
-import pandas as pd
-from rich.table import Table
 
 from fusion_gym.evaluation.envelope import EnvelopePoint, height
 from fusion_gym.validation import ConfigurationError, choice
 
 from ..output.markup import NONE, code, markup_number, plain_text, ranged, share
-from ..output.tables import table_tables
 from .config import NOMINAL, SOLVED
 from .envelopes import at_least, bound_of, hull_of, path_of, read_envelopes, rollout_of
 from .tables import VERDICT, Row, group_by, read_rows
@@ -337,45 +334,6 @@ def hulls_of(envelopes: Row) -> dict[str, dict[bool, list[EnvelopePoint]]]:
     return result
 
 
-# The frames of the report.
-
-
-def knowing_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
-    """Return the effect of more knowledge on rules and agents."""
-    return pd.DataFrame(
-        {"setting": plain_text(item.label), "of": who}
-        | {
-            head: share(item.worth(kind)[who]) if who in item.worth(kind) else item.reason(kind)
-            for kind, head in KNOWING.items()
-        }
-        for item in settings
-        for who in ("rules", "agents")
-    )
-
-
-def learning_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
-    """Return what learning is worth: agents against the rules of the same class."""
-    return pd.DataFrame(
-        {
-            "setting": plain_text(item.label),
-            "centre": item.middle("centre"),
-            "alone": item.middle(f"local_{item.broadcast}"),
-            "alone, memory": item.middle(f"local_{item.broadcast}_memory"),
-            "scheduler": item.middle("sensors"),
-            "scheduler, memory": item.middle("sensors_memory"),
-        }
-        for item in settings
-    )
-
-
-def headline_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
-    """Return the front page's table: the effects of memory on rules and of learning."""
-    frame, knowing = learning_frame(settings), knowing_frame(settings)
-    memory = knowing[knowing["of"] == "rules"][KNOWING["memory"]].to_numpy()
-    frame.insert(1, "rules of a scheduler: memory", memory)
-    return frame
-
-
 def text_of(results: Mapping[str, SettingResults], panels: Mapping[str, Sequence[str]]) -> str:
     """Return the report in Markdown; ``panels`` has the small panels of each setting's figure."""
     settings = list(results.values())
@@ -433,7 +391,7 @@ def update_pages(
 # Perturbed cases.
 
 
-def robustness_frame(reports: Sequence[Row], titles: Mapping[str, str]) -> pd.DataFrame:
+def robustness_rows(reports: Sequence[Row], titles: Mapping[str, str]) -> list[dict[str, Any]]:
     """Return in how many cases agents are ahead of the rules; ``titles`` of settings by name."""
     rows = []
     for report in reports:
@@ -460,7 +418,7 @@ def robustness_frame(reports: Sequence[Row], titles: Mapping[str, str]) -> pd.Da
                     "at worst": f"{share(result[worst])}, {plain_text(worst)}" if worst else NONE,
                 }
             )
-    return pd.DataFrame(rows)
+    return rows
 
 
 def robustness_text(reports: Sequence[Row], titles: Mapping[str, str]) -> str:
@@ -495,11 +453,11 @@ def learning_text(courses: Sequence[Row]) -> str:
 # The quick benchmark beside the full one.
 
 
-def agreement_table(quick: Path, full: Path, settings: Sequence[str]) -> Table | None:
+def agreement_text(quick: Path, full: Path, settings: Sequence[str]) -> str:
     """Return each class of agents over the middle of its front, by both, and whether they agree.
 
-    They agree where their 95 % intervals have a value in common. ``None`` where the folder
-    ``full`` has no verdict of any class that the folder ``quick`` has.
+    They agree where their 95 % intervals have a value in common. Empty where the folder ``full``
+    has no verdict of any class that the folder ``quick`` has.
 
     Raises:
         ConfigurationError: a verdict that is damaged.
@@ -514,17 +472,5 @@ def agreement_table(quick: Path, full: Path, settings: Sequence[str]) -> Table |
         }
         for folder in (quick, full)
     )
-    rows = []
-    for names in (names for names in ours if names in theirs):
-        our, their = ours[names], theirs[names]
-        agree = our["low"] <= their["high"] and their["low"] <= our["high"]
-        rows.append((*names, share(our), share(their), "yes" if agree else "no"))
-    if not rows:
-        return None
-    agreeing = sum(row[-1] == "yes" for row in rows)
-    return table_tables(
-        "agents against the rules of their class: the quick benchmark and the full one",
-        ("setting", "class", "quick", "full", "agree"),
-        rows,
-        f"{agreeing} of {len(rows)} verdicts agree: their 95 % intervals overlap",
-    )
+    both = [(*names, own, theirs[names]) for names, own in ours.items() if names in theirs]
+    return _render("agreement.md", both=both) if both else ""
