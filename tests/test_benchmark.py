@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import optuna
+import pandas as pd
 import pytest
 import yaml
 from command_runs import call
@@ -26,7 +27,7 @@ from fusion_gym.agents.experiments.config import load_suite
 from fusion_gym.agents.experiments.envelopes import envelope_task, read_envelopes, searches_of
 from fusion_gym.agents.experiments.figures import report_text
 from fusion_gym.agents.experiments.report import SettingResults, read_results
-from fusion_gym.agents.experiments.tables import read_frame, read_rows, write_rows
+from fusion_gym.agents.experiments.tables import read_rows, write_rows
 from fusion_gym.agents.output.files import load_results, save_results
 from fusion_gym.agents.output.markup import code, page_of
 from fusion_gym.agents.training.checked import load_checked
@@ -76,10 +77,10 @@ def test_from_tuning_to_report_and_zoo(
     assert {name: front["seeds"] for name, front in classes.items()} == {
         "centre": 2, "local_estimate": 2, "local_packets_memory": 2, "sensors": 2,
     }  # fmt: skip
-    policies = read_frame(results / "small", "policies")
+    policies = pd.read_csv(results / "small" / "policies.csv")
     assert set(policies[policies["family"] == "gain"]["knows"]) == {"centre"}
     assert list(policies[policies["run"] == "genie"]["name"]) == ["everything arrives"]
-    runs = read_frame(results / "small", "runs").set_index("run")
+    runs = pd.read_csv(results / "small" / "runs.csv").set_index("run")
     assert runs["episodes"]["hindsight"] == 5
     dear = policies[policies["run"] == "hindsight"].set_index("name")["tokens"]
     assert dear["hindsight at price 0.1"] < dear["hindsight at price 0.001"]

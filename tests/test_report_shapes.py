@@ -49,11 +49,16 @@ def change(file: Path, column: str, value: str) -> None:
     [
         ("verdict", "title", ABSENT, "has other columns than the table 'verdict': 'title'"),
         ("verdict", "always", "0.0", "always = [0.0] is not allowed"),
-        ("fronts", "mode", "nobody", "mode = 'nobody' is not allowed: it must be 'centre' or"),
-        ("fronts", "rates", "[1", "rates = '[1' is not allowed: it must be JSON"),
-        ("fronts", "seeds", "1.5", "seeds = 1.5 is not allowed: it must be a whole number"),
-        ("worth", "rules_low", "", "rules_low = an empty cell is not allowed: it must be a finite"),
-        ("points", "mse", "", "mse = an empty cell is not allowed"),
+        (
+            "fronts",
+            "mode",
+            "nobody",
+            "mode = 'nobody' is not allowed: Input should be 'centre', 'local' or",
+        ),
+        ("fronts", "rates", "[1", "rates = '[1' is not allowed: Invalid JSON"),
+        ("fronts", "seeds", "1.5", "seeds = '1.5' is not allowed: Input should be a valid integer"),
+        ("worth", "rules_low", "", "rules.low is not allowed: Field required"),
+        ("points", "mse", "", "mse is not allowed: Field required"),
     ],
 )
 def test_results_of_another_shape(
