@@ -64,10 +64,9 @@ def test_vertices_are_those_of_the_tuning_episodes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     suite = load_suite(small_suite(tmp_path))
+    rule = {"options": {}, "family": "family", "knows": "centre", "found_by": (0, 1)}
     candidates = {
-        name: envelopes.Candidate(
-            name, (), "family", "centre", (0, 1), rate, interval(mse, mse, mse)
-        )
+        name: rule | {"policy": name, "rate": rate, "mse": interval(mse, mse, mse)}
         for name, (rate, mse) in (TUNED | {"d": (0.5, 0.8)}).items()
     }
     monkeypatch.setattr(envelopes, "candidates_of", lambda *_: (candidates, 4))

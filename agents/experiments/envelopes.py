@@ -9,14 +9,15 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
 
 from fusion_gym import zoo
-from fusion_gym.core.system import Knowledge, covers
+from fusion_gym.core.system import covers
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import EnvelopePoint, lower_hull, points_of
@@ -39,7 +40,8 @@ SHIPPED = Path(__file__).parents[2] / "results"
 Options = tuple[tuple[str, Any], ...]
 
 
-class Search(NamedTuple):
+@dataclass(frozen=True)
+class Search:
     """A family to tune in a setting with some options of its classes.
 
     With ``policies`` there is nothing to tune: these compete as they are.
@@ -50,11 +52,7 @@ class Search(NamedTuple):
     family: Family
     tuning: Tuning
     policies: tuple[str, ...] = ()
-
-    @property
-    def weight(self) -> float:
-        """About how long it takes, in seconds on one core."""
-        return 10.0
+    weight: ClassVar[float] = 10.0
 
     @property
     def inputs(self) -> dict[str, Any]:
@@ -89,7 +87,8 @@ class Search(NamedTuple):
             ) from None
 
 
-class Test(NamedTuple):
+@dataclass(frozen=True)
+class Test:
     """A policy to be measured on the test episodes, with options that it adds to the setting's.
 
     ``label`` stands for its text where that names a file.
@@ -101,11 +100,7 @@ class Test(NamedTuple):
     episodes: int
     seed: int
     label: str | None = None
-
-    @property
-    def weight(self) -> float:
-        """About how long it takes, in seconds on one core."""
-        return 0.4 + 0.9 * self.episodes / 1000
+    weight: ClassVar[float] = 1.0
 
     @property
     def name(self) -> str:
@@ -229,76 +224,61 @@ def searches_of(suite: Suite, setting: Setting, classes: Sequence[Class]) -> lis
     return result
 
 
-class Candidate(NamedTuple):
-    """A tuned policy, as a point of rate and error on all tuning episodes."""
-
-    policy: str
-    options: Options
-    family: str
-    knows: Knowledge
-    found_by: tuple[int, ...]
-    rate: float
-    mse: dict[str, float]
-
-    @property
-    def point(self) -> EnvelopePoint:
-        """Where it lies."""
-        return EnvelopePoint(
-            policy_with_options(self.policy, self.options), self.rate, self.mse["mean"]
-        )
-
-
 def candidates_of(
     setting: Setting, of: Class, searches: Iterable[Search], cache: Cache
-) -> tuple[dict[str, Candidate], int]:
-    """The tuned policies that know no more than a class, by name, and the number of trials."""
+) -> tuple[dict[str, Row], int]:
+    """Return the tuned policies that know no more than a class, by name, and the trials."""
     inside = [c for c in classes_of(setting) if of.contains(c)]
-    result: dict[str, Candidate] = {}
+    result: dict[str, Row] = {}
     trials = 0
     for search in searches:
         able = [c for c in inside if search.family.tuned_in in ("setting", c.mode)]
         if not any(search.options in (c.world, c.options) for c in able):
             continue
         tuned = cache.call(run_search, search.inputs, search)
-        fitting = [
-            Candidate(**entry, options=search.options, family=search.family.label)
+        own = {"options": dict(search.options), "family": search.family.label}
+        fitting = {
+            policy_with_options(entry["policy"], search.options): entry | own
             for entry in tuned["policies"]
             if covers(of.knows, entry["knows"])
-        ]
-        result |= {candidate.point.name: candidate for candidate in fitting}
+        }
+        result |= fitting
         trials += tuned["trials"] if fitting else 0
     return result, trials
 
 
-def select_candidates(candidates: Mapping[str, Candidate]) -> list[Candidate]:
-    """Those on the lower envelope on all tuning episodes, by rising rate."""
-    hull = lower_hull(candidate.point for candidate in candidates.values())
-    return [candidates[point.name] for point in hull]
+def hull_of_tuned(candidates: Mapping[str, Row]) -> list[EnvelopePoint]:
+    """Return the lower envelope on all tuning episodes, by rising rate."""
+    return lower_hull(
+        EnvelopePoint(name, row["rate"], row["mse"]["mean"]) for name, row in candidates.items()
+    )
 
 
 def content_of(
     suite: Suite, setting: Setting, of: Class, searches: Sequence[Search], cache: Cache
 ) -> dict[str, Any]:
-    """A class as its tables hold it, without the hash."""
+    """Return a class as its tables hold it, without the hash."""
     candidates, trials = candidates_of(setting, of, searches, cache)
-    vertices = select_candidates(candidates)
-    measured = read_tests(tests_of(suite, setting, vertices), cache)
+    vertices = {point.name: candidates[point.name] for point in hull_of_tuned(candidates)}
+    tests = rule_tests(setting, vertices.values(), suite.episodes, suite.seed)
+    measured = read_tests(tests, cache)
     places = {point.name: point for point in points_of(measured)}
     convex = {point.name for point in lower_hull(places.values())}
     listed = [
         {
-            "name": vertex.point.name,
-            "policy": vertex.policy,
-            "options": dict(vertex.options),
-            "family": vertex.family,
-            "knows": vertex.knows,
-            "tuning_rate": vertex.rate,
-            "tuning_mse": vertex.mse,
-            "test_rate": places[vertex.point.name].rate,
-            "test_mse": mean_interval(measured[vertex.point.name].mse)._asdict(),
-            "convex": vertex.point.name in convex,
+            "name": name,
+            **{key: vertex[key] for key in ("policy", "options", "family", "knows")},
+            "tuning_rate": vertex["rate"],
+            "tuning_mse": vertex["mse"],
+            "test_rate": places[name].rate,
+            "test_mse": mean_interval(measured[name].mse)._asdict(),
+            "convex": name in convex,
         }
-        for vertex in vertices
+        for name, vertex in vertices.items()
+    ]
+    by_seed = [
+        {name: row for name, row in candidates.items() if seed in row["found_by"]}
+        for seed in range(suite.tuning_of(setting).seeds)
     ]
     return {
         "mode": of.mode,
@@ -307,23 +287,11 @@ def content_of(
         "knows": of.knows,
         "options": dict(of.options),
         "contains": [c.name for c in classes_of(setting) if of.contains(c) and c != of],
-        "families": sorted({candidate.family for candidate in candidates.values()}),
+        "families": sorted({candidate["family"] for candidate in candidates.values()}),
         "trials": trials,
         "vertices": listed,
-        "searches": [
-            [[p.rate, p.mse] for p in lower_hull(c.point for c in candidates.values()
-                                                 if seed in c.found_by)]
-            for seed in range(suite.tuning_of(setting).seeds)
-        ],
-    }  # fmt: skip
-
-
-def tests_of(suite: Suite, setting: Setting, vertices: Iterable[Candidate]) -> list[Test]:
-    """What is to be measured on the test seeds."""
-    return [
-        Test(setting, vertex.options, vertex.policy, suite.episodes, suite.seed)
-        for vertex in vertices
-    ]
+        "searches": [[[p.rate, p.mse] for p in hull_of_tuned(own)] for own in by_seed],
+    }
 
 
 def envelope_inputs(suite: Suite, setting: Setting) -> dict[str, Any]:
@@ -544,12 +512,11 @@ class EnvelopeStore(NamedTuple):
         searches = searches_of(suite, setting, required)
         longest = sorted(searches, key=lambda search: -len(search.family.parameters))
         side_by_side(missing(run_search, longest, cache), pool, f"{setting.name}: tuning")
-        vertices = [
-            vertex
-            for of in required
-            for vertex in select_candidates(candidates_of(setting, of, searches, cache)[0])
-        ]
-        tests = tests_of(suite, setting, vertices)
+        tests: list[Test] = []
+        for of in required:
+            candidates, _ = candidates_of(setting, of, searches, cache)
+            vertices = [candidates[point.name] for point in hull_of_tuned(candidates)]
+            tests += rule_tests(setting, vertices, suite.episodes, suite.seed)
         side_by_side(missing(run_test, tests, cache), pool, f"{setting.name}: testing")
         earlier, inputs = self.read(setting), envelope_inputs(suite, setting)
         classes = earlier["classes"]

@@ -31,7 +31,7 @@ from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, Val
 from ..training.monitor import Measure
 from ..training.run import holds_training, train
 from .classes import classes_of
-from .config import SOLVED, Course, Learning, Setting, Suite, front_prices
+from .config import SOLVED, Course, Setting, Suite, front_prices
 from .envelopes import (
     EnvelopeStore,
     Test,
@@ -121,28 +121,18 @@ class LearningSetup:
     folders: Folders
 
     @property
-    def learning(self) -> Learning:
-        """How learning is measured."""
-        return self.suite.learning
-
-    @property
     def prices(self) -> list[float]:
         """The prices at which every front is measured."""
-        return front_prices(self.setting.price_range, self.learning.prices)
+        return front_prices(self.setting.price_range, self.suite.learning.prices)
 
     @property
     def inner(self) -> list[bool]:
         """Which prices lie in the inner part of the range, in the logarithm."""
         low, high = self.setting.price_range
         price = Price(None, (low, high))
-        first, last = self.learning.inner
+        first, last = self.suite.learning.inner
         places = price.encode(np.array(self.prices)).tolist()
         return [first <= place <= last for place in places]
-
-    @property
-    def tables(self) -> Path:
-        """The folder of its tables."""
-        return self.folders.results / "learning" / self.setting.name
 
     @functools.cached_property
     def envelopes(self) -> dict[str, Any]:
@@ -199,10 +189,9 @@ class LearningSetup:
         Raises:
             OSError: the model cannot be read.
         """
-        return Test.at_prices(
-            *(self.setting, tuple(self.options.items()), f"model:{model}", self.learning.prices),
-            *(self.suite.episodes, self.suite.seed),
-        )
+        options, count = tuple(self.options.items()), self.suite.learning.prices
+        requested = (self.suite.episodes, self.suite.seed)
+        return Test.at_prices(self.setting, options, f"model:{model}", count, *requested)
 
     @property
     def front(self) -> Experiment:
@@ -212,42 +201,6 @@ class LearningSetup:
             ConfigurationError: a config that is not allowed.
         """
         return load_checked(Experiment, self.course.front, "front")
-
-    def experiment(self, kind: Kind, seed: int) -> Experiment:
-        """Return the training of one seed, with the measurements' spacing.
-
-        Raises:
-            ConfigurationError: a config that is not allowed.
-        """
-        value, every = self.front, self.learning.every
-        if kind == "plain":
-            value, every = self._plain(), self.learning.plain.every
-        plain = value.model_dump()
-        plain["validation"]["every"] = every
-        plain["training"] |= {"seed": seed, "threads": 1}
-        plain["training"]["timesteps"] = self.learning.timesteps or value.training.timesteps
-        place = self.folders.work / "learning" / self.setting.name
-        plain["output"] = str(place / f"{kind}_{seed}")
-        return parse(Experiment, plain, self.course.front, "front")
-
-    def _plain(self) -> Experiment:
-        """Plain PPO's training: without memory, on the squared error, at the suite's prices."""
-        setting, plain, course = self.setting, self.learning.plain, self.course
-        own = setting.price_exponent
-        priced = {"cost_weight": "random", "price_range": list(setting.price_range)}
-        return Experiment(
-            environment=EnvironmentConfig(
-                id=setting.environment.id, options=setting.environment.options | priced
-            ),
-            algorithm=self.learning.algorithm_of(course),
-            training=TrainingConfig(
-                timesteps=round(plain.timesteps * course.plain.longer),
-                num_envs=plain.num_envs,
-                price_exponent=self.suite.price_exponent if own is None else own,
-            ),
-            validation=ValidationConfig(episodes=512),
-            output=str(self.folders.work),
-        )
 
     @property
     def options(self) -> dict[str, Any]:
@@ -306,8 +259,39 @@ class LearningRun:
 
     @property
     def experiment(self) -> Experiment:
-        """What is trained."""
-        return self.setup.experiment(self.kind, self.seed)
+        """What is trained, with the measurements' spacing.
+
+        Raises:
+            ConfigurationError: a config that is not allowed.
+        """
+        setup, learning = self.setup, self.setup.suite.learning
+        front = self.kind == "front"
+        value = setup.front if front else self._plain()
+        plain = value.model_dump()
+        plain["validation"]["every"] = learning.every if front else learning.plain.every
+        timesteps = learning.timesteps or value.training.timesteps
+        plain["training"] |= {"seed": self.seed, "threads": 1, "timesteps": timesteps}
+        place = setup.folders.work / "learning" / setup.setting.name
+        plain["output"] = str(place / f"{self.kind}_{self.seed}")
+        return parse(Experiment, plain, setup.course.front, "front")
+
+    def _plain(self) -> Experiment:
+        """Plain PPO's training: without memory, on the squared error, at the suite's prices."""
+        suite, setting, course = self.setup.suite, self.setup.setting, self.setup.course
+        plain, own = suite.learning.plain, setting.price_exponent
+        priced = {"cost_weight": "random", "price_range": list(setting.price_range)}
+        options = setting.environment.options | priced
+        return Experiment(
+            environment=EnvironmentConfig(id=setting.environment.id, options=options),
+            algorithm=suite.learning.algorithm_of(course),
+            training=TrainingConfig(
+                timesteps=round(plain.timesteps * course.plain.longer),
+                num_envs=plain.num_envs,
+                price_exponent=suite.price_exponent if own is None else own,
+            ),
+            validation=ValidationConfig(episodes=512),
+            output=str(self.setup.folders.work),
+        )
 
     @property
     def inputs(self) -> dict[str, Any]:
@@ -317,7 +301,7 @@ class LearningRun:
             "training": training_of(self.experiment),
             "course": {"setting": setup.setting.name} | course.model_dump(mode="json"),
             "prices": setup.prices,
-            "episodes": setup.learning.episodes,
+            "episodes": setup.suite.learning.episodes,
             "test": {"episodes": setup.suite.episodes, "seed": setup.suite.seed},
             "envelopes": {name: setup.envelope(name)["sha256"] for name in setup.classes},
         }
@@ -352,7 +336,7 @@ def runs_of(setup: LearningSetup, kind: Kind, seeds: Iterable[int]) -> list[Lear
         return [LearningRun(setup, kind, seed) for seed in seeds]
     if setup.memoryless is None:
         return []
-    plain, trained = setup.learning.plain, finished_runs(setup, "front")
+    plain, trained = setup.suite.learning.plain, finished_runs(setup, "front")
     taken = [item["curve"][-1]["cpu_seconds"] for item in trained]
     budget = plain.budget * statistics.fmean(taken) if taken else math.inf
     return [LearningRun(setup, kind, seed, budget) for seed in list(seeds)[: plain.seeds]]
@@ -394,10 +378,10 @@ def write_learning(setup: LearningSetup) -> None:
         for rate, mse in point["front"]
     ]
     points = [{"seed": run["seed"]} | point for run in runs for point in run.get("points", ())]
-    write_rows(setup.tables, "learning_trainings", runs)
-    write_rows(setup.tables, "learning_curves", curves)
-    write_rows(setup.tables, "learning_points", points)
-    write_rows(setup.tables, "learning", [whole])
+    tables = {"_trainings": runs, "_curves": curves, "_points": points, "": [whole]}
+    for table, rows in tables.items():
+        folder = setup.folders.results / "learning" / setup.setting.name
+        write_rows(folder, f"learning{table}", rows)
 
 
 def read_learning(folder: Path) -> dict[str, Any]:
@@ -406,26 +390,24 @@ def read_learning(folder: Path) -> dict[str, Any]:
     Raises:
         ConfigurationError: a table that cannot be read or is of another shape.
     """
-    curves: dict[tuple[str, int], dict[int, dict[str, Any]]] = {}
-    for row in read_rows(folder, "learning_curves", "output"):
-        curve = curves.setdefault((row.pop("kind"), row.pop("seed")), {})
-        place = [row.pop("rate"), row.pop("mse")]
-        curve.setdefault(row["timesteps"], {"excess": None} | row | {"front": []})
-        curve[row["timesteps"]]["front"].append(place)
-    points = group_by(read_rows(folder, "learning_points", "output"), "seed")
-    runs: dict[str, list[dict[str, Any]]] = {"front": [], "plain": []}
-    for row in read_rows(folder, "learning_trainings", "output"):
-        kind = row.pop("kind")
-        row["curve"] = list(curves.get((kind, row["seed"]), {}).values())
-        if kind == "front":
-            row["points"] = points.get(row["seed"], [])
-        runs[kind].append(row)
-    result: dict[str, Any] = {"setting": folder.name, "throughput": None}
-    result |= dict(*read_rows(folder, "learning", "output")[:1])
+    trainings, curves, points, whole = (
+        read_rows(folder, f"learning{table}", "output")
+        for table in ("_trainings", "_curves", "_points", "")
+    )
+    for run in trainings:
+        own = [row for row in curves if all(row[key] == run[key] for key in ("kind", "seed"))]
+        run["curve"] = [
+            {"excess": None, "timesteps": steps}
+            | rows[0]
+            | {"front": [[row["rate"], row["mse"]] for row in rows]}
+            for steps, rows in group_by(own, "timesteps").items()
+        ]
+        if run["kind"] == "front":
+            run["points"] = [point for point in points if point["seed"] == run["seed"]]
+    runs = {kind: [run for run in trainings if run["kind"] == kind] for kind in KINDS}
+    result: Row = {"setting": folder.name, "throughput": None} | whole[0]
     result |= {"fronts": runs["front"], "plain": runs["plain"]}
-    result["reached"] = {
-        kind: [first_below(item) for item in every] for kind, every in runs.items()
-    }
+    result["reached"] = {kind: [first_below(run) for run in own] for kind, own in runs.items()}
     return result | {"finished": judge_fronts(result)}
 
 
@@ -503,7 +485,7 @@ def run_course(run: LearningRun) -> dict[str, Any]:
     torch.set_num_threads(1)
     experiment, setup = run.experiment, run.setup
     folder = Path(experiment.output)
-    measure: Measure = meter(experiment, setup.prices, setup.learning.episodes)
+    measure: Measure = meter(experiment, setup.prices, setup.suite.learning.episodes)
     enough = False
 
     def watch(record: dict[str, Any]) -> bool:

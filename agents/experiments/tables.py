@@ -41,7 +41,7 @@ KINDS: dict[str, Any] = {
     "number": pydantic.FiniteFloat,
     "count": int,
     "flag": bool,
-    "json": pydantic.Json[Any],
+    "json": pydantic.Json,
     "interval": Ends,
 }
 
@@ -56,7 +56,8 @@ class Column(NamedTuple):
     @property
     def field(self) -> Any:
         """The type of its cells, and its default."""
-        kind = Literal[self.allowed] if self.allowed else KINDS[self.kind]  # type: ignore[misc]
+        words: Any = Literal
+        kind = words[self.allowed] if self.allowed else KINDS[self.kind]
         return (kind, None) if self.empty else (kind, ...)
 
 
@@ -84,8 +85,9 @@ def header_of(table: str) -> list[str]:
 
 @functools.cache
 def _shape_of(table: str) -> Any:
-    fields = {name: column.field for name, column in TABLES[table].items()}
-    return list[pydantic.create_model(table, **fields)]  # type: ignore[misc]
+    fields: dict[str, Any] = {name: column.field for name, column in TABLES[table].items()}
+    row: Any = pydantic.create_model(table, **fields)
+    return list[row]
 
 
 def write_rows(folder: Path, table: str, rows: Iterable[Mapping[str, Any]]) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 
@@ -13,7 +14,7 @@ from fusion_gym.core.system import least_covering
 from fusion_gym.core.task import Task
 from fusion_gym.deprecation import replace_value
 from fusion_gym.evaluation.envelope import points_of
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.hindsight import run_hindsight
 from fusion_gym.evaluation.metrics import robust_summary, summarise
 from fusion_gym.policies.registry import make_policy
@@ -113,11 +114,6 @@ class Agent(NamedTuple):
         return experiment_of(self.suite, self.setting, self.of, self.seed, self.work)
 
     @property
-    def prices(self) -> list[float]:
-        """The prices that it is tested at."""
-        return front_prices(self.setting.price_range, self.suite.prices)
-
-    @property
     def inputs(self) -> dict[str, Any]:
         """All that its results depend on."""
         return tested_inputs(self.suite, self.setting) | {
@@ -131,29 +127,24 @@ class Agent(NamedTuple):
 def run_agent(agent: Agent) -> dict[str, Any]:
     """Train an agent that sees the price, and return how that went and its results by price."""
     summary = run_training(agent.experiment)
-    task = agent_task(agent.setting, agent.of)
-    model = Path(agent.experiment.output) / "best_model.zip"
-    policies = [make_policy(f"model:{model},price={price!r}", task) for price in agent.prices]
+    suite, setting = agent.suite, agent.setting
+    model = f"model:{Path(agent.experiment.output) / 'best_model.zip'}"
+    options = tuple(agent_options(setting, agent.of).items())
+    tests = Test.at_prices(setting, options, model, suite.prices, suite.episodes, suite.seed)
     return {
         "seconds": summary["seconds"],
         "best_validation": summary["best_validation"],
-        "results": [
-            run_episodes(task, policy, agent.suite.episodes, agent.suite.seed)
-            for policy in policies
-        ],
+        "results": [run_test(test) for test in tests],
     }
 
 
-class HindsightSearch(NamedTuple):
+@dataclass(frozen=True)
+class HindsightSearch:
     """A clairvoyant's schedules for the first test episodes."""
 
     suite: Suite
     setting: Setting
-
-    @property
-    def weight(self) -> float:
-        """About how long it takes, in seconds on one core."""
-        return 0.6 * self.suite.hindsight_episodes
+    weight: ClassVar[float] = 60.0
 
     @property
     def inputs(self) -> dict[str, Any]:
@@ -288,7 +279,8 @@ class SettingWork(NamedTuple):
         for agent in self.agents():
             if cache.holds(run_agent, agent.inputs):
                 content = cache.call(run_agent, agent.inputs, agent)
-                names = [f"price={price!r}" for price in agent.prices]
+                prices = front_prices(self.setting.price_range, self.suite.prices)
+                names = [f"price={price!r}" for price in prices]
                 own = {
                     "class": agent.of.name,
                     "class_options": agent.of.information | self.setting.agent_options,
