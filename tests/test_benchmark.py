@@ -28,13 +28,13 @@ from fusion_gym.agents.experiments.envelopes import envelope_task, read_envelope
 from fusion_gym.agents.experiments.figures import report_text
 from fusion_gym.agents.experiments.report import SettingResults, read_results
 from fusion_gym.agents.experiments.tables import read_rows, write_rows
-from fusion_gym.agents.output.files import load_results, save_results
+from fusion_gym.agents.experiments.workers import Folders
 from fusion_gym.agents.output.markup import code, page_of
 from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.core.system import covers
 from fusion_gym.deprecation import replace_value
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.periodic_optimum import Schedule
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
@@ -233,15 +233,10 @@ def test_a_class_that_a_setting_has_not_is_refused(tmp_path: Path) -> None:
             trained_classes(suite, suite.settings[0])
 
 
-def test_results_survive_the_disk(tmp_path: Path) -> None:
-    task = fusion_gym.make_task(ENV, filter="tobit", horizon=5)
-    outcome = {p: run_episodes(task, make_policy(p, task), 3, 0) for p in ("always", "never")}
-    save_results(tmp_path / "x.npz", outcome)
-    again = load_results(tmp_path / "x.npz")
-    assert list(again) == ["always", "never"]
-    for name, results in outcome.items():
-        for field in EpisodeResults.__dataclass_fields__:
-            np.testing.assert_array_equal(getattr(again[name], field), getattr(results, field))
+def test_a_work_folder_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "work" / "small" / "tuned").mkdir(parents=True)
+    with pytest.raises(ConfigurationError, match=r"of an earlier version: give another --work"):
+        Folders.create(tmp_path, tmp_path / "work", quick=False)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from fusion_gym.agents.experiments.tuning import (
 from fusion_gym.core.system import covers
 from fusion_gym.deprecation import replace_value
 from fusion_gym.evaluation.beside import run_beside
-from fusion_gym.evaluation.envelope import EnvelopePoint, best_mse, lower_hull
+from fusion_gym.evaluation.envelope import EnvelopePoint, lower_hull
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 
@@ -114,20 +114,6 @@ def test_classes_contain_what_knows_less() -> None:
         assert measured[-1].name == "sensors_memory"
         assert all(measured[-1].contains(c) for c in measured)
         assert all(c.packet == "estimate" for c in classes if not measured[-1].contains(c))
-
-
-def test_chosen_policies_all_count() -> None:
-    """A vertex that lies above its neighbours' line on other episodes stays in the envelope."""
-    task = fusion_gym.make_task(ENV, filter="tobit", horizon=10)
-    results = {
-        name: run_episodes(task, make_policy(name, task), 5, 0)
-        for name in ("never", "random:rate=0.3", "always")
-    }
-    rate = float(results["random:rate=0.3"].rate.mean())
-    mixed = best_mse(results, rate)
-    assert mixed is not None
-    np.testing.assert_array_equal(mixed, results["random:rate=0.3"].mse)
-    assert best_mse(results, -0.1) is None
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:

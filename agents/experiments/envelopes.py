@@ -32,7 +32,7 @@ from ..output.folders import check_inputs
 from .classes import Class, classes_of
 from .config import Family, Setting, Suite, Tuning, front_prices
 from .tables import Row, group_by, read_rows, write_rows
-from .tuning import as_they_are, first_values, policy_text, tune_families
+from .tuning import first_values, policy_text, tune_families
 from .workers import Pool, missing, side_by_side
 
 # Beside the folder of the commands, in a clone as in an installed package.
@@ -157,12 +157,9 @@ def envelope_task(setting: Setting, options: Iterable[tuple[str, Any]] = ()) -> 
 def run_search(search: Search) -> dict[str, Any]:
     """Return a family's finalists, on the episodes of all searches, and the number of trials."""
     task = envelope_task(search.setting, search.options)
-    if search.policies:
-        tried, finalists = 0, as_they_are(task, search.policies, search.tuning)
-    else:
-        tried, finalists = tune_families(
-            task, search.family, search.tuning, search.setting.price_range
-        )
+    tried, finalists = tune_families(
+        task, search.family, search.tuning, search.setting.price_range, search.policies
+    )
     policies = [
         {
             "policy": finalist.policy,

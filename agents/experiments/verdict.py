@@ -326,7 +326,9 @@ def _kind(more: Class, less: Class) -> str | None:
     if more.mode == less.mode and same and more.broadcast == less.broadcast:
         return "memory" if more.memory and not less.memory else None
     if more.memory == less.memory and more.mode == less.mode == "local":
-        return "hearing" if _broadcast_level(more) > _broadcast_level(less) else None
+        order = HEARD.index
+        wider = order(more.broadcast or "none") > order(less.broadcast or "none")
+        return "hearing" if wider else None
     if more.memory == less.memory and more.mode == less.mode == "sensors":
         return "packets that hold the estimate" if more.packet == "estimate" and not same else None
     if more.memory == less.memory and same and more.mode == "sensors":
@@ -335,10 +337,6 @@ def _kind(more: Class, less: Class) -> str | None:
             return "deciding together"
         return "seeing measurements" if less.mode == "centre" else None
     return None
-
-
-def _broadcast_level(of: Class) -> int:
-    return -1 if of.broadcast is None else HEARD.index(of.broadcast)
 
 
 ROBUSTNESS = "robustness"  # of the page for readers in that of the results, and a table's name
