@@ -28,7 +28,7 @@ VERDICT = "verdict"  # the table of a setting that is written last
 _ENDS = {"mean": "", "low": "_low", "high": "_high"}  # of an interval's columns
 
 
-class Ends(pydantic.BaseModel):
+class CellInterval(pydantic.BaseModel):
     """A mean with the ends of its interval."""
 
     mean: pydantic.FiniteFloat
@@ -42,7 +42,7 @@ KINDS: dict[str, Any] = {
     "count": int,
     "flag": bool,
     "json": pydantic.Json,
-    "interval": Ends,
+    "interval": CellInterval,
 }
 
 

@@ -178,7 +178,7 @@ def tested_inputs(suite: Suite, setting: Setting) -> dict[str, Any]:
     }
 
 
-class Run(NamedTuple):
+class BenchmarkRun(NamedTuple):
     """Policies that were tested together: their results by name, and the run's other columns."""
 
     name: str
@@ -265,17 +265,17 @@ class SettingWork(NamedTuple):
             *missing(run_agent, [agent for agent in left if agent.of.name in classes], cache),
         ]
 
-    def runs(self) -> list[Run]:
+    def runs(self) -> list[BenchmarkRun]:
         """Return all runs, with the agents that are finished."""
         cache = self.folders.cache
         result = [
-            Run(name, self.inputs(name), read_tests(tests, cache), {})
+            BenchmarkRun(name, self.inputs(name), read_tests(tests, cache), {})
             for name, tests in self.tests().items()
         ]
         for search in self.hindsight():
             tested = cache.call(search_in_hindsight, search.inputs, search)
             episodes = {"episodes": len(next(iter(tested.values())).mse)}
-            result.append(Run("hindsight", search.inputs, tested, episodes))
+            result.append(BenchmarkRun("hindsight", search.inputs, tested, episodes))
         for agent in self.agents():
             if cache.holds(run_agent, agent.inputs):
                 content = cache.call(run_agent, agent.inputs, agent)
@@ -287,7 +287,7 @@ class SettingWork(NamedTuple):
                     "training_seed": agent.seed,
                 }
                 tested = dict(zip(names, content.pop("results"), strict=True))
-                result.append(Run(agent.name, agent.inputs, tested, own | content))
+                result.append(BenchmarkRun(agent.name, agent.inputs, tested, own | content))
         return result
 
 
@@ -353,7 +353,7 @@ def judge_setting(work: SettingWork) -> None:
     write_verdict(work.folders.results / setting.name, verdict, rows, policies_of(work, runs))
 
 
-def policies_of(work: SettingWork, runs: Sequence[Run]) -> list[Row]:
+def policies_of(work: SettingWork, runs: Sequence[BenchmarkRun]) -> list[Row]:
     """Return a row for each policy of the runs; rules have their family and what it must know."""
     task, vertices, genie = envelope_task(work.setting), work.vertices, work.setting.genie
     families: dict[str, Row] = {}
