@@ -1,5 +1,6 @@
 """Results on disk: found again for the same inputs and code alone, whatever a process left."""
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -57,6 +58,7 @@ DAMAGES: dict[str, Callable[[Path], Any]] = {
     "other": lambda path: path.write_bytes(b"PK\x03\x04" + bytes(range(256))),
     "removed": Path.unlink,
     "folder removed": lambda path: [item.unlink() for item in path.parent.iterdir()],
+    "code": lambda path: (path.parents[1] / "func_code.py").write_text("# first line: 1\nhalf"),
     "half-written": lambda path: path.rename(f"{path}.0123-45-67"),
 }
 
@@ -77,19 +79,20 @@ def test_a_damaged_entry_is_computed_again(
 def test_a_result_that_cannot_be_written_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*arguments: object) -> None:
+    def fail(*arguments: object, **keywords: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("joblib._store_backends.concurrency_safe_write_rename", fail, raising=False)
-    monkeypatch.setattr("joblib._store_backends.concurrency_safe_write", fail, raising=False)
+    monkeypatch.setattr("joblib.numpy_pickle.dump", fail)
     with pytest.raises(ConfigurationError, match=r"folder = .* No space left on device"):
         Cache(tmp_path).call(evaluate, INPUTS, 2.0)
 
 
+START = "import sys; from pathlib import Path; from fusion_gym.agents.output.cache import Cache\n"
+
+
 def test_two_processes_at_once(tmp_path: Path) -> None:
     """Both return the result, and leave it; many keys, so that the processes meet."""
-    program = (
-        "import sys; from pathlib import Path; from fusion_gym.agents.output.cache import Cache\n"
+    program = START + (
         "def number(value): return value\n"
         "for value in range(100):\n"
         "    assert Cache(Path(sys.argv[1])).call(number, {'value': value}, value) == value\n"
@@ -98,6 +101,14 @@ def test_two_processes_at_once(tmp_path: Path) -> None:
     assert [process.wait(60) for process in both] == [0, 0]
     assert len(entries(tmp_path)) == 100
     assert not list(tmp_path.rglob("output.pkl.*"))
+
+
+def test_another_process_reads_every_folder_of_this_one(tmp_path: Path) -> None:
+    program = START + "import os; print(Cache(Path(sys.argv[1])).read(os.cpu_count, {}))"
+    for name in ("first", "second"):
+        count = Cache(tmp_path / name).call(os.cpu_count, {})
+        words = [sys.executable, "-c", program, str(tmp_path / name)]
+        assert int(subprocess.run(words, capture_output=True, check=True).stdout) == count
 
 
 @pytest.fixture

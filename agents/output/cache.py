@@ -94,11 +94,12 @@ class Cache:
 
     @property
     def _memorized(self) -> Any:
-        return Memory(self.folder, verbose=0, compress=True).cache(_evaluate, ignore=["evaluation"])
+        # Of a module's function joblib notes the code in the first folder of a process alone, and
+        # another process would then not trust the results in the second.
+        def evaluate(evaluation: Callable[[], Any], key: str) -> Any:
+            return evaluation()
 
-
-def _evaluate(evaluation: Callable[[], Any], key: str) -> Any:
-    return evaluation()
+        return Memory(self.folder, verbose=0, compress=True).cache(evaluate, ignore=["evaluation"])
 
 
 def _refuse() -> None:
