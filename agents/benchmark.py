@@ -114,15 +114,14 @@ class Benchmark(Long):
         Raises:
             ConfigurationError: there are some, and no ``--resume``.
         """
-        names = {"envelopes": "{}/classes.csv", "agents": "{}/verdict.csv"}
-        names |= {"robustness": "{}/robustness.csv", "learning": "learning/{}/learning.csv"}
-        paths = [
-            folders.results / names[part].format(setting.name)
-            for part in self.parts
-            if part in names
-            for setting in settings
+        last = {"envelopes": "{}/classes.csv", "agents": "{}/verdict.csv"}
+        last |= {"robustness": "{}/robustness.csv", "learning": "learning/{}/learning.csv"}
+        tables = [
+            last[part].format(item.name)
+            for part in set(self.parts) & last.keys()
+            for item in settings
         ]
-        there = [path for path in paths if path.exists()]
+        there = [table for table in tables if (folders.results / table).exists()]
         pieces = list(folders.cache.folder.rglob("output.pkl"))
         refuse_earlier("results", folders.results, len(there), self.resume)
         refuse_earlier("work", folders.work, len(pieces), self.resume)
