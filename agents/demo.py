@@ -140,8 +140,9 @@ class Demo(Long):
         for learner in learners:
             self._check(learner)
         with ended_like_by_ctrl_c(), alone_in(self.output, "output"):
-            for learner in learners if self.fresh else ():
-                shutil.rmtree(learner.folder, ignore_errors=True)
+            for learner in learners:
+                if self.fresh and learner.folder.exists():
+                    shutil.rmtree(learner.folder)
             writing(("models, figures and tables", self.output))
             began = time.perf_counter()
             calls = [Call(1.0, run_training, (learner.experiment,)) for learner in learners]
