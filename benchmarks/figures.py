@@ -32,8 +32,8 @@ from typing import Any
 import torch
 import yaml
 
-from fusion_gym.agents.experiments.references import read_envelopes
-from fusion_gym.agents.experiments.tables import read_frame
+from fusion_gym.agents.experiments.envelopes import read_envelopes
+from fusion_gym.agents.experiments.tables import read_rows
 
 TIMESTEPS = 100_000
 VALIDATION = {"every": 60_000, "episodes": 64}  # once on the way, and once at the end
@@ -131,7 +131,7 @@ def envelope_pieces(episodes: int) -> Iterator[tuple[str, Piece]]:
     for path in sorted(Path("results").glob("*/fronts.csv")):
         stored = read_envelopes(path.parent)
         worlds: dict[str, dict[str, Any]] = {}
-        for name in read_frame(path.parent, "fronts")["class"]:
+        for name in (row["class"] for row in read_rows(path.parent, "fronts")):
             for vertex in stored["classes"][name]["vertices"]:
                 key = ", ".join(f"{k}={v}" for k, v in vertex["options"].items()) or "as it is"
                 world = worlds.setdefault(key, {"options": vertex["options"], "policies": {}})

@@ -77,7 +77,7 @@ def test_all_commands_under_one_name() -> None:
     assert unknown.returncode == 2
     assert "did you mean 'train'?" in unknown.stderr
     assert len(unknown.stderr.splitlines()) == 1
-    absent = run("report", "--results", "absent")
+    absent = run("benchmark", "--parts", "report", "--results", "absent")
     assert absent.returncode == 1
     assert absent.stderr.startswith("error: results = 'absent'")
 

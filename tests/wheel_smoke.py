@@ -140,7 +140,6 @@ def use(programs: Path, folder: Path) -> None:
     call(program, "benchmark", *suite, cwd=folder)
     again = call(program, "benchmark", *suite, cwd=folder, status=1).stderr
     assert "--resume" in again.splitlines()[-1], again
-    call(program, "report", cwd=folder)
     assert "`fusion-gym benchmark`" in (folder / "results" / "README.md").read_text()
     call(program, "zoo", "--work", "work", "--zoo", "zoo", cwd=folder)
     assert (folder / "zoo" / "small_sensors.zip").exists()
