@@ -62,7 +62,7 @@ LOCAL = Course(
 )
 TITLES = {
     "scheduler": "A scheduler that sees all new measurements",
-    "alone": "Sensors by themselves, which hear the centre's estimate",
+    "local": "Local sensors, which receive the centre's estimate",
 }
 
 
@@ -145,7 +145,10 @@ class Demo(Long):
                     shutil.rmtree(learner.folder)
             writing(("models, figures and tables", self.output))
             began = time.perf_counter()
-            calls = [Call(1.0, run_training, (learner.experiment,)) for learner in learners]
+            calls = [
+                Call(1.0, run_training, (learner.experiment,), learner.experiment)
+                for learner in learners
+            ]
             side_by_side(calls, TEAM, "trainings")
             trained = time.perf_counter()
             side_by_side([call for learner in learners for call in learner.calls()], TEAM, "tests")

@@ -46,9 +46,6 @@ BASES: dict[str, dict[str, list[str]]] = {
     "export": {"model": ["zoo:remote_estimation_sensors"], "onnx": ["made.onnx"]},
     "zoo": {"results": ["results"], "work": ["work"], "zoo": ["made"]},
     "demo": {"output": ["made"], "episodes": ["2"], "timesteps": ["32"]},
-    "solved": {
-        "config": ["training.yaml"], "output": ["made"], "episodes": ["2"], "seeds": ["0"],
-    },
     "train": {"config": ["training.yaml"], "output": ["made"]},
     "tune": {"config": ["training.yaml"], "output": ["made"], "trials": ["1"]},
     "benchmark": {

@@ -29,7 +29,7 @@ from fusion_gym.agents.experiments.figures import report_text
 from fusion_gym.agents.experiments.report import SettingResults, read_results
 from fusion_gym.agents.experiments.tables import read_rows, write_rows
 from fusion_gym.agents.experiments.workers import Folders
-from fusion_gym.agents.maintenance import solved, zoo
+from fusion_gym.agents.maintenance import zoo
 from fusion_gym.agents.output.markup import code, page_of
 from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
@@ -294,32 +294,6 @@ def test_agents_of_the_zoo_reach_their_numbers(name: str) -> None:
     deviation = results.mse.std() / np.sqrt(60)
     assert results.mse.mean() == pytest.approx(received["mse"]["mean"], abs=4.5 * deviation)
     assert np.mean(received["rate"]) == pytest.approx(results.rate.mean(), abs=0.03)
-
-
-def test_the_solved_case_is_trained_once_and_compared(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    options = {"error_weight": 0.1, "cost_weight": 0.5, "horizon": 20}
-    config = small_config(
-        tmp_path,
-        environment={"id": "fusion_gym/RemoteEstimation-v0", "options": options},
-        algorithm={"name": "ppo", "batch_size": 64},
-        training={"timesteps": 512, "num_envs": 8},
-    )
-    arguments = ["--config", str(config), "--episodes", "50", "--output", str(tmp_path / "s")]
-    run_main(monkeypatch, solved, *arguments, "--seeds", "0")
-    stamp = (tmp_path / "s" / "ppo_0" / "final_model.zip").stat().st_mtime_ns
-    run_main(monkeypatch, solved, *arguments, "--seeds", "0", "1")
-    assert (tmp_path / "s" / "ppo_0" / "final_model.zip").stat().st_mtime_ns == stamp
-    content = json.loads((tmp_path / "s" / "ppo.json").read_text())["agents"]
-    assert set(content) == {"0", "1"}
-    # A folder with another training is refused, and kept.
-    config.write_text(config.read_text().replace("batch_size: 64", "batch_size: 32"))
-    with pytest.raises(SystemExit, match="batch_size = 32 differs"):
-        run_main(monkeypatch, solved, *arguments, "--seeds", "0")
-    # Hardly trained, an agent costs more than the optimum.
-    assert content["0"]["mean"] > 0.0
-    assert "above the optimum" in capsys.readouterr().out
 
 
 def small_tuning(folder: Path) -> Path:

@@ -149,14 +149,14 @@ def test_output_that_nobody_reads_or_takes() -> None:
 
 def test_a_fresh_demo_removes_nothing_but_a_demo(here: Path) -> None:
     """Neither what is not its own, nor anything when it is refused."""
-    for name in ("scheduler", "alone"):
+    for name in ("scheduler", "local"):
         (here / name / "agent").mkdir(parents=True)
         (here / name / "agent" / "config.yaml").touch()
-    (here / "alone" / "agent" / "config.yaml").rename(here / "alone" / "notes")
+    (here / "local" / "agent" / "config.yaml").rename(here / "local" / "notes")
     ended = call("demo", ["--fresh", "--output", "."])
     assert (ended.status, ended.trace) == (1, "")
     assert "fresh = True is not allowed: 'alone' holds no results of a demo" in ended.err
-    assert (here / "alone" / "notes").exists()
+    assert (here / "local" / "notes").exists()
     assert (here / "scheduler" / "agent" / "config.yaml").exists()
 
 

@@ -10,10 +10,11 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib
+import json
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,9 +28,10 @@ from fusion_gym.validation import ConfigurationError
 from ..output.cache import Cache
 from ..output.ending import name_user_code
 from ..output.folders import alone_in, check_inputs, fingerprint
-from ..output.progress import progress_bar
+from ..output.progress import Bar, progress_bar
 from ..training.checked import read_yaml
 from ..training.config import Experiment
+from ..training.monitor import log_line
 from ..training.run import holds_training, train
 
 BackendName = Literal["loky", "dask", "ray"]
@@ -206,11 +208,23 @@ def run_training(experiment: Experiment) -> dict[str, Any]:
 
 
 class Call(NamedTuple):
-    """A call and about how long it takes, in seconds on one core."""
+    """A call, about how long it takes in seconds on one core, and the training that it does."""
 
     weight: float
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
+    training: Experiment | None = None
+
+    @property
+    def validation(self) -> dict[str, Any] | None:
+        """The last validation that its training has written."""
+        if self.training is None:
+            return None
+        with contextlib.suppress(FileNotFoundError):
+            text = Path(self.training.output, "validation.jsonl").read_text(encoding="utf-8")
+            whole = text[: text.rfind("\n") + 1].splitlines()
+            return json.loads(whole[-1]) if whole else None
+        return None
 
 
 class WorkPiece(Protocol):
@@ -228,7 +242,7 @@ def missing(
     """Return the calls that put the results of these pieces into the cache, each once."""
     every = {fingerprint(piece.inputs): piece for piece in pieces}
     return [
-        Call(piece.weight, _fill, (cache, function, piece))
+        Call(piece.weight, _fill, (cache, function, piece), getattr(piece, "experiment", None))
         for piece in every.values()
         if not cache.holds(function, piece.inputs)
     ]
@@ -248,21 +262,54 @@ def side_by_side(work: Sequence[Call], pool: Pool, description: str) -> list[Any
     if not work:
         return []
     results: list[Any] = [None] * len(work)
-    total, done = sum(call.weight for call in work), 0.0
+    left = dict(enumerate(work))
     parent = os.getpid() if pool.local else None
-    with progress_bar(len(work), description, unit="pieces") as bar, pool.connect():
+    with (
+        progress_bar(len(work), description, unit="pieces") as bar,
+        pool.connect(),
+        _watch(bar, left),
+    ):
         ended = pool.map_unordered(functools.partial(_do, parent), list(enumerate(work)))
         try:
-            for count, (place, result) in enumerate(ended, 1):
+            for place, result in ended:
                 results[place] = result
-                done += work[place].weight
-                bar.reach(count, done / total)
+                del left[place]
         except BrokenProcessPool:
             raise ConfigurationError(
                 f"workers = {pool.workers}: the system ended one of them, perhaps for want of "
                 "memory; finished pieces of work are kept: go on as after an interrupt"
             ) from None
     return results
+
+
+@contextlib.contextmanager
+def _watch(bar: Bar, left: Mapping[int, Call]) -> Iterator[None]:
+    """Show on the bar how far the calls that are ``left`` and their trainings are."""
+    total, calls = sum(call.weight for call in left.values()), len(left)
+    end = threading.Event()
+
+    def show() -> None:
+        share = 1.0
+        for call in list(left.values()):
+            last = call.validation
+            share -= call.weight / total
+            if last is not None and call.training is not None:
+                share += call.weight / total * last["timesteps"] / call.training.training.timesteps
+                bar.say(f"{Path(call.training.output).parent.name}: {log_line(last)}")
+        bar.reach(calls - len(left), share)
+
+    def repeat() -> None:
+        while not end.wait(_EVERY):
+            show()
+
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        end.set()
+        thread.join()
+        show()
 
 
 def _do(parent: int | None, item: tuple[int, Call]) -> tuple[int, Any]:

@@ -86,7 +86,6 @@ Steps = Annotated[int | None, Whole(1, 10**12)]
 Seed = Annotated[int, Whole(0)]
 _TRAINING = Whole(0, 2**32 - 1)  # as torch and numpy take it
 TrainingSeed = Annotated[int | None, _TRAINING]
-TrainingSeeds = Annotated[tuple[int, ...], _TRAINING]
 
 
 def check_options(values: Any) -> None:
