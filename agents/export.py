@@ -14,11 +14,12 @@ import tyro
 
 from fusion_gym import zoo
 from fusion_gym.envs.registration import make_task
+from fusion_gym.importing import require
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.settings import parse_settings
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, refusal
 
-from .command_line import Command, SetOptions
+from .command_line import Command, EnvironmentOptions
 from .input.options import OutputFile
 from .output.files import replacing
 from .training.environment import environment_of
@@ -27,19 +28,13 @@ _KINDS = ("zoo", "model")
 
 
 @dataclass(frozen=True)
-class Export(Command):
-    """Export a saved agent as an ONNX file."""
+class Export(EnvironmentOptions, Command):
+    """Export a saved agent as an ONNX file, by default for the environment of its training."""
 
     model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
     """An agent: zoo:NAME, model:PATH or the path of a .zip, with ,price=PRICE for one price."""
     onnx: Annotated[Path, OutputFile()]
     """The file to write."""
-    env: str | None = None
-    """Id of a registered environment, instead of the one that the agent was trained in."""
-    config: str | None = None
-    """Take environment and options from a training's YAML, or from a shipped config by its name."""
-    options: SetOptions = ()
-    """Options of gym.make for the environment; they go before all others."""
     trust: bool = False
     """Run code of files: what they name as module:name, and what model:PATH holds besides data."""
 
@@ -62,11 +57,10 @@ def export(command: Export) -> list[str]:
     """
     kind, _, rest = spec(command.model).partition(":")
     env_id, options = _environment(command, kind, rest.partition(",")[0])
+    require("onnx", "onnx", "onnx", "onnxruntime")
     # Here, for it needs torch, which takes seconds to load.
     from fusion_gym.evaluation.onnx_export import export_onnx
-    from fusion_gym.policies.onnx_graph import require_onnx
 
-    require_onnx("onnx")
     task = make_task(env_id, **options)
     agent = make_policy(f"{kind}:{rest}", task)
     try:
@@ -99,9 +93,7 @@ def spec(text: str) -> str:
         return text
     if text.partition(",")[0].endswith(".zip"):
         return f"model:{text}"
-    raise ConfigurationError(
-        f"model = {text!r} is not allowed: it must be zoo:NAME, model:PATH or the path of a .zip"
-    )
+    raise refusal("model", text, "zoo:NAME, model:PATH or the path of a .zip")
 
 
 def _environment(command: Export, kind: str, name: str) -> tuple[str, dict[str, Any]]:

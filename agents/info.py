@@ -12,7 +12,7 @@ from typing import Annotated
 import tyro
 from rich.markdown import Markdown
 
-from fusion_gym.validation import ConfigurationError, nearest
+from fusion_gym.validation import nearest, refusal
 
 from .command_line import Command
 from .output.tables import console
@@ -38,9 +38,7 @@ class Info(Command):
         names = [entry for named in entries.values() for entry in named]
         if name not in names:
             hint = f"; did you mean {nearest(name, names)!r}?" if nearest(name, names) else ""
-            raise ConfigurationError(
-                f"name = {name!r} is not allowed: it must be a name of fusion-gym list{hint}"
-            )
+            raise refusal("name", name, f"a name of fusion-gym list{hint}")
         for kind, named in entries.items():
             if name in named:
                 text = f"# {name} ({kind})\n\n{named[name].page()}"

@@ -14,6 +14,7 @@ were made from the same inputs by the same code.
 import itertools
 import shlex
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,12 +27,21 @@ from fusion_gym.validation import ConfigurationError, integer
 from .command_line import Command, SetOptions
 from .experiments.workers import Call, Pool, side_by_side
 from .input.options import OutputFolder, Seed, Whole
+from .output.cache import Cache
 from .output.ending import ended_like_by_ctrl_c
-from .output.files import remove_partials
 from .output.folders import alone_in
-from .papers.cache import PieceJob, simulate_piece
 from .papers.page import draw_figure, write_figure, write_overview, write_page
-from .papers.paper import NAMES, NOTHING, Data, Paper, Piece, Settings, load_paper, load_papers
+from .papers.paper import (
+    NAMES,
+    NOTHING,
+    Data,
+    Paper,
+    Piece,
+    PieceJob,
+    Settings,
+    load_paper,
+    load_papers,
+)
 
 
 @dataclass(frozen=True)
@@ -85,17 +95,17 @@ class Reproduce(Command):
     def _reproduce_pages(self, papers: list[Paper], output: Path) -> None:
         with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
             print(f"simulations go into {self.work}, pages into {output}", file=sys.stderr)
-            jobs = [
-                self._job(paper, piece, self.work, paper.settings({}))
+            jobs = {
+                (paper.name, piece.name): self._job(piece, paper.settings({}))
                 for paper in papers
                 for piece in paper.pieces
-            ]
-            self._simulate(jobs)
+            }
+            results = dict(zip(jobs, self._simulate(list(jobs.values())), strict=True))
             for paper in papers:
-                own = [job for job in jobs if job.paper == paper.name]
-                results = {job.piece: job.read() for job in own}
-                counts = {job.piece: {"episodes": job.episodes, "seed": job.seed} for job in own}
-                write_page(paper, results, counts, output)
+                names = [piece.name for piece in paper.pieces]
+                data = {name: results[paper.name, name] for name in names}
+                counts = {name: jobs[paper.name, name].counts for name in names}
+                write_page(paper, data, counts, output)
                 print(f"{paper.name}: {output / paper.name}.md")
             write_overview(output)
 
@@ -104,27 +114,23 @@ class Reproduce(Command):
         settings = paper.settings(changes, figure.without)
         path = (self.output or Path("runs/figures")) / paper.name / name
         with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
-            work, piece = self.work / "figures", paper.piece(figure.piece)
-            job = self._job(paper, piece, work, settings, figure.restriction)
-            self._simulate([job])
-            write_figure(figure, job.read(), path)
+            job = self._job(paper.piece(figure.piece), settings, figure.restriction)
+            write_figure(figure, self._simulate([job])[0], path)
         print(f"{paper.name}: {path}.png")
 
-    def _job(
-        self, paper: Paper, piece: Piece, work: Path, settings: Data, part: Settings = NOTHING
-    ) -> PieceJob:
-        count = self.episodes or piece.usual
-        return PieceJob(paper.name, piece.name, count, self.seed, settings, dict(part), work)
+    def _job(self, piece: Piece, settings: Data, restriction: Settings = NOTHING) -> PieceJob:
+        return PieceJob(piece, self.episodes or piece.usual, self.seed, settings, dict(restriction))
 
-    def _simulate(self, jobs: list[PieceJob]) -> None:
-        for job in jobs:
-            remove_partials(job.path.parent)
-        work = [
-            Call(job.find().weight * job.episodes / job.find().usual, simulate_piece, (job,))
-            for job in jobs
-            if not (self.resume and job.finished())
-        ]
+    def _simulate(self, jobs: Sequence[PieceJob]) -> list[Data]:
+        """Return the data of all jobs, from the work folder or simulated now."""
+        cache = Cache(self.work)
+        if not self.resume:
+            for job in jobs:
+                cache.drop(*job.key)
+        absent = [job for job in jobs if not cache.holds(*job.key)]
+        work = [Call(job.weight, job.simulate, (cache,)) for job in absent]
         side_by_side(work, Pool(self.workers), "reproducing")
+        return [cache.read(*job.key) for job in jobs]
 
     def interrupted(self) -> str:
         """Finished simulations are kept."""

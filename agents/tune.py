@@ -31,7 +31,7 @@ from optuna.exceptions import ExperimentalWarning, StorageInternalError
 from optuna.trial import TrialState
 from sqlalchemy.exc import IntegrityError, OperationalError, SQLAlchemyError
 
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import ConfigurationError, refusal
 
 from .command_line import Long
 from .input.options import OutputFolder, Steps, Whole
@@ -172,13 +172,7 @@ def open_study(experiment: Experiment, folder: Path) -> optuna.Study:
             f"output = {str(folder)!r} holds trials without their study, study.db: give another "
             "--output"
         )
-    study = optuna.create_study(
-        study_name="tune",
-        storage=f"sqlite:///{path}",
-        load_if_exists=True,
-        direction="maximize",
-        pruner=pruner(),
-    )
+    study = _study("tune", f"sqlite:///{path}")
     if study.get_trials(deepcopy=False) or "inputs" in study.user_attrs:
         check_inputs(inputs, study.user_attrs.get("inputs"), f"the study in {str(folder)!r}")
     study.set_user_attr("inputs", inputs)
@@ -191,9 +185,21 @@ def inputs_of(experiment: Experiment) -> dict[str, Any]:
     return {"timesteps": experiment.training.timesteps} | experiment.inputs()
 
 
-def pruner() -> optuna.pruners.BasePruner:
-    """What ends trials that fall behind."""
-    return optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=1)
+def _study(
+    name: str,
+    storage: str | optuna.storages.RDBStorage,
+    sampler: optuna.samplers.BaseSampler | None = None,
+) -> optuna.Study:
+    """The study of this name in a storage, a new one if there is none."""
+    pruner = optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=1)
+    return optuna.create_study(
+        study_name=name,
+        storage=storage,
+        sampler=sampler,
+        pruner=pruner,
+        load_if_exists=True,
+        direction="maximize",
+    )
 
 
 def search(study: optuna.Study, experiment: Experiment, trials: int, folder: Path) -> None:
@@ -223,17 +229,9 @@ def shared_study(experiment: Experiment, storage: str) -> optuna.Study:
         result = _opened(storage)
     except (SQLAlchemyError, ImportError) as error:
         reason = str(error).splitlines()[0]
-        raise ConfigurationError(
-            f"storage = {storage!r} is not allowed: it must be a database's URL ({reason})"
-        ) from None
-    study = optuna.create_study(
-        study_name=f"tune_{fingerprint(inputs)[:16]}",
-        storage=result,
-        sampler=optuna.samplers.TPESampler(constant_liar=True),
-        load_if_exists=True,
-        direction="maximize",
-        pruner=pruner(),
-    )
+        raise refusal("storage", storage, f"a database's URL ({reason})") from None
+    liar = optuna.samplers.TPESampler(constant_liar=True)
+    study = _study(f"tune_{fingerprint(inputs)[:16]}", result, liar)
     study.set_user_attr("inputs", inputs)
     return study
 

@@ -21,7 +21,7 @@ from fusion_gym.evaluation.watching import watch
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-from .command_line import Long, SetOptions
+from .command_line import EnvironmentOptions, Long
 from .input.options import OutputFile, Seed, Whole
 from .output.films import checked_film, save_film
 from .output.progress import progress_bar, writing
@@ -29,19 +29,13 @@ from .training.environment import environment_of
 
 
 @dataclass(frozen=True)
-class Watch(Long):
+class Watch(EnvironmentOptions, Long):
     """Watch one or two policies through an episode."""
 
     policy: Annotated[str, tyro.conf.arg(metavar="NAME[:key=value,…]")]
     """A rule or reference by name, zoo:NAME, model:PATH or module:Class."""
     against: Annotated[str | None, tyro.conf.arg(metavar="NAME[:key=value,…]")] = None
     """Another policy beside it, on the same noise."""
-    env: str | None = None
-    """Id of a registered environment."""
-    config: str | None = None
-    """Take environment and options from a training's YAML, or from a shipped config by its name."""
-    options: SetOptions = ()
-    """Options of gym.make for the environment; they go before the config's."""
     save: Annotated[Path | None, OutputFile()] = None
     """Write a film, .gif or .mp4, instead of showing a window."""
     seed: Seed = 0

@@ -12,28 +12,26 @@ at the price of a token that the budget has (weak duality).
 
 import argparse
 import json
-import time
+import tempfile
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from rich.console import Console
 from rich.table import Table
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
 
+from fusion_gym.agents.compare import run_all
 from fusion_gym.agents.output import tables
 from fusion_gym.agents.output.progress import progress_bar, quietly
 from fusion_gym.agents.training.checked import load_checked, parse
+from fusion_gym.agents.training.checkpoint import read_journal
 from fusion_gym.agents.training.config import Experiment
-from fusion_gym.agents.training.run import check_run
+from fusion_gym.agents.training.run import train
 from fusion_gym.core.task import Task
-from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.solvers import lagrangian_bound
@@ -63,36 +61,11 @@ FAMILIES: dict[str, Sequence[float]] = {
 
 
 class Cost(NamedTuple):
-    """Microseconds of CPU for one step of one run of a training, by what they go to."""
+    """Microseconds of one step of one run of a training, on one thread, by what they go to."""
 
     environment: float
     policy: float
     update: float
-
-
-class _Clock(BaseCallback):
-    """CPU seconds of rollouts and updates."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.rollouts = self.updates = 0.0
-        self._mark: float | None = None
-
-    def _lap(self) -> float:
-        before, self._mark = self._mark, time.process_time()
-        return 0.0 if before is None else self._mark - before
-
-    def _on_rollout_start(self) -> None:
-        self.updates += self._lap()
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_end(self) -> None:
-        self.rollouts += self._lap()
-
-    def _on_training_end(self) -> None:
-        self.updates += self._lap()
 
 
 def cost(sensors: int, local: bool) -> Cost:
@@ -109,25 +82,13 @@ def cost(sensors: int, local: bool) -> Cost:
             "initial_rate": 0.1,
         },
         "training": {"timesteps": ROLLOUTS * STEPS * rows, "num_envs": RUNS},
-        "output": "unused",
+        "validation": {"episodes": 1},
     }  # fmt: skip
-    model, env, _ = check_run(parse(Experiment, content, "many_sensors"))
-    assert isinstance(env, PrivilegedVecEnv)
-    stepped, inside = env.step_alternatives, [0.0]
-
-    def timed(*value: Any) -> Any:
-        began = time.process_time()
-        result = stepped(*value)
-        inside[0] += time.process_time() - began
-        return result
-
-    env.step_alternatives = timed  # type: ignore[assignment, method-assign]
-    env.seed(0)
-    model.set_logger(Logger(None, []))
-    clock = _Clock()
-    model.learn(ROLLOUTS * STEPS * rows, clock)
+    with tempfile.TemporaryDirectory() as folder:
+        train(parse(Experiment, content | {"output": folder}, "many_sensors"), quiet=True)
+        seconds = read_journal(Path(folder) / "latest.zip").seconds
     scale = 1e6 / (ROLLOUTS * STEPS * RUNS)
-    return Cost(inside[0] * scale, (clock.rollouts - inside[0]) * scale, clock.updates * scale)
+    return Cost(*(seconds[part] * scale for part in Cost._fields))
 
 
 def exponent(sensors: Sequence[int], costs: Sequence[float]) -> float:
@@ -138,7 +99,7 @@ def exponent(sensors: Sequence[int], costs: Sequence[float]) -> float:
 def cost_table(sensors: Sequence[int]) -> tuple[Table, dict[str, Any]]:
     """A row a number of sensors and kind of agent, and the exponents below."""
     heads = ("agent", "sensors", *Cost._fields, "sum")
-    table = tables.table_tables("CPU microseconds of a training step of one run", heads)
+    table = tables.table_tables("microseconds of a training step of one run", heads)
     report: dict[str, Any] = {"sensors": list(sensors)}
     for local in (False, True):
         name = "local rows" if local else "scheduler, flips"
@@ -198,12 +159,7 @@ def comparison(
     task: Task, agent: str, rules: Sequence[str], episodes: int, seed: int
 ) -> list[dict[str, Any]]:
     """Agent and rules, best first, each with its paired difference to the agent."""
-    result: dict[str, EpisodeResults] = {}
-    with progress_bar((1 + len(rules)) * episodes * task.horizon, "testing") as bar:
-        for name in (agent, *rules):
-            bar.say(name)
-            policy = make_policy(name, task)
-            result[name] = run_episodes(task, policy, episodes, seed, bar.update)
+    result = run_all(task, [agent, *rules], episodes, seed, "testing")
     rows = [
         {
             "policy": name,
@@ -250,7 +206,6 @@ def main() -> None:
     parser.add_argument("--output", type=Path, help="write the figures to this JSON file")
     parser.add_argument("--quiet", action="store_true", help="no progress")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
     warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
     with quietly(arguments.quiet):
         table, report = build_parts(arguments, parser)

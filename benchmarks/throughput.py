@@ -19,7 +19,7 @@ import gymnasium
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 import fusion_gym
 from fusion_gym.agents.output import tables
@@ -81,21 +81,21 @@ def vector(
 
 def native_sb3(options: dict[str, Any], num_envs: int) -> Workload:
     """The native SB3 environment, its first episodes staggered as in training."""
-    env = fusion_gym.make_sb3_vec_env(ENV, num_envs, seed=0, stagger=True, **options)
-    env.reset()
-    actions = np.random.default_rng(0).integers(0, 2, (16, num_envs, 3), dtype=np.int8)
-    count = iter(range(10**12))
-    return _timed(lambda: env.step(actions[next(count) % 16]), num_envs)
+    return _sb3(fusion_gym.make_sb3_vec_env(ENV, num_envs, seed=0, stagger=True, **options))
 
 
 def dummy_sb3(options: dict[str, Any], num_envs: int) -> Workload:
     """SB3's DummyVecEnv over single environments."""
     env = DummyVecEnv([lambda: gymnasium.make(ENV, **options)] * num_envs)
     env.seed(0)
+    return _sb3(env)
+
+
+def _sb3(env: VecEnv) -> Workload:
     env.reset()
-    actions = np.random.default_rng(0).integers(0, 2, (16, num_envs, 3), dtype=np.int8)
+    actions = np.random.default_rng(0).integers(0, 2, (16, env.num_envs, 3), dtype=np.int8)
     count = iter(range(10**12))
-    return _timed(lambda: env.step(actions[next(count) % 16]), num_envs)
+    return _timed(lambda: env.step(actions[next(count) % 16]), env.num_envs)
 
 
 # An environment's options in the comparison of what memory costs.

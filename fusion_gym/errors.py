@@ -35,9 +35,10 @@ class UnexpectedArgumentError(ConfigurationError, TypeError):
         return cls(f"{owner} got an unexpected keyword argument {name!r}: {reason}")
 
 
-def refusal(field: str, value: Any, allowed: str) -> ConfigurationError:
-    """The error of a field whose value is not what is allowed."""
-    return ConfigurationError(f"{field} = {display(value)} is not allowed: it must be {allowed}")
+def refusal(field: str, value: Any, allowed: str, where: str = "") -> ConfigurationError:
+    """The error of a field whose value is not what is allowed; ``where``, if not everywhere."""
+    refused = f"{field} = {display(value)} is not allowed {where}".rstrip()
+    return ConfigurationError(f"{refused}: it must be {allowed}")
 
 
 def display(value: Any) -> str:

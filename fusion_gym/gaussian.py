@@ -201,24 +201,15 @@ def interval_moments(low: ArrayLike, high: ArrayLike) -> IntervalMoments:
     Raises:
         ValueError: `low` is not below `high` somewhere, or one of them is NaN.
     """
-    low, high = _ordered("low", low, "high", high)
-    flip = low + high < 0.0
-    near, width = _truncate(np.where(flip, -high, low), high - low)
-    probability, _, mean, variance = _inside(near, width)
-    return IntervalMoments(probability, np.where(flip, -mean, mean), variance)
-
-
-def _ordered(
-    low_name: str, low: ArrayLike, high_name: str, high: ArrayLike
-) -> tuple[FloatArray, FloatArray]:
-    low = np.asarray(low, dtype=np.float64)
-    high = np.asarray(high, dtype=np.float64)
+    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     ordered = low < high
     if not ordered.all():
         lows, highs = np.broadcast_arrays(low, high)
         first = np.unravel_index(int(np.argmin(ordered)), ordered.shape)
         raise ValueError(
-            f"{low_name} = {lows[first]} and {high_name} = {highs[first]} are not allowed: "
-            f"{low_name} must be below {high_name}"
+            f"low = {lows[first]} and high = {highs[first]} are not allowed: low must be below high"
         )
-    return low, high
+    flip = low + high < 0.0
+    near, width = _truncate(np.where(flip, -high, low), high - low)
+    probability, _, mean, variance = _inside(near, width)
+    return IntervalMoments(probability, np.where(flip, -mean, mean), variance)

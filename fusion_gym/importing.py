@@ -5,6 +5,7 @@ A file may name code where the user trusts it: with ``--trust``, or in :func:`tr
 
 import contextlib
 import importlib
+import importlib.util
 import re
 from collections.abc import Iterator
 from contextvars import ContextVar
@@ -73,6 +74,18 @@ def import_named(field: str, text: str) -> Any:
             f"{field} = {text!r} is not allowed: the module {module!r} has no {name!r}"
         )
     return getattr(result, name)
+
+
+def require(user: str, extra: str, *packages: str) -> None:
+    """Check that packages of an extra are installed.
+
+    Raises:
+        ConfigurationError: one is absent; names what needs it.
+    """
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            absent = f"{user} needs {package}, which is absent"
+            raise ConfigurationError(f"{absent}: pip install 'fusion-gym[{extra}]'")
 
 
 def name_of(value: Any) -> str:

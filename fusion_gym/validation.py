@@ -68,6 +68,16 @@ def array(
     return result
 
 
+def square(field: str, value: ArrayLike) -> Array:
+    """A finite square matrix of float64.
+
+    Raises:
+        ConfigurationError: not numeric, not finite, or not square.
+    """
+    size = len(array(field, value, (None, None)))
+    return array(field, value, (size, size))
+
+
 def spread(field: str, value: ArrayLike, shape: tuple[int, ...], *, infinity: int = 0) -> Array:
     """Like :func:`array`, but a value that broadcasts to ``shape`` (one number for all) will do.
 

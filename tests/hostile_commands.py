@@ -37,7 +37,6 @@ BASES: dict[str, dict[str, list[str]]] = {
     },
     "list": {"kinds": ["rules"]},
     "info": {"name": ["whittle"]},
-    "report": {"results": ["results"]},
     "table": {"config": ["rows.yaml"], "episodes": ["2"]},
     "reproduce": {
         "papers": ["markov_jump"], "figure": ["5"], "output": ["made"], "work": ["made_too"],
@@ -47,20 +46,11 @@ BASES: dict[str, dict[str, list[str]]] = {
     "export": {"model": ["zoo:remote_estimation_sensors"], "onnx": ["made.onnx"]},
     "zoo": {"results": ["results"], "work": ["work"], "zoo": ["made"]},
     "demo": {"output": ["made"], "episodes": ["2"], "timesteps": ["32"]},
-    "solved": {
-        "config": ["training.yaml"], "output": ["made"], "episodes": ["2"], "seeds": ["0"],
-    },
     "train": {"config": ["training.yaml"], "output": ["made"]},
     "tune": {"config": ["training.yaml"], "output": ["made"], "trials": ["1"]},
     "benchmark": {
         "config": ["suite.yaml"], "results": ["made"], "work": ["made_too"], "workers": ["1"],
-    },
-    "robustness": {
-        "config": ["robust.yaml"], "results": ["made"], "work": ["made_too"], "workers": ["1"],
-        "class": ["sensors"],
-    },
-    "envelope": {
-        "config": ["suite.yaml"], "results": ["made"], "work": ["made_too"], "workers": ["1"],
+        "parts": ["robustness"], "classes": ["sensors"],
     },
 }  # fmt: skip
 
@@ -112,9 +102,8 @@ def options(name: str) -> dict[str, Any]:
     kind: type[Command] = load(name)
     hints = typing.get_type_hints(kind, include_extras=True)
     result = {field.name: hints[field.name] for field in dataclasses.fields(kind)}
-    for field, option in (("options", "set"), ("of", "class")):
-        if field in result:
-            result[option] = result.pop(field)
+    if "options" in result:
+        result["set"] = result.pop("options")
     return result
 
 
@@ -156,6 +145,9 @@ def tries() -> Iterator[Try]:
         yield Try(command, "", "stray", [*line(command, base), "stray"])
     evaluate = BASES["evaluate"]
     for name in JSON:
+        results = {"parts": ["report"], "results": [f"bad_results/{name}"]}
+        words = line("benchmark", BASES["benchmark"] | results)
+        yield Try("benchmark", "results", f"bad_results/{name}", words)
         words = line("evaluate", evaluate | {"json": [f"{name}.json"]})
         yield Try("evaluate", "json", f"{name}.json", [*words, "--resume"])
     yield Try("evaluate", "resume", "json", [*line("evaluate", evaluate)[:-2], "--resume"])

@@ -37,16 +37,10 @@ SUITE = {
             "title": "one",
             "environment": TRAINING["environment"],
             "price_range": [0.1, 1.0],
+            "drawn": {"true_process_noise": [0.5, 2.0]},
         }
     ],
 }
-
-ROBUST = {
-    "suite": "suite.yaml",
-    "cases": [],
-    "settings": [{"setting": "one", "drawn": {"true_process_noise": [0.5, 2.0]}}],
-}
-
 # Files that are no config and no result, by name.
 BROKEN: dict[str, bytes] = {
     "empty": b"",
@@ -81,10 +75,8 @@ BROKEN: dict[str, bytes] = {
 
 def scratch(folder: Path) -> None:
     """A folder with what the tries need, where everybody may write."""
-    for name, content in (
-        ("training", TRAINING), ("sweep", SWEEP), ("rows", ROWS), ("suite", SUITE),
-        ("robust", ROBUST),
-    ):  # fmt: skip
+    configs = {"training": TRAINING, "sweep": SWEEP, "rows": ROWS, "suite": SUITE}
+    for name, content in configs.items():
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(content))
     whole = small_results(folder / "results", classes=["sensors"], seeds=1)
     for name, raw in BROKEN.items():

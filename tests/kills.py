@@ -74,11 +74,11 @@ def benchmark(folder: Path) -> tuple[list[str], Callable[[], Outcome]]:
     def outcome() -> Outcome:
         tables = (path for path in results.rglob("*.csv") if path.stem != "runs")  # with seconds
         result: Outcome = {path.name: path.read_text() for path in tables}
-        return result | {"episodes": sorted(path.name for path in work.rglob("*.npz"))}
+        return result | {"pieces": sorted(path.parent.name for path in work.rglob("output.pkl"))}
 
     config = small_suite(folder, timesteps=4096)
     arguments = ["--config", str(config), "--results", str(results), "--work", str(work)]
-    return [*arguments, "--workers", "1"], outcome
+    return [*arguments, "--workers", "1", "--parts", "agents"], outcome
 
 
 def attempt(command: str, arguments: list[str], log: Path, seconds: float | None) -> str:

@@ -34,7 +34,7 @@ def quick(paper: Paper, episodes: int) -> tuple[dict[str, Any], dict[str, Data]]
         plain = {name: value for name, value in result.items() if not hasattr(value, "dtype")}
         data[piece.name] = result | json.loads(json.dumps(plain))
         counts[piece.name] = {"episodes": episodes, "seed": SEED}
-    return render_page(paper, data, counts).numbers, data
+    return render_page(paper, data, counts)[1], data
 
 
 def check_numbers(

@@ -83,27 +83,31 @@ def front(name: str, seeds: int) -> dict[str, Any]:
     }
 
 
-def run() -> dict[str, Any]:
-    """What every piece of work says of itself."""
+def run(name: str) -> dict[str, Any]:
+    """What every run says of itself."""
     inputs = {"environment": {"id": ENV, "options": {"horizon": 4}}, "seed": 0}
     inputs |= {"training": {"validation": {"episodes": 1000, "seed": 500_000_000}}}
-    return {"horizon": 4, "episodes": 20, "made_from": "0", "inputs": inputs}
+    return {"run": name, "horizon": 4, "episodes": 20, "made_from": "0", "inputs": inputs}
 
 
-def agent(name: str, seed: int) -> dict[str, Any]:
-    """The report of one training."""
+def agent(name: str, seed: int) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """One training, and what it did at its prices."""
     mode, memory, broadcast, _, scale = CLASSES[name]
     options: dict[str, Any] = {"memory": True} if memory else {}
     if broadcast not in (None, "none"):
         options["broadcast"] = broadcast
-    return run() | {
+    label = f"agent_{name}_{seed}"
+    policies = [
+        {"run": label, "name": f"price={price}", "price": price}
+        | outcome(rate, (1.0 + 0.1 * seed) * error(scale, rate))
+        for price, rate in zip(PRICES, RATES, strict=True)
+    ]
+    return run(label) | {
         "class": name,
         "class_options": options | ({"information": "centre"} if mode == "centre" else {}),
         "training_seed": seed,
         "best_validation": {"return": -1.0 - seed},
-        "prices": list(PRICES),
-        "points": [outcome(rate, (1.0 + 0.1 * seed) * error(scale, rate)) for rate in RATES],
-    }
+    }, policies
 
 
 def small_results(
@@ -123,22 +127,21 @@ def small_results(
         "worth": [worth | {"rules": interval(-0.2), "agents": interval(0.0)}],
     }
     places = [place for item in fronts.values() for place in item["envelope"]]
-    policies = {place["name"]: outcome(place["rate"], place["mse"]) for place in places}
-    baselines: dict[str, Any] = run() | {
-        "curves": {
-            "always": {"knows": "centre", "policies": ["always"]},
-        },
-        "policies": policies | {"always": outcome(ALWAYS, 1.0)},
-        "genie": outcome(0.5, 0.5) | {"assumes": "everything arrives"},
-    }
-    if policies:
-        baselines["curves"]["paced"] = {"knows": "centre", "policies": list(policies)}
-    ahead = {f"lookahead:steps=1,price={rate}": outcome(rate, error(0.7, rate)) for rate in RATES}
-    reports = {"baselines": baselines, "informed": run() | {"policies": ahead}}
-    for name in classes:
-        for seed in range(seeds):
-            reports[f"agent_{name}_{seed}"] = agent(name, seed)
-    write_verdict(folder, verdict, reports)
+    rules = {place["name"]: ("paced", outcome(place["rate"], place["mse"])) for place in places}
+    rules["always"] = ("always", outcome(ALWAYS, 1.0))
+    policies = [
+        {"run": "baselines", "name": name, "family": family, "knows": "centre"} | rule
+        for name, (family, rule) in rules.items()
+    ]
+    policies.append({"run": "genie", "name": "everything arrives"} | outcome(0.5, 0.5))
+    for rate in RATES:
+        ahead = {"run": "informed", "name": f"lookahead:steps=1,price={rate}"}
+        policies.append(ahead | outcome(rate, error(0.7, rate)))
+    runs = [run("baselines"), run("informed")]
+    for row, tested in (agent(name, seed) for name in classes for seed in range(seeds)):
+        runs.append(row)
+        policies += tested
+    write_verdict(folder, verdict, runs, policies)
     return folder
 
 

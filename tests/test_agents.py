@@ -1,7 +1,5 @@
 """The scripts, used as a user does: configs, evaluation, training with interrupts, the demo."""
 
-import copy
-import dataclasses
 import json
 import math
 import os
@@ -16,14 +14,15 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from command_runs import call
 from stable_baselines3 import PPO
 from training_configs import ENV, SMALL, read_records, small_config
 
 import fusion_gym
 from fusion_gym.agents import demo, evaluate
 from fusion_gym.agents.command_line import read_command
-from fusion_gym.agents.experiments.config import Suite, Sweep, SweepSettings
-from fusion_gym.agents.experiments.references import CommittedRules, Trials
+from fusion_gym.agents.experiments.config import Setting, Suite, Sweep, SweepSettings
+from fusion_gym.agents.experiments.envelopes import EnvelopeStore
 from fusion_gym.agents.experiments.workers import Pool
 from fusion_gym.agents.training import run as train
 from fusion_gym.agents.training.algorithms import TABLE
@@ -190,9 +189,7 @@ def test_validation_counts_episodes_by_their_price(tmp_path: Path) -> None:
     train.train(load_checked(Experiment, path), quiet=True)
     record = read_records(tmp_path / "run")[-1]
     task = fusion_gym.make_task(ENV, **content["environment"]["options"])
-    batch = EpisodeBatch(task, 4)
-    batch.seed(np.arange(4), [500_000_000 + place for place in range(4)])
-    batch.reset()
+    batch = EpisodeBatch.seeded(task, 4, 500_000_000)
     price = batch.price.copy()
     final = make_policy(f"model:{tmp_path / 'run' / 'final_model.zip'}", task)
     results = run_episodes(task, final, 4, 500_000_000)
@@ -240,9 +237,8 @@ def test_an_interrupted_training_loses_nothing(tmp_path: Path, number: signal.Si
     summary = json.loads((folder / "summary.json").read_text())
     assert not summary["finished"]
     records = len(read_records(folder))
-    more = ["--timesteps", str(summary["timesteps"] + 1500)]
-    resumed = [*command[:3], *shlex.split(again)[1:], *more]
-    subprocess.run(resumed, cwd=ROOT, check=True, capture_output=True, timeout=120)
+    _, name, *words = shlex.split(again)
+    assert call(name, [*words, "--timesteps", str(summary["timesteps"] + 1500)]).status == 0
     later = json.loads((folder / "summary.json").read_text())
     assert later["finished"]
     assert later["timesteps"] >= summary["timesteps"] + 1500
@@ -303,33 +299,33 @@ def test_evaluation_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         run_evaluation(monkeypatch, *common, "--seed", "1", "--resume", "--policies", "always")
 
 
-def thinned(ground: CommittedRules, every: int = 30) -> CommittedRules:
-    """With fewer rules, for speed."""
-    envelopes = copy.deepcopy(dict(ground.envelopes))
-    for content in envelopes["classes"].values():
-        content["vertices"] = content["vertices"][::every]
-    return dataclasses.replace(ground, envelopes=envelopes)
-
-
 def test_demo_from_training_to_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ground, learner = thinned(CommittedRules.read(demo.SETTING, 2)), demo.LEARNERS[1]
-    monkeypatch.setattr(demo.CommittedRules, "read", lambda *_: ground)
-    monkeypatch.setattr(demo, "LEARNERS", (learner,))
+    def thinned(self: EnvelopeStore, setting: Setting) -> dict[str, Any]:
+        """With fewer rules, for speed."""
+        content = whole(self, setting)
+        for of in content["classes"].values():
+            of["vertices"] = of["vertices"][::30]
+        return content
+
+    whole = EnvelopeStore.read
+    monkeypatch.setattr(EnvelopeStore, "read", thinned)
+    learner = demo.learners_of(tmp_path, 2, 4096)[1]
+    monkeypatch.setattr(demo, "learners_of", lambda *_: [learner])
     monkeypatch.setattr(demo, "TEAM", Pool(1))
     words = ["--output", str(tmp_path), "--episodes", "2", "--timesteps", "4096"]
     monkeypatch.setattr(sys, "argv", ["demo", *words])
     demo.Demo.main()
-    assert learner.title in capsys.readouterr().out
-    folder, classes = tmp_path / learner.name, (learner.plain, learner.with_memory)
+    assert demo.TITLES[learner.name] in capsys.readouterr().out
+    folder, remembering = tmp_path / learner.name, learner.classes["with"]
     for figure in ("front.png", "episode_agent.png", "episode_rule.png"):
         assert (folder / figure).stat().st_size > 20_000
     assert json.loads((folder / "agent" / "summary.json").read_text())["finished"]
     report = json.loads((folder / "front.json").read_text())
     prices = [point["price"] for point in report["points"]]
     assert prices == pytest.approx(np.geomspace(0.003, 0.3, 7))
-    assert list(report["classes"]) == list(classes)
+    assert list(report["classes"]) == ["local_estimate", "local_estimate_memory"]
     agent = f"model:{folder / 'agent' / 'best_model.zip'},price={prices[3]}"
     task = fusion_gym.make_task(ENV, **report["options"], memory=True)
     results, point = run_episodes(task, make_policy(agent, task), 2, 0), report["points"][3]
@@ -337,34 +333,32 @@ def test_demo_from_training_to_figures(
     assert point["mse"]["mean"] == pytest.approx(float(results.mse.mean()))
     # The line through the rules, once more.
     rules = []
-    for vertex in ground.envelopes["classes"][learner.with_memory]["vertices"]:
+    for vertex in learner.setup.envelope(remembering)["vertices"]:
         task = fusion_gym.make_task(ENV, **report["options"], **vertex["options"])
         brought = run_episodes(task, make_policy(vertex["policy"], task), 2, 0)
         rules.append((float(brought.rate.mean()), float(brought.mse.mean())))
     below = np.interp(point["rate"], *np.array(sorted(rules)).T)
-    beside = point["rules"][learner.with_memory]
+    beside = point["rules"][remembering]
     assert beside["mse"] == pytest.approx(below)
     assert beside["difference"]["mean"] == pytest.approx(results.mse.mean() / below - 1.0)
     # The same command again has nothing left to test; another model has all of its prices.
-    assert Trials.of(ground, classes, folder).left() == []
+    assert learner.calls() == []
     with (folder / "agent" / "best_model.zip").open("ab") as model:
         model.write(b"another")
-    assert len(Trials.of(ground, classes, folder).left()) == 7
+    assert len(learner.calls()) == 7
 
 
-def test_the_demo_trains_in_the_setting_of_its_rules() -> None:
+def test_the_demo_trains_in_the_setting_of_its_rules(tmp_path: Path) -> None:
     """What differs from the environment of the rules with memory is the price, which is drawn."""
-    ground = CommittedRules.read(demo.SETTING, 1)
-    for learner in demo.LEARNERS:
-        plain, remembering = (
-            ground.envelopes["classes"][name] for name in (learner.plain, learner.with_memory)
-        )
+    for learner in demo.learners_of(tmp_path, 1, None):
+        setup = learner.setup
+        plain, remembering = (setup.envelope(name) for name in learner.classes.values())
         assert (plain["memory"], remembering["memory"]) == (False, True)
         assert plain["mode"] == remembering["mode"]
-        environment = load_checked(Experiment, learner.config).environment
+        environment = learner.experiment.environment
         assert (environment.id, environment.local) == (ENV, plain["mode"] == "local")
-        price = {"cost_weight": "random", "price_range": ground.setting.price_range}
-        rules = ground.setting.environment.options | remembering["options"]
+        price = {"cost_weight": "random", "price_range": setup.setting.price_range}
+        rules = setup.setting.environment.options | remembering["options"]
         assert json.dumps(environment.options, sort_keys=True) == json.dumps(
             rules | price, sort_keys=True
         )

@@ -13,7 +13,6 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.beliefs import Beliefs
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation import run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.estimate_difference import EstimateDifference
 from fusion_gym.policies.rules.kullback_leibler import KullbackLeibler
@@ -218,21 +217,3 @@ def test_what_cannot_be_decided_is_refused(spec: str, options: Any, message: str
     with pytest.raises(ConfigurationError, match=message) as caught:
         make_policy(spec, task_of(**options))
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("packet", "episodes", "mse", "rate"),
-    [
-        ("measurement", 200, (0.070, 0.006), (0.029, 0.002)),
-        ("estimate", 200, (0.064, 0.006), (0.030, 0.003)),
-    ],
-)
-def test_memory_halves_the_error_of_the_benchmarks_oscillator(
-    packet: str, episodes: int, mse: tuple[float, float], rate: tuple[float, float]
-) -> None:
-    """Its tuned rules without memory leave about .145 at this rate."""
-    task = task_of(memory=True, packet=packet)
-    rule = make_policy("value_of_information:threshold=0.03,at_most=1", task)
-    results = run_episodes(task, rule, episodes, 0)
-    assert results.mse.mean() == pytest.approx(mse[0], abs=mse[1])
-    assert results.requests.mean() == pytest.approx(rate[0], abs=rate[1])

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import optuna
+import pandas as pd
 import pytest
 import yaml
 from command_runs import call
@@ -19,21 +20,22 @@ from training_configs import small_config
 
 import fusion_gym
 from fusion_gym.agents import __main__ as everything
-from fusion_gym.agents import benchmark, report, tune
+from fusion_gym.agents import benchmark, tune
 from fusion_gym.agents.experiments import training as jobs
 from fusion_gym.agents.experiments.classes import classes_of, trained_classes
 from fusion_gym.agents.experiments.config import load_suite
-from fusion_gym.agents.experiments.references import read_envelopes, searches_of
-from fusion_gym.agents.experiments.report import read_results, read_verdict
-from fusion_gym.agents.experiments.tables import read_frame, read_rows, write_rows
-from fusion_gym.agents.maintenance import solved, zoo
-from fusion_gym.agents.output.files import load_results, save_results
+from fusion_gym.agents.experiments.envelopes import envelope_task, read_envelopes, searches_of
+from fusion_gym.agents.experiments.figures import report_text
+from fusion_gym.agents.experiments.report import SettingResults, read_results
+from fusion_gym.agents.experiments.tables import read_rows, write_rows
+from fusion_gym.agents.experiments.workers import Folders
+from fusion_gym.agents.maintenance import zoo
 from fusion_gym.agents.output.markup import code, page_of
 from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.core.system import covers
 from fusion_gym.deprecation import replace_value
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.periodic_optimum import Schedule
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
@@ -57,53 +59,52 @@ def test_from_tuning_to_report_and_zoo(
     ]  # fmt: skip
     run_main(monkeypatch, benchmark, *arguments, "--seeds", "1", "--classes", "sensors")
     folder = work / "small"
-    first = read_verdict(results / "small")
-    assert first["classes"]["sensors"]["seeds"] == 1
-    stamp = (folder / "agent_sensors_0.json").stat().st_mtime_ns
+    assert SettingResults(results / "small").classes["sensors"]["seeds"] == 1
+    stamp = (folder / "sensors_0" / "latest.zip").stat().st_mtime_ns
     with pytest.raises(SystemExit, match="--resume"):
         run_main(monkeypatch, benchmark, *arguments)
     run_main(monkeypatch, benchmark, *arguments, "--resume")
-    assert (folder / "agent_sensors_0.json").stat().st_mtime_ns == stamp
+    assert (folder / "sensors_0" / "latest.zip").stat().st_mtime_ns == stamp
     (tmp_path / "other").mkdir()
     other = small_suite(tmp_path / "other", episodes=13)
     for option, value, message in (
-        ("--timesteps", "512", "training.training.timesteps = 512 differs"),
+        ("--timesteps", "512", "training.timesteps = 512 differs"),
         ("--config", str(other), "episodes = 13 differs"),
     ):
         with pytest.raises(SystemExit, match=message) as caught:
             run_main(monkeypatch, benchmark, *arguments, "--resume", option, value)
         assert "\n" not in str(caught.value)
-    verdict = read_verdict(results / "small")
-    assert {name: front["seeds"] for name, front in verdict["classes"].items()} == {
+    classes = SettingResults(results / "small").classes
+    assert {name: front["seeds"] for name, front in classes.items()} == {
         "centre": 2, "local_estimate": 2, "local_packets_memory": 2, "sensors": 2,
     }  # fmt: skip
-    policies = read_frame(results / "small", "policies")
+    policies = pd.read_csv(results / "small" / "policies.csv")
     assert set(policies[policies["family"] == "gain"]["knows"]) == {"centre"}
     assert list(policies[policies["run"] == "genie"]["name"]) == ["everything arrives"]
-    runs = read_frame(results / "small", "runs").set_index("run")
+    runs = pd.read_csv(results / "small" / "runs.csv").set_index("run")
     assert runs["episodes"]["hindsight"] == 5
     dear = policies[policies["run"] == "hindsight"].set_index("name")["tokens"]
     assert dear["hindsight at price 0.1"] < dear["hindsight at price 0.001"]
     # The envelope that an agent was compared with, and that it is one of the agent's inputs.
     committed = read_envelopes(results / "small")["classes"]
-    front = verdict["classes"]["local_estimate"]
+    front = classes["local_estimate"]
     assert front["sha256"] == committed["local_estimate"]["sha256"]
     stored = json.loads(runs["inputs"]["agent_local_estimate_1"])["envelope"]
     assert stored == {"class": "local_estimate", "sha256": front["sha256"]}
-    in_local = {point["name"] for point in verdict["classes"]["local_estimate"]["envelope"]}
+    in_local = {point["name"] for point in classes["local_estimate"]["envelope"]}
     assert not any(name.startswith("information_gain") for name in in_local)
-    agent = json.loads((folder / "agent_local_estimate_1.json").read_text())
-    assert agent["training"]["environment"]["local"]
-    assert len(agent["points"]) == 3
+    training = json.loads(runs["inputs"]["agent_local_estimate_1"])["training"]
+    assert training["environment"]["local"]
+    agent = policies[policies["run"] == "agent_local_estimate_1"]
+    assert len(agent) == 3
     # The written numbers are those that the saved model reaches on the test seeds.
     visible = ["difference", "value"]  # as rules without memory look at it
     task = fusion_gym.make_task(ENV, filter="tobit", horizon=10, belief_features=visible)
     path = work / "small" / "local_estimate_1" / "best_model.zip"
-    model = f"model:{path},price={agent['prices'][1]!r}"
+    model = f"model:{path},price={float(agent['price'].iloc[1])!r}"
     again = run_episodes(task, make_policy(model, task), 12, seed=0)
-    assert agent["points"][1]["mse"]["mean"] == pytest.approx(again.mse.mean())
+    assert agent["mse"].iloc[1] == pytest.approx(again.mse.mean())
 
-    run_main(monkeypatch, report, "--results", str(results))
     text = (results / "README.md").read_text()
     assert "| local_packets_memory | 2 |" in text
     assert "Agents of a class: 2 training seeds." in text
@@ -146,14 +147,14 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
 
     def task_of(setting: Any, options: Any = ()) -> Any:
         name = f"{setting.name} {options}"
-        tasks[name] = tasks.get(name) or jobs.envelope_task(setting, options)
+        tasks[name] = tasks.get(name) or envelope_task(setting, options)
         return tasks[name]
 
-    monkeypatch.setattr("fusion_gym.agents.experiments.references.envelope_task", task_of)
+    monkeypatch.setattr("fusion_gym.agents.experiments.envelopes.envelope_task", task_of)
     suite = load_suite(ROOT / "configs" / "benchmark.yaml")
     assert load_suite(ROOT / "configs" / "benchmark.yaml", quick=True).settings == suite.settings
     for setting in suite.settings:
-        task = jobs.envelope_task(setting)
+        task = envelope_task(setting)
         optima = [name for name in setting.informed if name.startswith("optimal:")]
         for name in (*setting.points, *setting.informed, *setting.references):
             if name not in optima[1:]:
@@ -233,15 +234,10 @@ def test_a_class_that_a_setting_has_not_is_refused(tmp_path: Path) -> None:
             trained_classes(suite, suite.settings[0])
 
 
-def test_results_survive_the_disk(tmp_path: Path) -> None:
-    task = fusion_gym.make_task(ENV, filter="tobit", horizon=5)
-    outcome = {p: run_episodes(task, make_policy(p, task), 3, 0) for p in ("always", "never")}
-    save_results(tmp_path / "x.npz", outcome)
-    again = load_results(tmp_path / "x.npz")
-    assert list(again) == ["always", "never"]
-    for name, results in outcome.items():
-        for field in EpisodeResults.__dataclass_fields__:
-            np.testing.assert_array_equal(getattr(again[name], field), getattr(results, field))
+def test_a_work_folder_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "work" / "small" / "tuned").mkdir(parents=True)
+    with pytest.raises(ConfigurationError, match=r"of an earlier version: give another --work"):
+        Folders.create(tmp_path, tmp_path / "work", quick=False)
 
 
 @pytest.mark.parametrize(
@@ -270,7 +266,7 @@ def test_the_report_shows_what_it_is_reported_as_text(tmp_path: Path) -> None:
     verdict["title"] = title + "\n\n<script>alert(3)</script>"
     verdict["env"] = "a`<script>alert(4)</script>|b"
     write_rows(folder, "verdict", [verdict])
-    text = report.report_text(read_results(tmp_path), "one")
+    text = report_text(read_results(tmp_path))
     text += "\n\n<script>alert(5)</script> <b onclick='f'>g</b>\n"
     page = page_of(text, tmp_path, "<script>alert(6)</script>")
     assert "<title>&lt;script&gt;alert(6)&lt;/script&gt;</title>" in page
@@ -298,32 +294,6 @@ def test_agents_of_the_zoo_reach_their_numbers(name: str) -> None:
     deviation = results.mse.std() / np.sqrt(60)
     assert results.mse.mean() == pytest.approx(received["mse"]["mean"], abs=4.5 * deviation)
     assert np.mean(received["rate"]) == pytest.approx(results.rate.mean(), abs=0.03)
-
-
-def test_the_solved_case_is_trained_once_and_compared(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    options = {"error_weight": 0.1, "cost_weight": 0.5, "horizon": 20}
-    config = small_config(
-        tmp_path,
-        environment={"id": "fusion_gym/RemoteEstimation-v0", "options": options},
-        algorithm={"name": "ppo", "batch_size": 64},
-        training={"timesteps": 512, "num_envs": 8},
-    )
-    arguments = ["--config", str(config), "--episodes", "50", "--output", str(tmp_path / "s")]
-    run_main(monkeypatch, solved, *arguments, "--seeds", "0")
-    stamp = (tmp_path / "s" / "ppo_0" / "final_model.zip").stat().st_mtime_ns
-    run_main(monkeypatch, solved, *arguments, "--seeds", "0", "1")
-    assert (tmp_path / "s" / "ppo_0" / "final_model.zip").stat().st_mtime_ns == stamp
-    content = json.loads((tmp_path / "s" / "ppo.json").read_text())["agents"]
-    assert set(content) == {"0", "1"}
-    # A folder with another training is refused, and kept.
-    config.write_text(config.read_text().replace("batch_size: 64", "batch_size: 32"))
-    with pytest.raises(SystemExit, match="batch_size = 32 differs"):
-        run_main(monkeypatch, solved, *arguments, "--seeds", "0")
-    # Hardly trained, an agent costs more than the optimum.
-    assert content["0"]["mean"] > 0.0
-    assert "above the optimum" in capsys.readouterr().out
 
 
 def small_tuning(folder: Path) -> Path:

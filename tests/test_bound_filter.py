@@ -245,16 +245,6 @@ def test_holding_and_predicting_differ_only_without_a_delivery() -> None:
     assert not np.allclose(held[2], problem.mean)
 
 
-def test_the_event_error_only_costs_certainty() -> None:
-    problem = random_problem(7, 2, 2, lanes=6)
-    with_error = outcomes(make_bound_filter(problem.sensors, True), problem)
-    without = outcomes(make_bound_filter(problem.sensors, False), problem)
-    gap = np.moveaxis(with_error[1] - without[1], -1, 1)
-    assert np.linalg.eigvalsh(gap).min() >= -1e-12
-    assert np.linalg.eigvalsh(gap).max() > 1e-3
-    assert np.array_equal(with_error[3], without[3])
-
-
 def test_holding_needs_independent_rows() -> None:
     sensors = CensoredSensors.create([[[1.0, 0.0], [2.0, 0.0]]], 0.5, 0.0, 2)
     with pytest.raises(ConfigurationError, match=r"measurement_matrices with row ranks \[1\]"):

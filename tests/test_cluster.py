@@ -58,6 +58,8 @@ def benchmark(suite: Path, folder: Path, *words: str) -> list[str]:
         "-m",
         "fusion_gym.agents",
         "benchmark",
+        "--parts",
+        "agents",
         "--config",
         str(suite),
         *places,

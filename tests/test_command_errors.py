@@ -17,7 +17,6 @@ from hostile_folder import ROOT, contents, scratch
 
 from fusion_gym.agents import __main__ as everything
 from fusion_gym.agents.command_line import Command
-from fusion_gym.agents.demo import remove
 from fusion_gym.agents.experiments.config import SweepCurve
 from fusion_gym.agents.output.ending import report_errors
 from fusion_gym.policies.settings import parse_value
@@ -75,12 +74,14 @@ def test_a_full_disk_in_a_training_is_reported(here: Path) -> None:
     assert call("train", [*line("train", BASES["train"]), "--resume"]).status == 0
 
 
-@pytest.mark.parametrize("name", ["evaluate", "report", "zoo"])
+@pytest.mark.parametrize("name", ["evaluate", "benchmark", "zoo"])
 def test_a_full_disk_is_reported_and_leaves_nothing_half_written(here: Path, name: str) -> None:
     """Files of no byte, and of a few: once in the trial and once in the work."""
+    report = {"parts": ["report"], "results": ["results"]}
+    words = line(name, BASES[name] | (report if name == "benchmark" else {}))
     before = contents(here)
     for limit, part in ((0, "is not allowed: it must be a f"), (16, os.strerror(errno.EFBIG))):
-        ended = call(name, line(name, BASES[name]), limit=limit)
+        ended = call(name, words, limit=limit)
         assert (ended.status, ended.trace) == (1, "")
         last = ended.err.splitlines()[-1]
         assert last.startswith("error: ")
@@ -89,7 +90,7 @@ def test_a_full_disk_is_reported_and_leaves_nothing_half_written(here: Path, nam
         assert {name for name, content in contents(here).items() if content is not None} == {
             name for name, value in before.items() if value is not None
         }
-    assert call(name, line(name, BASES[name])).status == 0
+    assert call(name, words).status == 0
 
 
 def test_an_error_of_the_programs_own_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,19 +149,15 @@ def test_output_that_nobody_reads_or_takes() -> None:
 
 def test_a_fresh_demo_removes_nothing_but_a_demo(here: Path) -> None:
     """Neither what is not its own, nor anything when it is refused."""
-    for name in ("scheduler", "alone"):
+    for name in ("scheduler", "local"):
         (here / name / "agent").mkdir(parents=True)
         (here / name / "agent" / "config.yaml").touch()
-    (here / "alone" / "agent" / "config.yaml").rename(here / "alone" / "notes")
-    with pytest.raises(ConfigurationError, match="fresh = True"):
-        remove([here / "folder"])
+    (here / "local" / "agent" / "config.yaml").rename(here / "local" / "notes")
     ended = call("demo", ["--fresh", "--output", "."])
     assert (ended.status, ended.trace) == (1, "")
     assert "fresh = True is not allowed: 'alone' holds no results of a demo" in ended.err
-    assert (here / "alone" / "notes").exists()
+    assert (here / "local" / "notes").exists()
     assert (here / "scheduler" / "agent" / "config.yaml").exists()
-    remove([here / "scheduler", here / "absent"])
-    assert not (here / "scheduler").exists()
 
 
 @pytest.mark.parametrize("text", ["{[]: 1}", "(" * 5000, "9" * 5000 + "x", "\0"])

@@ -19,7 +19,7 @@ from fusion_gym.agents.training.algorithms import TABLE
 from fusion_gym.agents.training.catalogue import catalogue
 from fusion_gym.agents.training.checked import config_path, load_checked, parse
 from fusion_gym.agents.training.config import Experiment
-from fusion_gym.policies.model import ALGORITHMS
+from fusion_gym.policies.card import ALGORITHMS
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
@@ -77,7 +77,7 @@ def test_all_commands_under_one_name() -> None:
     assert unknown.returncode == 2
     assert "did you mean 'train'?" in unknown.stderr
     assert len(unknown.stderr.splitlines()) == 1
-    absent = run("report", "--results", "absent")
+    absent = run("benchmark", "--parts", "report", "--results", "absent")
     assert absent.returncode == 1
     assert absent.stderr.startswith("error: results = 'absent'")
 

@@ -2,17 +2,16 @@
 
 import math
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rules import make_rule
 
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.system import Signals
 from fusion_gym.envs.registration import make_task
-from fusion_gym.policies.registry import make_rule
 from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
 from fusion_gym.policies.rules.random import Random
 from fusion_gym.validation import ConfigurationError
@@ -20,7 +19,6 @@ from fusion_gym.validation import ConfigurationError
 build = partial(make_task, "fusion_gym/CorrelatedTracking-v0")
 
 Array = NDArray[np.float64]
-ROOT = Path(__file__).parent.parent
 
 
 # --- the trigger ---------------------------------------------------------------------------------
@@ -64,59 +62,12 @@ def test_memory_of_one_run_restarts_alone_and_reset_forgets() -> None:
     assert not trigger(signals(small, False)).any()
 
 
-def test_special_cases_of_the_trigger() -> None:
-    draw = np.random.default_rng(2)
-    fixed, always = AdaptiveInnovation(0.7, 0.3, 0.0), AdaptiveInnovation(threshold=0.0)
-    for step in range(20):
-        innovation = draw.normal(size=(3, 2, 4))
-        size = (innovation**2).sum(1)
-        np.testing.assert_array_equal(
-            fixed(signals(innovation, step == 0)), size >= 0.7 * math.exp(-0.3)
-        )
-        assert always(signals(0.0 * innovation, step == 0)).all()
-
-
-@pytest.mark.parametrize("name", ["threshold", "offset", "sensitivity"])
-@pytest.mark.parametrize("value", [-1.0, float("nan"), "high", (1.0, -2.0)])
-def test_parameters_of_the_trigger_are_checked(name: str, value: Any) -> None:
-    with pytest.raises(ConfigurationError, match=name):
-        AdaptiveInnovation(**{name: value})
-
-
 # --- the environment -----------------------------------------------------------------------------
 
 
-def test_variance_signals_are_what_a_delivery_brings() -> None:
-    for fusion in ("sici", "sci", "ci"):
-        task = build(fusion=fusion)
-        weights = task.reward.state_weights[:, 0]
-        batch = EpisodeBatch(task, 4)
-        batch.seed(np.arange(4), [1, 2, 3, 4])
-        batch.reset()
-        policy = Random(0.4)
-        policy.reset(4)
-        for step in range(12):
-            offered = batch.signals()
-            silent, gain = offered["silent_variance"], offered["variance_reduction"]
-            requests = policy(offered)
-            if step % 4 < 3:  # this sensor alone
-                requests = np.zeros((3, 4), dtype=bool)
-                requests[step % 4] = True
-            batch.step(requests)
-            claimed = batch.delivered.covariance[0]
-            trace = np.einsum("i,iir->r", weights, claimed)
-            if step % 4 < 3:
-                np.testing.assert_allclose(silent - gain[step % 4], trace, rtol=1e-10)
-        batch.step(np.zeros((3, 4), dtype=bool))
-        prior = batch.delivered.prior_covariance[0]
-        np.testing.assert_array_equal(batch.delivered.covariance[0], prior)
-
-
 def test_actual_covariance_is_on_demand_and_changes_nothing() -> None:
-    plain, tracked = (EpisodeBatch(build(track_actual=on), 3) for on in (False, True))
+    plain, tracked = (EpisodeBatch.seeded(build(track_actual=on), 3, 5) for on in (False, True))
     for batch in (plain, tracked):
-        batch.seed(np.arange(3), [5, 6, 7])
-        batch.reset()
         policy = Random(0.5)
         policy.reset(3, 9)
         for _ in range(20):
@@ -130,9 +81,7 @@ def test_actual_covariance_is_on_demand_and_changes_nothing() -> None:
 
 
 def test_noise_scale_is_drawn_for_each_episode() -> None:
-    batch = EpisodeBatch(build(noise_scale="random", horizon=3), 4000)
-    batch.seed(np.arange(4000), list(range(4000)))
-    batch.reset()
+    batch = EpisodeBatch.seeded(build(noise_scale="random", horizon=3), 4000, 0)
     first = batch.state.scale.copy()
     assert 0.4 <= first.min() < 0.41
     assert 0.99 < first.max() <= 1.0
@@ -143,47 +92,20 @@ def test_noise_scale_is_drawn_for_each_episode() -> None:
     assert (batch.state.scale != first).all()
 
 
-def test_smaller_noises_are_the_same_noises_scaled() -> None:
-    paths = []
-    for scale in (1.0, 0.25):
-        batch = EpisodeBatch(build(noise_scale=scale, initial_mean=(0.0, 0.0, 0.0)), 2)
-        batch.seed(np.arange(2), [1, 2])
-        batch.reset()
-        paths.append(np.concatenate((batch.state.truth, batch.state.measurement[:, 0])))
-    np.testing.assert_allclose(paths[1], 0.5 * paths[0], rtol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"noise_scale": 0.0}, r"noise_scale = 0.0 .* > 0"),
         ({"noise_scale": 1.5}, r"noise_scale = 1.5 .* <= 1"),
-        ({"noise_scale": "often"}, r"noise_scale = 'often' .* 'random'"),
-        ({"noise_scale": True}, "noise_scale = True"),
-        ({"noise_scale": None}, "noise_scale = None"),
         ({"fusion": "information"}, r"fusion = 'information' .* process noise"),
         ({"fusion": "federated"}, r"fusion = 'federated' .* 'sici'"),
         ({"fusion": "scii"}, r"did you mean 'sci"),
-        ({"fusion": 3}, r"fusion = 3 .* 'sici'"),
         ({"fusion": "ci", "order": (0, 1, 2)}, r"order = .* fusion='ci'"),
-        ({"order": (0, 1)}, "order"),
         ({"order": (0, 1, 1)}, r"order = \(0, 1, 1\) .* once"),
         ({"order": (1, 2, 3)}, "order"),
-        ({"order": "first"}, "order"),
-        ({"track_actual": 1}, "track_actual = 1"),
         ({"transition": ((1.0, 0.1),)}, "transition"),
-        ({"process_gain": (1.0, 1.0, 1.0)}, "process_gain"),
         ({"process_variance": 0.0}, "process_variance"),
-        ({"initial_mean": (0.0, 0.0)}, "initial_mean"),
         ({"initial_covariance": -np.eye(3)}, "initial_covariance"),
-        ({"measurement_variance": -1.0}, "measurement_variance"),
-        ({"noise_coupling": (0.1, 0.2)}, "noise_coupling"),
-        ({"trigger_threshold": -0.1}, "trigger_threshold"),
-        ({"trigger_offset": (0.1, 0.2)}, "trigger_offset"),
-        ({"trigger_sensitivity": "high"}, "trigger_sensitivity"),
-        ({"tokens": "many"}, "tokens = 'many'"),
-        ({"horizon": 0}, "horizon = 0"),
-        ({"state_weights": (1.0, 1.0)}, "state_weights"),
         ({"thresholds": 1.0}, "unknown option .*trigger_threshold"),
     ],
 )

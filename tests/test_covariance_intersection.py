@@ -1,15 +1,10 @@
 """Covariance intersection and its inverse form against optimisers, and what their bounds cover."""
 
 import warnings
-from typing import Any
 
 import numpy as np
 import pytest
 from difficult_estimates import KINDS, Array, estimates, parts
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
-from scipy.linalg import eigh
 from scipy.optimize import minimize_scalar
 
 from fusion_gym.fusion.intersection import (
@@ -104,79 +99,6 @@ def test_a_covariance_that_is_none_spoils_only_its_own_lane(rule: str) -> None:
     assert np.all(np.isnan(spoiled.covariance[..., 1]))
     for first, other in zip(parts(spoiled), parts(clean), strict=True):
         assert np.array_equal(first[..., [0, 2]], other[..., [0, 2]])
-
-
-def actual(fused: Any, first: Array, second: Array, cross: Array) -> Array:
-    """The covariance (n, n) of K e_A + L e_B for errors with this cross-covariance."""
-    k, other = fused.gains[0][..., 0], fused.gains[1][..., 0]
-    mixed = k @ cross @ other.T
-    return k @ first @ k.T + other @ second @ other.T + mixed + mixed.T
-
-
-def overconfidence(conservative: Array, real: Array) -> float:
-    """Largest generalised eigenvalue of the actual against the conservative covariance."""
-    return float(eigh(real, conservative, eigvals_only=True)[-1])
-
-
-def fuse_one(rule: str, first: Array, second: Array) -> Any:
-    mean = np.zeros((len(first), 1))
-    return RULES[rule](mean, first[..., None], mean, second[..., None])
-
-
-matrices = st.integers(1, 4).flatmap(
-    lambda size: arrays(np.float64, (3, size, size), elements=st.floats(-3, 3, width=32))
-)
-
-
-def covariance_of(factor: Array) -> Array:
-    return factor @ factor.T + 1e-3 * np.eye(len(factor))
-
-
-@given(matrices)
-@settings(deadline=None, max_examples=150)
-def test_covariance_intersection_bounds_every_correlation(factors: Array) -> None:
-    first, second = covariance_of(factors[0]), covariance_of(factors[1])
-    contraction = factors[2] / max(float(np.linalg.norm(factors[2], 2)), 1e-6)
-    cross = np.linalg.cholesky(first) @ contraction @ np.linalg.cholesky(second).T
-    fused = fuse_one("ci", first, second)
-    real = actual(fused, first, second, cross)
-    assert overconfidence(fused.covariance[..., 0], real) <= 1 + 1e-7
-
-
-@given(matrices)
-@settings(deadline=None, max_examples=150)
-def test_inverse_covariance_intersection_bounds_common_information(factors: Array) -> None:
-    """P_A⁻¹ = A⁻¹ + G, P_B⁻¹ = B⁻¹ + G: the common piece makes the cross-covariance P_A G P_B."""
-    own_first, own_second = covariance_of(factors[0]), covariance_of(factors[1])
-    common = factors[2] @ factors[2].T
-    first = np.linalg.inv(np.linalg.inv(own_first) + common)
-    second = np.linalg.inv(np.linalg.inv(own_second) + common)
-    cross = first @ common @ second
-    fused = fuse_one("ici", first, second)
-    conservative, weight = fused.covariance[..., 0], fused.weights[0, 0]
-    real = actual(fused, first, second, cross)
-    assert overconfidence(conservative, real) <= 1 + 1e-7
-    spread = np.linalg.inv(weight * first + (1 - weight) * second) @ conservative
-    margin = weight * (1 - weight) * spread.T @ (first + second - cross - cross.T) @ spread
-    np.testing.assert_allclose(
-        conservative - real, margin, atol=1e-6 * np.trace(conservative), rtol=0.0
-    )
-
-
-def test_inverse_covariance_intersection_is_no_bound_for_other_correlations() -> None:
-    """Correlated across the components: covariance intersection covers it, the inverse doesn't."""
-    first, second = np.eye(2), np.diag([4.0, 0.25])
-    turn = 0.9 * np.array([[0.0, 1.0], [1.0, 0.0]])
-    cross = np.linalg.cholesky(first) @ turn @ np.linalg.cholesky(second).T
-    joint = np.block([[first, cross], [cross.T, second]])
-    assert np.linalg.eigvalsh(joint)[0] > 0.0  # an admissible correlation
-    ici, ci = (fuse_one(rule, first, second) for rule in ("ici", "ci"))
-    ici_ratio, ci_ratio = (
-        overconfidence(fused.covariance[..., 0], actual(fused, first, second, cross))
-        for fused in (ici, ci)
-    )
-    assert ci_ratio <= 1.0
-    assert ici_ratio > 1.2
 
 
 @pytest.mark.parametrize("kind", KINDS)

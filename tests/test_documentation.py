@@ -11,7 +11,7 @@ import pytest
 from page_blocks import blocks_of, imported
 
 import fusion_gym
-from fusion_gym.agents.experiments.config import load_learning, load_robustness, load_suite
+from fusion_gym.agents.experiments.config import load_suite
 from fusion_gym.agents.experiments.figures import report_text
 from fusion_gym.agents.experiments.learning import read_learning
 from fusion_gym.agents.experiments.report import (
@@ -21,6 +21,7 @@ from fusion_gym.agents.experiments.report import (
     robustness_text,
     update_pages,
 )
+from fusion_gym.agents.experiments.verdict import read_cases
 from fusion_gym.envs import pages
 from fusion_gym.envs.option_text import options_in
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
@@ -37,6 +38,7 @@ def importable(code: str) -> bool:
     return all(importlib.util.find_spec(package) is not None for package in packages)
 
 
+TITLES = {setting.name: setting.title for setting in load_suite("benchmark").settings}
 JOURNEYS = [path.read_text() for path in (ROOT / "tests" / "journeys").glob("*.py")]
 BLOCKS = {
     path.name: blocks_of(path.relative_to(ROOT), path.read_text())
@@ -106,42 +108,22 @@ def test_files_and_names_of_the_library_that_the_texts_name_exist() -> None:
     assert not [name for name in names if pydoc.locate(name) is None]
 
 
-def test_the_committed_report_says_what_the_results_say() -> None:
-    settings = read_results(ROOT / "results")
-    written = (ROOT / "results" / "README.md").read_text()
-    assert written == report_text(settings, "fusion-gym benchmark")
+def test_the_committed_pages_say_what_the_results_say() -> None:
+    results = ROOT / "results"
+    settings, cases = read_results(results), read_cases(results, list(TITLES))
+    learned = [results / "learning" / name for name in TITLES]
+    courses = [read_learning(path) for path in learned if (path / "learning.csv").exists()]
+    for folder, text in {
+        ".": report_text(settings),
+        "envelopes": envelopes_text(results),
+        "learning": learning_text(courses),
+        "robustness": robustness_text(cases, TITLES),
+    }.items():
+        assert (results / folder / "README.md").read_text() == text, folder
+    assert {report["setting"] for report in cases} == set(TITLES)
     for path in (ROOT / "README.md", *DOCS):
         text = path.read_text()
-        assert update_pages(text, settings, ROOT / "results") == text, path.name
-
-
-def test_the_committed_table_of_perturbed_cases_is_that_of_the_verdicts() -> None:
-    results = ROOT / "results"
-    written = (results / "robustness" / "README.md").read_text()
-    command = re.search(r"^Made by `(.*?)`", written, re.M)
-    assert command is not None
-    suite = {setting.name: setting.title for setting in load_suite("benchmark").settings}
-    titles = {item.setting: suite[item.setting] for item in load_robustness("robustness").settings}
-    assert robustness_text(results, titles, command[1]) == written
-    tried = {path.parent.name for path in results.glob("*/robustness.csv")}
-    assert tried == set(titles)
-
-
-def test_the_committed_envelopes_are_what_the_pages_say() -> None:
-    results = ROOT / "results"
-    written = (results / "envelopes" / "README.md").read_text()
-    assert written == envelopes_text(results, "fusion-gym envelope")
-
-
-def test_the_committed_fronts_are_what_the_pages_say() -> None:
-    folder = ROOT / "results" / "learning"
-    files = {path.parent.name: read_learning(path.parent) for path in folder.glob("*/learning.csv")}
-    known = [course.setting for course in load_learning("learning").settings]
-    reports = [files[name] for name in known if name in files]
-    written = (folder / "README.md").read_text()
-    command = re.search("Made by `(.*)`;", written)
-    assert command
-    assert written == learning_text(reports, command.group(1))
+        assert update_pages(text, settings, results, TITLES) == text, path.name
 
 
 def doc_of(env_id: str) -> str:

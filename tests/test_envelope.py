@@ -1,19 +1,18 @@
 """Tuning and committed envelopes: what is searched, chosen, measured, hashed and compared."""
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from small_suite import ENV, small_suite
+from small_suite import ENV, SMALL, small_suite
 
 import fusion_gym
-from fusion_gym.agents import envelope
+from fusion_gym.agents.__main__ import load
 from fusion_gym.agents.experiments.classes import Class, classes_of
 from fusion_gym.agents.experiments.config import Choices, Family, Range, Tuning, load_suite
-from fusion_gym.agents.experiments.references import merge_curves, read_envelopes, write_envelopes
+from fusion_gym.agents.experiments.envelopes import merge_curves, read_envelopes, write_envelopes
 from fusion_gym.agents.experiments.tables import read_rows, write_rows
 from fusion_gym.agents.experiments.tuning import (
     TuningTrial,
@@ -25,7 +24,7 @@ from fusion_gym.agents.experiments.tuning import (
 from fusion_gym.core.system import covers
 from fusion_gym.deprecation import replace_value
 from fusion_gym.evaluation.beside import run_beside
-from fusion_gym.evaluation.envelope import EnvelopePoint, best_mse, lower_hull
+from fusion_gym.evaluation.envelope import EnvelopePoint, lower_hull
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 
@@ -117,23 +116,9 @@ def test_classes_contain_what_knows_less() -> None:
         assert all(c.packet == "estimate" for c in classes if not measured[-1].contains(c))
 
 
-def test_chosen_policies_all_count() -> None:
-    """A vertex that lies above its neighbours' line on other episodes stays in the envelope."""
-    task = fusion_gym.make_task(ENV, filter="tobit", horizon=10)
-    results = {
-        name: run_episodes(task, make_policy(name, task), 5, 0)
-        for name in ("never", "random:rate=0.3", "always")
-    }
-    rate = float(results["random:rate=0.3"].rate.mean())
-    mixed = best_mse(results, rate)
-    assert mixed is not None
-    np.testing.assert_array_equal(mixed, results["random:rate=0.3"].mse)
-    assert best_mse(results, -0.1) is None
-
-
 def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
-    monkeypatch.setattr(sys, "argv", ["envelope", *words])
-    envelope.Envelope.main()
+    monkeypatch.setattr(sys, "argv", ["benchmark", "--parts", "envelopes", "report", *words])
+    load("benchmark").main()
 
 
 def test_envelopes_are_committed_and_kept(
@@ -143,7 +128,7 @@ def test_envelopes_are_committed_and_kept(
         "label": "own", "policy": "value_of_information:own=true", "tuned_in": "local",
         "parameters": {"threshold": {"low": 0.01, "high": 1}},
     }  # fmt: skip
-    families = [json.loads(json.dumps(f)) for f in small_families()] + [own]
+    families = [*SMALL["families"], own]
     config = str(small_suite(tmp_path, families=families))
     results = tmp_path / "results"
     words = ["--config", config, "--results", str(results), "--work", str(tmp_path / "work")]
@@ -162,8 +147,7 @@ def test_envelopes_are_committed_and_kept(
     for name, content in envelopes["classes"].items():
         listed = content["vertices"]
         tuned[name] = [
-            EnvelopePoint(v["name"], v["tuning"]["rate"], v["tuning"]["mse"]["mean"])
-            for v in listed
+            EnvelopePoint(v["name"], v["tuning_rate"], v["tuning_mse"]["mean"]) for v in listed
         ]
         assert tuned[name] == lower_hull(tuned[name]), "chosen on the tuning seeds"
         assert len(content["searches"]) == 2
@@ -181,7 +165,7 @@ def test_envelopes_are_committed_and_kept(
     vertex = envelopes["classes"]["sensors_memory"]["vertices"][-1]
     task = fusion_gym.make_task(ENV, filter="tobit", horizon=10, **vertex["options"])
     again = run_episodes(task, make_policy(vertex["policy"], task), 12, 0)
-    assert vertex["test"]["mse"]["mean"] == pytest.approx(again.mse.mean())
+    assert vertex["test_mse"]["mean"] == pytest.approx(again.mse.mean())
     text = (results / "envelopes" / "README.md").read_text()
     assert "| small | sensors |" in text
     assert "| small | local, packets |" in text
@@ -200,13 +184,6 @@ def test_envelopes_are_committed_and_kept(
     capsys.readouterr()
 
 
-def small_families() -> list[dict[str, Any]]:
-    from small_suite import SMALL
-
-    result: list[dict[str, Any]] = SMALL["families"]
-    return result
-
-
 def test_a_family_that_does_not_fit_is_reported_before_anything_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -221,10 +198,9 @@ def test_a_family_that_does_not_fit_is_reported_before_anything_runs(
 
 
 def test_classes_that_are_added_take_no_curves_away() -> None:
-    first = [{"family": "a", "options": {}, "trials": 1}, {"family": "b", "options": {}}]
+    first = [{"family": "a", "options": {}, "rate": 1}, {"family": "b", "options": {}}]
     new = [
-        {"family": "a", "options": {}, "trials": 2},
+        {"family": "a", "options": {}, "rate": 2},
         {"family": "b", "options": {"memory": True}},
     ]
-    result = merge_curves(first, new)
-    assert result == [new[0], first[1], new[1]]
+    assert merge_curves(first, new) == [first[1], *new]

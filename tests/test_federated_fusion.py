@@ -15,32 +15,11 @@ from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredSystem
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
-EQUAL = (1 / 3, 1 / 3, 1 / 3)
 UNEQUAL = (0.5, 0.3, 0.2)
 MATRICES = np.array([[[1.0, 0.0], [0.3, 1.0]], [[0.0, 1.0], [1.0, -1.0]], [[1.0, 2.0], [0.0, 0.5]]])
 VARIANCES = np.array([[0.5, 0.2], [1.0, 0.1], [0.3, 2.0]])
 TRANSITION = np.array([[0.9, 0.4], [-0.4, 0.9]])
 PROCESS = np.outer([0.3, 0.1], [0.3, 0.1])  # rank one
-
-
-def nodes(generator: np.random.Generator, sensors: int, states: int, runs: int) -> Any:
-    mean = generator.normal(size=(sensors, states, runs))
-    factor = generator.normal(size=(sensors, states, states + 1, runs))
-    return mean, np.einsum("sikN,sjkN->sijN", factor, factor)
-
-
-@pytest.mark.parametrize("share", [None, UNEQUAL, (0.98, 0.01, 0.01)])
-def test_what_is_distributed_fuses_to_what_it_was(share: Any) -> None:
-    generator = np.random.default_rng(2)
-    mean, covariance = (value[0] for value in nodes(generator, 1, 3, runs=5))
-    mean_argument, values = Feedback.in_shares(share, 3).distribute(mean, covariance)
-    weights = EQUAL if share is None else share
-    for sensor, weight in enumerate(weights):
-        np.testing.assert_allclose(values[sensor], covariance / weight, rtol=1e-15)
-        assert np.array_equal(mean_argument[sensor], mean)
-    back = InformationFusion().fuse(mean_argument, values)
-    np.testing.assert_allclose(back.covariance, covariance, rtol=1e-9)
-    np.testing.assert_allclose(back.mean, mean, rtol=1e-9)
 
 
 def make_system(kind: Any, share: Any) -> CensoredSystem:

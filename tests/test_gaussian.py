@@ -69,21 +69,6 @@ def worst(actual: Any, expected: list[Any]) -> float:
     return max(error(a, e) for a, e in zip(np.ravel(actual), expected, strict=True))
 
 
-def test_reference_agrees_with_quadrature() -> None:
-    for low, high in [(-2, 3), (4, 6), (-1, 1)]:
-        points = mpmath.linspace(low, high, 6)
-        moments = [mpmath.quad(lambda x, n=n: x**n * exact_density(x), points) for n in range(3)]
-        probability, mean, variance = exact_inside(low, high)
-        assert abs(probability - moments[0]) < mpmath.mpf("1e-60")
-        assert abs(mean - moments[1] / moments[0]) < mpmath.mpf("1e-55")
-        square = moments[2] / moments[0] - (moments[1] / moments[0]) ** 2
-        assert abs(variance - square) < mpmath.mpf("1e-50")
-    hazard, _, variance = exact_beyond(1.0)
-    truncated = exact_inside(1.0, 40.0)
-    assert abs(hazard - truncated[1]) < mpmath.mpf("1e-100")
-    assert abs(variance - truncated[2]) < mpmath.mpf("1e-100")
-
-
 def test_density_and_upper_tail() -> None:
     assert worst(gaussian.density(Z_GRID), [exact_density(z) for z in Z_GRID]) < TOLERANCE
     assert worst(gaussian.upper_tail(Z_GRID), [exact_tail(z) for z in Z_GRID]) < TOLERANCE
@@ -192,22 +177,6 @@ def test_interval_moments_where_the_probability_underflows() -> None:
 
 reals = st.floats(-60.0, 60.0)
 widths = st.floats(-4.0, 2.0).map(lambda exponent: 10.0**exponent)
-
-
-@given(z=st.floats(-1e8, 1e8))
-def test_truncated_variance_within_bounds(z: float) -> None:
-    hazard, excess = gaussian.hazard(z), excess_beyond(z)
-    assert 0.0 < gaussian.truncated_variance(z) <= 1.0
-    assert excess > 0.0
-    assert hazard >= max(z, 0.0)
-
-
-@given(z=st.floats(-37.0, 1e6), step=st.floats(1e-3, 10.0))
-def test_monotone(z: float, step: float) -> None:
-    assert gaussian.hazard(z + step) > gaussian.hazard(z)
-    assert excess_beyond(z + step) < excess_beyond(z)
-    assert gaussian.truncated_variance(z + step) <= gaussian.truncated_variance(z)
-    assert gaussian.upper_tail(z + step) <= gaussian.upper_tail(z)
 
 
 @given(low=reals, width=widths)

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from small_suite import small_suite
 
-from fusion_gym.agents.experiments import references as envelopes
+from fusion_gym.agents.experiments import envelopes
 from fusion_gym.agents.experiments.classes import classes_of
 from fusion_gym.agents.experiments.config import load_suite
-from fusion_gym.agents.experiments.report import robustness_frame
+from fusion_gym.agents.experiments.report import robustness_rows
+from fusion_gym.agents.output.cache import Cache
 from fusion_gym.agents.papers.numbers import below
 from fusion_gym.agents.papers.round_robin_tobit_runs import always_below
 from fusion_gym.evaluation.envelope import best_mse
@@ -40,8 +41,7 @@ def test_cases_are_counted_by_their_intervals_and_the_worst_is_named() -> None:
         "worse": interval(0.2, 0.1, 0.3),
     }
     cases = {name: {"title": name, "agents": {"middle": item}} for name, item in result.items()}
-    frame = robustness_frame([{"setting": "small", "cases": cases}], {"small": "a setting"})
-    (row,) = frame.to_dict("records")
+    (row,) = robustness_rows([{"setting": "small", "cases": cases}], {"small": "a setting"})
     assert [row[name] for name in ("better", "undecided", "worse")] == [1, 1, 1]
     assert row["at worst"].endswith("worse")
     assert "+20" in row["at worst"]
@@ -64,15 +64,16 @@ def test_vertices_are_those_of_the_tuning_episodes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     suite = load_suite(small_suite(tmp_path))
+    rule = {"options": {}, "family": "family", "knows": "centre", "found_by": (0, 1)}
     candidates = {
-        name: envelopes.Candidate(
-            name, (), "family", "centre", (0, 1), rate, interval(mse, mse, mse)
-        )
+        name: rule | {"policy": name, "rate": rate, "mse": interval(mse, mse, mse)}
         for name, (rate, mse) in (TUNED | {"d": (0.5, 0.8)}).items()
     }
     monkeypatch.setattr(envelopes, "candidates_of", lambda *_: (candidates, 4))
-    monkeypatch.setattr(envelopes.Test, "read", lambda test, work: RESULTS[test.policy])
+    monkeypatch.setattr(
+        envelopes, "read_tests", lambda tests, _: {t.name: RESULTS[t.policy] for t in tests}
+    )
     of = next(iter(classes_of(suite.settings[0])))
-    result = envelopes.content_of(suite, suite.settings[0], of, [], tmp_path)
+    result = envelopes.content_of(suite, suite.settings[0], of, [], Cache(tmp_path))
     assert [vertex["policy"] for vertex in result["vertices"]] == ["a", "b", "c"]
     assert [vertex["convex"] for vertex in result["vertices"]] == [True, False, True]

@@ -1,6 +1,5 @@
-"""How fast agents learn: when a front is below an envelope, and the command that measures it."""
+"""How fast agents learn: when a front is below an envelope, and the part that measures it."""
 
-import argparse
 import math
 import os
 import shutil
@@ -13,15 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from command_runs import Ended, call
 from small_suite import SMALL, small_suite
 from training_configs import small_config
 
-from benchmarks import learning
+from benchmarks.learning import measure_throughput
 from fusion_gym.agents.experiments import learning as fronts
-from fusion_gym.agents.experiments.config import load_learning, load_suite
-from fusion_gym.agents.experiments.references import complete_envelopes
+from fusion_gym.agents.experiments.config import Course, load_suite
+from fusion_gym.agents.experiments.envelopes import SHIPPED, EnvelopeStore
 from fusion_gym.agents.experiments.tables import write_rows
-from fusion_gym.agents.experiments.workers import Pool
+from fusion_gym.agents.experiments.workers import Folders
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import EnvelopePoint
@@ -29,7 +29,6 @@ from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-ROOT = Path(__file__).parent.parent
 # 4, 2, 1 at the rates 0, .1 and .3: 3 in the middle of the first piece, 1.5 of the second.
 ENVELOPE = [
     EnvelopePoint("never", 0.0, 4.0),
@@ -75,11 +74,11 @@ def test_a_front_is_more_than_a_point_and_than_silence(
 
 
 def test_a_range_counts_from_a_twentieth_of_always_transmitting(school: Path) -> None:
-    study = study_of(school)
-    always = study.envelopes["always"]
-    assert study.below([(0.0, 0.001), (0.151 * always, 0.0005)])
-    assert not study.below([(0.0, 0.001), (0.149 * always, 0.0005)])
-    assert not study_of(school, memoryless=None).below([(0.0, 0.001), (always, 0.0005)])
+    setup = setup_of(school)
+    always = setup.envelopes["always"]
+    assert setup.below([(0.0, 0.001), (0.151 * always, 0.0005)])
+    assert not setup.below([(0.0, 0.001), (0.149 * always, 0.0005)])
+    assert not setup_of(school, memoryless=None).below([(0.0, 0.001), (always, 0.0005)])
 
 
 def test_the_first_moment_below_and_what_came_after() -> None:
@@ -99,13 +98,13 @@ def test_the_first_moment_below_and_what_came_after() -> None:
     assert "first" not in fronts.first_below({"seed": 3, "curve": curve[:1]})
 
 
-def study_of(folder: Path, **course: Any) -> fronts.LearningSetup:
-    """The only course of the config that :func:`school` writes, with changes."""
-    taught = load_learning(folder / "learning.yaml")
-    plain = taught.settings[0].model_dump() | course
-    suite = load_suite(taught.suite)
+def setup_of(school: Path, **course: Any) -> fronts.LearningSetup:
+    """The course of the suite that :func:`school` writes, with changes."""
+    suite = load_suite(school / "suite.yaml")
+    plain = suite.settings[0].course.model_dump() | course  # type: ignore[union-attr]
+    store = EnvelopeStore(suite, school / "results")
     return fronts.LearningSetup(
-        taught, suite, type(taught.settings[0])(**plain), folder / "results", folder, folder
+        suite, suite.settings[0], Course(**plain), store, Folders(school, school)
     )
 
 
@@ -119,13 +118,6 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "environment": {"id": "fusion_gym/RemoteEstimation-v0", "options": {"horizon": 5}},
         "price_range": [0.1, 1.0],
     }
-    gain = [family for family in SMALL["families"] if family["label"] == "gain"]
-    suite = small_suite(folder, settings=[*SMALL["settings"], source], families=gain)
-    choice = load_suite(suite)
-    classes = ["sensors", "sensors_memory"]
-    complete_envelopes(
-        choice, choice.settings[:1], classes, folder / "results", folder / "tuning", Pool(1)
-    )
     options = {
         "small": {"filter": "tobit", "horizon": 10, "memory": True},
         "centre": {"filter": "tobit", "horizon": 10, "information": "centre"},
@@ -144,28 +136,19 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
             algorithm={"name": "counterfactual_ppo", "n_steps": 8, "batch_size": 32},
             training={"timesteps": 128, "num_envs": 4},
         )
-    course = {
-        "setting": "small",
-        "front": str(folder / "small" / "config.yaml"),
-        "memoryless": "sensors",
-        "against": "sensors_memory",
-    }
-    content = {
-        "suite": str(suite),
-        "prices": 3,
-        "every": 64,
-        "episodes": 4,
-        "plain": {
-            "every": 128,
-            "seeds": 1,
-            "budget": 1000.0,
-            "timesteps": 256,
-            "num_envs": 4,
-            "algorithm": {"name": "ppo", "n_steps": 16, "batch_size": 32},
-        },
-        "settings": [course],
-    }
-    (folder / "learning.yaml").write_text(yaml.safe_dump(content))
+    course = {"front": str(folder / "small" / "config.yaml")}
+    course |= {"memoryless": "sensors", "against": "sensors_memory"}
+    plain = {"every": 128, "seeds": 1, "budget": 1000.0, "timesteps": 256, "num_envs": 4}
+    plain |= {"algorithm": {"name": "ppo", "n_steps": 16, "batch_size": 32}}
+    suite = small_suite(
+        folder,
+        settings=[SMALL["settings"][0] | {"course": course}, source],
+        families=[family for family in SMALL["families"] if family["label"] == "gain"],
+        learning={"prices": 3, "every": 64, "episodes": 4, "plain": plain},
+    )
+    words = ["--classes", "sensors", "sensors_memory", "--results", str(folder / "results")]
+    ended = run(suite, folder, "--envs", "small", *words, parts="envelopes")
+    assert ended.status == 0, ended.err + ended.trace
     return folder
 
 
@@ -174,19 +157,9 @@ def fewer_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fusion_gym.agents.experiments.verdict.RESAMPLES", 20)
 
 
-def arguments_of(school: Path, folder: Path, **changes: Any) -> argparse.Namespace:
-    plain = {
-        "settings": [],
-        "config": school / "learning.yaml",
-        "seeds": 2,
-        "workers": 1,
-        "resume": False,
-        "quick": False,
-        "results": school / "results",
-        "output": folder / "learning",
-        "work": folder / "work",
-    }
-    return argparse.Namespace(**(plain | changes))
+def run(suite: Path, folder: Path, *more: str, parts: str = "learning report") -> Ended:
+    words = ["--config", str(suite), "--work", str(folder / "work"), "--workers", "1"]
+    return call("benchmark", [*words, "--parts", *parts.split(), *more], seconds=200.0)
 
 
 def without_seconds(value: Any) -> Any:
@@ -197,16 +170,20 @@ def without_seconds(value: Any) -> Any:
 
 
 def test_an_interrupted_run_ends_as_an_undisturbed_one(
-    school: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    school: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("benchmarks.throughput.TURNS", 1)
-    monkeypatch.setattr(learning.measure_throughput, "__defaults__", (0.01,))
-    whole = arguments_of(school, tmp_path / "whole")
-    learning.run(whole)
-    content = fronts.read_learning(whole.output / "small")
+    def learn(name: str, *more: str) -> Ended:
+        folder = tmp_path / name
+        if not folder.exists():
+            shutil.copytree(school / "results" / "small", folder / "results" / "small")
+        return run(school / "suite.yaml", folder, "--results", str(folder / "results"), *more)
+
+    def tables(name: str) -> dict[str, Any]:
+        return fronts.read_learning(tmp_path / name / "results" / "learning" / "small")
+
+    ended = learn("whole")
+    assert (ended.status, ended.trace) == (0, ""), ended.err
+    content = tables("whole")
     assert [front["seed"] for front in content["fronts"]] == [0, 1]
     assert content["fronts"][0]["curve"] != content["fronts"][1]["curve"]
     for front in content["fronts"]:
@@ -216,15 +193,11 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
         assert [point["price"] for point in front["points"]] == content["prices"]
     assert [item["algorithm"] for item in content["plain"]] == ["ppo"], "fewer seeds of it"
     assert [point["timesteps"] for point in content["plain"][0]["curve"]] == [128, 256]
-    assert content["throughput"]["values"] < content["throughput"]["without"]
     assert content["finished"]["compared"] == 2, "the inner one of three prices, of two seeds"
-    assert "`python -m benchmarks.learning --seeds 2" in (whole.output / "README.md").read_text()
-    assert "small" in capsys.readouterr().out
+    page = tmp_path / "whole" / "results" / "learning" / "README.md"
+    assert "| small | – | – |" in page.read_text()
+    assert "go on with --resume" in learn("whole").err
 
-    with pytest.raises(ConfigurationError, match=r"holds small already: go on with --resume"):
-        learning.run(whole)
-
-    broken = arguments_of(school, tmp_path / "broken")
     before, counted = PrivilegedVecEnv.step_alternatives, 0
 
     def step_alternatives(self: PrivilegedVecEnv, *arguments: Any) -> Any:
@@ -235,17 +208,28 @@ def test_an_interrupted_run_ends_as_an_undisturbed_one(
         return before(self, *arguments)
 
     monkeypatch.setattr(PrivilegedVecEnv, "step_alternatives", step_alternatives)
-    with pytest.raises(KeyboardInterrupt):
-        learning.run(broken)
-    stored = fronts.read_learning(broken.output / "small")
-    assert [front["seed"] for front in stored["fronts"]] == [0]
-    broken.resume = True
-    learning.run(broken)
+    assert learn("broken").status == 130
+    assert learn("broken", "--resume").status == 0
     assert counted == 64, "nothing is trained twice"
-    again = fronts.read_learning(broken.output / "small")
-    assert without_seconds(again) == without_seconds(content)
-    learning.run(broken)
+    assert without_seconds(tables("broken")) == without_seconds(content)
+    assert learn("broken", "--resume").status == 0
     assert counted == 64
+    assert "timesteps = 32 differs" in learn("broken", "--resume", "--config", shorter(school)).err
+
+
+def shorter(school: Path) -> str:
+    """The suite with shorter trainings."""
+    content = yaml.safe_load((school / "suite.yaml").read_text())
+    content["learning"]["timesteps"] = 32
+    path = school / "shorter.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return str(path)
+
+
+def test_throughput_is_part_of_the_tables(school: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("benchmarks.throughput.TURNS", 1)
+    speeds = measure_throughput(load_suite(school / "suite.yaml").settings[0], 0.01)
+    assert speeds["values"] < speeds["without"]
 
 
 @pytest.mark.parametrize(("budget", "below"), [(1e-9, False), (math.inf, True)])
@@ -253,15 +237,9 @@ def test_plain_ppo_ends_with_its_budget_or_below_the_rules(
     school: Path, tmp_path: Path, budget: float, below: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fusion_gym.agents.experiments.learning.is_below", lambda *_: below)
-    study = replace(study_of(school), work=tmp_path, output=tmp_path)
-    lesson = fronts.LearningRun(study, "plain", 0, budget)
-    fronts.run_course(lesson, 1)
-    result = lesson.result()
-    assert result is not None
+    setup = replace(setup_of(school), folders=Folders(tmp_path, tmp_path))
+    result = fronts.run_course(fronts.LearningRun(setup, "plain", 0, budget))
     assert [point["timesteps"] for point in result["curve"]] == [128], "not the whole 256"
-    changed = study.learning.model_copy(update={"episodes": 5})
-    with pytest.raises(ConfigurationError, match=r"^episodes = 5 differs from that of .*: 4$"):
-        fronts.LearningRun(replace(study, learning=changed), "plain", 0).result()
 
 
 @pytest.mark.parametrize(
@@ -279,21 +257,20 @@ def test_plain_ppo_ends_with_its_budget_or_below_the_rules(
 def test_a_front_beside_the_optimum_or_the_best_of_schedules(
     school: Path, tmp_path: Path, course: dict[str, Any]
 ) -> None:
-    plain = yaml.safe_load((school / "learning.yaml").read_text())
-    course |= {"front": str(school / course["front"] / "config.yaml")}
-    (tmp_path / "learning.yaml").write_text(yaml.safe_dump(plain | {"settings": [course]}))
-    selection = arguments_of(school, tmp_path, config=tmp_path / "learning.yaml", seeds=1)
-    selection.work.mkdir()
-    (selection.work / course["setting"]).mkdir()
-    (selection.work / course["setting"] / "throughput.json").write_text("{}")
-    learning.run(selection)
-    content = fronts.read_learning(selection.output / course["setting"])
+    plain = yaml.safe_load((school / "suite.yaml").read_text())
+    (setting,) = (item for item in plain["settings"] if item["name"] == course["setting"])
+    front = {"front": str(school / course["front"] / "config.yaml")}
+    setting["course"] = {k: v for k, v in course.items() if k != "setting"} | front
+    (tmp_path / "suite.yaml").write_text(yaml.safe_dump(plain))
+    words = ["--envs", course["setting"], "--seeds", "1", "--results", str(tmp_path)]
+    ended = run(tmp_path / "suite.yaml", tmp_path, *words)
+    assert (ended.status, ended.trace) == (0, ""), ended.err
+    content = fronts.read_learning(tmp_path / "learning" / course["setting"])
     assert content["plain"] == []
     assert content["finished"]["compared"] == 3, "all prices"
-    suite = load_suite(school / "suite.yaml")
-    where = next(s.environment for s in suite.settings if s.name == course["setting"])
+    where = setting["environment"]
     for point in content["fronts"][0]["points"]:
-        task = make_task(where.id, **where.options, cost_weight=point["price"])
+        task = make_task(where["id"], **where["options"], cost_weight=point["price"])
         best = min(
             -run_episodes(task, make_policy(policy, task), 12, 0).returns.mean()
             for policy in course.get("schedules", ["optimal"])
@@ -313,17 +290,17 @@ def test_a_front_beside_the_optimum_or_the_best_of_schedules(
         ),
         ({"front": "source"}, r"id = 'fusion_gym/RemoteEstimation-v0' is not allowed in small"),
         ({"front": "narrow"}, r"price_range = \[0.01, 0.1\] is not allowed .* has \[0.001, 0.1\]"),
-        ({"against": "local_estimate_memory"}, r"class = 'local_estimate_memory' is not allowed"),
+        ({"against": "local_none"}, r"class = 'local_none' is not allowed"),
     ],
 )
 def test_a_front_is_compared_with_what_knows_the_same(
     school: Path, course: dict[str, Any], expected: str
 ) -> None:
-    study_of(school).check()
+    setup_of(school).check()
     if "front" in course:
         course = course | {"front": str(school / course["front"] / "config.yaml")}
     with pytest.raises(ConfigurationError, match=expected):
-        study_of(school, **course).check()
+        setup_of(school, **course).check()
 
 
 def test_seeds_and_prices_that_lie_above_are_counted(school: Path) -> None:
@@ -343,8 +320,8 @@ def test_seeds_and_prices_that_lie_above_are_counted(school: Path) -> None:
         {"seed": 0, "points": [bad, point(0.02, 0.011, 1.8), bad]},
         {"seed": 1, "points": [bad, point(0.03, 0.009, 1.4), bad]},
     ]
-    study = {"course": study_of(school).course.model_dump(), "inner": [False, True, False]}
-    result = fronts.judge_fronts(study | {"fronts": seeds})
+    setup = {"course": setup_of(school).course.model_dump(), "inner": [False, True, False]}
+    result = fronts.judge_fronts(setup | {"fronts": seeds})
     assert result is not None
     assert result["compared"] == 2
     assert [(p["seed"], p["difference"]["low"]) for p in result["above"]] == [(0, 0.011)]
@@ -352,7 +329,7 @@ def test_seeds_and_prices_that_lie_above_are_counted(school: Path) -> None:
     assert result["rates"] == pytest.approx([0.14, 0.18])
     assert result["closed"] == {"rollout": None, "bound": pytest.approx((0.2 + 0.6) / 2.0)}
     assert fronts.gap_share([{"envelope": 1.0, "bound": 1.0, "mse": 1.0}], "bound") is None
-    assert fronts.judge_fronts(study | {"fronts": []}) is None
+    assert fronts.judge_fronts(setup | {"fronts": []}) is None
 
 
 def test_a_rollout_counts_on_its_own_episodes_and_only_where_it_was_run(
@@ -372,24 +349,26 @@ def test_a_rollout_counts_on_its_own_episodes_and_only_where_it_was_run(
     write_rows(tmp_path / "small", "bounds", [bound | cost for cost in costs])
     hard = np.array([2.0, 2.0, 1.0, 1.0])
     envelope = {str(rate): SimpleNamespace(rate=np.array([rate]), mse=hard) for rate in (0.0, 1.0)}
-    study = replace(study_of(school), results=tmp_path)
-    assert fronts.best_known(study, 0.2, envelope) == {
+    setup = setup_of(school)
+    setup = replace(setup, store=setup.store._replace(results=tmp_path))
+    assert fronts.best_known(setup, 0.2, envelope) == {
         "rollout": 0.75 * 1.5,
         "bound": pytest.approx(0.5),
     }
-    assert fronts.best_known(study, 0.05, envelope) == {"bound": pytest.approx(1.1)}
-    assert fronts.best_known(study, 0.31, envelope) == {"bound": 0.4}
-    course = study.course.model_copy(update={"against": "sensors"})
-    assert "rollout" not in fronts.best_known(replace(study, course=course), 0.2, envelope), (
+    assert fronts.best_known(setup, 0.05, envelope) == {"bound": pytest.approx(1.1)}
+    assert fronts.best_known(setup, 0.31, envelope) == {"bound": 0.4}
+    course = setup.course.model_copy(update={"against": "sensors"})
+    assert "rollout" not in fronts.best_known(replace(setup, course=course), 0.2, envelope), (
         "it remembers"
     )
 
 
 def test_every_shipped_front_knows_what_it_is_compared_with(tmp_path: Path) -> None:
-    taught = load_learning("learning")
-    suite = load_suite(taught.suite)
-    for course in taught.settings:
-        study = fronts.LearningSetup(taught, suite, course, ROOT / "results", tmp_path, tmp_path)
-        study.check()
-        assert study.inner == [False, *[True] * (taught.prices - 2), False], course.setting
-        assert len(study.tests) == len({test.name for test in study.tests}) > 5
+    suite = load_suite("benchmark")
+    store, folders = EnvelopeStore(suite, SHIPPED), Folders(tmp_path, tmp_path)
+    for setting in suite.settings:
+        assert setting.course is not None
+        setup = fronts.LearningSetup(suite, setting, setting.course, store, folders)
+        setup.check()
+        assert setup.inner == [False, *[True] * 5, False], setting.name
+        assert len(setup.tests) == len({test.name for test in setup.tests}) > 5

@@ -85,14 +85,6 @@ def test_prediction_is_the_formula() -> None:
         np.testing.assert_allclose(prior[..., run], expected, rtol=1e-13)
 
 
-def test_open_loop_of_a_scalar_plant_is_a_geometric_sum() -> None:
-    plant = LinearPlant.create([[0.9]], [[0.2]], [1.0], [[0.5]])
-    ratio, horizon = 0.81, 30
-    fixed = 0.2 / (1 - ratio)
-    decaying = sum((0.5 - fixed) * ratio**t for t in range(1, horizon + 1))
-    assert plant.open_loop(horizon) == pytest.approx([fixed + decaying / horizon], rel=1e-12)
-
-
 def test_open_loop_is_what_simulation_gives() -> None:
     plant, runs, horizon = make(), 50_000, 12
     generator = np.random.default_rng(5)

@@ -24,9 +24,7 @@ GLOBAL = {CORRELATED: {"fused_innovation", "log_deviation", "estimate"}}
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_a_row_has_what_the_sensor_knows_and_nothing_else(env_id: str) -> None:
     task = fusion_gym.make_task(env_id, price_range=(0.001, 0.1), cost_weight=0.01)
-    view, batch = SensorView(task), EpisodeBatch(task, 5)
-    batch.seed(np.arange(5), list(range(5)))
-    batch.reset()
+    view, batch = SensorView(task), EpisodeBatch.seeded(task, 5, 0)
     for _ in range(3):
         batch.step(np.ones((task.sensors, 5), dtype=np.bool_))
     observation = batch.observe()
@@ -74,9 +72,7 @@ def test_a_shared_policy_is_trained_saved_and_evaluated(tmp_path: Path) -> None:
     model.save(tmp_path / "local.zip")
     policy = make_policy(f"model:{tmp_path / 'local.zip'}", task)
     results = run_episodes(task, policy, 3, seed=0)
-    batch = EpisodeBatch(task, 3)
-    batch.seed(np.arange(3), [0, 1, 2])
-    batch.reset()
+    batch = EpisodeBatch.seeded(task, 3, 0)
     rate = np.zeros((3, 3))
     for _ in range(10):
         action, _ = model.predict(SensorView(task).rows(batch.observe()), deterministic=True)

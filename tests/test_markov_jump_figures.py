@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from reference_markov_jump import options, random_model
 
 from fusion_gym import linalg
-from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.agents.papers.walk import walk
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.base import Policy
@@ -106,12 +106,8 @@ def agreement(policy: Policy, runs: int, steps: int, seed: int) -> tuple[Array, 
     task = build(horizon=steps)
     values, claimed = np.zeros((steps, 2, 2)), np.zeros((steps, 2, 2))
     for part in range(runs // 2000):
-        batch = EpisodeBatch(task, 2000)
-        batch.seed(np.arange(2000), [seed + 2000 * part + run for run in range(2000)])
-        batch.reset()
-        policy.reset(2000, seed + part)
-        for step in range(steps):
-            batch.step(policy(batch.signals()))
+        for step, (batch, requests) in enumerate(walk(task, policy, 2000, seed + 2000 * part)):
+            batch.step(requests)
             mean, covariance = task.system.fused(batch.delivered)
             error = task.system.truth(batch.delivered) - mean
             values[step] += linalg.outer(error, error).sum(-1) / runs
@@ -149,11 +145,8 @@ def test_claimed_trace_of_other_models(seed: int) -> None:
 def test_centre_variance_at_seven_packets_beats_the_papers_trigger_at_nine() -> None:
     """The known figure for such a trigger, 1.673 with 7 packets in 6 steps, is reached as well."""
     task = build(horizon=240)
-    batch = EpisodeBatch(task, 1)
-    batch.reset()
-    policy, packets, traces = CentreVariance(1.58), 0, []
-    for step in range(240):
-        requests = policy(batch.signals())
+    packets, traces = 0, []
+    for step, (batch, requests) in enumerate(walk(task, CentreVariance(1.58), 1, 0)):
         batch.step(requests)
         if step >= 120:
             packets += int(requests.sum())

@@ -15,7 +15,6 @@ from fusion_gym.systems.markov_jump.lag_errors import LagRecursion
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
 from fusion_gym.systems.markov_jump.plant import MarkovJumpPlant
 from fusion_gym.systems.markov_jump.sensors import FadingSensors
-from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]
 
@@ -294,22 +293,3 @@ def test_an_estimate_that_comes_twice_changes_nothing() -> None:
         many = MatrixWeightedFusion().fuse(means[order], joint[np.ix_(order, order)])
         np.testing.assert_allclose(many.mean, pair.mean, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(many.covariance, pair.covariance, rtol=1e-9, atol=1e-9)
-
-
-# --- bad input -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"chain": np.array([[0.6, 0.35], [0.35, 0.65]])}, r"mode_transition .* rows add up to 1"),
-        ({"pi": np.array([0.5, 0.4])}, r"initial_probabilities .* add up to 1, not 0.9"),
-        ({"transitions": np.array([np.eye(2), np.eye(2)])}, r"mean-square stable.* is 1"),
-        ({"periods": [1, 0, 3]}, r"sampling_periods = \[1, 0, 3\] .* whole number >= 1"),
-        ({"values": PAPER["values"] + 0.5}, r"fading_values .* from 0 to 1"),
-        ({"shares": PAPER["shares"] * 0.9}, r"fading_probabilities .* rows add up to 1"),
-    ],
-)
-def test_what_is_not_allowed_is_said_in_one_error(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message):
-        parts(PAPER | change)

@@ -18,37 +18,6 @@ from fusion_gym.policies.registry import make_policy
 
 ENV_ID = "fusion_gym/TobitOscillator-v0"
 BIASED = "fusion_gym/BiasedOscillator-v0"
-SCARCE: dict[str, Any] = {"filter": "tobit", "token_rate": 1.0, "initial_tokens": 5.0}
-
-
-def played(steps: int, env_id: str = ENV_ID, **options: Any) -> EpisodeBatch:
-    batch = EpisodeBatch(fusion_gym.make_task(env_id, **options), 40)
-    batch.seed(np.arange(40), list(range(40)))
-    batch.reset()
-    generator = np.random.default_rng(0)
-    for _ in range(steps):
-        batch.step(generator.random((batch.task.sensors, 40)) < 0.5)
-    return batch
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"sharing": "rotating", "token_cost": (1.0, 3.0, 6.0)},
-        {"sharing": "fixed"},
-        {"access": "round_robin", "sharing": "rotating"},
-        {"tokens": "unlimited"},
-    ],
-)
-@pytest.mark.parametrize("steps", [0, 7])
-def test_grantable_is_what_the_network_grants_alone(options: dict[str, Any], steps: int) -> None:
-    grantable = played(steps, **(SCARCE | options)).grantable()
-    for sensor in range(3):
-        batch = played(steps, **(SCARCE | options))
-        single = np.zeros((3, 40), dtype=np.bool_)
-        single[sensor] = True
-        np.testing.assert_array_equal(batch.step(single).granted[sensor], grantable[sensor])
 
 
 @pytest.mark.parametrize("options", [{}, {"action": "discrete"}, {"access": "single"}])

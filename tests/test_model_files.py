@@ -24,11 +24,13 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 import fusion_gym
-from fusion_gym.agents import compare, evaluate, table
+from fusion_gym.agents import compare, evaluate
+from fusion_gym.agents.maintenance import table
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.policies import archive
-from fusion_gym.policies.model import ALGORITHMS, tag_model
+from fusion_gym.policies.card import ALGORITHMS
+from fusion_gym.policies.model import tag_model
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 

@@ -66,21 +66,6 @@ def test_twenty_uncensored_steps_are_filterpys(kind: Any) -> None:
                 )
 
 
-def test_a_censoring_threshold_matters_to_the_tobit_filter_only() -> None:
-    free = random_problem(3, 2, 2, lanes=5, threshold=NEVER_CENSORED)
-    censored = free._replace(
-        sensors=CensoredSensors.create(
-            free.sensors.measurement_matrix[..., 0], free.sensors.variance[..., 0], 0.5, 2
-        )
-    )
-    same = outcomes(KalmanFilter(free.sensors), free)
-    for left, right in zip(same, outcomes(KalmanFilter(censored.sensors), censored), strict=True):
-        assert np.array_equal(left, right)
-    tobit = outcomes(TobitKalmanFilter(censored.sensors), censored)
-    assert not np.allclose(same[0], tobit[0], rtol=1e-2)
-    assert not np.allclose(same[1], tobit[1], rtol=1e-2)
-
-
 def test_a_component_without_threshold_beside_a_censored_one() -> None:
     # With C and P diagonal the components do not touch: one is FilterPy's, the other stands alone.
     sensors = CensoredSensors.create(np.eye(2)[None], 0.5, (NEVER_CENSORED, 1.0), 2)

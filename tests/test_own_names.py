@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from command_runs import call
+from rules import make_rule
 from stable_baselines3.common.env_util import make_vec_env
 
 import fusion_gym
@@ -18,7 +19,7 @@ from fusion_gym.agents.training.config import EnvironmentConfig
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.one_batch import one_batch
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.registry import make_policy, make_rule
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 TOBIT = "fusion_gym/TobitOscillator-v0"

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from reference_markov_jump import PAPER, Dense, best_weights
 
 import fusion_gym
@@ -19,10 +18,8 @@ from fusion_gym.policies import periodic_optimum
 from fusion_gym.policies.periodic_optimum import PeriodicOptimum, steady_traces
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.random import Random
-from fusion_gym.systems.markov_jump.system import MarkovJumpSystem
 from fusion_gym.validation import ConfigurationError
 
-Array = NDArray[np.float64]
 ENV_ID = "fusion_gym/MarkovJumpTracking-v0"
 
 
@@ -35,23 +32,6 @@ def _forgetful(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(periodic_optimum, "_found", {})
 
 
-def recursion_traces(schedules: NDArray[np.bool_], steps: int, last: int) -> Array:
-    """Mean fused trace over the last times, from the covariances' recursion alone."""
-    system, runs = markov().system, schedules.shape[-1]
-    assert isinstance(system, MarkovJumpSystem)
-    recursion = system.recursion
-    lags, means = recursion.start(runs), np.zeros((3, 2, runs))
-    sent, total = np.ones((3, runs), dtype=bool), np.zeros(runs)
-    for time in range(1, steps + 1):
-        place = recursion.filters.at(np.full(runs, time))
-        lags = recursion.predict(lags, sent, recursion.filters.at(np.full(runs, time - 1)))
-        sent = schedules[(time - 1) % len(schedules)]
-        if time > steps - last:
-            prediction = recursion.prediction(lags, place)
-            total += linalg.trace(system.fusion.fuse(means, prediction.joint(sent)).covariance)
-    return total / last
-
-
 @pytest.mark.parametrize(("packets", "best"), [(2, 2.333), (4, 1.727)])
 def test_known_optima(packets: int, best: float) -> None:
     policy = make_policy(f"periodic_optimum:packets={packets},period=6", markov())
@@ -62,22 +42,16 @@ def test_known_optima(packets: int, best: float) -> None:
 
 
 @pytest.mark.parametrize("period", [4, 6])
-def test_traces_are_those_of_the_recursion_alone(period: int) -> None:
+def test_the_trace_is_that_of_dense_matrices(period: int) -> None:
     """With a period of 4 and sampling that repeats after 6 steps the traces repeat after 12."""
-    schedules = np.random.default_rng(0).random((period, 3, 40)) < 0.3
-    result = steady_traces(markov().system, schedules)
-    np.testing.assert_allclose(result, recursion_traces(schedules, 144, 12), rtol=1e-6)
-
-
-def test_the_trace_is_that_of_dense_matrices() -> None:
-    policy = PeriodicOptimum(markov(), 3, 6)
+    policy = PeriodicOptimum(markov(), 3, period)
     dense, traces = Dense(PAPER), []
     dense.send(np.ones(3, dtype=bool))
     for step in range(96):
-        sent = policy.schedule[step % 6]
+        sent = policy.schedule[step % period]
         traces.append(np.trace(best_weights(dense.copies(sent), 2)[1]))
         dense.send(sent)
-    assert np.mean(traces[-6:]) == pytest.approx(policy.trace, rel=1e-5)
+    assert np.mean(traces[-12:]) == pytest.approx(policy.trace, rel=1e-5)
 
 
 @pytest.mark.parametrize("options", [{}, {"filter": "centralised"}, {"fusion": "ci"}])

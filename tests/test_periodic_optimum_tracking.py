@@ -117,37 +117,6 @@ def test_the_mean_over_drawn_noise_scales() -> None:
     assert policy.trace == pytest.approx(0.7 * fixed.trace, rel=1e-9)
 
 
-def test_a_system_that_tracks_already_has_the_same_optimum() -> None:
-    tracked = PeriodicOptimum(correlated(track_actual=True, horizon=20), 2, 3, average="episode")
-    other = PeriodicOptimum(correlated(horizon=20), 2, 3, average="episode")
-    np.testing.assert_array_equal(tracked.schedule, other.schedule)
-    assert tracked.trace == other.trace
-
-
-@pytest.mark.slow
-def test_an_input_as_the_filter_believes_it_makes_the_claim_true() -> None:
-    """One sensor, so that nothing is fused; 2,000 episodes, 4 standard errors of 0.5 %."""
-    retention = np.exp(-1.0 / 5.0)
-    task = unknown(
-        horizon=240,
-        measurement_matrices=[[[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]],
-        measurement_covariance=[[0.01, 0.02]],
-        input_signal="random_walk",
-        input_amplitude=0.5,
-        input_period=5.0,
-        input_memory=retention,
-        input_change=0.5 * np.sqrt(1.0 - retention**2),
-        input_deviation=0.5,
-    )
-    for average, transient in (("episode", 0), ("steady", 40)):
-        policy = PeriodicOptimum(task, 2, 4, average=average)
-        results = run_episodes(task, policy, 2000, 0)
-        result = results.squared_error[transient:].sum(1).mean()
-        error = results.mse.std() / np.sqrt(2000 * (1.0 - transient / 240))
-        assert error < 0.005 * policy.trace
-        assert abs(result - policy.trace) <= 4 * error
-
-
 def intersected(a: Array, b: Array) -> Array:
     """Covariance intersection of the smallest trace by a general-purpose search."""
 

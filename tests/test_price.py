@@ -41,13 +41,6 @@ def test_every_episode_draws_its_own_price() -> None:
     assert started(2, cost_weight="random", price_range=SPAN).price[1] == first[1]
 
 
-def test_a_fixed_price_in_a_range_is_observed() -> None:
-    batch = started(2, cost_weight=0.01, price_range=SPAN)
-    entry = batch.layout.names.index("price")
-    np.testing.assert_allclose(batch.observe()[:, entry], 0.5, atol=1e-6)
-    assert "price" not in started(2, cost_weight=0.01).layout.names
-
-
 def test_an_agent_is_asked_at_any_price(tmp_path: Any) -> None:
     from stable_baselines3 import PPO
 

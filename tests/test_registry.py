@@ -10,7 +10,13 @@ import fusion_gym
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy, Rule
-from fusion_gym.policies.registry import make_policy, policy_names, register_policy
+from fusion_gym.policies.registry import (
+    make_policy,
+    policy_maker,
+    policy_names,
+    policy_parameters,
+    register_policy,
+)
 from fusion_gym.validation import ConfigurationError
 
 
@@ -91,6 +97,15 @@ def test_a_maker_is_given_the_task_and_says_what_is_missing(task: Task) -> None:
     register_policy("flat", Flat)
     with pytest.raises(ConfigurationError, match=r"an array of bool \(3,\): .* \(3, 1\)"):
         make_policy("flat", task)
+
+
+@pytest.mark.parametrize("value", ["high", float("nan"), {}, (1.0, float("inf")), -1.0])
+@pytest.mark.parametrize("name", policy_names("rule"))
+def test_a_parameter_that_a_rule_cannot_have_is_refused_by_name(name: str, value: Any) -> None:
+    for parameter in policy_parameters(name):
+        if (parameter, value) != ("m", -1.0):
+            with pytest.raises(ConfigurationError, match=f"^{parameter} = "):
+                policy_maker(name)(**{parameter: value})
 
 
 @pytest.mark.usefixtures("own_table")

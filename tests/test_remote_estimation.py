@@ -6,16 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rules import make_rule
 
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.channel import Channel
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.optimal import OptimalPolicy
-from fusion_gym.policies.registry import make_rule
-from fusion_gym.solvers.joint import JointProblem, solve_joint_average
-from fusion_gym.solvers.single import SourceProblem, solve_average
-from fusion_gym.solvers.task import solve_task, source_problems
+from fusion_gym.solvers.single import solve_average
+from fusion_gym.solvers.task import source_problems
 from fusion_gym.validation import ConfigurationError
 
 build_tracking = partial(make_task, "fusion_gym/CorrelatedTracking-v0")
@@ -74,9 +73,7 @@ def test_simple_channels_and_certain_starts() -> None:
 def test_library_and_plain_loop_walk_the_same_trajectories(options: dict[str, Any]) -> None:
     task = build(horizon=60, cost_weight=3.0, **options)
     sensors, system = task.sensors, task.system
-    batch, runs = EpisodeBatch(task, 4), 4
-    batch.seed(np.arange(runs), [7, 8, 9, 10])
-    batch.reset()
+    batch, runs = EpisodeBatch.seeded(task, 4, 7), 4
     ask = np.random.default_rng(3).random((60, sensors, runs)) < 0.3
     a = np.broadcast_to(task.settings["coefficient"], sensors)
     estimate, age = np.zeros((sensors, runs)), np.zeros((sensors, runs))
@@ -115,31 +112,9 @@ def test_library_and_plain_loop_walk_the_same_trajectories(options: dict[str, An
         np.testing.assert_allclose(np.diagonal(covariance).T, variance, atol=1e-9, rtol=1e-9)
 
 
-def test_sources_have_the_stated_law_whatever_is_sent() -> None:
-    task = build(coefficient=0.9, noise_deviation=2.0, initial_deviation=5.0, horizon=40)
-    truths = []
-    for policy in ("never", "always"):
-        batch, rule = EpisodeBatch(task, 4000), make_rule(policy)
-        batch.seed(np.arange(4000), list(range(4000)))
-        batch.reset()
-        path = [task.system.truth(batch.state)[0]]
-        for _ in range(30):
-            batch.step(rule(batch.signals()))
-            path.append(task.system.truth(batch.state)[0])
-        truths.append(np.array(path))
-    np.testing.assert_array_equal(*truths)
-    path = truths[0]
-    assert path[0].std() == pytest.approx(math.hypot(4.5, 2.0), rel=0.05)
-    noise = path[1:] - 0.9 * path[:-1]
-    assert noise.std() == pytest.approx(2.0, rel=0.01)
-    assert abs((noise[1:] * noise[:-1]).mean()) < 0.1
-
-
 def test_knowledge_of_the_channel_is_one_step_late() -> None:
     task = build(**LOSSY, initial_channel="bad", horizon=200)
-    batch = EpisodeBatch(task, 400)
-    batch.seed(np.arange(400), list(range(400)))
-    batch.reset()
+    batch = EpisodeBatch.seeded(task, 400, 0)
     names = list(batch.layout.names)
     assert names == ["error[0]", "age[0]", "channel[0,bad]", "channel[0,good]", "tokens"]
     assert (batch.signals()["channel_state"] == 0).all()
@@ -241,19 +216,6 @@ def test_stationary_policy_loses_nothing_in_long_episodes() -> None:
     gain = first - two
     assert -3.0 * gain.std() / math.sqrt(3000) < gain.mean() < 0.01 * abs(first.mean())
     assert average.optimum.cost * task.horizon == pytest.approx(finite.optimum.cost, rel=0.05)
-
-
-def test_optimum_of_several_sources_that_share_nothing_is_the_sum() -> None:
-    both = solve_task(build(**CASES["two"]))
-    parts = [
-        solve_task(build(coefficient=1.0)).cost,
-        solve_task(build(coefficient=0.8, state_weights=(0.5,))).cost,
-    ]
-    assert both.cost == pytest.approx(sum(parts))
-    task = build(sensors=2, access="single", cost_weight=0.0)
-    single = SourceProblem.create(price=0.0)
-    joint = solve_joint_average(JointProblem.create((single, single), at_most=1))
-    assert solve_task(task, "average").cost == pytest.approx(joint.cost)
 
 
 # --- what is refused -----------------------------------------------------------------------------

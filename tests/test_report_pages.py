@@ -1,13 +1,11 @@
 """The parts of pages that say who wins: made of results, and only where a page asks for them."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
-import pytest
+from command_runs import call
 from small_results import small_results
 
-from fusion_gym.agents import report
 from fusion_gym.agents.experiments.report import read_results, update_pages
 from fusion_gym.agents.experiments.verdict import write_cases
 
@@ -21,21 +19,17 @@ The rest stays. <!-- end -->
 """
 
 
-def test_the_command_writes_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_writes_pages(tmp_path: Path) -> None:
     results, page = tmp_path / "results", tmp_path / "page.md"
     small_results(results)
     page.write_text(PAGE.format(name="headline"))
-    words = ["report", "--results", str(results), "--pages", str(page)]
-    monkeypatch.setattr(sys, "argv", words)
-    report.Report.main()
+    words = ["--parts", "report", "--results", str(results), "--pages", str(page)]
+    assert call("benchmark", words).status == 0
     settings = read_results(results)
-    assert page.read_text() == update_pages(PAGE.format(name="headline"), settings, results)
+    assert page.read_text() == update_pages(PAGE.format(name="headline"), settings, results, {})
     page.write_text(PAGE.format(name="nobody"))
-    with pytest.raises(SystemExit, match="results = 'nobody'"):
-        report.Report.main()
-    monkeypatch.setattr(sys, "argv", [*words[:-1], str(tmp_path / "absent.md")])
-    with pytest.raises(SystemExit, match="pages"):
-        report.Report.main()
+    assert "results = 'nobody'" in call("benchmark", words).err
+    assert "pages" in call("benchmark", [*words[:-1], str(tmp_path / "absent.md")]).err
 
 
 def test_perturbed_cases_are_counted(tmp_path: Path) -> None:
@@ -52,9 +46,10 @@ def test_perturbed_cases_are_counted(tmp_path: Path) -> None:
     }
     report = {"class": "sensors", "cases": cases, "episodes": 2, "sha256": "0"}
     write_cases(tmp_path / "tobit_oscillator", report)
-    text = update_pages(PAGE.format(name="robustness"), {}, tmp_path)
+    titles = {"tobit_oscillator": "Tobit oscillator, with an option"}
+    text = update_pages(PAGE.format(name="robustness"), {}, tmp_path, titles)
     expected = "| Tobit oscillator | as they are | -20.0% [-30.0%, -10.0%] | 1 | 1 | 1 | "
     assert f"{expected}+2.0% [+1.0%, +3.0%], louder |" in text
     assert "trained over draws" not in text
-    nothing = update_pages(PAGE.format(name="robustness"), {}, tmp_path / "absent")
+    nothing = update_pages(PAGE.format(name="robustness"), {}, tmp_path / "absent", titles)
     assert "- Nothing has been tried so far." in nothing

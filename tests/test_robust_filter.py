@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from fusion_gym.systems.correlated.filters import JointErrorCovariance, RobustKalmanFilter
 from fusion_gym.systems.correlated.sensors import CorrelatedSensors
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]
 T = 0.01
@@ -70,18 +69,6 @@ def random_covariances(seed: int, sensors: int, n: int, runs: int) -> Array:
 # --- sensors -----------------------------------------------------------------------------------
 
 
-def test_noise_covariances_of_the_papers_example() -> None:
-    plant, sensors = paper_parts()
-    for i in range(3):
-        np.testing.assert_allclose(
-            sensors.cross_covariance[i, :, :, 0], GAMMA * 0.16 * BETA[i], rtol=1e-14
-        )
-        for j in range(3):
-            expected = 0.16 * BETA[i] * BETA[j] + (ETA[i] if i == j else 0.0)
-            assert sensors.covariance[i, j, 0, 0, 0] == pytest.approx(expected, rel=1e-14)
-    np.testing.assert_allclose(plant.process_covariance[..., 0], GAMMA @ GAMMA.T * 0.16)
-
-
 def test_measured_noises_have_the_stated_covariances() -> None:
     plant, sensors = random_parts(5)
     runs = 400_000
@@ -128,36 +115,6 @@ def test_update_agrees_with_filterpys_correlated_update(size: int) -> None:
             np.testing.assert_allclose(
                 outcomes.delivered_covariance[sensor, ..., run], other.P, rtol=1e-8, atol=1e-10
             )
-
-
-def test_posterior_is_the_papers_lyapunov_form_and_its_gain_the_best() -> None:
-    """(18), (19) with Ψ = (I - K H) Φ and noise gain [I - K H, -K]; any other gain is worse."""
-    plant, sensors = random_parts(21)
-    before = random_covariances(22, 3, plant.size, 1)
-    _, prior = plant.predict(np.zeros((3, plant.size, 1)), before)
-    outcomes = RobustKalmanFilter(sensors).outcomes(prior)
-
-    def lyapunov(sensor: int, gain: Array) -> Array:
-        retention = np.eye(plant.size) - gain @ sensors.measurement_matrix[sensor, ..., 0]
-        cross = sensors.cross_covariance[sensor, ..., 0]
-        noise = np.block(
-            [
-                [plant.process_covariance[..., 0], cross],
-                [cross.T, sensors.covariance[sensor, sensor, ..., 0]],
-            ]
-        )
-        psi, through = retention @ plant.transition[..., 0], np.hstack([retention, -gain])
-        result: Array = psi @ before[sensor, ..., 0] @ psi.T + through @ noise @ through.T
-        return result
-
-    for sensor in range(3):
-        gain = outcomes.gain[sensor, ..., 0]
-        best = lyapunov(sensor, gain)
-        np.testing.assert_allclose(outcomes.delivered_covariance[sensor, ..., 0], best, rtol=1e-8)
-        for seed in range(5):
-            worse = lyapunov(sensor, gain + np.random.default_rng(seed).normal(size=gain.shape))
-            assert np.linalg.eigvalsh(worse - best)[0] >= -1e-9
-            assert np.trace(worse) > np.trace(best)
 
 
 # --- the joint error covariance ------------------------------------------------------------------
@@ -264,24 +221,3 @@ def test_conservative_covariance_is_actual_at_the_bounds_and_above_it_below() ->
             np.testing.assert_allclose(own, conservative[node], rtol=1e-7, atol=1e-9)
             gap = np.linalg.eigvalsh(conservative[node] - smaller[node + 1, node + 1])
             assert gap[0] > 0.0
-
-
-# --- bad input -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"matrices": np.eye(3)}, "measurement_matrices"),
-        ({"variance": [[1.0], [2.0, 3.0]]}, "measurement_variance"),
-        ({"coupling": float("nan")}, "noise_coupling"),
-    ],
-)
-def test_what_cannot_be_used_is_refused(change: dict[str, Any], message: str) -> None:
-    arguments: dict[str, Any] = {
-        "matrices": np.eye(3)[:, None],
-        "variance": ETA,
-        "coupling": BETA,
-    }
-    with pytest.raises(ConfigurationError, match=message):
-        parts(PHI, GAMMA, np.array([0.16]), **(arguments | change))

@@ -76,12 +76,6 @@ def test_the_joint_filter_agrees_up_to_rounding() -> None:
     np.testing.assert_allclose(result[1], expected[1], rtol=1e-9, atol=1e-12)
 
 
-def test_where_nothing_is_saved_it_is_not_offered() -> None:
-    for options in ({"fusion": "sci"}, {"filter": "adf", "censoring_threshold": -1.0}):
-        task = task_of(**options)
-        assert not task.system.offers("fused_alone")
-
-
 @pytest.mark.parametrize("shared", [True, False])
 def test_informations_after_an_answer_are_the_inverses_of_what_results(shared: bool) -> None:
     rng = np.random.default_rng(0)

@@ -7,12 +7,13 @@ import pytest
 from filter_problems import outcomes, random_problem
 from filterpy.kalman import KalmanFilter as FilterPyFilter
 from numpy.typing import NDArray
+from rules import make_rule
 
 from fusion_gym import ConfigurationError, make_task
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.policies.registry import make_policy, make_rule
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.stochastic_event import StochasticEvent
 from fusion_gym.systems.tobit.filters import KalmanFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -73,13 +74,6 @@ def deviations(values: Array) -> float:
     return float(values.mean() / (values.std() / np.sqrt(len(values))))
 
 
-def started(task: Task, runs: int) -> EpisodeBatch:
-    batch = EpisodeBatch(task, runs)
-    batch.seed(np.arange(runs), list(range(runs)))
-    batch.reset()
-    return batch
-
-
 # --- exactness ----------------------------------------------------------------------------------
 
 
@@ -91,60 +85,6 @@ def test_the_filter_is_exact_for_its_trigger(system: dict[str, Any], weight: Any
     assert abs(deviations(results.bound_trace - results.mse)) < DEVIATIONS
     assert results.nees.mean() == pytest.approx(1.0, abs=0.03)
     assert results.bound_trace.mean() == pytest.approx(results.mse.mean(), rel=0.03)
-
-
-@pytest.mark.parametrize(("system", "weight"), SYSTEMS)
-def test_the_error_is_gaussian_after_a_delivery_and_after_silence(
-    system: dict[str, Any], weight: Any
-) -> None:
-    """d² = eᵀ P⁻¹ e is chi-squared with n degrees of freedom, however many sensors were silent."""
-    runs = 4000
-    task = task_of(system, weight, horizon=30)
-    policy, batch = make_policy("stochastic_event", task), started(task, runs)
-    policy.reset(runs, 0)
-    for _ in range(30):
-        outcome = batch.step(policy(batch.signals()))
-    mean, covariance = task.system.fused(batch.delivered)
-    error = (task.system.truth(batch.delivered) - mean).T
-    distance = (
-        error * np.linalg.solve(covariance.transpose(2, 0, 1), error[..., None])[..., 0]
-    ).sum(1)
-    states = error.shape[1]
-    for deliveries in range(task.sensors + 1):
-        kind = distance[outcome.granted.sum(0) == deliveries]
-        if len(kind) < 100:
-            continue
-        assert abs(deviations(kind - states)) < DEVIATIONS
-        assert abs(deviations(kind**2 - states * (states + 2))) < DEVIATIONS
-    assert np.unique(outcome.granted.sum(0)).size > 1
-
-
-@pytest.mark.parametrize(("system", "weight"), SYSTEMS)
-def test_the_ordinary_filter_claims_too_much_variance(system: dict[str, Any], weight: Any) -> None:
-    known = task_of(system, weight)
-    unknown = task_of(system, None, filter="kalman")
-    text = "/".join(map(str, np.atleast_1d(weight)))
-    results = evaluate(unknown, f"stochastic_event:weight={text}")
-    assert deviations(results.nees - 1.0) < -10
-    assert deviations(results.bound_trace - results.mse) > 10
-    better = evaluate(known)
-    assert deviations(results.mse - better.mse) > DEVIATIONS  # what silence is worth
-    assert better.rate.mean() <= results.rate.mean() * 1.01  # and not for more transmissions
-
-
-@pytest.mark.parametrize(
-    ("options", "policy"),
-    [
-        pytest.param({"tokens": "limited", "token_rate": 1.0}, "stochastic_event", id="denials"),
-        pytest.param({"censoring_threshold": 0.0}, "stochastic_event", id="censoring"),
-        pytest.param({}, "stochastic_event:weight=0.2", id="a more silent policy"),
-        pytest.param({}, "paced:rate=0.4", id="a policy by the clock"),
-    ],
-)
-def test_silence_is_over_interpreted_elsewhere(options: dict[str, Any], policy: str) -> None:
-    results = evaluate(task_of(ROTATION, (1.0, 0.3, 3.0), **options), policy, 500)
-    assert deviations(results.nees - 1.0) > 10
-    assert deviations(results.bound_trace - results.mse) < -10
 
 
 # --- the update ---------------------------------------------------------------------------------
@@ -190,14 +130,6 @@ def test_silence_adds_information(size: int) -> None:
             np.testing.assert_array_equal(silent, silent.T)
 
 
-def test_silence_without_weight_says_nothing_and_with_all_weight_everything() -> None:
-    problem = random_problem(9, 2, 3, lanes=5, threshold=-INFINITY)
-    nothing = outcomes(StochasticEventFilter(problem.sensors, np.zeros((2, 1))), problem)
-    np.testing.assert_allclose(nothing[3], problem.covariance, rtol=1e-14)
-    everything = outcomes(StochasticEventFilter.create(problem.sensors, 1e14), problem)
-    np.testing.assert_allclose(everything[3], everything[1], rtol=1e-8, atol=1e-10)
-
-
 def test_federation_is_one_filter_that_takes_silence_as_a_measurement() -> None:
     """Against FilterPy with all sensors stacked: y with R, or C x̂ with R + Z⁻¹ when silent."""
     weight, runs = (1.0, 0.3, 3.0), 3
@@ -210,7 +142,7 @@ def test_federation_is_one_filter_that_takes_silence_as_a_measurement() -> None:
         other.F, other.Q = plant.transition[..., 0], plant.process_covariance[..., 0]
         other.H = sensors.measurement_matrix[..., 0].reshape(6, 2)
         filters.append(other)
-    generator, batch = np.random.default_rng(2), started(task, runs)
+    generator, batch = np.random.default_rng(2), EpisodeBatch.seeded(task, runs, 0)
     for _ in range(25):
         granted = generator.random((3, runs)) < 0.4
         measurement = batch.signals()["measurement"].copy()
@@ -227,36 +159,6 @@ def test_federation_is_one_filter_that_takes_silence_as_a_measurement() -> None:
 
 
 # --- the rate -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("system", "weight"), SYSTEMS)
-def test_the_rate_is_one_less_the_root_of_a_determinant(
-    system: dict[str, Any], weight: Any
-) -> None:
-    """P(silent) = det(I + (C P Cᵀ + R) Z)^(-1/2) given P, for z ~ N(0, C P Cᵀ + R).
-
-    Requests less their probabilities are differences of a martingale: the variance of their sum
-    is the sum of p (1 - p).
-    """
-    runs = 500
-    task = task_of(system, weight)
-    sensors, weights = task.system.centre.sensors, np.broadcast_to(weight, task.sensors)
-    policy, batch = make_policy("stochastic_event", task), started(task, runs)
-    policy.reset(runs, 0)
-    excess, variance = np.zeros(task.sensors), np.zeros(task.sensors)
-    for _ in range(60):
-        signals = batch.signals()
-        prior = signals["prior_covariance"].transpose(2, 0, 1)
-        requests = policy(signals)
-        for sensor in range(task.sensors):
-            matrix = sensors.measurement_matrix[sensor, :, :, 0]
-            spread = matrix @ prior @ matrix.T + np.diag(sensors.variance[sensor, :, 0])
-            silence = np.linalg.det(np.eye(len(matrix)) + weights[sensor] * spread) ** -0.5
-            excess[sensor] += (requests[sensor] - (1 - silence)).sum()
-            variance[sensor] += (silence * (1 - silence)).sum()
-        batch.step(requests)
-    assert np.all(np.abs(excess) < DEVIATIONS * np.sqrt(variance))
-    assert np.all(np.sqrt(variance) / (60 * runs) < 0.003)  # so much is a rate known
 
 
 # --- the trigger --------------------------------------------------------------------------------

@@ -140,61 +140,6 @@ def test_limits_hold_for_any_numbers_up_to_rounding(
         tokens = answer.tokens
 
 
-@given(tokens=st.floats(0.0, 30.0), request=st.lists(st.booleans(), min_size=3, max_size=3))
-@settings(max_examples=200, deadline=None)
-def test_equal_sharing_with_equal_costs_is_all_or_nothing(
-    tokens: float, request: list[bool]
-) -> None:
-    bucket = TokenBucket.create(**PAPER)
-    requests = np.array(request)[:, None]
-    granted = bucket.grant(np.array([tokens]), requests, np.array([0])).granted
-    # Three sensors at three tokens each: from nine tokens on, however few of them ask.
-    assert np.array_equal(granted, requests if tokens >= 9.0 else np.zeros_like(requests))
-
-
-def test_equal_sharing_looks_at_the_tokens_before_this_steps_spending() -> None:
-    bucket = TokenBucket.create(**PAPER)
-    everyone = np.ones((3, 4), dtype=np.bool_)
-    before = np.array([8.999, 9.0, 4.0, 30.0])
-    answer = bucket.grant(before, everyone, np.zeros(4, dtype=np.int64))
-    # At nine tokens all three are served although nothing is left for a fourth; at 8.999 and at
-    # 4 none is, although 4 + 5 - 3 tokens would pay for one after the refill.
-    assert answer.granted.all(0).tolist() == [False, True, False, True]
-    assert answer.granted.any(0).tolist() == [False, True, False, True]
-    assert answer.spent.tolist() == [0.0, 9.0, 0.0, 9.0]
-    assert answer.tokens == pytest.approx([13.999, 5.0, 9.0, 26.0], abs=1e-12)
-
-
-def test_rules_in_order_spend_while_tokens_last() -> None:
-    everyone = np.ones((3, 3), dtype=np.bool_)
-    tokens = np.full(3, 7.0)  # pays for two of three
-    steps = np.array([0, 1, 2])
-    fixed = TokenBucket.create(**(PAPER | {"sharing": "fixed"})).grant(tokens, everyone, steps)
-    assert fixed.granted.T.tolist() == [[True, True, False]] * 3
-    turning = TokenBucket.create(**(PAPER | {"sharing": "rotating"})).grant(tokens, everyone, steps)
-    assert turning.granted.T.tolist() == [
-        [True, True, False],
-        [False, True, True],
-        [True, False, True],
-    ]
-    assert turning.tokens.tolist() == [6.0] * 3
-
-
-def test_a_dear_sensor_does_not_block_a_cheap_one_behind_it() -> None:
-    bucket = TokenBucket.create(0.0, 10.0, 2.0, (5.0, 2.0), 2, sharing="fixed")
-    answer = bucket.grant(bucket.start(1), np.ones((2, 1), dtype=np.bool_), np.array([0]))
-    assert answer.granted[:, 0].tolist() == [False, True]
-
-
-def test_at_most_five_ninths_of_all_requests_are_sustained() -> None:
-    bucket = TokenBucket.create(**PAPER)
-    tokens, granted, steps = bucket.start(1), 0, 9000
-    for number in range(steps):
-        answer = bucket.grant(tokens, np.ones((3, 1), dtype=np.bool_), np.array([number]))
-        tokens, granted = answer.tokens, granted + int(answer.granted.sum())
-    assert granted / (3 * steps) == pytest.approx(5 / 9, abs=2e-4)
-
-
 @given(bucket=buckets(unlimited=True), seed=st.integers(0, 2**31))
 @settings(max_examples=50, deadline=None)
 def test_unlimited_grants_everything_and_counts_it(bucket: TokenBucket, seed: int) -> None:
@@ -221,19 +166,13 @@ def test_an_unlimited_bucket_needs_no_capacity_for_a_transmission() -> None:
         ({"capacity": 2.0, "initial": 1.0, "sharing": "fixed"}, "token_capacity", "2"),
         ({"cost": (1.0, 1.0, 11.0)}, "token_capacity", "30"),
         ({"capacity": 0.0}, "token_capacity", "0.0"),
-        ({"capacity": math.inf}, "token_capacity", "inf"),
         ({"cost": -3.0}, "token_cost", "-3.0"),
         ({"cost": 0.0}, "token_cost", "0.0"),
         ({"cost": (1.0, 2.0)}, "token_cost", r"\(1.0, 2.0\)"),
-        ({"cost": "dear"}, "token_cost", "dear"),
         ({"rate": -1.0}, "token_rate", "-1.0"),
-        ({"rate": math.nan}, "token_rate", "nan"),
-        ({"rate": True}, "token_rate", "True"),
         ({"initial": 31.0}, "initial_tokens", "31.0"),
         ({"initial": -0.5}, "initial_tokens", "-0.5"),
         ({"sharing": "even"}, "sharing", "even"),
-        ({"sharing": None}, "sharing", "None"),
-        ({"unlimited": 1}, "unlimited", "1"),
     ],
 )
 def test_bad_input_is_refused_by_name_and_value(

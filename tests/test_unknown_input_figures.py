@@ -14,12 +14,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fusion_gym.agents.papers.unknown_input import record_run
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import make_task
-from fusion_gym.policies.base import Policy
-from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
-from fusion_gym.policies.rules.constant import Always, Never
-from fusion_gym.policies.rules.random import Random
 
 build = partial(make_task, "fusion_gym/UnknownInput-v0")
 
@@ -34,35 +31,20 @@ class Run(NamedTuple):
     state: Array
     inputs: Array
     errors: Array
-    truth: Array
+
+
+POLICIES = {"event": "adaptive_threshold", "random": "random:rate=0.3"}
 
 
 @cache
 def run(policy: str, episodes: int = 400, horizon: int = 100, **options: Any) -> Run:
     task = build(horizon=horizon, **options)
     n = task.system.plant.size
-    rule: Policy = {
-        "event": AdaptiveThreshold(**task.policy_defaults["adaptive_threshold"]),
-        "always": Always(),
-        "never": Never(),
-        "random": Random(0.3),
-    }[policy]
-    batch = EpisodeBatch(task, episodes)
-    batch.seed(np.arange(episodes), list(range(9000, 9000 + episodes)))
-    batch.reset()
-    rule.reset(episodes, 1)
-    rates, errors, truths = [], [], []
-    for _ in range(horizon):
-        rates.append(batch.step(rule(batch.signals())).granted)
-        state = batch.delivered
-        fused = task.system.fused(state)[0]
-        truth = task.system.truth(state)
-        errors.append(np.concatenate((task.system.local_means(state), fused[None])) - truth)
-        truths.append(truth)
-    error = np.array(errors)
+    record = record_run(task, POLICIES.get(policy, policy), episodes, 9000)
+    every = np.concatenate((record.local, record.fused[:, None]), axis=1)
+    error = every - record.truth[:, None]
     square = (error**2).mean(0)
-    rate = np.mean(rates, axis=0, dtype=np.float64)
-    return Run(rate, square[:, :n].sum(1), square[:, n:].sum(1), error, np.array(truths))
+    return Run(record.granted.mean(0), square[:, :n].sum(1), square[:, n:].sum(1), error)
 
 
 def assert_rmse(name: str, samples: Array, printed: float, digit: float) -> None:

@@ -24,7 +24,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy, owner_of
 
 Values = dict[str, Any]
-RUNS, STEPS = 6, 10
+RUNS, STEPS = 6, 7
 CLOCK = ("step", "start", "token_cost")  # all runs know the costs, which never change
 TOLD = (*CLOCK, "tokens", "price")
 

@@ -23,31 +23,11 @@ import venv
 import zipfile
 from pathlib import Path
 
+from small_suite import small_suite
+
 ROOT = Path(__file__).parent.parent
 CONSTRAINTS = str(ROOT / "constraints.txt")
 HIDDEN = {".ci", ".gitignore"}  # of the repository alone
-SUITE = {
-    "episodes": 4,
-    "training_seeds": 1,
-    "timesteps": 256,
-    "num_envs": 4,
-    "prices": 2,
-    "classes": ["sensors"],
-    "tuning": {"trials": 4, "prices": 2, "episodes": 4, "seeds": 2},
-    "algorithm": {"name": "ppo", "n_steps": 8, "batch_size": 32},
-    "families": [
-        {"label": "rule", "policy": "paced", "parameters": {"rate": {"low": 0.1, "high": 1}}}
-    ],
-    "settings": [
-        {
-            "name": "small",
-            "title": "a small setting",
-            "environment": {"id": "fusion_gym/TobitOscillator-v0", "options": {"horizon": 10}},
-            "price_range": [0.001, 0.1],
-            "broadcasts": ["estimate"],
-        }
-    ],
-}
 LIBRARY = """
 import sys
 import gymnasium as gym
@@ -155,12 +135,11 @@ def use(programs: Path, folder: Path) -> None:
     assert (folder / "demo" / "scheduler" / "front.png").exists()
     table = call(program, "table", "--episodes", "2", "--markdown", cwd=folder).stdout
     assert table.startswith("| setting |"), table
-    (folder / "suite.yaml").write_text(json.dumps(SUITE))
+    small_suite(folder, training_seeds=1, classes=["sensors"])
     suite = ("--config", "suite.yaml", "--results", "results", "--work", "work", "--workers", "1")
     call(program, "benchmark", *suite, cwd=folder)
     again = call(program, "benchmark", *suite, cwd=folder, status=1).stderr
     assert "--resume" in again.splitlines()[-1], again
-    call(program, "report", cwd=folder)
     assert "`fusion-gym benchmark`" in (folder / "results" / "README.md").read_text()
     call(program, "zoo", "--work", "work", "--zoo", "zoo", cwd=folder)
     assert (folder / "zoo" / "small_sensors.zip").exists()

@@ -8,7 +8,6 @@ from fusion_gym.envs.pages import page
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 from fusion_gym.envs.views import make_view
 from website.papers import paper_of
-from website.parts import filter_slug
 from website.places import DOCS, pages_of
 
 SECTIONS = ("Action space", "Reward", "Episode end", "Info")
@@ -32,9 +31,8 @@ def at_a_glance(env_id: str) -> str:
         ("action", f"`{view.actions}`"),
         ("steps of an episode", str(task.horizon)),
     ]
-    kind = options_of(env_id)
     links = [
-        f"[`{name or owner.__name__}`](filters/{filter_slug(owner)}.md)"
+        f"[`{name or owner.__name__}`](filters/{owner.__name__}.md)"
         for name, owner in kind.filters.items()
     ]
     if links:
@@ -44,7 +42,7 @@ def at_a_glance(env_id: str) -> str:
         rows.append(("fusion", ", ".join(f"[`{name}`](fusion/{name}.md)" for name in names)))
     paper = paper_of(env_id)
     if (DOCS / "reproduction" / f"{paper}.md").exists():
-        rows.append(("made anew", f"[the paper's figures and claims](reproduction/{paper}.md)"))
+        rows.append(("reproduced", f"[the paper's figures and claims](reproduction/{paper}.md)"))
     return table(("", env_id.split("/")[1]), rows)
 
 

@@ -13,15 +13,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from website import (
-    environment_pages,
-    markup,
-    navigation,
-    part_pages,
-    parts,
-    places,
-    reference,
-)
+from website import environment_pages, markup, parts, places, reference
 
 # In the search: a part's own page goes before those that only name it, and long tables come last.
 _RANKED = "---\nsearch:\n  boost: {:g}\n---\n\n"
@@ -30,8 +22,12 @@ _README = re.compile(r"^<!-- README: (.+?) -->$", re.MULTILINE)
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """The table of contents, from what there is."""
-    config.nav = navigation.navigation()
+    """The table of contents of mkdocs.yml, with the pages that are made."""
+    kinds = [{title: list(parts.pages(kind))} for kind, title in parts.KIND_NAMES.items()]
+    made = {"Parts": kinds, "Reference": reference.navigation()}
+    config.nav = [
+        {title: made.get(title, page) for title, page in item.items()} for item in config.nav
+    ]
     return config
 
 
@@ -47,7 +43,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         files.append(File.generated(config, place, abs_src_path=str(path)))
     add("site.css", (Path(__file__).parent / "site.css").read_text(encoding="utf-8"))
     for kind in parts.KIND_NAMES:
-        for place, text in part_pages.pages(kind).items():
+        for place, text in parts.pages(kind).items():
             add(place, _RANKED.format(_FIRST) + text)
     for place, text in reference.pages().items():
         add(place, text)

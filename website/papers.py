@@ -28,7 +28,7 @@ def citations(text: str) -> list[str]:
             )
             links = f"[our reading of it](../{page}.md)"
             if (DOCS / "reproduction" / f"{word}.md").exists():
-                links += f", [its figures and claims made anew](../reproduction/{word}.md)"
+                links += f", [its figures and claims, reproduced](../reproduction/{word}.md)"
             result.append(f"*{word}* is {cited} See {links}.")
     return result
 

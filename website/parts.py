@@ -1,16 +1,19 @@
-"""The policies, fusion rules and filters that have a page each, as their declarations have them."""
+"""A page each for the policies, fusion rules and filters, and an overview of each kind.
+
+A page is the docstring that declares the part, with who knows what or where it is offered above.
+"""
 
 import inspect
-import re
 from dataclasses import dataclass
 from typing import Any
 
 from fusion_gym.core.system import MEANING
-from fusion_gym.docstrings import Docstring, read
+from fusion_gym.docstrings import read, table
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 from fusion_gym.fusion.table import REASONS, RULES
-from fusion_gym.policies.registry import Kind, policy_maker, policy_names, policy_parameters
+from fusion_gym.policies.registry import Kind, policy_maker, policy_names
 from website.docstrings import markdown
+from website.papers import citations
 from website.places import pages_of
 
 KIND_NAMES = {"rules": "Rules and references", "fusion": "Fusion rules", "filters": "Filters"}
@@ -18,14 +21,16 @@ _KINDS: dict[Kind, str] = {
     "rule": "a rule: it looks at signals alone",
     "reference": "a reference: it takes the task and its model, without the truth",
 }
-# Types of parameters in words.
-_WORDS = {
-    "PerSensor": "a number, or one a sensor",
-    "float": "a number",
-    "int": "a whole number",
-    "bool": "True or False",
-    "str": "a word",
-    "None": "None",
+_INTROS = {
+    "rules": "Every policy by name. A *rule* looks at signals alone; a *reference* takes the task "
+    "and its model. [Policies](../policies.md) has how they are named and evaluated, and the saved "
+    "agents besides.",
+    "fusion": "How the centre joins the nodes' estimates: the option `fusion` of the environments. "
+    "A rule whose assumption does not hold in an environment is refused there, with the reason. "
+    "Estimates xᵢ with covariances Pᵢ, i = 1…l, are joined to x̂ with P.",
+    "filters": "What nodes or centre make of the measurements that arrive: the option `filter` of "
+    "the environments. All equations are of one step, after the prediction x̂ ← A x̂, "
+    "P ← A P Aᵀ + W; x̂⁺, P⁺ are what follows a delivery, C is the measurement matrix, R the noise.",
 }
 
 
@@ -37,12 +42,16 @@ class Part:
     owner: Any
     meaning: str
     rows: tuple[tuple[str, str], ...]
-    kind: str = ""
 
     @property
-    def docstring(self) -> Docstring:
-        """The declaration."""
-        return read(self.owner)
+    def page(self) -> str:
+        """The page's Markdown; the reference is where links to the object lead."""
+        place = f"{self.owner.__module__}.{self.owner.__qualname__}"
+        code = ("in code", f"[`{self.owner.__name__}`][{place}]")
+        declared = f"::: {place}\n    options: {{members: false, skip_local_inventory: true}}"
+        source = markdown(read(self.owner).labelled["Source"])
+        first = [f"# `{self.name}`", table(("", ""), (*self.rows, code)), declared]
+        return "\n\n".join([*first, *citations(source)]) + "\n"
 
 
 def parts(kind: str) -> list[Part]:
@@ -50,18 +59,29 @@ def parts(kind: str) -> list[Part]:
     return {"rules": policies, "fusion": fusions, "filters": filters}[kind]()
 
 
+def pages(kind: str) -> dict[str, str]:
+    """The pages of a kind by their places, its overview first."""
+    every = parts(kind)
+    rows = [(f"[`{part.name}`]({part.name}.md)", part.meaning) for part in every]
+    overview = f"# {KIND_NAMES[kind]}\n\n{_INTROS[kind]}\n\n{table(('', ''), rows)}\n"
+    return {f"{kind}/index.md": overview} | {f"{kind}/{part.name}.md": part.page for part in every}
+
+
 def policies() -> list[Part]:
     """Rules and references of the registry, rules first."""
+    makers = {
+        name: (policy_maker(name), text)
+        for kind, text in _KINDS.items()
+        for name in policy_names(kind)
+    }
     return [
         Part(
             name,
-            policy_maker(name),
-            _summary(policy_maker(name)),
-            (("kind", text), ("who knows what it looks at", _knows(policy_maker(name)))),
-            kind,
+            maker,
+            _summary(maker),
+            (("kind", text), ("who knows what it looks at", _knows(maker))),
         )
-        for kind, text in _KINDS.items()
-        for name in policy_names(kind)
+        for name, (maker, text) in makers.items()
     ]
 
 
@@ -88,29 +108,8 @@ def filters() -> list[Part]:
             option = f' (`filter="{value}"`)' if value else ""
             places.setdefault(owner, []).append(environment_link(env_id) + option)
     return [
-        Part(filter_slug(owner), owner, _summary(owner), (("offered in", ", ".join(lines)),))
+        Part(owner.__name__, owner, _summary(owner), (("offered in", ", ".join(lines)),))
         for owner, lines in places.items()
-    ]
-
-
-def filter_slug(owner: type) -> str:
-    """The name of a filter's page."""
-    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", owner.__name__).lower()
-
-
-def example_of(part: Part) -> tuple[str, str]:
-    """The text of a policy's example, and its environment with options: ``ID name=value …``."""
-    example = " ".join(part.docstring.labelled["Example"].split())
-    spec, env = re.findall("``(.+?)``", example)
-    return spec, env
-
-
-def parameters(part: Part) -> list[tuple[str, str, str, str]]:
-    """Name, default, allowed values and meaning of each parameter of a policy."""
-    meanings = part.docstring.arguments
-    return [
-        (f"`{name}`", _default(value), _allowed(value), markdown(meanings[name]))
-        for name, value in policy_parameters(part.name).items()
     ]
 
 
@@ -121,17 +120,6 @@ def environment_link(env_id: str) -> str:
 
 def _summary(owner: Any) -> str:
     return markdown(read(owner).summary)
-
-
-def _default(parameter: inspect.Parameter) -> str:
-    value = parameter.default
-    if value is parameter.empty:
-        return "required"
-    return "/".join(map(str, value)) if isinstance(value, tuple) else str(value)
-
-
-def _allowed(parameter: inspect.Parameter) -> str:
-    return " or ".join(_WORDS.get(word, word) for word in str(parameter.annotation).split(" | "))
 
 
 def _knows(maker: Any) -> str:

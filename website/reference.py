@@ -1,56 +1,43 @@
 """The reference: a page a public module of the library, made of its docstrings."""
 
-import ast
-from pathlib import Path
+from typing import Any
 
-from website.docstrings import markdown
 from website.places import ROOT
 
-_PACKAGE = ROOT / "fusion_gym"
-_INTRO = """\
+_INDEX = """\
 # Reference
 
 Every public module of the library, from its docstrings. Shapes have the batch axis N last. What
 most people need is imported by `import fusion_gym` alone:
 
 ::: fusion_gym
-    options:
-      heading_level: 2
-      show_root_heading: false
-
-## Modules
-
+    options: {summary: {modules: true}, skip_local_inventory: true}
 """
 
 
-def modules() -> dict[str, str]:
-    """Public modules with the first line of their docstrings, by their dotted names."""
-    result = {}
-    for path in sorted(_PACKAGE.rglob("*.py")):
-        parts = path.relative_to(ROOT).with_suffix("").parts
-        if any(part.startswith("_") and part != "__init__" for part in parts):
-            continue
-        name = ".".join(part for part in parts if part != "__init__")
-        if name != "fusion_gym":
-            result[name] = _first_line(path)
-    return result
-
-
-def place(module: str) -> str:
-    """Where the page of a module stands."""
-    return f"api/{module}.md"
+def modules() -> list[str]:
+    """The dotted names of the public modules."""
+    paths = sorted((ROOT / "fusion_gym").rglob("*.py"))
+    names = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths]
+    public = (
+        name.removesuffix(".__init__")
+        for name in names
+        if "._" not in name.removesuffix(".__init__")
+    )
+    return [name for name in public if name != "fusion_gym"]
 
 
 def pages() -> dict[str, str]:
-    """All pages of the reference by their places."""
-    every = modules()
-    rows = [f"| [`{name}`]({name}.md) | {line} |" for name, line in every.items()]
-    result = {"api/index.md": _INTRO + "\n".join(["| | |", "|---|---|", *rows]) + "\n"}
-    for name in every:
-        result[place(name)] = f"# `{name}` {{ #{name} }}\n\n::: {name}\n"
-    return result
+    """All pages by their places."""
+    return {"api/index.md": _INDEX} | {
+        f"api/{n}.md": f"# `{n}` {{ #{n} }}\n\n::: {n}\n" for n in modules()
+    }
 
 
-def _first_line(path: Path) -> str:
-    text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
-    return markdown(text.partition("\n")[0]).replace("|", "\\|")
+def navigation() -> list[Any]:
+    """The pages by the packages of the library."""
+    groups: dict[str, list[dict[str, str]]] = {}
+    for name in modules():
+        _, package, *inner = name.split(".")
+        groups.setdefault(package, []).append({".".join(inner) or package: f"api/{name}.md"})
+    return ["api/index.md", *({package: pages} for package, pages in groups.items())]

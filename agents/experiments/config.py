@@ -1,7 +1,8 @@
-"""The configs of the experiments: settings, rules, agents, perturbed cases and trainings."""
+"""The one description of the experiments: settings, rules, agents, cases and courses."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -9,10 +10,10 @@ import numpy as np
 import pydantic
 
 from fusion_gym.envs.registration import make_task
-from fusion_gym.validation import ConfigurationError, choice
+from fusion_gym.validation import ConfigurationError
 
 from ..training.algorithms import AlgorithmConfig, AnyAlgorithm, PPOConfig, settings
-from ..training.checked import Positive, Rate, Share, Strict, load_changed, load_checked
+from ..training.checked import Positive, Rate, Share, Strict, parse, read_yaml
 from ..training.config import EnvironmentConfig
 
 Mode = Literal["sensors", "centre", "local"]
@@ -92,6 +93,90 @@ class Hindsight(Strict):
     width: Positive = 32
 
 
+class Case(Strict):
+    """Other options of a setting: ``options`` as they are, ``scaled`` ones by a factor."""
+
+    name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
+    title: str
+    options: dict[str, Any] = pydantic.Field(default_factory=dict)
+    scaled: dict[str, Rate] = pydantic.Field(default_factory=dict)
+
+
+NOMINAL = Case(name="as_assumed", title="as assumed")  # the case without a perturbation
+
+
+class Plain(Strict):
+    """Plain PPO without memory in the suite's settings, for comparison.
+
+    It ends below the memoryless envelope, or after ``budget`` times the processor seconds that the
+    fronts' trainings took.
+    """
+
+    every: Positive = 100_000
+    seeds: Positive = 2
+    budget: Rate = 3.0
+    timesteps: Positive = 3_200_000
+    num_envs: Positive = 256
+    algorithm: AnyAlgorithm = PPOConfig(name="ppo")
+
+
+class Learning(Strict):
+    """How learning is measured: at ``prices`` prices, ``every`` so many steps.
+
+    A measurement has ``episodes`` episodes at each price. A finished front is judged in the
+    ``inner`` part of the range of prices, in the logarithm. ``timesteps`` replaces those of the
+    fronts' configs.
+    """
+
+    prices: Positive = 7
+    inner: tuple[Share, Share] = (0.05, 0.95)
+    every: Positive = 50_000
+    episodes: Positive = 128
+    timesteps: Positive | None = None
+    plain: Plain = Plain()
+
+    def algorithm_of(self, course: Course) -> AlgorithmConfig:
+        """Return plain PPO's hyper-parameters in a setting, checked again.
+
+        Raises:
+            ValueError: a hyper-parameter that is unknown or not allowed.
+        """
+        return settings(self.plain.algorithm.model_dump() | course.plain.algorithm)
+
+
+class PlainChanges(Strict):
+    """What is other in a setting; ``longer`` multiplies the length."""
+
+    longer: Longer = 1.0
+    algorithm: dict[str, Any] = pydantic.Field(default_factory=dict)
+
+
+SOLVED = ("optimum", "schedules")  # what fronts are compared with by costs
+
+
+class Course(Strict):
+    """A front to train in a setting, and what it is compared with.
+
+    ``front`` is the training's config, ``memoryless`` the class of the committed envelope to get
+    below while learning. The finished front is compared with ``against``: a class of the committed
+    envelope, the ``optimum`` at each price, or the best of ``schedules`` there; a share of
+    ``allowed`` above it is still good.
+    """
+
+    front: str
+    memoryless: str | None = None
+    against: str
+    schedules: tuple[str, ...] = ()
+    allowed: Rate = 0.01
+    plain: PlainChanges = PlainChanges()
+
+    @pydantic.model_validator(mode="after")
+    def _scheduled(self) -> Course:
+        if (self.against == "schedules") != bool(self.schedules):
+            raise ValueError("schedules and against: schedules stand together")
+        return self
+
+
 class Setting(Strict):
     """One environment in one setting; ``families`` are labels, all of them by default.
 
@@ -107,6 +192,10 @@ class Setting(Strict):
     and ``tuning`` replace the suite's, ``envs`` the number of environments of one mode or class;
     ``algorithm`` changes entries of the suite's, ``algorithms`` those of one mode; ``pace`` is
     about how many steps a second they train, for the time that is told to remain.
+
+    ``cases`` are perturbed cases: names of the suite's, or cases of its own. ``drawn`` are options
+    that agents trained over draws have: pairs, drawn anew in every episode. ``course`` is what
+    learns there.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
@@ -134,10 +223,22 @@ class Setting(Strict):
     estimates: bool = False
     genie: Genie | None = None
     hindsight: Hindsight | None = None
+    cases: tuple[str | Case, ...] = ()
+    drawn: dict[str, Any] = pydantic.Field(default_factory=dict)
+    course: Course | None = None
+
+    def with_options(self, options: dict[str, Any]) -> Setting:
+        """Return the setting with these options of the environment in the place of its own."""
+        environment = self.environment.model_copy(update={"options": options})
+        return self.model_copy(update={"environment": environment})
 
 
 class Suite(Strict):
-    """The whole benchmark; ``classes`` are those in which agents are trained, by name (all)."""
+    """The whole benchmark; ``classes`` are those in which agents are trained, by name (all).
+
+    Settings name ``cases``, in each of which a policy runs ``robustness_episodes`` episodes.
+    ``quick`` has what the quick version changes.
+    """
 
     episodes: Positive = 1000
     seed: int = pydantic.Field(default=0, ge=0)
@@ -147,12 +248,16 @@ class Suite(Strict):
     prices: Positive = 7
     price_exponent: Share = 0.5
     hindsight_episodes: Positive = 100
+    robustness_episodes: Positive = 300
     error: Error = "squared"
     classes: tuple[str, ...] | None = None
     tuning: Tuning = Tuning()
     algorithm: AnyAlgorithm
     algorithms: dict[Mode, dict[str, Any]] = pydantic.Field(default_factory=dict)
     families: tuple[Family, ...]
+    cases: tuple[Case, ...] = ()
+    learning: Learning = Learning()
+    quick: dict[str, Any] = pydantic.Field(default_factory=dict)
     settings: tuple[Setting, ...]
 
     def algorithm_of(self, setting: Setting, mode: Mode) -> AlgorithmConfig:
@@ -187,6 +292,22 @@ class Suite(Strict):
         names = setting.families
         return [f for f in self.families if names is None or f.label in names]
 
+    def cases_of(self, setting: Setting) -> list[Case]:
+        """Return a setting's cases, the nominal one first.
+
+        Raises:
+            ValueError: one that the suite does not have, or two of one name.
+        """
+        shared = {case.name: case for case in self.cases}
+        for case in setting.cases:
+            if isinstance(case, str) and case not in shared:
+                raise ValueError(f"cases of {setting.name}: {case!r} is none of {list(shared)}")
+        own = [shared[case] if isinstance(case, str) else case for case in setting.cases]
+        names = [case.name for case in (NOMINAL, *own)]
+        if len(set(names)) < len(names):
+            raise ValueError(f"cases of {setting.name} must differ: {names}")
+        return [NOMINAL, *own]
+
     @pydantic.model_validator(mode="after")
     def _named(self) -> Suite:
         labels = [family.label for family in self.families]
@@ -196,31 +317,64 @@ class Suite(Strict):
             for mode in get_args(Mode):
                 self.algorithm_of(setting, mode)
             self.tuning_of(setting)
+            self.cases_of(setting)
+            if setting.course is not None:
+                self.learning.algorithm_of(setting.course)
             for name in setting.families or ():
                 if name not in labels:
                     raise ValueError(f"families of {setting.name}: {name!r} is none of {labels}")
         return self
 
 
-# What --quick changes: the same work, less of it. Trainings are as long as in the full one, for
-# agents of shorter ones are others.
-QUICK: dict[str, Any] = {
-    "episodes": 200,
-    "training_seeds": 1,
-    "prices": 5,
-    "hindsight_episodes": 10,
-    "classes": ["local_estimate_memory", "sensors", "sensors_memory"],
-    "tuning": {"trials": 4, "prices": 4, "refined": 1, "episodes": 32, "seeds": 2},
-}
-
-
-def load_suite(path: str | Path, quick: bool = False) -> Suite:
-    """The benchmark's config, or its quick version.
+def load_suite(path: str | Path, quick: bool = False, **changes: Any) -> Suite:
+    """Return the benchmark's description or its quick version, with ``changes`` of its entries.
 
     Raises:
         ConfigurationError: unreadable, an unknown key, or a value that is not allowed.
     """
-    return load_changed(Suite, path, QUICK if quick else {})
+    content = read_yaml(path)
+    if isinstance(content, dict):  # all else is refused
+        content |= changes
+    suite = parse(Suite, content, str(path))
+    if quick and not suite.quick:
+        raise ConfigurationError(
+            f"quick = True is not allowed with config {str(path)!r}, which has no quick"
+        )
+    return parse(Suite, _merge(content, suite.quick) | changes, str(path)) if quick else suite
+
+
+def _merge(content: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content with the changes, those within an entry as well."""
+    result = dict(content)
+    for key, value in changes.items():
+        within = isinstance(value, dict) and isinstance(content.get(key), dict)
+        result[key] = _merge(content[key], value) if within else value
+    return result
+
+
+def world(setting: Setting, case: Case) -> Setting:
+    """Return the setting as it is in a case.
+
+    Raises:
+        ConfigurationError: an option that is scaled and is no number.
+    """
+    options = dict(setting.environment.options)
+    defaults = make_task(setting.environment.id).settings
+    for name, factor in case.scaled.items():
+        value = options.get(name, defaults.get(name))
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ConfigurationError(
+                f"scaled = {{{name!r}: {factor:g}}} of the case {case.name!r} is not allowed: "
+                f"{name} of {setting.name} must be a number, and is {value!r}"
+            )
+        options[name] = value * factor
+    return setting.with_options(options | case.options)
+
+
+def front_prices(price_range: tuple[float, float], count: int) -> list[float]:
+    """Prices over the whole range, evenly in the logarithm, both ends exactly."""
+    low, high = price_range
+    return [min(max(float(price), low), high) for price in np.geomspace(low, high, count)]
 
 
 class SweepCurve(Strict):
@@ -270,206 +424,3 @@ class SweepSettings(Strict):
 
     environment: str
     rows: tuple[ComparisonRow, ...] = pydantic.Field(min_length=1)
-
-
-class Plain(Strict):
-    """Plain PPO without memory in the suite's settings, for comparison.
-
-    It ends below the memoryless envelope, or after ``budget`` times the processor seconds that the
-    fronts' trainings took.
-    """
-
-    every: Positive = 100_000
-    seeds: Positive = 2
-    budget: Rate = 3.0
-    timesteps: Positive = 3_200_000
-    num_envs: Positive = 256
-    algorithm: AnyAlgorithm = PPOConfig(name="ppo")
-
-
-class PlainChanges(Strict):
-    """What is other in a setting; ``longer`` multiplies the length."""
-
-    longer: float = pydantic.Field(default=1.0, gt=0)
-    algorithm: dict[str, Any] = pydantic.Field(default_factory=dict)
-
-
-SOLVED = ("optimum", "schedules")  # what fronts are compared with by costs
-
-
-class Course(Strict):
-    """What is trained in one setting of the suite, and what it is compared with.
-
-    ``front`` is the training's config, ``memoryless`` the class of the committed envelope to get
-    below while learning. The finished front is compared with ``against``: a class of the committed
-    envelope, the ``optimum`` at each price, or the best of ``schedules`` there; a share of
-    ``allowed`` above it is still good.
-    """
-
-    setting: str
-    front: str
-    memoryless: str | None = None
-    against: str
-    schedules: tuple[str, ...] = ()
-    allowed: Rate = 0.01
-    plain: PlainChanges = PlainChanges()
-
-    @pydantic.model_validator(mode="after")
-    def _scheduled(self) -> Course:
-        if (self.against == "schedules") != bool(self.schedules):
-            raise ValueError("schedules and against: schedules stand together")
-        return self
-
-
-class Learning(Strict):
-    """All settings; ``timesteps`` and ``test_episodes`` stand for those of configs and suite."""
-
-    suite: str = "benchmark"
-    prices: Positive = 7
-    inner: tuple[Share, Share] = (0.05, 0.95)
-    every: Positive = 50_000
-    episodes: Positive = 128
-    timesteps: Positive | None = None
-    test_episodes: Positive | None = None
-    plain: Plain = Plain()
-    settings: tuple[Course, ...] = pydantic.Field(min_length=1)
-
-    def algorithm_of(self, course: Course) -> AlgorithmConfig:
-        """Plain PPO's hyper-parameters in a setting, checked again.
-
-        Raises:
-            ValueError: a hyper-parameter that is unknown or not allowed.
-        """
-        return settings(self.plain.algorithm.model_dump() | course.plain.algorithm)
-
-    @pydantic.model_validator(mode="after")
-    def _trainable(self) -> Learning:
-        for course in self.settings:
-            self.algorithm_of(course)
-        return self
-
-
-# What --quick changes: the same work, less of it.
-LEARNING_QUICK: dict[str, Any] = {
-    "timesteps": 50_000,
-    "every": 25_000,
-    "test_episodes": 100,
-    "episodes": 32,
-    "plain": {"every": 25_000, "seeds": 1, "budget": 1.0},
-}
-
-
-def load_learning(path: str | Path, quick: bool = False) -> Learning:
-    """The config, or its quick version.
-
-    Raises:
-        ConfigurationError: unreadable, an unknown key, or a value that is not allowed.
-    """
-    return load_changed(Learning, path, LEARNING_QUICK if quick else {})
-
-
-NOMINAL = "as_assumed"  # the case without a perturbation
-
-
-class Case(Strict):
-    """Other options of a setting: ``options`` as they are, ``scaled`` ones by a factor."""
-
-    name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
-    title: str
-    options: dict[str, Any] = pydantic.Field(default_factory=dict)
-    scaled: dict[str, Rate] = pydantic.Field(default_factory=dict)
-
-
-class Perturbed(Strict):
-    """The cases of a setting: ``shared`` ones by name, then its ``own``.
-
-    ``drawn`` are options that agents trained over draws have: pairs, drawn anew in every episode.
-    """
-
-    setting: str
-    shared: tuple[str, ...] = ()
-    own: tuple[Case, ...] = ()
-    drawn: dict[str, Any] = pydantic.Field(default_factory=dict)
-
-
-class RobustnessSettings(Strict):
-    """Which settings of a suite are tried, and under which cases; the nominal one goes before."""
-
-    suite: str = "benchmark"
-    cases: tuple[Case, ...]
-    settings: tuple[Perturbed, ...] = pydantic.Field(min_length=1)
-
-    @pydantic.model_validator(mode="after")
-    def _named(self) -> RobustnessSettings:
-        known = [case.name for case in self.cases]
-        for setting in self.settings:
-            unknown = [name for name in setting.shared if name not in known]
-            if unknown:
-                raise ValueError(f"shared of {setting.setting}: {unknown[0]!r} is none of {known}")
-            names = [NOMINAL, *setting.shared, *(case.name for case in setting.own)]
-            if len(set(names)) < len(names):
-                raise ValueError(f"cases of {setting.setting} must differ: {names}")
-        return self
-
-    def cases_of(self, setting: Perturbed) -> list[Case]:
-        """A setting's cases, the nominal one first."""
-        shared = {case.name: case for case in self.cases}
-        nominal = Case(name=NOMINAL, title="as assumed")
-        return [nominal, *(shared[name] for name in setting.shared), *setting.own]
-
-
-def load_robustness(path: str | Path) -> RobustnessSettings:
-    """The config.
-
-    Raises:
-        ConfigurationError: unreadable, an unknown key, or a value that is not allowed.
-    """
-    return load_checked(RobustnessSettings, path)
-
-
-def select_settings(config: RobustnessSettings, names: tuple[str, ...]) -> list[Perturbed]:
-    """The settings of these names (none: all), each of which the suite has.
-
-    Raises:
-        ConfigurationError: one that the config or the suite does not have.
-    """
-    by_name = {setting.setting: setting for setting in config.settings}
-    known = [setting.name for setting in load_suite(config.suite).settings]
-    for name in by_name:
-        choice("setting", name, known)
-    return [by_name[choice("envs", name, by_name)] for name in names or by_name]
-
-
-def world(setting: Setting, case: Case) -> Setting:
-    """The setting as it is in a case.
-
-    Raises:
-        ConfigurationError: an option that is scaled and is no number.
-    """
-    environment, options = setting.environment, dict(setting.environment.options)
-    defaults = make_task(environment.id).settings
-    for name, factor in case.scaled.items():
-        value = options.get(name, defaults.get(name))
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise ConfigurationError(
-                f"scaled = {{{name!r}: {factor:g}}} of the case {case.name!r} is not allowed: "
-                f"{name} of {setting.name} must be a number, and is {value!r}"
-            )
-        options[name] = value * factor
-    return _with_options(setting, options | case.options)
-
-
-def drawn_world(setting: Setting, perturbed: Perturbed) -> Setting:
-    """The setting in which agents are trained over draws."""
-    return _with_options(setting, setting.environment.options | perturbed.drawn)
-
-
-def _with_options(setting: Setting, options: dict[str, Any]) -> Setting:
-    environment = setting.environment.model_copy(update={"options": options})
-    return setting.model_copy(update={"environment": environment})
-
-
-def front_prices(price_range: tuple[float, float], count: int) -> list[float]:
-    """Prices over the whole range, evenly in the logarithm, both ends exactly."""
-    low, high = price_range
-    return [min(max(float(price), low), high) for price in np.geomspace(low, high, count)]

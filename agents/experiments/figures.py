@@ -8,9 +8,23 @@ import numpy as np
 from fusion_gym.evaluation.envelope import EnvelopePoint, height, lower_hull
 
 from ..output import overview_figure, palette, pareto_figure
+from ..output.files import write_text
+from ..output.markup import page_of
 from ..output.overview_figure import Dot, OverviewRow
 from ..output.pareto_figure import Differences, Limits, Panel, Series
-from .report import KNOWING, SettingResults, kind_of, text_of
+from .learning import read_learning
+from .report import (
+    KNOWING,
+    SettingResults,
+    envelopes_text,
+    kind_of,
+    learning_text,
+    read_results,
+    robustness_text,
+    text_of,
+    update_pages,
+)
+from .verdict import read_cases
 
 FINE = 80  # rates of a curved line
 LEFT = 0.04  # of the rate that always transmitting gets: where the figure begins
@@ -21,11 +35,44 @@ MIXED = "found before"  # no family of one rule
 BROADCAST_LABELS = {"none": "hear nothing", "estimate": "hear estimate", "packets": "hear packets"}
 
 
-def report_text(settings: Mapping[str, SettingResults], command: str) -> str:
+def write_report(results: Path, titles: Mapping[str, str], pages: Mapping[Path, str]) -> None:
+    """Write the pages and figures of all tables in the folder, and the marked parts of ``pages``.
+
+    ``titles`` has the title of each of the benchmark's settings.
+
+    Raises:
+        ConfigurationError: there are no tables, or one that cannot be read.
+    """
+    texts: dict[Path, str] = {}
+    if any(results.glob("*/classes.csv")):
+        texts[results / "envelopes"] = envelopes_text(results)
+    if cases := read_cases(results, list(titles)):
+        texts[results / "robustness"] = robustness_text(cases, titles)
+    learned = [results / "learning" / name for name in titles]
+    if courses := [read_learning(path) for path in learned if (path / "learning.csv").exists()]:
+        texts[results / "learning"] = learning_text(courses)
+    if pages or not texts or any(results.glob("*/verdict.*")):
+        settings = read_results(results)
+        updated = {
+            path: update_pages(text, settings, results, titles) for path, text in pages.items()
+        }
+        texts[results] = report_text(settings)
+        draw_overview(results, settings)
+        for name, item in settings.items():
+            draw_setting(results / name, item)
+        html = page_of(texts[results], results, "Results of the benchmark")
+        write_text(results / "report.html", html)
+        for path, text in updated.items():
+            write_text(path, text)
+    for folder, text in texts.items():
+        write_text(folder / "README.md", text)
+
+
+def report_text(settings: Mapping[str, SettingResults]) -> str:
     """Return the report, which names the panels of every figure."""
     small = {name: panels_of(results)[1] for name, results in settings.items()}
     titles = {name: [" ".join(p.title.split()) for p in panels] for name, panels in small.items()}
-    return text_of(settings, command, titles)
+    return text_of(settings, titles)
 
 
 def draw_setting(folder: Path, results: SettingResults) -> None:
@@ -170,11 +217,12 @@ def _single(results: SettingResults, names: Sequence[str]) -> list[list[tuple[fl
         heights = (height(hull, rate) for hull in hulls)
         return min((error for error in heights if error is not None), default=0.0)
 
-    return [
-        [(point["rate"], max(point["mse"], least(point["rate"]))) for point in curve["points"]]
-        for curve in results.envelopes.get("curves", ())
-        if curve["family"] in families and curve["options"] in options and len(curve["points"]) > 1
-    ]
+    curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for row in results.envelopes.get("curves", ()):
+        if row["family"] in families and row["options"] in options:
+            point = row["rate"], max(row["mse"], least(row["rate"]))
+            curves.setdefault((row["family"], str(row["options"])), []).append(point)
+    return [points for points in curves.values() if len(points) > 1]
 
 
 def _fine(results: SettingResults) -> list[float]:

@@ -1,51 +1,53 @@
 """How fast agents learn: their fronts while they train, and beside the rules when finished."""
 
+from __future__ import annotations
+
 import functools
 import json
 import math
+import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
-from filelock import FileLock
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.reward import Price
-from fusion_gym.core.task import Task
 from fusion_gym.deprecation import replace_value
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.beside import run_beside
 from fusion_gym.evaluation.envelope import EnvelopePoint, best_mse, height, lower_hull
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.policies.model import ModelPolicy
-from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError, choice
 
-from ..output.files import read_json, write
-from ..output.folders import check_inputs
+from ..output.files import read_json
 from ..training.checked import load_checked, parse
 from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, ValidationConfig
 from ..training.monitor import Measure
 from ..training.run import holds_training, train
-from .config import SOLVED, Course, Learning, Setting, Suite, front_prices
-from .references import (
+from .classes import classes_of
+from .config import SOLVED, Course, Setting, Suite, front_prices
+from .envelopes import (
+    EnvelopeStore,
     Test,
     at_least,
     bound_of,
-    committed_classes,
+    check_vertex,
     envelope_task,
     hull_of,
-    read_envelopes,
+    read_tests,
     rollout_of,
+    rule_tests,
     run_test,
 )
-from .tables import group_by, read_rows, write_rows
-from .training import check_vertex, training_of
+from .tables import Row, group_by, read_rows, write_rows
 from .verdict import MIDDLE, AgentFront, excess, interval
+from .workers import Folders, Pool, check_training, missing, side_by_side, training_of
 
 Points = Sequence[Sequence[float]]  # (rate, MSE) at each price
 WIDTH = 3.0  # the least factor between the rates of a front: less is hardly more than a point
@@ -102,76 +104,44 @@ def range_of(front: Points) -> tuple[float, float]:
 
 
 Kind = Literal["front", "plain"]
+KINDS: tuple[Kind, ...] = ("front", "plain")
+_SPEED = 40_000  # steps of a training in a second, about
 # Options that change neither the task nor what a policy may know of it: rules see the time anyway.
 _FREE = ("memory_filter", "belief_features", "clock")
 
 
 @dataclass(frozen=True)
 class LearningSetup:
-    """A course and where its files are: ``results`` holds the committed ones."""
+    """A course of a setting, the committed envelopes, and where its files are."""
 
-    learning: Learning
     suite: Suite
+    setting: Setting
     course: Course
-    results: Path
-    output: Path
-    work: Path
-
-    @property
-    def setting(self) -> Setting:
-        """The suite's setting.
-
-        Raises:
-            ConfigurationError: there is none of that name.
-        """
-        by_name = {setting.name: setting for setting in self.suite.settings}
-        return by_name[choice("setting", self.course.setting, by_name)]
+    store: EnvelopeStore
+    folders: Folders
 
     @property
     def prices(self) -> list[float]:
-        """The prices that every front is asked for."""
-        return front_prices(self.setting.price_range, self.learning.prices)
+        """The prices at which every front is measured."""
+        return front_prices(self.setting.price_range, self.suite.learning.prices)
 
     @property
     def inner(self) -> list[bool]:
         """Which prices lie in the inner part of the range, in the logarithm."""
         low, high = self.setting.price_range
         price = Price(None, (low, high))
-        first, last = self.learning.inner
+        first, last = self.suite.learning.inner
         places = price.encode(np.array(self.prices)).tolist()
         return [first <= place <= last for place in places]
 
-    @property
-    def episodes(self) -> int:
-        """Test episodes."""
-        return self.learning.test_episodes or self.suite.episodes
-
-    @property
-    def report(self) -> Path:
-        """The table for readers that is written last."""
-        return self.output / self.setting.name / "learning.csv"
-
-    @property
-    def throughput(self) -> Path:
-        """The JSON of this machine's steps per second."""
-        return self.work / self.setting.name / "throughput.json"
-
     @functools.cached_property
     def envelopes(self) -> dict[str, Any]:
-        """The committed file of the setting's envelopes."""
-        committed_classes(
-            self.suite, self.setting, self.results
-        )  # made from what the suite says now
-        return read_envelopes(self.results / self.setting.name)
+        """The committed envelopes of the setting, made from what the suite says now."""
+        return self.store.read(self.setting)
 
     def envelope(self, name: str) -> dict[str, Any]:
-        """A class of the committed envelopes.
-
-        Raises:
-            ConfigurationError: there is none of that name.
-        """
-        classes = self.envelopes["classes"]
-        return classes[choice("class", name, classes)]
+        """Return a class of the committed envelopes."""
+        return dict(self.envelopes["classes"][name])
 
     @property
     def classes(self) -> list[str]:
@@ -179,7 +149,7 @@ class LearningSetup:
         own = [] if self.solved else [self.course.against]
         return own + ([self.course.memoryless] if self.course.memoryless else [])
 
-    @property
+    @functools.cached_property
     def memoryless(self) -> list[EnvelopePoint] | None:
         """The envelope to get below while learning, as it was measured on the test seeds."""
         name = self.course.memoryless
@@ -196,74 +166,51 @@ class LearningSetup:
         """Whether the finished front is compared with an optimum, by costs."""
         return self.course.against in SOLVED
 
-    @property
-    def vertices(self) -> list[dict[str, Any]]:
-        """The vertices of the envelope that the finished front is compared with, if it is one."""
-        own = self.course.against
-        return list(self.envelope(own)["vertices"]) if own in self.classes else []
+    def rules(self, name: str) -> list[Test]:
+        """Return the tests of a class's rules."""
+        vertices = self.envelope(name)["vertices"]
+        return rule_tests(self.setting, vertices, self.suite.episodes, self.suite.seed)
 
     @property
     def tests(self) -> list[Test]:
         """What the finished front is compared with, to be run on the test episodes."""
+        if not self.solved:
+            return self.rules(self.course.against)
+        # What was spent is counted at each price.
+        prices = self.prices if self.course.against == "optimum" else []
+        policies = self.course.schedules or [f"optimal:price={price!r}" for price in prices]
+        free = {"options": {"cost_weight": 0.0}}
+        vertices = [free | {"policy": policy} for policy in policies]
+        return rule_tests(self.setting, vertices, self.suite.episodes, self.suite.seed)
 
-        def test(policy: str, options: dict[str, Any]) -> Test:
-            return Test(
-                self.setting, tuple(options.items()), policy, self.episodes, self.suite.seed
-            )
+    def agents(self, model: Path) -> list[Test]:
+        """Return the tests of a finished front's model at each price.
 
-        free = {"cost_weight": 0.0}  # what was spent is counted at each price
-        if self.course.against == "optimum":
-            return [test(f"optimal:price={price!r}", free) for price in self.prices]
-        if self.course.schedules:
-            return [test(policy, free) for policy in self.course.schedules]
-        return [test(vertex["policy"], vertex["options"]) for vertex in self.vertices]
+        Raises:
+            OSError: the model cannot be read.
+        """
+        options, count = tuple(self.options.items()), self.suite.learning.prices
+        requested = (self.suite.episodes, self.suite.seed)
+        return Test.at_prices(self.setting, options, f"model:{model}", count, *requested)
 
-    def experiment(self, kind: Kind, seed: int) -> Experiment:
-        """The training of one seed, with the measurements' spacing.
+    @property
+    def front(self) -> Experiment:
+        """The course's training as its config has it.
 
         Raises:
             ConfigurationError: a config that is not allowed.
         """
-        if kind == "front":
-            value, every = load_checked(Experiment, self.course.front, "front"), self.learning.every
-        else:
-            value = self._plain()
-            every = self.learning.plain.every
-        plain = value.model_dump()
-        plain["validation"]["every"] = every
-        plain["training"] |= {"seed": seed, "threads": 1}
-        plain["training"]["timesteps"] = self.learning.timesteps or value.training.timesteps
-        plain["output"] = str(self.work / self.setting.name / f"{kind}_{seed}")
-        return parse(Experiment, plain, self.course.front, "front")
+        return load_checked(Experiment, self.course.front, "front")
 
-    def _plain(self) -> Experiment:
-        """Plain PPO's training: without memory, on the squared error, at the suite's prices."""
-        setting, plain, course = self.setting, self.learning.plain, self.course
-        own = setting.price_exponent
-        priced = {"cost_weight": "random", "price_range": list(setting.price_range)}
-        return Experiment(
-            environment=EnvironmentConfig(
-                id=setting.environment.id, options=setting.environment.options | priced
-            ),
-            algorithm=self.learning.algorithm_of(course),
-            training=TrainingConfig(
-                timesteps=round(plain.timesteps * course.plain.longer),
-                num_envs=plain.num_envs,
-                price_exponent=self.suite.price_exponent if own is None else own,
-            ),
-            validation=ValidationConfig(episodes=512),
-            output=str(self.work),
-        )
-
-    def task(self) -> Task:
-        """What a finished front is tested in: its own environment, without a price in sight.
+    @property
+    def options(self) -> dict[str, Any]:
+        """The options of a finished front's test: its environment's, without a price in sight.
 
         Where costs are compared tokens are free of charge, and counted at each price.
         """
-        where = load_checked(Experiment, self.course.front, "front").environment
         priced = ("cost_weight", "price_range")
-        own = {key: value for key, value in where.options.items() if key not in priced}
-        return make_task(where.id, **(own | ({"cost_weight": 0.0} if self.solved else {})))
+        own = {k: v for k, v in self.front.environment.options.items() if k not in priced}
+        return own | ({"cost_weight": 0.0} if self.solved else {})
 
     def check(self) -> None:
         """Whether the front knows what it is compared with: neither less nor more.
@@ -271,7 +218,7 @@ class LearningSetup:
         Raises:
             ConfigurationError: another environment, setting or class; names the first difference.
         """
-        where = load_checked(Experiment, self.course.front, "front").environment
+        where = self.front.environment
         options: dict[str, Any] = {}
         local, free = False, set(_FREE)
         if self.course.against == "schedules":
@@ -279,11 +226,13 @@ class LearningSetup:
         elif self.course.against == "optimum":
             free.add("memory")  # it knows the errors themselves
         else:
-            compared = self.envelope(self.course.against)
-            options, local = compared["options"], compared["mode"] == "local"
+            classes = {of.name: of for of in classes_of(self.setting)}
+            compared = classes[choice("class", self.course.against, classes)]
+            options, local = dict(compared.options), compared.mode == "local"
         expected = {"id": self.setting.environment.id, "local": local}
         expected |= envelope_task(self.setting, options.items()).settings
-        value = {"id": where.id, "local": where.local} | self.task().settings
+        value = {"id": where.id, "local": where.local}
+        value |= make_task(where.id, **self.options).settings
         expected |= {"cost_weight": "random", "price_range": list(self.setting.price_range)}
         value |= {key: where.options.get(key) for key in ("cost_weight", "price_range")}
         for key in dict.fromkeys([*expected, *value]):
@@ -294,7 +243,8 @@ class LearningSetup:
                 )
 
 
-class LearningRun(NamedTuple):
+@dataclass(frozen=True)
+class LearningRun:
     """The training of one seed in a setup; ``budget`` in processor seconds ends a plain one."""
 
     setup: LearningSetup
@@ -303,14 +253,45 @@ class LearningRun(NamedTuple):
     budget: float = math.inf
 
     @property
-    def experiment(self) -> Experiment:
-        """What is trained."""
-        return self.setup.experiment(self.kind, self.seed)
+    def weight(self) -> float:
+        """About how long it takes, in seconds on one core."""
+        return self.experiment.training.timesteps / _SPEED
 
     @property
-    def path(self) -> Path:
-        """The JSON of what it taught."""
-        return self.setup.work / self.setup.setting.name / f"{self.kind}_{self.seed}.json"
+    def experiment(self) -> Experiment:
+        """What is trained, with the measurements' spacing.
+
+        Raises:
+            ConfigurationError: a config that is not allowed.
+        """
+        setup, learning = self.setup, self.setup.suite.learning
+        front = self.kind == "front"
+        value = setup.front if front else self._plain()
+        plain = value.model_dump()
+        plain["validation"]["every"] = learning.every if front else learning.plain.every
+        timesteps = learning.timesteps or value.training.timesteps
+        plain["training"] |= {"seed": self.seed, "threads": 1, "timesteps": timesteps}
+        place = setup.folders.work / "learning" / setup.setting.name
+        plain["output"] = str(place / f"{self.kind}_{self.seed}")
+        return parse(Experiment, plain, setup.course.front, "front")
+
+    def _plain(self) -> Experiment:
+        """Plain PPO's training: without memory, on the squared error, at the suite's prices."""
+        suite, setting, course = self.setup.suite, self.setup.setting, self.setup.course
+        plain, own = suite.learning.plain, setting.price_exponent
+        priced = {"cost_weight": "random", "price_range": list(setting.price_range)}
+        options = setting.environment.options | priced
+        return Experiment(
+            environment=EnvironmentConfig(id=setting.environment.id, options=options),
+            algorithm=suite.learning.algorithm_of(course),
+            training=TrainingConfig(
+                timesteps=round(plain.timesteps * course.plain.longer),
+                num_envs=plain.num_envs,
+                price_exponent=suite.price_exponent if own is None else own,
+            ),
+            validation=ValidationConfig(episodes=512),
+            output=str(self.setup.folders.work),
+        )
 
     @property
     def inputs(self) -> dict[str, Any]:
@@ -318,83 +299,89 @@ class LearningRun(NamedTuple):
         setup, course = self.setup, self.setup.course
         return {
             "training": training_of(self.experiment),
-            "course": course.model_dump(mode="json"),
+            "course": {"setting": setup.setting.name} | course.model_dump(mode="json"),
             "prices": setup.prices,
-            "episodes": setup.learning.episodes,
-            "test": {"episodes": setup.episodes, "seed": setup.suite.seed},
+            "episodes": setup.suite.learning.episodes,
+            "test": {"episodes": setup.suite.episodes, "seed": setup.suite.seed},
             "envelopes": {name: setup.envelope(name)["sha256"] for name in setup.classes},
         }
 
-    def result(self) -> dict[str, Any] | None:
-        """What it taught, if it is finished.
 
-        Raises:
-            ConfigurationError: the file is damaged, or was made from other inputs.
-        """
-        if not self.path.exists():
-            return None
-        content = read_json(self.path, "work")
-        check_inputs(self.inputs, content.get("inputs"), repr(str(self.path)))
-        return content
+def learn(setups: Sequence[LearningSetup], pool: Pool) -> None:
+    """Run the references, then fronts, then plain PPO for a multiple of the fronts' seconds.
 
-
-def finished_runs(setup: LearningSetup, kind: Kind, seeds: int) -> list[dict[str, Any]]:
-    """What the first so many seeds taught, as far as they are finished.
+    The tables of every setup are written after each of these.
 
     Raises:
-        ConfigurationError: a file is damaged, or was made from other inputs.
+        ConfigurationError: a training that is there has another config.
     """
-    results = [LearningRun(setup, kind, seed).result() for seed in range(seeds)]
-    return [result for result in results if result is not None]
+    if not setups:
+        return
+    cache, seeds = setups[0].folders.cache, range(setups[0].suite.training_seeds)
+    tests = [test for setup in setups for test in setup.tests]
+    side_by_side(missing(run_test, tests, cache), pool, "references")
+    for kind in KINDS:
+        runs = [run for setup in setups for run in runs_of(setup, kind, seeds)]
+        for run in runs:
+            if not cache.holds(run_course, run.inputs):
+                check_training(run.experiment)
+        side_by_side(missing(run_course, runs, cache), pool, f"{kind} trainings")
+        for setup in setups:
+            write_learning(setup)
 
 
-def report(setup: LearningSetup, seeds: int) -> dict[str, Any]:
-    """Write the setup's tables again and return what they hold; runs may end side by side."""
-    folder = setup.report.parent
-    folder.mkdir(parents=True, exist_ok=True)
-    with FileLock(setup.work / f".{setup.setting.name}.lock"):
-        speed = setup.throughput
-        write_learning(
-            folder,
-            {
-                "title": setup.setting.title,
-                "env": setup.setting.environment.id,
-                "course": setup.course.model_dump(mode="json"),
-                "prices": setup.prices,
-                "inner": setup.inner,
-                "seeds": seeds,
-                "fronts": finished_runs(setup, "front", seeds),
-                "plain": finished_runs(setup, "plain", min(seeds, setup.learning.plain.seeds)),
-            }
-            | ({"throughput": read_json(speed, "work")} if speed.exists() else {}),
-        )
-    return read_learning(folder)
+def runs_of(setup: LearningSetup, kind: Kind, seeds: Iterable[int]) -> list[LearningRun]:
+    """Return the trainings of a kind, plain ones with their budget."""
+    if kind == "front":
+        return [LearningRun(setup, kind, seed) for seed in seeds]
+    if setup.memoryless is None:
+        return []
+    plain, trained = setup.suite.learning.plain, finished_runs(setup, "front")
+    taken = [item["curve"][-1]["cpu_seconds"] for item in trained]
+    budget = plain.budget * statistics.fmean(taken) if taken else math.inf
+    return [LearningRun(setup, kind, seed, budget) for seed in list(seeds)[: plain.seeds]]
 
 
-def write_learning(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write the tables of a setup, the setup itself at the end."""
-    runs = [
-        {"kind": kind} | run
-        for kind, key in (("front", "fronts"), ("plain", "plain"))
-        for run in content[key]
+def finished_runs(setup: LearningSetup, kind: Kind) -> list[Row]:
+    """Return the results of the finished trainings of a kind."""
+    cache = setup.folders.cache
+    runs = [LearningRun(setup, kind, seed) for seed in range(setup.suite.training_seeds)]
+    return [
+        {"kind": kind, "inputs": run.inputs} | cache.call(run_course, run.inputs, run)
+        for run in runs
+        if cache.holds(run_course, run.inputs)
     ]
-    tables: dict[str, list[dict[str, Any]]] = {
-        "learning_trainings": runs,
-        "learning_curves": [
-            run | point | {"rate": rate, "mse": mse}
-            for run in runs
-            for point in run["curve"]
-            for rate, mse in point["front"]
-        ],
-        "learning_points": [
-            {"seed": front["seed"]} | point
-            for front in content["fronts"]
-            for point in front["points"]
-        ],
-        "learning": [dict(content)],
+
+
+def throughput_path(work: Path, setting: str) -> Path:
+    """Return where the JSON of this machine's steps per second in a setting is."""
+    return work / "learning" / setting / "throughput.json"
+
+
+def write_learning(setup: LearningSetup) -> None:
+    """Write the tables of a setup, the setup itself at the end."""
+    runs = [*finished_runs(setup, "front"), *finished_runs(setup, "plain")]
+    speed = throughput_path(setup.folders.work, setup.setting.name)
+    whole = {
+        "title": setup.setting.title,
+        "env": setup.setting.environment.id,
+        "course": {"setting": setup.setting.name} | setup.course.model_dump(mode="json"),
+        "prices": setup.prices,
+        "inner": setup.inner,
+        "seeds": setup.suite.training_seeds,
     }
+    whole |= {"throughput": read_json(speed, "work")} if speed.exists() else {}
+    curves = [
+        run | point | {"rate": rate, "mse": mse}
+        for run in runs
+        for point in run["curve"]
+        for rate, mse in point["front"]
+    ]
+    points = [{"seed": run["seed"]} | point for run in runs for point in run.get("points", ())]
+    tables = {"_trainings": runs, "_curves": curves, "_points": points, "": [whole]}
     for table, rows in tables.items():
-        write_rows(folder, table, rows)
+        folder = setup.folders.results / "learning" / setup.setting.name
+        write_rows(folder, f"learning{table}", rows)
 
 
 def read_learning(folder: Path) -> dict[str, Any]:
@@ -403,26 +390,24 @@ def read_learning(folder: Path) -> dict[str, Any]:
     Raises:
         ConfigurationError: a table that cannot be read or is of another shape.
     """
-    curves: dict[tuple[str, int], dict[int, dict[str, Any]]] = {}
-    for row in read_rows(folder, "learning_curves", "output"):
-        curve = curves.setdefault((row.pop("kind"), row.pop("seed")), {})
-        place = [row.pop("rate"), row.pop("mse")]
-        curve.setdefault(row["timesteps"], {"excess": None} | row | {"front": []})
-        curve[row["timesteps"]]["front"].append(place)
-    points = group_by(read_rows(folder, "learning_points", "output"), "seed")
-    runs: dict[str, list[dict[str, Any]]] = {"front": [], "plain": []}
-    for row in read_rows(folder, "learning_trainings", "output"):
-        kind = row.pop("kind")
-        row["curve"] = list(curves.get((kind, row["seed"]), {}).values())
-        if kind == "front":
-            row["points"] = points.get(row["seed"], [])
-        runs[kind].append(row)
-    result: dict[str, Any] = {"setting": folder.name, "throughput": None}
-    result |= dict(*read_rows(folder, "learning", "output")[:1])
+    trainings, curves, points, whole = (
+        read_rows(folder, f"learning{table}", "output")
+        for table in ("_trainings", "_curves", "_points", "")
+    )
+    for run in trainings:
+        own = [row for row in curves if all(row[key] == run[key] for key in ("kind", "seed"))]
+        run["curve"] = [
+            {"excess": None, "timesteps": steps}
+            | rows[0]
+            | {"front": [[row["rate"], row["mse"]] for row in rows]}
+            for steps, rows in group_by(own, "timesteps").items()
+        ]
+        if run["kind"] == "front":
+            run["points"] = [point for point in points if point["seed"] == run["seed"]]
+    runs = {kind: [run for run in trainings if run["kind"] == kind] for kind in KINDS}
+    result: Row = {"setting": folder.name, "throughput": None} | whole[0]
     result |= {"fronts": runs["front"], "plain": runs["plain"]}
-    result["reached"] = {
-        kind: [first_below(item) for item in every] for kind, every in runs.items()
-    }
+    result["reached"] = {kind: [first_below(run) for run in own] for kind, own in runs.items()}
     return result | {"finished": judge_fronts(result)}
 
 
@@ -491,17 +476,8 @@ def gap_share(points: Sequence[Mapping[str, Any]], name: str) -> float | None:
     return sum(point["envelope"] - point["mse"] for point in known) / gap if gap > 0.0 else None
 
 
-def run_reference(test: Test, work: Path) -> None:
-    """Run what a finished front is compared with on the test episodes, if that was not done."""
-    torch.set_num_threads(1)
-    if not test.path(work).exists():
-        run_test(test, work)
-
-
-def run_course(run: LearningRun, seeds: int) -> None:
+def run_course(run: LearningRun) -> dict[str, Any]:
     """Train one seed, measure its front on the way, and test it if it is one with credit.
-
-    The setup's report, over so many ``seeds``, then holds it.
 
     Raises:
         KeyboardInterrupt: the training was interrupted.
@@ -509,7 +485,7 @@ def run_course(run: LearningRun, seeds: int) -> None:
     torch.set_num_threads(1)
     experiment, setup = run.experiment, run.setup
     folder = Path(experiment.output)
-    measure: Measure = meter(experiment, setup.prices, setup.learning.episodes)
+    measure: Measure = meter(experiment, setup.prices, setup.suite.learning.episodes)
     enough = False
 
     def watch(record: dict[str, Any]) -> bool:
@@ -525,14 +501,12 @@ def run_course(run: LearningRun, seeds: int) -> None:
         raise KeyboardInterrupt
     result = {
         "seed": run.seed,
-        "inputs": run.inputs,
         "algorithm": experiment.algorithm.name,
         "curve": curve(setup, folder),
     }
     if run.kind == "front":
         result["points"] = evaluate_front(setup, folder / "best_model.zip")
-    write(run.path, result)
-    report(setup, seeds)
+    return result
 
 
 def curve(setup: LearningSetup, folder: Path) -> list[dict[str, Any]]:
@@ -553,27 +527,28 @@ def curve(setup: LearningSetup, folder: Path) -> list[dict[str, Any]]:
 
 
 def evaluate_front(setup: LearningSetup, model: Path) -> list[dict[str, Any]]:
-    """A finished front on the test episodes, price by price, beside what it is compared with.
+    """Return a finished front on the test episodes, price by price, and what it is compared with.
 
     Raises:
         ConfigurationError: a rule does other than its committed envelope says.
     """
-    references = {test.name: test.read(setup.work) for test in setup.tests}
-    for vertex in setup.vertices if setup.episodes == setup.suite.episodes else []:
-        check_vertex(vertex, references[vertex["name"]])
-    task, result = setup.task(), []
-    for place, price in enumerate(setup.prices):
-        policy = make_policy(f"model:{model},price={price!r}", task)
-        agent = run_episodes(task, policy, setup.episodes, setup.suite.seed)
+    cache = setup.folders.cache
+    references = read_tests(setup.tests, cache)
+    if not setup.solved and setup.suite.episodes == setup.store.suite.episodes:
+        for vertex in setup.envelope(setup.course.against)["vertices"]:
+            check_vertex(vertex, references[vertex["name"]])
+    horizon, result = envelope_task(setup.setting).horizon, []
+    agents = read_tests(setup.agents(model), cache).values()
+    for place, (price, agent) in enumerate(zip(setup.prices, agents, strict=True)):
         point: dict[str, Any] = {
             "price": price,
             "rate": float(agent.rate.mean()),
             "mse": float(agent.mse.mean()),
         }
-        if setup.course.against == "optimum":
-            point |= above_optimum(price, task.horizon, agent, [list(references.values())[place]])
-        elif setup.course.schedules:
-            point |= above_optimum(price, task.horizon, agent, references.values())
+        if setup.solved:
+            every = list(references.values())
+            own = every if setup.course.schedules else every[place : place + 1]
+            point |= above_optimum(price, horizon, agent, own)
         else:
             point |= beside_envelope(setup, agent, references)
         result.append(point)
@@ -624,7 +599,7 @@ def best_known(
     The rollout was run on the first of the test episodes: it is taken as a share of the envelope
     on these, times the envelope on all.
     """
-    result, folder = {}, setup.results / setup.setting.name
+    result, folder = {}, setup.store.results / setup.setting.name
     rollout, episodes = rollout_of(folder)
     same = replace_value(setup.envelope(setup.course.against)["knows"]) == "scheduler_memory"
     inside = same and bool(rollout) and rollout[0].rate <= rate <= rollout[-1].rate

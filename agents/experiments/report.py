@@ -6,22 +6,19 @@ A new column of a page is a new entry in the rows of one of these frames.
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import jinja2
 import numpy as np
-import pandas as pd
-from rich.markdown import Markdown
-from rich.table import Table
 
 from fusion_gym.evaluation.envelope import EnvelopePoint, height
 from fusion_gym.validation import ConfigurationError, choice
 
 from ..output.markup import NONE, code, markup_number, plain_text, ranged, share
-from ..output.tables import table_tables
-from .config import NOMINAL, SOLVED, load_suite
-from .references import at_least, bound_of, hull_of, path_of, read_envelopes, rollout_of
+from .config import NOMINAL, SOLVED
+from .envelopes import at_least, bound_of, hull_of, path_of, read_envelopes, rollout_of
 from .tables import VERDICT, Row, group_by, read_rows
 from .verdict import MIDDLE, RATES, SHARES, is_gain, read_cases
 
@@ -60,31 +57,108 @@ TEMPLATES = jinja2.Environment(
 )
 TEMPLATES.filters |= {
     "share": share, "percent": _percent, "text": plain_text, "code": code, "ranged": ranged,
-    "mean": lambda values: float(np.mean(values)),
+    "number": markup_number, "mean": lambda values: float(np.mean(values)),
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class SettingResults:
-    """A setting's tables as pages and figures need them.
+    """A setting's tables as pages and figures need them; what is not there is empty.
 
-    ``seeds[class]`` has rate and error at each price, by training seed; ``ahead`` are the
-    scheduler's references and ``known`` the centre's. What is not there is empty.
+    A property raises ConfigurationError where a table cannot be read or is of another shape.
     """
 
-    name: str
-    verdict: Row
-    classes: dict[str, Row]
-    worths: list[Row]
-    envelopes: Row
-    ahead: list[EnvelopePoint]
-    known: list[EnvelopePoint]
-    genie: Row | None
-    seeds: dict[str, list[list[tuple[float, float]]]]
-    validation: Row
-    rollout: list[EnvelopePoint]
-    rollout_episodes: int
-    bound: Row | None
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """The setting's name."""
+        return self.folder.name
+
+    @cached_property
+    def verdict(self) -> Row:
+        """The setting itself."""
+        rows = read_rows(self.folder, VERDICT)
+        if len(rows) != 1 or rows[0]["always"] <= 0.0:
+            path = str(self.folder / f"{VERDICT}.csv")
+            raise ConfigurationError(
+                f"results = {path!r}: always = {[row['always'] for row in rows]} is not allowed: "
+                "it must be one positive rate"
+            )
+        return rows[0]
+
+    @cached_property
+    def classes(self) -> dict[str, Row]:
+        """The classes with agents, each with its ``points``, errors ``at`` rates and envelope."""
+        parts = {"points": "points", "at": "equal_rates", "envelope": "envelope"}
+        tables = {part: group_by(read_rows(self.folder, t), "class") for part, t in parts.items()}
+        return {
+            (name := row.pop("class")): {"broadcast": None}
+            | row
+            | {part: every.get(name, []) for part, every in tables.items()}
+            for row in read_rows(self.folder, "fronts")
+        }
+
+    @cached_property
+    def worths(self) -> list[Row]:
+        """What each class is worth beside one that knows less."""
+        return read_rows(self.folder, "worth")
+
+    @cached_property
+    def envelopes(self) -> Row:
+        """The committed envelopes."""
+        committed = path_of(self.folder.parent, self.name).exists()
+        return read_envelopes(self.folder) if committed else {}
+
+    @cached_property
+    def policies(self) -> dict[str, list[Row]]:
+        """The tested policies by run."""
+        return group_by(read_rows(self.folder, "policies"), "run")
+
+    @cached_property
+    def runs(self) -> list[Row]:
+        """The runs of agents."""
+        return [row for row in read_rows(self.folder, "runs") if row.get("class") in self.classes]
+
+    @cached_property
+    def seeds(self) -> dict[str, list[list[tuple[float, float]]]]:
+        """Rate and error at each price, by class and training seed."""
+        result: dict[str, list[list[tuple[float, float]]]] = {}
+        for run in self.runs:
+            points = [(rate_of(p), p["mse"]["mean"]) for p in self.policies.get(run["run"], [])]
+            if len(points) == len(self.classes[run["class"]]["points"]):
+                result.setdefault(run["class"], []).append(points)
+        return result
+
+    @property
+    def ahead(self) -> list[EnvelopePoint]:
+        """The scheduler's references."""
+        return _places(self.policies.get("informed", []))
+
+    @cached_property
+    def known(self) -> list[EnvelopePoint]:
+        """The centre's references."""
+        return _places(self.policies.get("references", []))
+
+    @property
+    def genie(self) -> Row | None:
+        """The policy to which everything arrives."""
+        return next(iter(self.policies.get("genie", [])), None)
+
+    @cached_property
+    def rollout(self) -> list[EnvelopePoint]:
+        """A rule that was improved by simulation."""
+        return rollout_of(self.folder)[0]
+
+    @property
+    def rollout_episodes(self) -> int:
+        """The number of its episodes."""
+        return rollout_of(self.folder)[1]
+
+    @cached_property
+    def bound(self) -> Row | None:
+        """The proven lower bound."""
+        return bound_of(self.folder)
 
     @property
     def label(self) -> str:
@@ -207,7 +281,7 @@ def read_results(results: Path) -> dict[str, SettingResults]:
     """Return every setting that is judged, by name.
 
     Raises:
-        ConfigurationError: there are none, or a table that cannot be read.
+        ConfigurationError: there are none.
     """
     found = sorted(results.glob(f"*/{VERDICT}.csv"))
     if not found:
@@ -216,68 +290,7 @@ def read_results(results: Path) -> dict[str, SettingResults]:
             f"results = {str(results)!r} is not allowed: it must hold tables of the "
             f"benchmark{earlier}"
         )
-    return {path.parent.name: read_setting(path.parent) for path in found}
-
-
-def read_setting(folder: Path) -> SettingResults:
-    """Return one setting's results.
-
-    Raises:
-        ConfigurationError: a table that cannot be read or is of another shape.
-    """
-    verdict = read_verdict(folder)
-    classes = verdict.pop("classes")
-    policies = group_by(read_rows(folder, "policies"), "run")
-    seeds: dict[str, list[list[tuple[float, float]]]] = {}
-    validation: Row = {}
-    for run in read_rows(folder, "runs"):
-        if run.get("class") in classes:
-            validation = validation or run["inputs"]["training"]["validation"]
-            points = [(rate_of(p), p["mse"]["mean"]) for p in policies.get(run["run"], [])]
-            if len(points) == len(classes[run["class"]]["points"]):
-                seeds.setdefault(run["class"], []).append(points)
-    rollout, episodes = rollout_of(folder)
-    committed = path_of(folder.parent, folder.name)
-    return SettingResults(
-        name=folder.name,
-        verdict=verdict,
-        classes=classes,
-        worths=verdict.pop("worth"),
-        envelopes=read_envelopes(folder) if committed.exists() else {},
-        ahead=_places(policies.get("informed", [])),
-        known=_places(policies.get("references", [])),
-        genie=next(iter(policies.get("genie", [])), None),
-        seeds=seeds,
-        validation=validation,
-        rollout=rollout,
-        rollout_episodes=episodes,
-        bound=bound_of(folder),
-    )
-
-
-def read_verdict(folder: Path) -> Row:
-    """Return the verdict of a setting, with its classes by name.
-
-    Raises:
-        ConfigurationError: a table that cannot be read or is of another shape.
-    """
-    rows = read_rows(folder, VERDICT)
-    if len(rows) != 1 or rows[0]["always"] <= 0.0:
-        path = str(folder / f"{VERDICT}.csv")
-        raise ConfigurationError(
-            f"results = {path!r}: always = {[row['always'] for row in rows]} is not allowed: it "
-            "must be one positive rate"
-        )
-    parts = {
-        part: group_by(read_rows(folder, table), "class")
-        for part, table in (("points", "points"), ("at", "equal_rates"), ("envelope", "envelope"))
-    }
-    classes: dict[str, Row] = {}
-    for row in read_rows(folder, "fronts"):
-        name = row.pop("class")
-        classes[name] = {"broadcast": None} | row
-        classes[name] |= {part: every.get(name, []) for part, every in parts.items()}
-    return rows[0] | {"classes": classes, "worth": read_rows(folder, "worth")}
+    return {path.parent.name: SettingResults(path.parent) for path in found}
 
 
 def _places(policies: Sequence[Row]) -> list[EnvelopePoint]:
@@ -311,133 +324,28 @@ def count_above(settings: Sequence[SettingResults]) -> tuple[int, int]:
     return sum(len(points) for points, _ in pairs), sum(count for _, count in pairs)
 
 
-# The frames of the report.
+def hulls_of(envelopes: Row) -> dict[str, dict[bool, list[EnvelopePoint]]]:
+    """Return each class's committed rules, by the class without memory in words, and memory."""
+    result: dict[str, dict[bool, list[EnvelopePoint]]] = {}
+    for content in envelopes["classes"].values():
+        mode, broadcast, packet = kind_of(content)
+        parts = [mode, broadcast, ESTIMATE if packet == "estimate" else ""]
+        result.setdefault(", ".join(filter(None, parts)), {})[content["memory"]] = hull_of(content)
+    return result
 
 
-def knowing_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
-    """Return the effect of more knowledge on rules and agents."""
-    return pd.DataFrame(
-        {"setting": plain_text(item.label), "of": who}
-        | {
-            head: share(item.worth(kind)[who]) if who in item.worth(kind) else item.reason(kind)
-            for kind, head in KNOWING.items()
-        }
-        for item in settings
-        for who in ("rules", "agents")
-    )
-
-
-def learning_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
-    """Return what learning is worth: agents against the rules of the same class."""
-    return pd.DataFrame(
-        {
-            "setting": plain_text(item.label),
-            "centre": item.middle("centre"),
-            "alone": item.middle(f"local_{item.broadcast}"),
-            "alone, memory": item.middle(f"local_{item.broadcast}_memory"),
-            "scheduler": item.middle("sensors"),
-            "scheduler, memory": item.middle("sensors_memory"),
-        }
-        for item in settings
-    )
-
-
-def headline_frame(settings: Sequence[SettingResults]) -> pd.DataFrame:
-    """Return the front page's table: the effects of memory on rules and of learning."""
-    frame, knowing = learning_frame(settings), knowing_frame(settings)
-    memory = knowing[knowing["of"] == "rules"][KNOWING["memory"]].to_numpy()
-    frame.insert(1, "rules of a scheduler: memory", memory)
-    return frame
-
-
-def classes_frame(results: SettingResults) -> pd.DataFrame:
-    """Return how the agents of each class did."""
-    rows = []
-    for name, front in results.classes.items():
-        above, count = above_of(front)
-        hindsight = front.get("hindsight_room")
-        rows.append(
-            {
-                "class": plain_text(name),
-                "seeds": front["seeds"],
-                "agents against rules, middle": share(front["middle"])
-                if "middle" in front
-                else "no price there",
-                "rates there": f"{len(front.get('rates', []))} of {RATES}",
-                "points above +1 %": f"{len(above)} of {count}",
-                "share of the gap to the reference closed": _closed(results, front),
-                "in hindsight": NONE if hindsight is None else f"{-hindsight:+.0%}",
-                "rules at a fifth of the rate": _strongest(results, name),
-            }
-        )
-    return pd.DataFrame(rows)
-
-
-def _closed(results: SettingResults, front: Row) -> str:
-    """Return how much of the room between rules and reference the agents close."""
-    if not any("reference" in point for point in front["points"]):
-        return "no reference"
-    what = results.reference(front).removeprefix("the ").removeprefix("a ")
-    room = front.get("room")
-    if room is None:
-        return f"none is left to {what}"
-    if room < LEAST_ROOM:
-        return f"room {room:.1%} only ({what})"
-    return f"{front['closed']:.0%} of {room:.1%} ({what})"
-
-
-def _strongest(results: SettingResults, name: str) -> str:
-    """Return the rules that are mixed at a typical rate, without their parameters."""
-    hull, rate = results.hull(name), HEADLINE * results.always
-    left = [point for point in hull if point.rate <= rate][-1:]
-    right = [point for point in hull if point.rate > rate][:1]
-    rules = dict.fromkeys(point.name.split(":")[0].split(" [")[0] for point in (*left, *right))
-    return ", ".join(code(rule) for rule in rules) or NONE
-
-
-def rates_frame(results: SettingResults) -> pd.DataFrame:
-    """Return rules and agents of each class at a few rates."""
-    simulated = "simulated"
-    if results.rollout:
-        simulated += f" ({results.rollout_episodes} episodes)"
-    classes = results.known_classes
-    rows = []
-    for name, front in classes.items():
-        last = "sensors_memory" if "sensors_memory" in classes else "sensors"
-        for row in front.get("at") or [{"rate": part * results.always} for part in SHARES]:
-            rate = row["rate"]
-            rules = markup_number(row.get("rules"))
-            if "at" not in front:  # without agents
-                error = results.rules_at(name, rate)
-                rules = NONE if error is None else f"{error:.4g}"
-            rows.append(
-                {
-                    "class": plain_text(name),
-                    "rate": f"{rate:.4g}",
-                    "rules": rules,
-                    "agents": markup_number(row.get("agents")),
-                    "difference": share(row.get("difference")),
-                    simulated: cell(results.rollout, rate) if name == last else NONE,
-                    "proven bound": f"{results.bound_at(rate):.4g}" if results.bound else NONE,
-                }
-            )
-    return pd.DataFrame(rows)
-
-
-def text_of(
-    results: Mapping[str, SettingResults], command: str, panels: Mapping[str, Sequence[str]]
-) -> str:
+def text_of(results: Mapping[str, SettingResults], panels: Mapping[str, Sequence[str]]) -> str:
     """Return the report in Markdown; ``panels`` has the small panels of each setting's figure."""
     settings = list(results.values())
     fronts = [front for item in settings for front in item.classes.values()]
     return _render(
         "report.md",
         settings=settings,
-        command=command,
         panels=panels,
+        shares=SHARES,
         trained=[front["seeds"] for front in fronts],
         tuned=[item.envelopes["inputs"]["tuning"] for item in settings if item.envelopes],
-        validated=[item.validation for item in settings if item.validation],
+        validated=[r["inputs"]["training"]["validation"] for s in settings for r in s.runs[:1]],
     )
 
 
@@ -450,17 +358,19 @@ def _render(template: str, **values: Any) -> str:
 # Parts of other pages.
 
 
-def update_pages(text: str, settings: Mapping[str, SettingResults], results: Path) -> str:
+def update_pages(
+    text: str, settings: Mapping[str, SettingResults], results: Path, titles: Mapping[str, str]
+) -> str:
     """Return the text with all its marked parts made again.
 
     ``<!-- results: SETTING -->`` to ``<!-- end -->`` holds what was found in a setting, with
     ``headline`` in its place the table of all settings and how many points lie above envelopes,
-    and with ``robustness`` what the folder ``results`` has of perturbed cases.
+    and with ``robustness`` what the folder ``results`` has of perturbed cases. ``titles`` are those
+    of the benchmark's settings by name.
 
     Raises:
         ConfigurationError: a setting that neither the results nor the benchmark has.
     """
-    titles = {setting.name: setting.title for setting in load_suite("benchmark").settings}
 
     def part(match: re.Match[str]) -> str:
         choice("results", match[2], dict.fromkeys(["headline", "robustness", *settings, *titles]))
@@ -481,19 +391,18 @@ def update_pages(text: str, settings: Mapping[str, SettingResults], results: Pat
 # Perturbed cases.
 
 
-def robustness_frame(reports: Sequence[Row], titles: Mapping[str, str]) -> pd.DataFrame:
+def robustness_rows(reports: Sequence[Row], titles: Mapping[str, str]) -> list[dict[str, Any]]:
     """Return in how many cases agents are ahead of the rules; ``titles`` of settings by name."""
     rows = []
     for report in reports:
-        choice("setting", report["setting"], titles)
         cases = report["cases"]
         for kind, name in (("agents", "as they are"), ("trained", "trained over draws")):
-            if kind not in cases[NOMINAL]:
+            if kind not in cases[NOMINAL.name]:
                 continue
             result = {
                 row["title"]: row[kind]["middle"]
                 for case, row in cases.items()
-                if case != NOMINAL and "middle" in row.get(kind, {})
+                if case != NOMINAL.name and "middle" in row.get(kind, {})
             }
             better = sum(is_gain(middle) for middle in result.values())
             worse = sum(middle["low"] > 0.0 for middle in result.values())
@@ -502,121 +411,66 @@ def robustness_frame(reports: Sequence[Row], titles: Mapping[str, str]) -> pd.Da
                 {
                     "setting": plain_text(titles[report["setting"]].partition(",")[0]),
                     "agents": name,
-                    "as assumed": share(cases[NOMINAL][kind].get("middle")),
+                    "as assumed": share(cases[NOMINAL.name][kind].get("middle")),
                     "better": better,
                     "undecided": len(result) - better - worse,
                     "worse": worse,
                     "at worst": f"{share(result[worst])}, {plain_text(worst)}" if worst else NONE,
                 }
             )
-    return pd.DataFrame(rows)
+    return rows
 
 
-def robustness_text(results: Path, titles: Mapping[str, str], command: str) -> str:
-    """Return the page of perturbed cases of the settings with these titles.
-
-    Raises:
-        ConfigurationError: a table that cannot be read or is of another shape.
-    """
-    reports = read_cases(results, list(titles))
-    of = {name: [r for r in reports if r["class"] == name] for name in
-          sorted({report["class"] for report in reports})}  # fmt: skip
-    return _render("robustness.md", reports=reports, by_class=of, titles=titles, command=command)
+def robustness_text(reports: Sequence[Row], titles: Mapping[str, str]) -> str:
+    """Return the page of perturbed cases of the settings with these titles."""
+    by_class = {name: [r for r in reports if r["class"] == name] for name in
+                sorted({report["class"] for report in reports})}  # fmt: skip
+    return _render("robustness.md", reports=reports, by_class=by_class, titles=titles)
 
 
 # Committed envelopes.
 
 
-def envelopes_text(results: Path, command: str) -> str:
+def envelopes_text(results: Path) -> str:
     """Return the page of the committed rules.
 
     Raises:
         ConfigurationError: a table that cannot be read or is of another shape.
     """
     folders = [path.parent for path in sorted(results.glob("*/classes.csv"))]
-    content = {folder.name: read_envelopes(folder) for folder in folders}
-    rows = pd.concat([envelopes_frame(results / name, item) for name, item in content.items()])
-    return _render("envelopes.md", command=command, rows=rows, settings=content)
-
-
-def envelopes_frame(folder: Path, envelopes: Row) -> pd.DataFrame:
-    """Return rules at a few rates; simulated were packets with a measurement."""
-    rates = [round(part * envelopes["always"], 4) for part in SHARES]
-    (rollout, episodes), bound = rollout_of(folder), bound_of(folder)
-    hulls: dict[str, dict[bool, list[EnvelopePoint]]] = {}
-    for content in envelopes["classes"].values():
-        mode, broadcast, packet = kind_of(content)
-        held = ESTIMATE if packet == "estimate" else ""
-        name = ", ".join(part for part in (mode, broadcast, held) if part)
-        hulls.setdefault(name, {})[content["memory"]] = hull_of(content)
-    rows = []
-    for name, by_memory in sorted(hulls.items()):
-        for rate in rates:
-            simulated = cell(rollout if name == "sensors" else [], rate)
-            rows.append(
-                {
-                    "setting": folder.name,
-                    "class": name,
-                    "rate": f"{rate:.4g}",
-                    "without memory": cell(by_memory.get(False, []), rate),
-                    "with memory": cell(by_memory.get(True, []), rate),
-                    "rollout": simulated if simulated == NONE else f"{simulated} ({episodes})",
-                    "bound": NONE if bound is None else f"{at_least(bound, rate):.4g}",
-                }
-            )
-    return pd.DataFrame(rows)
+    settings = {folder: read_envelopes(folder) for folder in folders}
+    return _render("envelopes.md", settings=settings, shares=SHARES)
 
 
 # How fast agents learn.
 
 
-def learning_text(studies: Sequence[Row], command: str) -> str:
+def learning_text(courses: Sequence[Row]) -> str:
     """Return the page of how fast agents learn."""
-    return _render("learning.md", studies=studies, command=command, SOLVED=SOLVED)
-
-
-def learning_table(studies: Sequence[Row]) -> Markdown:
-    """Return its first table for the terminal."""
-    rows = TEMPLATES.get_template("learning_rows.md").make_module(globals())
-    return Markdown(str(rows.overview(studies)))  # type: ignore[attr-defined]
+    return _render("learning.md", courses=courses, SOLVED=SOLVED)
 
 
 # The quick benchmark beside the full one.
 
 
-def agreement_table(quick: Path, full: Path, settings: Sequence[str]) -> Table | None:
+def agreement_text(quick: Path, full: Path, settings: Sequence[str]) -> str:
     """Return each class of agents over the middle of its front, by both, and whether they agree.
 
-    They agree where their 95 % intervals have a value in common. ``None`` where the folder
-    ``full`` has no verdict of any class that the folder ``quick`` has.
+    They agree where their 95 % intervals have a value in common. Empty where the folder ``full``
+    has no verdict of any class that the folder ``quick`` has.
 
     Raises:
         ConfigurationError: a verdict that is damaged.
     """
     ours, theirs = (
-        pd.DataFrame(
-            [
-                (name, row["class"], row["middle"])
-                for name in settings
-                if (folder / name / "fronts.csv").exists()
-                for row in read_rows(folder / name, "fronts")
-                if "middle" in row
-            ],
-            columns=["setting", "class", "middle"],
-        )
+        {
+            (name, row["class"]): row["middle"]
+            for name in settings
+            if (folder / name / "fronts.csv").exists()
+            for row in read_rows(folder / name, "fronts")
+            if "middle" in row
+        }
         for folder in (quick, full)
     )
-    both = ours.merge(theirs, on=["setting", "class"], suffixes=("_quick", "_full"))
-    if both.empty:
-        return None
-    rows = []
-    for *names, our, their in both.itertuples(index=False):
-        agree = our["low"] <= their["high"] and their["low"] <= our["high"]
-        rows.append((*names, share(our), share(their), "yes" if agree else "no"))
-    agreeing = sum(row[-1] == "yes" for row in rows)
-    return table_tables(
-        "agents against the rules of their class: the quick benchmark and the full one",
-        ("setting", "class", "quick", "full", "agree"),
-        rows,
-        f"{agreeing} of {len(rows)} verdicts agree: their 95 % intervals overlap",
-    )
+    both = [(*names, own, theirs[names]) for names, own in ours.items() if names in theirs]
+    return _render("agreement.md", both=both) if both else ""

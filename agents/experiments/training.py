@@ -1,215 +1,66 @@
-"""The benchmark's pieces of work: the tests of rules and references, and one training each."""
+"""The benchmark of a setting: its tests, one training for each agent, and the verdict over them."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
-import numpy as np
 import torch
 
 from fusion_gym.core.system import least_covering
 from fusion_gym.core.task import Task
-from fusion_gym.envs.registration import make_task
+from fusion_gym.deprecation import replace_value
 from fusion_gym.evaluation.envelope import points_of
-from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.hindsight import run_hindsight
 from fusion_gym.evaluation.metrics import robust_summary, summarise
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.validation import ConfigurationError
 
-from ..output.files import load_results, read_json, save_results, write
-from ..output.folders import alone_in, check_inputs, fingerprint
+from ..output.folders import fingerprint
 from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, ValidationConfig
-from ..training.run import holds_training, train
-from .classes import Class, classes_of, names_of, trained_classes
+from .classes import Class, classes_of, trained_classes
 from .config import Setting, Suite, front_prices
-from .references import EnvelopeStore, Test, envelope_task, run_test
-from .tables import VERDICT, write_rows
+from .envelopes import (
+    EnvelopeStore,
+    Test,
+    check_vertex,
+    envelope_task,
+    read_tests,
+    rule_tests,
+    run_test,
+)
+from .tables import VERDICT, Row, write_rows
 from .verdict import ClassTests, at_rates, judge, worths
+from .workers import (
+    Call,
+    Folders,
+    Pool,
+    check_training,
+    missing,
+    run_training,
+    side_by_side,
+    training_of,
+)
 
 VALIDATIONS = 2  # of a training
-
-
-class Job(NamedTuple):
-    """One piece of work; ``weight`` is about how long it takes, in seconds on one core.
-
-    ``envelopes`` are the classes of committed envelopes that it depends on, with their hashes.
-    """
-
-    setting: Setting
-    kind: str
-    of: Class | None = None
-    seed: int = 0
-    weight: float = 1.0
-    envelopes: tuple[tuple[str, str], ...] = ()
-
-    @property
-    def name(self) -> str:
-        """Name of its JSON, without the suffix."""
-        return self.kind if self.of is None else f"agent_{self.of.name}_{self.seed}"
-
-    @property
-    def place(self) -> str:
-        """Path of its files in the work folder, without the suffix."""
-        return f"{self.setting.name}/{self.name}"
-
-
-class Folders(NamedTuple):
-    """``results`` holds tables for readers, ``work`` finished pieces, models and episodes."""
-
-    results: Path
-    work: Path
-
-    @classmethod
-    def create(cls, results: Path | None, work: Path | None, quick: bool) -> Folders:
-        """The folders that a command line names, or those of the full or the quick benchmark."""
-        return cls(
-            results or Path("results/quick" if quick else "results"),
-            work or Path("runs/benchmark/quick" if quick else "runs/benchmark/full"),
-        )
-
-    def finished(self, place: str, inputs: Mapping[str, Any]) -> bool:
-        """Return whether the results of a piece of work are there.
-
-        Raises:
-            ConfigurationError: they are damaged, or were made from other inputs; says which.
-        """
-        report = self.work / f"{place}.json"
-        if not (report.exists() and report.with_suffix(".npz").exists()):
-            return False
-        check_inputs(inputs, read_json(report, "work").get("inputs"), repr(str(report)))
-        self.read(place)
-        return True
-
-    def read(self, place: str) -> tuple[dict[str, Any], dict[str, EpisodeResults]]:
-        """Return the report of a finished piece of work, and its episodes by policy.
-
-        Raises:
-            ConfigurationError: they are damaged.
-        """
-        report = read_json(self.work / f"{place}.json", "work")
-        return report, load_results(self.work / f"{place}.npz", report.get("made_from", ""))
-
-    def write(
-        self, place: str, report: Mapping[str, Any], episodes: Mapping[str, EpisodeResults]
-    ) -> None:
-        """Write the episodes of a piece of work, then its report."""
-        save_results(self.work / f"{place}.npz", episodes, report["made_from"])
-        write(self.work / f"{place}.json", report)
-
-    @contextmanager
-    def lock(self) -> Iterator[None]:
-        """Both folders, made if they are not there, for this process alone.
-
-        Raises:
-            ConfigurationError: another process works there, or they cannot be written.
-        """
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(alone_in(self.results, "results"))
-            if self.work.resolve() != self.results.resolve():
-                stack.enter_context(alone_in(self.work, "work"))
-            yield
-
-
-def jobs(
-    suite: Suite, settings: Sequence[Setting], classes: Sequence[str], store: EnvelopeStore
-) -> Iterator[Job]:
-    """All work, what everything else needs first; agents of some classes, by name.
-
-    Raises:
-        ConfigurationError: a class that an agent would be compared with is not there.
-    """
-    required = {setting.name: trained_classes(suite, setting) for setting in settings}
-    hashes = {setting.name: _hashes(store, setting, required[setting.name]) for setting in settings}
-    for setting in settings:
-        yield Job(setting, "baselines", weight=5.0, envelopes=tuple(hashes[setting.name].items()))
-    for setting in settings:
-        for kind in ("informed", "references"):
-            if policies_of(setting, kind):
-                yield Job(setting, kind, weight=60.0)
-        if setting.hindsight:
-            yield Job(setting, "hindsight", weight=0.6 * suite.hindsight_episodes)
-    for seed in range(suite.training_seeds):
-        for setting in settings:
-            for of in required[setting.name]:
-                if of.name in classes:
-                    weight = 10.0 + suite.timesteps_of(setting, of.name, of.mode) / setting.pace
-                    stored = ((of.name, hashes[setting.name][of.name]),)
-                    yield Job(setting, "agent", of, seed, weight, stored)
-
-
-def _hashes(store: EnvelopeStore, setting: Setting, classes: Sequence[Class]) -> dict[str, str]:
-    """The hash of each class of agents, and of those without agents that are there as well."""
-    names = {of.name for of in classes}
-    return {
-        of.name: store.envelope(setting, of.name)["sha256"]
-        for of in classes_of(setting)
-        if of.name in names
-    }
-
-
-def rules_of(suite: Suite, setting: Setting, store: EnvelopeStore) -> list[Test]:
-    """The rules of the envelopes that agents are compared with, to be run on the test episodes."""
-    names = [of.name for of in trained_classes(suite, setting)]
-    return [
-        Test(setting, tuple(v["options"].items()), v["policy"], suite.episodes, suite.seed)
-        for v in store.vertices(setting, names)
-    ]
-
-
-def policies_of(setting: Setting, kind: str) -> tuple[str, ...]:
-    """The setting's references of a kind: "informed" or "references"."""
-    return setting.informed if kind == "informed" else setting.references
+_METRICS = ("mse", "return", "rate", "denied", "tokens", "nees")  # of each policy
 
 
 def agent_options(setting: Setting, of: Class) -> dict[str, Any]:
-    """The options of the environment in which an agent of a class decides."""
+    """Return the options of the environment in which an agent of a class decides."""
     return setting.environment.options | of.information | setting.agent_options
 
 
 def agent_task(setting: Setting, of: Class) -> Task:
-    """The task in which an agent of a class is tested: no price is drawn."""
+    """Return the task in which an agent of a class is tested: no price is drawn."""
     return envelope_task(setting, agent_options(setting, of).items())
 
 
-def training_of(experiment: Experiment) -> dict[str, Any]:
-    return experiment.model_dump(mode="json", exclude={"output"})
-
-
-def job_inputs(job: Job, suite: Suite) -> dict[str, Any]:
-    """All that the results of a job depend on."""
-    setting = job.setting
-    result: dict[str, Any] = {
-        "environment": setting.environment.model_dump(mode="json"),
-        "episodes": suite.episodes,
-        "seed": suite.seed,
-    }
-    if job.kind == "baselines":
-        genie = setting.genie and setting.genie.model_dump(mode="json")
-        return result | {
-            "envelopes": dict(job.envelopes),
-            "points": list(setting.points),
-            "genie": genie,
-        }
-    if job.kind in ("informed", "references"):
-        return result | {job.kind: list(policies_of(setting, job.kind))}
-    if job.kind == "hindsight":
-        assert setting.hindsight is not None
-        hindsight = setting.hindsight.model_dump(mode="json")
-        return result | {"hindsight": hindsight | {"episodes": suite.hindsight_episodes}}
-    assert job.of is not None
-    experiment = experiment_of(suite, setting, job.of, job.seed, Path())
-    tested = {"prices": suite.prices, "price_range": list(setting.price_range)}
-    envelope = {"class": job.envelopes[0][0], "sha256": job.envelopes[0][1]}
-    return result | {"training": training_of(experiment), "envelope": envelope} | tested
-
-
 def experiment_of(suite: Suite, setting: Setting, of: Class, seed: int, work: Path) -> Experiment:
-    """The training of one agent: the price drawn for each episode and seen."""
+    """Return the training of one agent: the price drawn for each episode and seen."""
     options = agent_options(setting, of) | {
         "cost_weight": "random",
         "price_range": list(setting.price_range),
@@ -233,48 +84,244 @@ def experiment_of(suite: Suite, setting: Setting, of: Class, seed: int, work: Pa
     )
 
 
-def run_job(job: Job, suite: Suite, folders: Folders, store: EnvelopeStore) -> None:
-    """Do a job and write its results."""
+class Agent(NamedTuple):
+    """One training of a class in a setting, tested at prices over the whole range.
+
+    ``sha256`` is the hash of the class of committed rules that it is compared with.
+    """
+
+    suite: Suite
+    setting: Setting
+    of: Class
+    seed: int
+    sha256: str
+    work: Path
+
+    @property
+    def name(self) -> str:
+        """Its name in the tables."""
+        return f"agent_{self.of.name}_{self.seed}"
+
+    @property
+    def weight(self) -> float:
+        """About how long it takes, in seconds on one core."""
+        steps = self.suite.timesteps_of(self.setting, self.of.name, self.of.mode)
+        return 10.0 + steps / self.setting.pace
+
+    @property
+    def experiment(self) -> Experiment:
+        """Its training."""
+        return experiment_of(self.suite, self.setting, self.of, self.seed, self.work)
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """All that its results depend on."""
+        return tested_inputs(self.suite, self.setting) | {
+            "training": training_of(self.experiment),
+            "envelope": {"class": self.of.name, "sha256": self.sha256},
+            "prices": self.suite.prices,
+            "price_range": list(self.setting.price_range),
+        }
+
+
+def run_agent(agent: Agent) -> dict[str, Any]:
+    """Train an agent that sees the price, and return how that went and its results by price."""
+    summary = run_training(agent.experiment)
+    suite, setting = agent.suite, agent.setting
+    model = f"model:{Path(agent.experiment.output) / 'best_model.zip'}"
+    options = tuple(agent_options(setting, agent.of).items())
+    tests = Test.at_prices(setting, options, model, suite.prices, suite.episodes, suite.seed)
+    return {
+        "seconds": summary["seconds"],
+        "best_validation": summary["best_validation"],
+        "results": [run_test(test) for test in tests],
+    }
+
+
+@dataclass(frozen=True)
+class HindsightSearch:
+    """A clairvoyant's schedules for the first test episodes."""
+
+    suite: Suite
+    setting: Setting
+    weight: ClassVar[float] = 60.0
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """All that its results depend on."""
+        assert self.setting.hindsight is not None
+        hindsight = self.setting.hindsight.model_dump(mode="json")
+        hindsight |= {"episodes": self.suite.hindsight_episodes}
+        return tested_inputs(self.suite, self.setting) | {"hindsight": hindsight}
+
+
+def search_in_hindsight(search: HindsightSearch) -> dict[str, EpisodeResults]:
+    """Return what a clairvoyant reaches at each price."""
     torch.set_num_threads(1)
-    if job.kind == "baselines":
-        _run_baselines(job, suite, folders, store)
-    elif job.kind in ("informed", "references"):
-        _run_references(job, suite, folders)
-    elif job.kind == "hindsight":
-        _run_hindsight(job, suite, folders)
-    else:
-        _run_agent(job, suite, folders)
+    suite, hindsight = search.suite, search.setting.hindsight
+    task, episodes = envelope_task(search.setting), min(suite.hindsight_episodes, suite.episodes)
+    assert hindsight is not None
+    return {
+        f"hindsight at price {price:g}": run_hindsight(
+            task, price, hindsight.width, episodes, suite.seed
+        )
+        for price in hindsight.prices
+    }
 
 
-def judge_setting(
-    suite: Suite, setting: Setting, folders: Folders, store: EnvelopeStore
-) -> dict[str, Any] | None:
-    """The verdict over whatever agents of a setting are finished, written as tables.
+def tested_inputs(suite: Suite, setting: Setting) -> dict[str, Any]:
+    """Return what all results of a setting depend on."""
+    return {
+        "environment": setting.environment.model_dump(mode="json"),
+        "episodes": suite.episodes,
+        "seed": suite.seed,
+    }
+
+
+class BenchmarkRun(NamedTuple):
+    """Policies that were tested together: their results by name, and the run's other columns."""
+
+    name: str
+    inputs: dict[str, Any]
+    results: Mapping[str, EpisodeResults]
+    columns: Row
+
+
+class SettingWork(NamedTuple):
+    """All that is tested and trained in a setting, beside committed envelopes."""
+
+    suite: Suite
+    setting: Setting
+    store: EnvelopeStore
+    folders: Folders
+
+    @property
+    def hashes(self) -> dict[str, str]:
+        """The hash of each class of agents, in the order of classes.
+
+        Raises:
+            ConfigurationError: a class that an agent would be compared with is not there.
+        """
+        trained = {of.name for of in trained_classes(self.suite, self.setting)}
+        names = [of.name for of in classes_of(self.setting) if of.name in trained]
+        return {name: self.store.envelope(self.setting, name)["sha256"] for name in names}
+
+    @property
+    def vertices(self) -> list[Row]:
+        """The rules of the envelopes that agents are compared with."""
+        names = [of.name for of in trained_classes(self.suite, self.setting)]
+        return self.store.vertices(self.setting, names)
+
+    def tests(self) -> dict[str, list[Test]]:
+        """Return the tests of rules and references by the run that reports them."""
+        setting, suite = self.setting, self.suite
+
+        def single(policies: Sequence[str], options: dict[str, Any] | None = None) -> list[Test]:
+            rules = [{"policy": policy, "options": options or {}} for policy in policies]
+            return rule_tests(setting, rules, suite.episodes, suite.seed)
+
+        rules = rule_tests(setting, self.vertices, suite.episodes, suite.seed)
+        result = {"baselines": rules + single(setting.points)}
+        if setting.genie:
+            result["genie"] = single(["always"], setting.genie.options)
+        result |= {run: single(getattr(setting, run)) for run in ("informed", "references")}
+        return {run: tests for run, tests in result.items() if tests}
+
+    def inputs(self, run: str) -> dict[str, Any]:
+        """Return all that the results of a run of rules or references depend on."""
+        result = tested_inputs(self.suite, self.setting)
+        if run != "baselines":
+            return result | {run: list(getattr(self.setting, run) or ())}
+        genie = self.setting.genie and self.setting.genie.model_dump(mode="json")
+        points = list(self.setting.points)
+        return result | {"envelopes": self.hashes, "points": points, "genie": genie}
+
+    def hindsight(self) -> list[HindsightSearch]:
+        """Return the search in hindsight, if there is one."""
+        return [HindsightSearch(self.suite, self.setting)] if self.setting.hindsight else []
+
+    def agents(self) -> list[Agent]:
+        """Return all trainings, seed by seed."""
+        hashes = self.hashes
+        return [
+            Agent(self.suite, self.setting, of, seed, hashes[of.name], self.folders.work)
+            for seed in range(self.suite.training_seeds)
+            for of in trained_classes(self.suite, self.setting)
+        ]
+
+    def calls(self, classes: Sequence[str]) -> list[Call]:
+        """Return the work that is not finished, with agents of some classes.
+
+        Raises:
+            ConfigurationError: a training that is there has another config.
+        """
+        cache = self.folders.cache
+        left = [a for a in self.agents() if not cache.holds(run_agent, a.inputs)]
+        for agent in left:
+            check_training(agent.experiment)
+        return [
+            *missing(run_test, itertools.chain(*self.tests().values()), cache),
+            *missing(search_in_hindsight, self.hindsight(), cache),
+            *missing(run_agent, [agent for agent in left if agent.of.name in classes], cache),
+        ]
+
+    def runs(self) -> list[BenchmarkRun]:
+        """Return all runs, with the agents that are finished."""
+        cache = self.folders.cache
+        result = [
+            BenchmarkRun(name, self.inputs(name), read_tests(tests, cache), {})
+            for name, tests in self.tests().items()
+        ]
+        for search in self.hindsight():
+            tested = cache.call(search_in_hindsight, search.inputs, search)
+            episodes = {"episodes": len(next(iter(tested.values())).mse)}
+            result.append(BenchmarkRun("hindsight", search.inputs, tested, episodes))
+        for agent in self.agents():
+            if cache.holds(run_agent, agent.inputs):
+                content = cache.call(run_agent, agent.inputs, agent)
+                prices = front_prices(self.setting.price_range, self.suite.prices)
+                names = [f"price={price!r}" for price in prices]
+                own = {
+                    "class": agent.of.name,
+                    "class_options": agent.of.information | self.setting.agent_options,
+                    "training_seed": agent.seed,
+                }
+                tested = dict(zip(names, content.pop("results"), strict=True))
+                result.append(BenchmarkRun(agent.name, agent.inputs, tested, own | content))
+        return result
+
+
+def run_benchmark(every: Sequence[SettingWork], classes: Sequence[str], pool: Pool) -> None:
+    """Test and train what is not finished, agents of some classes, and judge every setting."""
+    side_by_side([call for work in every for call in work.calls(classes)], pool, "benchmark")
+    side_by_side([Call(30.0, judge_setting, (work,)) for work in every], pool, "verdicts")
+
+
+def judge_setting(work: SettingWork) -> None:
+    """Write the tables of a setting: its runs, and the verdict over the finished agents.
 
     Raises:
-        ConfigurationError: results that are damaged or were made from other settings.
+        ConfigurationError: a rule does other than its committed envelope says.
     """
-    every = jobs(suite, [setting], names_of(suite), store)
-    pieces = [job for job in every if folders.finished(job.place, job_inputs(job, suite))]
-    read = {job.name: folders.read(job.place) for job in pieces}
-    reports = {name: report for name, (report, _) in read.items()}
-    result = {name: episodes for name, (_, episodes) in read.items()}
-    if "baselines" not in result:
-        return None
+    suite, setting, store, runs = work.suite, work.setting, work.store, work.runs()
+    result = {run.name: run.results for run in runs}
     rules, known = result["baselines"], result.get("references", {})
-    references = {"sensors": result.get("informed", {}) | known, "centre": known, "local": {}}
+    if suite.episodes == store.suite.episodes and suite.seed == store.suite.seed:
+        for vertex in work.vertices:
+            check_vertex(vertex, rules[vertex["name"]])
+    references = {"sensors": {**result.get("informed", {}), **known}, "centre": known, "local": {}}
     always = float(rules["always"].rate.mean())
     committed, tested, classes = store.classes(setting), {}, {}
     for of in trained_classes(suite, setting):
         own = committed[of.name]
         envelope = {vertex["name"]: rules[vertex["name"]] for vertex in own["vertices"]}
-        done = [job.name for job in pieces if job.of == of]
-        agents = [list(result[job].values()) for job in done]
+        agents = [list(r.results.values()) for r in runs if r.columns.get("class") == of.name]
         tested[of.name] = ClassTests(of, envelope, agents, own["searches"])
-        if done:
-            prices = reports[done[0]]["prices"]
-            clairvoyant = result.get("hindsight", {}) if of.packet == "measurement" else {}
-            ahead = references[of.mode] if of.packet == "measurement" else {}
+        if agents:
+            measured = of.packet == "measurement"
+            ahead = references[of.mode] if measured else {}
+            clairvoyant = result.get("hindsight", {}) if measured else {}
+            prices = front_prices(setting.price_range, suite.prices)
             classes[of.name] = {
                 **judge(agents, prices, envelope, ahead, always, clairvoyant, own["searches"]),
                 "at": at_rates(tested[of.name], always),
@@ -287,180 +334,65 @@ def judge_setting(
                 "envelope": [point._asdict() for point in points_of(envelope)],
             }
     verdict = {
-        "setting": setting.name,
         "title": setting.title,
+        "env": setting.environment.id,
+        "episodes": suite.episodes,
+        "seed": suite.seed,
         "always": always,
         "classes": classes,
         "worth": worths(tested, always),
     }
-    baselines = reports["baselines"]
-    verdict |= {key: baselines[key] for key in ("env", "episodes", "seed")}
-    write_verdict(folders.results / setting.name, verdict, reports)
-    return verdict
+    common = {"horizon": envelope_task(setting).horizon, "episodes": suite.episodes}
+    rows = [
+        common
+        | {"run": run.name, "inputs": run.inputs, "made_from": fingerprint(run.inputs)}
+        | run.columns
+        for run in runs
+        if run.name != "genie"
+    ]
+    write_verdict(work.folders.results / setting.name, verdict, rows, policies_of(work, runs))
+
+
+def policies_of(work: SettingWork, runs: Sequence[BenchmarkRun]) -> list[Row]:
+    """Return a row for each policy of the runs; rules have their family and what it must know."""
+    task, vertices, genie = envelope_task(work.setting), work.vertices, work.setting.genie
+    families: dict[str, Row] = {}
+    for vertex in vertices:
+        own = [replace_value(v["knows"]) for v in vertices if v["family"] == vertex["family"]]
+        if vertex["family"] not in work.setting.points:
+            families[vertex["name"]] = {"family": vertex["family"], "knows": least_covering(own)}
+    for name in work.setting.points:
+        families[name] = {"family": name, "knows": make_policy(name, task).knowledge}
+    result = []
+    for run in runs:
+        for name, results in run.results.items():
+            row: Row = {"run": run.name, "name": name}
+            if run.name == "baselines":
+                row |= families.get(name, {})
+            elif run.name == "genie" and genie:
+                row["name"] = genie.assumes
+            elif "class" in run.columns:
+                row["price"] = float(name.removeprefix("price="))
+            summary = summarise(results)
+            row |= {key: summary[key] for key in _METRICS}
+            result.append(row | {"median": robust_summary(results)["median"]})
+    return result
 
 
 def write_verdict(
-    folder: Path, verdict: Mapping[str, Any], reports: Mapping[str, Mapping[str, Any]]
+    folder: Path, verdict: Mapping[str, Any], runs: Sequence[Row], policies: Sequence[Row]
 ) -> None:
-    """Write the tables of a setting: its pieces of work by name, and its verdict at the end."""
-    policies: list[dict[str, Any]] = []
-    for run, report in reports.items():
-        families: dict[str, dict[str, Any]] = {
-            name: {"family": family, "knows": curve["knows"]}
-            for family, curve in report.get("curves", {}).items()
-            for name in curve["policies"]
-        }
-        for name, policy in report.get("policies", {}).items():
-            policies.append({"run": run, "name": name, **families.get(name, {}), **policy})
-        for price, policy in zip(report.get("prices", []), report.get("points", []), strict=True):
-            policies.append({"run": run, "name": f"price={price!r}", "price": price, **policy})
-        if "genie" in report:
-            genie = report["genie"]
-            policies.append({"run": "genie", "name": genie["assumes"], **genie})
+    """Write the tables of a setting: its runs, their policies, and the verdict at the end."""
     classes: dict[str, Any] = verdict["classes"]
-    tables: dict[str, list[dict[str, Any]]] = {
-        "runs": [{"run": run, **report} for run, report in reports.items()],
+    tables: dict[str, Sequence[Mapping[str, Any]]] = {
+        "runs": runs,
         "policies": policies,
         "points": [{"class": name} | p for name, of in classes.items() for p in of["points"]],
         "equal_rates": [{"class": name} | p for name, of in classes.items() for p in of["at"]],
         "envelope": [{"class": name} | p for name, of in classes.items() for p in of["envelope"]],
         "fronts": [{"class": name} | of for name, of in classes.items()],
         "worth": verdict["worth"],
-        VERDICT: [dict(verdict)],
+        VERDICT: [verdict],
     }
     for table, rows in tables.items():
         write_rows(folder, table, rows)
-
-
-def _test(task: Task, policies: list[str], suite: Suite) -> dict[str, EpisodeResults]:
-    return {
-        name: run_episodes(task, make_policy(name, task), suite.episodes, suite.seed)
-        for name in dict.fromkeys(policies)
-    }
-
-
-def _run_baselines(job: Job, suite: Suite, folders: Folders, store: EnvelopeStore) -> None:
-    """Gather the tested rules of the committed envelopes, test the single policies and the genie.
-
-    Raises:
-        ConfigurationError: a rule does other than its envelope says.
-    """
-    setting = job.setting
-    curves: dict[str, dict[str, Any]] = {}
-    result: dict[str, EpisodeResults] = {}
-    vertices = store.vertices(setting, [name for name, _ in job.envelopes])
-    for vertex, test in zip(vertices, rules_of(suite, setting, store), strict=True):
-        if not test.path(folders.work).exists():
-            run_test(test, folders.work)
-        results = test.read(folders.work)
-        if suite.episodes == store.suite.episodes and suite.seed == store.suite.seed:
-            check_vertex(vertex, results)
-        policy = make_policy(vertex["policy"], envelope_task(setting, vertex["options"].items()))
-        result[vertex["name"]] = results
-        curve = curves.setdefault(vertex["family"], {"knows": [], "policies": []})
-        curve["knows"].append(policy.knowledge)
-        curve["policies"].append(vertex["name"])
-    task = envelope_task(setting)
-    for name in setting.points:
-        result |= _test(task, [name], suite)
-        knows = [make_policy(name, task).knowledge]
-        curves[name] = {"knows": knows, "policies": [name]}
-    for curve in curves.values():
-        curve["knows"] = least_covering(curve["knows"])
-        curve["policies"].sort(key=lambda name: float(result[name].rate.mean()))
-    report: dict[str, Any] = {**_header(job, suite, task), "curves": curves}
-    if setting.genie is not None:
-        options = setting.environment.options | setting.genie.options
-        free = make_task(setting.environment.id, **options)
-        results = run_episodes(free, make_policy("always", free), suite.episodes, suite.seed)
-        report["genie"] = _summary(results) | {"assumes": setting.genie.assumes}
-    _keep(job, folders, result, report)
-
-
-def check_vertex(vertex: dict[str, Any], results: EpisodeResults) -> None:
-    """Whether a rule does on the test seeds what its envelope says."""
-    claim, does = vertex["test"]["mse"]["mean"], float(results.mse.mean())
-    if not np.isclose(claim, does, rtol=1e-6):
-        raise ConfigurationError(
-            f"envelopes: {vertex['name']!r} has an error of {does:.6g} on the test seeds, and not "
-            f"{claim:.6g} as its envelope says: tune it again"
-        )
-
-
-def _run_references(job: Job, suite: Suite, folders: Folders) -> None:
-    """Test policies that were computed."""
-    task = envelope_task(job.setting)
-    result = _test(task, list(policies_of(job.setting, job.kind)), suite)
-    _keep(job, folders, result, _header(job, suite, task))
-
-
-def _run_hindsight(job: Job, suite: Suite, folders: Folders) -> None:
-    """Search a clairvoyant's schedules for the first test episodes."""
-    task, hindsight = envelope_task(job.setting), job.setting.hindsight
-    assert hindsight is not None
-    episodes = min(suite.hindsight_episodes, suite.episodes)
-    result = {
-        f"hindsight at price {price:g}": run_hindsight(
-            task, price, hindsight.width, episodes, suite.seed
-        )
-        for price in hindsight.prices
-    }
-    header = _header(job, suite, task) | {"episodes": episodes, "width": hindsight.width}
-    _keep(job, folders, result, header)
-
-
-def _run_agent(job: Job, suite: Suite, folders: Folders) -> None:
-    """Train one agent that sees the price, then test it at prices over the whole range."""
-    setting, of = job.setting, job.of
-    assert of is not None
-    experiment = experiment_of(suite, setting, of, job.seed, folders.work)
-    folder = Path(experiment.output)
-    summary = train(experiment, resume=holds_training(folder), quiet=True)
-    if not summary["finished"]:
-        raise KeyboardInterrupt
-    task, model = agent_task(setting, of), folder / "best_model.zip"
-    prices = front_prices(setting.price_range, suite.prices)
-    names = [f"model:{model},price={price!r}" for price in prices]
-    result = _test(task, names, suite)
-    report = {
-        **_header(job, suite, task),
-        "mode": of.mode,
-        "class": of.name,
-        "class_options": of.information | setting.agent_options,
-        "training_seed": job.seed,
-        "training": training_of(experiment),
-        "seconds": summary["seconds"],
-        "best_validation": summary["best_validation"],
-        "prices": prices,
-        "points": [_summary(result[name]) for name in names],
-    }
-    folders.write(job.place, report, result)
-
-
-def _keep(
-    job: Job, folders: Folders, content: dict[str, EpisodeResults], report: dict[str, Any]
-) -> None:
-    """Write the episodes, then the report with a summary of every policy."""
-    policies = {name: _summary(results) for name, results in content.items()}
-    folders.write(job.place, report | {"policies": policies}, content)
-
-
-def _header(job: Job, suite: Suite, task: Task) -> dict[str, Any]:
-    inputs = job_inputs(job, suite)
-    return {
-        "setting": job.setting.name,
-        "title": job.setting.title,
-        "env": job.setting.environment.id,
-        "options": job.setting.environment.options,
-        "episodes": suite.episodes,
-        "seed": suite.seed,
-        "horizon": task.horizon,
-        "made_from": fingerprint(inputs),
-        "inputs": inputs,
-    }
-
-
-def _summary(results: EpisodeResults) -> dict[str, Any]:
-    summary = summarise(results)
-    stored = {key: summary[key] for key in ("mse", "return", "rate", "denied", "tokens", "nees")}
-    return stored | {"median": robust_summary(results)["median"]}

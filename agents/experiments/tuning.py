@@ -218,38 +218,29 @@ def near_hull(trials: Sequence[TuningTrial], near: float, finalists: int) -> lis
 
 
 def tune_families(
-    task: Task, family: Family, tuning: Tuning, price_range: tuple[float, float]
+    task: Task,
+    family: Family,
+    tuning: Tuning,
+    price_range: tuple[float, float],
+    known: Sequence[str] = (),
 ) -> tuple[int, list[Finalist]]:
     """The number of trials of all searches, and their finalists, each on all searches' episodes.
+
+    ``known`` policies are the finalists in the place of searches, as if every one had found them.
 
     Raises:
         ConfigurationError: a policy that does not fit the task.
     """
-    found_by: dict[str, list[int]] = {}
+    seeds = range(tuning.seeds)
+    found_by: dict[str, list[int]] = {text: list(seeds) for text in known}
     tried = 0
-    for seed in range(tuning.seeds):
+    for seed in () if known else seeds:
         trials = search_family(task, family, tuning, price_range, seed)
         tried += len(trials)
         for text in near_hull(trials, tuning.near, tuning.finalists):
             found_by.setdefault(text, []).append(seed)
-    briefs = on_all_episodes(task, list(found_by), tuning)
+    briefs = briefs_of(task, list(found_by), tuning.seeds * tuning.episodes, tuning.seed)
     return tried, [
-        Finalist(text, brief, tuple(seeds))
-        for (text, seeds), brief in zip(found_by.items(), briefs, strict=True)
+        Finalist(text, brief, tuple(own))
+        for (text, own), brief in zip(found_by.items(), briefs, strict=True)
     ]
-
-
-def as_they_are(task: Task, policies: Sequence[str], tuning: Tuning) -> list[Finalist]:
-    """Policies that were found before, as if every search had found them.
-
-    Raises:
-        ConfigurationError: a policy that does not fit the task.
-    """
-    briefs = on_all_episodes(task, policies, tuning)
-    every = tuple(range(tuning.seeds))
-    return [Finalist(t, brief, every) for t, brief in zip(policies, briefs, strict=True)]
-
-
-def on_all_episodes(task: Task, policies: Sequence[str], tuning: Tuning) -> list[Brief]:
-    """The policies on the episodes of all searches together."""
-    return briefs_of(task, policies, tuning.seeds * tuning.episodes, tuning.seed)

@@ -326,7 +326,9 @@ def _kind(more: Class, less: Class) -> str | None:
     if more.mode == less.mode and same and more.broadcast == less.broadcast:
         return "memory" if more.memory and not less.memory else None
     if more.memory == less.memory and more.mode == less.mode == "local":
-        return "hearing" if _broadcast_level(more) > _broadcast_level(less) else None
+        order = HEARD.index
+        wider = order(more.broadcast or "none") > order(less.broadcast or "none")
+        return "hearing" if wider else None
     if more.memory == less.memory and more.mode == less.mode == "sensors":
         return "packets that hold the estimate" if more.packet == "estimate" and not same else None
     if more.memory == less.memory and same and more.mode == "sensors":
@@ -337,12 +339,8 @@ def _kind(more: Class, less: Class) -> str | None:
     return None
 
 
-def _broadcast_level(of: Class) -> int:
-    return -1 if of.broadcast is None else HEARD.index(of.broadcast)
-
-
 ROBUSTNESS = "robustness"  # of the page for readers in that of the results, and a table's name
-KINDS = {"agents": "agent_", "trained": "trained_"}  # what their labels begin with
+KINDS = ("agents", "trained")  # agents as they are, and trained over draws
 Report = Mapping[str, Any]
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
-from fusion_gym.validation import ConfigurationError, integer, number
+from fusion_gym.validation import integer, number, refusal
 
 
 class Mark(ABC):
@@ -86,7 +86,6 @@ Steps = Annotated[int | None, Whole(1, 10**12)]
 Seed = Annotated[int, Whole(0)]
 _TRAINING = Whole(0, 2**32 - 1)  # as torch and numpy take it
 TrainingSeed = Annotated[int | None, _TRAINING]
-TrainingSeeds = Annotated[tuple[int, ...], _TRAINING]
 
 
 def check_options(values: Any) -> None:
@@ -140,9 +139,7 @@ def _try_out(option: str, path: Path, allowed: str, write: Callable[[], object])
         write()
     except (OSError, ValueError) as error:  # a ValueError of a path that no system knows
         reason = getattr(error, "strerror", None) or str(error)
-        raise ConfigurationError(
-            f"{option} = {str(path)!r} is not allowed: it must be {allowed} ({reason})"
-        ) from None
+        raise refusal(option, str(path), f"{allowed} ({reason})") from None
 
 
 def _write_in(folder: Path) -> None:

@@ -22,7 +22,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.cross_term import CrossTerm, cross_terms, usual_policies, worst
 from fusion_gym.policies.registry import make_policy
 
-from ..command_line import Long, PolicyNames, SetOptions
+from ..command_line import EnvironmentOptions, Long, PolicyNames
 from ..input.options import OutputFile, Seed, Whole
 from ..output import tables
 from ..output.files import write
@@ -31,15 +31,9 @@ from ..training.environment import environment_of
 
 
 @dataclass(frozen=True)
-class Mismatch(Long):
+class Mismatch(EnvironmentOptions, Long):
     """Measure whether a training may take the mismatch for the error: the cross term."""
 
-    env: str | None = None
-    """Id of a registered environment."""
-    config: str | None = None
-    """Take environment, options and filter from a training's YAML, or from a shipped config."""
-    options: SetOptions = ()
-    """Options of gym.make for the environment; they go before the config's."""
     filter: str | None = None
     """Filter that takes in every measurement; by default the config's, or that of a memory."""
     policies: PolicyNames = ()

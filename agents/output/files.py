@@ -11,12 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.validation import ConfigurationError, read_text
 
-FIELDS = tuple(EpisodeResults.__dataclass_fields__)
 # What reading a damaged archive raises; RuntimeError where a part says that it is encrypted.
 DAMAGED = (
     *(OSError, EOFError, KeyError, TypeError, ValueError, RuntimeError),
@@ -89,38 +85,3 @@ def read_json(path: Path, name: str) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ConfigurationError(f"{name} = {str(path)!r} holds no JSON object")
     return content
-
-
-def save_results(path: Path, results: Mapping[str, EpisodeResults], made_from: str = "") -> None:
-    """All results in one compressed file, with a hash of what they were made from."""
-    arrays = {
-        f"{place}/{field}": getattr(result, field)
-        for place, result in enumerate(results.values())
-        for field in FIELDS
-    }
-    with replacing(path) as partial:
-        np.savez_compressed(
-            partial,
-            names=np.array(list(results), dtype=np.str_),
-            made_from=np.array(made_from, dtype=np.str_),
-            **arrays,
-        )
-
-
-def load_results(path: Path, made_from: str = "") -> dict[str, EpisodeResults]:
-    """What :func:`save_results` wrote.
-
-    Raises:
-        ConfigurationError: the file cannot be read, or was made from something else.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            if str(arrays["made_from"]) != made_from:
-                raise ValueError("they were made from something else")
-            return {
-                str(name): EpisodeResults(**{field: arrays[f"{place}/{field}"] for field in FIELDS})
-                for place, name in enumerate(arrays["names"])
-            }
-    except DAMAGED as error:
-        reason = " ".join(str(error).split()).strip("'\"") or type(error).__name__
-        raise ConfigurationError(f"episodes = {str(path)!r} cannot be read: {reason}") from None

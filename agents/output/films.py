@@ -2,13 +2,13 @@
 
 import contextlib
 import errno
-import importlib.util
 import io
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from fusion_gym.envs.drawing import Frame
+from fusion_gym.importing import require
 from fusion_gym.validation import ConfigurationError
 
 from .files import replacing
@@ -26,11 +26,7 @@ def checked_film(option: str, path: Path) -> None:
         raise ConfigurationError(
             f"{option} = {str(path)!r} is not allowed: it must end with {' or '.join(ENDINGS)}"
         )
-    for package in ("imageio", "imageio_ffmpeg"):
-        if importlib.util.find_spec(package) is None:
-            raise ConfigurationError(
-                f"{option} needs {package}, which is absent: pip install 'fusion-gym[render]'"
-            )
+    require(option, "render", "imageio", "imageio_ffmpeg")
 
 
 def save_film(frames: Iterable[Frame], path: Path, fps: int) -> None:

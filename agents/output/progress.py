@@ -12,7 +12,7 @@ import contextlib
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
 
@@ -77,13 +77,26 @@ class Bar:
         needed = (self._reached - self._began) * (1.0 - self.share) / (self.share - self._first)
         return max(needed - (time.monotonic() - self._reached), 0.0)
 
+    @property
+    def count(self) -> str:
+        """What is done, of all."""
+        return f"{int(self.done):,}/{int(self.total):,} {self.unit}"
+
+    @property
+    def clock(self) -> str:
+        """The time so far, and the one that remains."""
+        if self.share >= 1.0:
+            return _time(self.seconds)
+        left = "?" if self.left is None else _time(self.left)
+        return f"{_time(self.seconds)}, {left} left"
+
     def end(self) -> None:
         """Nothing more will be done."""
         self._ended, self.plain = time.monotonic(), False
 
     def line(self) -> str:
         """All of it in one line."""
-        message = [f"{self.description}: {int(100 * self.share)} %", _count(self), _clock(self)]
+        message = [f"{self.description}: {int(100 * self.share)} %", self.count, self.clock]
         return ", ".join([*message, self.note] if self.note else message)
 
 
@@ -167,14 +180,14 @@ _SCREEN = _Screen()
 
 
 class _Part(ProgressColumn):
-    """A column that is read from a bar."""
+    """A column of an attribute of a bar; ``whole`` ones give way last where room is scarce."""
 
-    def __init__(self, text: Callable[[Bar], str], style: str, whole: bool = True) -> None:
-        super().__init__(Column(no_wrap=whole))  # others give way first where room is scarce
-        self._text, self._style = text, style
+    def __init__(self, name: str, style: str = "", whole: bool = True) -> None:
+        super().__init__(Column(no_wrap=whole))
+        self._name, self._style = name, style
 
     def render(self, task: Task) -> Text:
-        text = self._text(task.fields["bar"])
+        text = getattr(task.fields["bar"], self._name)
         return Text(text, self._style, no_wrap=True, overflow="ellipsis")
 
 
@@ -190,24 +203,12 @@ class _Drawn(ProgressColumn):
 
 def _columns() -> list[ProgressColumn]:
     return [
-        _Part(lambda bar: bar.description, ""),
+        _Part("description"),
         _Drawn(),
-        _Part(_count, "progress.download"),
-        _Part(_clock, "progress.remaining"),
-        _Part(lambda bar: bar.note, "", whole=False),
+        _Part("count", "progress.download"),
+        _Part("clock", "progress.remaining"),
+        _Part("note", whole=False),
     ]
-
-
-def _count(bar: Bar) -> str:
-    return f"{int(bar.done):,}/{int(bar.total):,} {bar.unit}"
-
-
-def _clock(bar: Bar) -> str:
-    """The time so far, and the one that remains."""
-    if bar.share >= 1.0:
-        return f"{_time(bar.seconds)}"
-    left = "?" if bar.left is None else _time(bar.left)
-    return f"{_time(bar.seconds)}, {left} left"
 
 
 def _time(seconds: float) -> str:

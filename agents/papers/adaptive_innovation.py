@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullLocator
 from numpy.typing import NDArray
 from scipy.stats import norm
 
@@ -21,6 +20,7 @@ from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
 
 from ..output import palette
 from .adaptive_innovation_runs import ELLIPSES, SENSORS, STEPS, Ask, ErrorRecord, Lane, steps, top
+from .drawing import legend, set_ticks
 from .numbers import Number, below, estimate, grid, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_of
 
@@ -394,7 +394,7 @@ def _draw_tracking(figure: Any, data: Data) -> None:
         axis.set_ylabel(f"$x_{state + 1}$ ({UNITS[state]})")
     axes[-1].set_xlabel("step k")
     axes[-1].set_xlim(0, STEPS)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    legend(figure, axes[0], 3)
 
 
 def _draw_traces(figure: Any, data: Data) -> None:
@@ -413,9 +413,7 @@ def _draw_traces(figure: Any, data: Data) -> None:
         axis.set_title(f"({'ab'[place]}) {NAMES[fusion]}", loc="left")
         axis.legend(loc="upper right", ncols=3, fontsize=9, columnspacing=1.0)
         axis.set_ylim(0.2, 4.0)
-        axis.yaxis.set_major_locator(FixedLocator([0.2, 0.3, 0.5, 1.0, 2.0, 4.0]))
-        axis.yaxis.set_major_formatter(FormatStrFormatter("%g"))
-        axis.yaxis.set_minor_locator(NullLocator())
+        set_ticks(axis, [0.2, 0.3, 0.5, 1.0, 2.0, 4.0])
     axes[-1].set_xlabel("step k")
     axes[-1].set_xlim(0, STEPS)
 
@@ -429,7 +427,7 @@ def _draw_comparison(figure: Any, data: Data) -> None:
     axis.set_ylabel(f"MSE, {_SUM}")
     axis.set_xlim(_TIME[_LATE][0], STEPS)
     axis.set_ylim(bottom=0.0)
-    figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", ncols=2)
+    legend(figure, axis, 2)
 
 
 def _draw_errors(figure: Any, data: Data, fusion: str) -> None:

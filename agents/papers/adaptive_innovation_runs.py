@@ -1,5 +1,6 @@
 """Runs of the tracking example side by side, and what is recorded of their errors."""
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -103,7 +104,7 @@ class ErrorRecord:
     the share of steps in which the actual deviation is at most the conservative one, ``bounded``
     the share in which P - P̄ is positive semidefinite, ``whitened`` (L, n, n, E) the mean of
     L⁻¹ e eᵀ L⁻ᵀ with P = L Lᵀ; ``worst`` is the largest generalised eigenvalue of P̄ against P in
-    any step, ``rate`` (L, sensors, E). ``square`` (L, n, E) and ``level`` (L, n, E): mean squares
+    any step. ``square`` (L, n, E) and ``level`` (L, n, E): mean squares
     of the fused errors, and of the states about their start. ``beats`` (L, sensors, E): the share
     of steps in which the fused conservative trace is the smaller, ``encloses`` (L, sensors, E) in
     which a node's conservative covariance is at least the fused one, ``encloses_plane`` of
@@ -124,7 +125,7 @@ class ErrorRecord:
         self.sums: dict[str, Array] = {}
         self.most: dict[str, Array] = {}
         self.compared = 0
-        self.rows: dict[str, list[Array]] = {}
+        self.rows: defaultdict[str, list[Array]] = defaultdict(list)
         self.stored: dict[str, Array] = {}
 
     def arrays(self) -> dict[str, Array]:
@@ -152,21 +153,20 @@ class ErrorRecord:
         largest = _largest(actual, claimed)
         start = state.truth - np.array(CorrelatedTrackingOptions().initial_mean)[:, None]
         self._add(
-            rate=step.outcome.requested, mse=mse, actual=traces[0], conservative=traces[1],
+            mse=mse, actual=traces[0], conservative=traces[1],
             inside=np.abs(error) <= 3.0 * deviation, ordered=deviation <= bound * (1.0 + _ROUNDING),
             bounded=largest <= 1.0 + _ROUNDING, whitened=_whitened(error, claimed), square=error**2,
             level=start**2, beats=traces[1] <= linalg.trace(state.covariance[1:]),
         )  # fmt: skip
         self._most(worst=largest)
         for name, value in zip(("mse", "actual", "conservative"), (mse, *traces), strict=True):
-            self._row(f"{name}_steps", self._lanes(value).mean(-1))
-        for name, value in (
-            ("truth", state.truth),
-            ("mean", state.mean[0]),
-            ("actual_deviation", deviation),
-            ("conservative_deviation", bound),
-        ):
-            self._row(name, self._lanes(value)[..., 0])
+            self.rows[f"{name}_steps"].append(self._lanes(value).mean(-1))
+        first = {
+            "truth": state.truth, "mean": state.mean[0], "actual_deviation": deviation,
+            "conservative_deviation": bound,
+        }  # fmt: skip
+        for name, value in first.items():
+            self.rows[name].append(self._lanes(value)[..., 0])
         if self.with_nodes:
             self._add(node_mse=((state.truth - state.mean[1:]) ** 2).sum(1))
         if step.number % _EVERY == 0:
@@ -199,16 +199,12 @@ class ErrorRecord:
 
     def _add(self, **values: NDArray[Any]) -> None:
         for name, value in values.items():
-            result = self._lanes(value).astype(float)
-            self.sums[name] = self.sums[name] + result if name in self.sums else result
+            self.sums[name] = self.sums.get(name, 0.0) + self._lanes(value).astype(float)
 
     def _most(self, **values: Array) -> None:
         for name, value in values.items():
             result = self._lanes(value)
             self.most[name] = np.maximum(self.most.get(name, result), result)
-
-    def _row(self, name: str, value: Array) -> None:
-        self.rows.setdefault(name, []).append(value)
 
 
 def _first(covariance: Array) -> NDArray[np.float64]:

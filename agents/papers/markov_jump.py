@@ -15,14 +15,15 @@ from numpy.typing import NDArray
 
 import fusion_gym
 from fusion_gym.arrays import Array
-from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingOptions
 
 from ..output.palette import BLACK, BLUE, GREEN, ORANGE, PURPLE, SENSORS, SKY, TRUTH, VERMILLION
+from .drawing import legend_of
 from .markov_jump_covariances import covariances
 from .numbers import Number, below, grid, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_list
+from .walk import walk
 
 STATES = ("position", "velocity")
 UNITS = ("m", "m/s")
@@ -82,13 +83,9 @@ class Run(NamedTuple):
 
 def run_markov_jump(task: Task, policy: str, episodes: int, seed: int) -> Run:
     """Run episodes with the seeds ``seed``, ``seed + 1``, …"""
-    rule = fusion_gym.make_policy(policy, task)
-    batch = EpisodeBatch.seeded(task, episodes, seed)
-    rule.reset(episodes, seed)
     rows: list[tuple[Any, ...]] = []
-    for _ in range(task.horizon):
-        outcome = batch.step(rule(batch.signals()))
-        state = batch.delivered
+    for batch, requests in walk(task, policy, episodes, seed):
+        outcome, state = batch.step(requests), batch.delivered
         mean, covariance = task.system.fused(state)
         truth = task.system.truth(state)
         local = task.system.local_means(state) if hasattr(state, "node_mean") else mean[None]
@@ -381,16 +378,14 @@ def _draw_instants(figure: Any, data: Data) -> None:
             axis.plot(
                 time[~there], 0.0 * time[~there] + base, "o", ms=2.6, mfc="none", color=colour
             )
+            axis.text(
+                1.01, (base + 1.0) / (_LANE * count + 0.3), f"node {sensor + 1}",
+                transform=axis.transAxes, va="center", color=colour,
+            )  # fmt: skip
         ticks = [_LANE * lane + up for lane in range(count) for up in (0, 1)]
         axis.set_yticks(ticks, ["0", "1"] * count)
         axis.set_ylim(-0.5, _LANE * count - 0.2)
         axis.set_title(f"({chr(ord('a') + place)}) {label}", loc="left")
-        for sensor in range(count):
-            height = (_LANE * (count - 1 - sensor) + 1.0) / (_LANE * count + 0.3)
-            axis.text(
-                1.01, height, f"node {sensor + 1}", transform=axis.transAxes, va="center",
-                color=SENSORS[sensor],
-            )  # fmt: skip
     axes[len(lanes) // 2].set_ylabel("received (1) or not (0)")
     axes[-1].set_xlabel(_TIME)
 
@@ -404,7 +399,7 @@ def _draw_tracking(figure: Any, data: Data) -> None:
         handles += _curves(axis, data, data["means"][..., state])
         _title(axis, state, STATES[state])
     axes[-1].set_xlabel(_TIME)
-    _legend(figure, handles)
+    legend_of(figure, handles, len(handles), 1.8)
 
 
 def _draw_errors(figure: Any, data: Data) -> None:
@@ -416,7 +411,7 @@ def _draw_errors(figure: Any, data: Data) -> None:
         axis.set_ylim(bottom=0.0)
         _title(axis, state, f"RMSE of {STATES[state]}")
     axes[-1].set_xlabel(_TIME)
-    _legend(figure, handles)
+    legend_of(figure, handles, len(handles), 1.8)
 
 
 def _draw_traces(figure: Any, data: Data) -> None:
@@ -425,7 +420,7 @@ def _draw_traces(figure: Any, data: Data) -> None:
     axis.set_ylabel("trace of $P_0$ (m² and m²/s²)")
     axis.set_ylim(bottom=0.0)
     axis.set_xlabel(_TIME)
-    _legend(figure, handles)
+    legend_of(figure, handles, len(handles), 1.8)
 
 
 def _title(axis: Any, state: int, what: str) -> None:
@@ -444,13 +439,6 @@ def _curves(axis: Any, data: Data, values: Array, width: float = 1.4, alpha: flo
             label=label,
         )  # fmt: skip
     return handles
-
-
-def _legend(figure: Any, handles: Any) -> None:
-    figure.legend(
-        handles=handles, loc="outside upper center", ncols=len(handles), handlelength=1.8,
-        columnspacing=1.2, handletextpad=0.5,
-    )  # fmt: skip
 
 
 PAPER = Paper(

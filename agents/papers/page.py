@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jinja2
 import matplotlib.pyplot as plt
@@ -19,15 +19,10 @@ TEMPLATES = Path(__file__).parent
 Counts = Mapping[str, Mapping[str, int]]  # episodes and seed of each piece
 
 
-class Page(NamedTuple):
-    """A paper's Markdown, and its numbers as plain JSON."""
-
-    text: str
-    numbers: dict[str, Any]
-
-
-def render_page(paper: Paper, results: Mapping[str, Data], counts: Counts) -> Page:
-    """Return the page of a paper from the data of all its pieces."""
+def render_page(
+    paper: Paper, results: Mapping[str, Data], counts: Counts
+) -> tuple[str, dict[str, Any]]:
+    """Return a paper's Markdown from the data of all its pieces, and its numbers as plain JSON."""
     pieces = {
         piece.name: results[piece.name] | piece.summarise(results[piece.name])
         for piece in paper.pieces
@@ -35,10 +30,10 @@ def render_page(paper: Paper, results: Mapping[str, Data], counts: Counts) -> Pa
     claims: list[dict[str, str]] = []
 
     def claim(text: str, source: str, verdict: str, caller: Callable[[], str]) -> str:
-        row = (_line(text), _line(source), verdict, _line(caller()))
-        claims.append(dict(zip(("text", "source", "verdict", "evidence"), row, strict=True)))
-        cells = [_cell(row[0]), _cell(row[1]), f"**{verdict}**", _cell(row[3])]
-        return f"| {' | '.join(cells)} |\n"
+        row = {"text": text, "source": source, "verdict": verdict, "evidence": caller()}
+        claims.append({name: _line(value) for name, value in row.items()})
+        cells = claims[-1] | {"verdict": f"**{verdict}**"}
+        return f"| {' | '.join(map(_cell, cells.values()))} |\n"
 
     template = _template(f"{paper.name}.md")
     text = template.render(pieces, paper=paper.name, claim=claim, counts=counts)
@@ -52,26 +47,23 @@ def render_page(paper: Paper, results: Mapping[str, Data], counts: Counts) -> Pa
         for name, piece in pieces.items()
         for table, numbers in piece.get("tables", {}).items()
     ]
-    return Page(
-        text,
-        {
-            "paper": paper.name,
-            "title": lines[0].removeprefix("# "),
-            "citation": lines[2],
-            "made": {name: dict(count) for name, count in counts.items()},
-            "tables": tables,
-            "claims": claims,
-        },
-    )
+    return text, {
+        "paper": paper.name,
+        "title": lines[0].removeprefix("# "),
+        "citation": lines[2],
+        "made": {name: dict(count) for name, count in counts.items()},
+        "tables": tables,
+        "claims": claims,
+    }
 
 
 def write_page(paper: Paper, results: Mapping[str, Data], counts: Counts, output: Path) -> None:
     """Write a paper's pictures, its page and its numbers."""
-    page = render_page(paper, results, counts)
+    text, numbers = render_page(paper, results, counts)
     for name, figure in paper.figures.items():
         write_figure(figure, results[figure.piece], output / paper.name / name)
-    write_text(output / f"{paper.name}.md", page.text)
-    write(output / f"{paper.name}.json", page.numbers)
+    write_text(output / f"{paper.name}.md", text)
+    write(output / f"{paper.name}.json", numbers)
 
 
 def write_overview(output: Path) -> None:

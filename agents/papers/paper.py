@@ -11,6 +11,8 @@ import fusion_gym
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError, choice, keys, number, refusal
 
+from ..output.cache import Cache
+
 NAMES = (
     "tobit_token_bucket",
     "adaptive_innovation",
@@ -37,6 +39,36 @@ class Piece(NamedTuple):
     summarise: Callable[[Data], Data]
     weight: float
     usual: int = 1000
+
+
+class PieceJob(NamedTuple):
+    """A piece with episodes, seed, settings, and the keywords of a figure that shows a part."""
+
+    piece: Piece
+    episodes: int
+    seed: int
+    settings: Data
+    restriction: Data
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Episodes and seed by name."""
+        return {"episodes": self.episodes, "seed": self.seed}
+
+    @property
+    def key(self) -> tuple[Callable[..., Data], Data]:
+        """The function, and all that the data depend on beside the code."""
+        inputs = self.counts | {"settings": self.settings, "restriction": self.restriction}
+        return self.piece.simulate, inputs
+
+    @property
+    def weight(self) -> float:
+        """About how many seconds of one core it takes."""
+        return self.piece.weight * self.episodes / self.piece.usual
+
+    def simulate(self, cache: Cache) -> Data:
+        """Return the data of the piece, from the cache or simulated now."""
+        return cache.call(*self.key, self.episodes, self.seed, self.settings, **self.restriction)
 
 
 class PaperFigure(NamedTuple):

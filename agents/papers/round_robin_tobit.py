@@ -3,9 +3,11 @@
 Source: round_robin_tobit, Section IV.
 """
 
+import functools
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -19,8 +21,10 @@ from fusion_gym.policies.registry import make_policy
 from ..output import palette
 from . import round_robin_tobit_runs as runs
 from . import round_robin_tobit_theorems as theorems
+from .drawing import legend
 from .numbers import Number, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_of
+from .walk import SomeSensors
 
 # Tables II and III of the paper: ARMSE1, ARMSE2, ARMSE3 by interval and by variance.
 TABLE_II = {
@@ -66,8 +70,7 @@ def simulate_oscillator(episodes: int, seed: int, settings: Settings) -> Data:
         result |= {"truth": run.truth, f"{name}_mean": run.mean}
     for name, options in (("whole", runs.FREE), ("clipped", {})):
         task = _oscillator(settings, **options)
-        policy = make_policy(settings["policy"], task)
-        result[f"held_{name}"] = runs.held_values(task, policy, seed)
+        result[f"held_{name}"] = runs.held_values(task, settings["policy"], seed)
     variance = {"measurement_variance": settings["variance"][0]}
     least = runs.floor(runs.OSCILLATOR, **(variance | settings["options"]))
     return result | {"interval": settings["interval"][0], "floor": least}
@@ -82,11 +85,10 @@ def simulate_target(episodes: int, seed: int, settings: Settings) -> Data:
 
 def _curves(tasks: dict[str, Task], episodes: int, seed: int, settings: Settings) -> Data:
     errors = {
-        name: runs.squares(task, make_policy(settings["policy"], task), episodes, seed)
-        for name, task in tasks.items()
+        name: runs.squares(task, settings["policy"], episodes, seed) for name, task in tasks.items()
     }
     aware = tasks["aware"]
-    never = runs.squares(aware, make_policy("never", aware), episodes, seed)
+    never = runs.squares(aware, "never", episodes, seed)
     return {
         **{f"{name}_rmse": runs.error_curve(error) for name, error in errors.items()},
         **{f"{name}_armse": runs.armse(error) for name, error in errors.items()},
@@ -157,7 +159,7 @@ def simulate_nodes(episodes: int, seed: int, settings: Settings) -> Data:
         "fused_armse": runs.armse(fused),
     }  # fmt: skip
     for sensor in range(2):
-        single = runs.SingleSensor(policy, sensor)
+        single = SomeSensors(policy, {sensor})
         errors = runs.squares(task, single, episodes, seed)
         data[f"single_{sensor}_mean"] = record_episode(task, single, seed).mean
         data[f"node_{sensor}_mean"] = run.local_mean[:, sensor]
@@ -213,37 +215,35 @@ def simulate_tables(
     Both begin with the first interval and the first variance.
     """
     intervals, variances = settings["interval"], settings["variance"]
-    first: Data = {}
-    data: Data = {}
-    for name in tables:
-        rows: list[Data] = []
-        before: dict[str, Array] = {}
-        for interval, variance in (
-            [(limit, variances[0]) for limit in intervals]
-            if name == "table_2"
-            else [(intervals[0], variance) for variance in variances]
-        ):
-            if not rows and first:
-                rows, before = [first["row"]], first["errors"]
-                continue
-            row: Data = {"interval": interval, "variance": variance}
-            errors = {}
-            for filter_ in _FILTERS:
-                task = _oscillator(settings, filter=filter_, **_options(interval, variance))
-                policy = make_policy(settings["policy"], task)
-                result = runs.squares(task, policy, episodes, seed)
-                rise = _rise(before.get(filter_, result), result)
-                row[filter_] = runs.armse(result) | _median(result) | {"rise": rise}
-                errors[filter_] = result
-            own = {"measurement_variance": variance} | settings["options"]
-            row["floor"] = runs.floor(runs.OSCILLATOR, **own)
-            row["floor_all"] = runs.floor(runs.OSCILLATOR, access="any", **own)
-            rows.append(row)
-            before = errors
-            first = first or {"row": row, "errors": errors}
-        data[name] = rows
+    pairs = {
+        "table_2": [(interval, variances[0]) for interval in intervals],
+        "table_3": [(intervals[0], variance) for variance in variances],
+    }
+
+    @functools.cache
+    def errors(pair: tuple[float, float]) -> dict[str, Array]:
+        tasks = {name: _oscillator(settings, filter=name, **_options(*pair)) for name in _FILTERS}
+        policy = settings["policy"]
+        return {name: runs.squares(task, policy, episodes, seed) for name, task in tasks.items()}
+
+    @functools.cache
+    def row(before: tuple[float, float], pair: tuple[float, float]) -> Data:
+        own = {"measurement_variance": pair[1]} | settings["options"]
+        floors = {
+            "floor": runs.floor(runs.OSCILLATOR, **own),
+            "floor_all": runs.floor(runs.OSCILLATOR, access="any", **own),
+        }
+        return {"interval": pair[0], "variance": pair[1]} | floors | {
+            name: runs.armse(result) | _median(result)
+            | {"rise": _rise(errors(before)[name], result)}
+            for name, result in errors(pair).items()
+        }  # fmt: skip
+
+    data: Data = {
+        name: [row(*each) for each in pairwise([pairs[name][0], *pairs[name]])] for name in tables
+    }
     task = _oscillator(settings)
-    never = runs.squares(task, make_policy("never", task), episodes, seed)
+    never = runs.squares(task, "never", episodes, seed)
     return data | {"silent": runs.armse(never), "bias_deviation": _bias_deviation(task)}
 
 
@@ -344,7 +344,7 @@ def simulate_tobit_readings(episodes: int, seed: int, settings: Settings) -> Dat
         for limit in (5.0, 0.5):
             task = runs.reading_task(reading, censoring_threshold=-limit, censoring_upper=limit)
             name = "always" if task.access == "any" else "round_robin"
-            errors = runs.squares(task, make_policy(name, task), episodes, seed)
+            errors = runs.squares(task, name, episodes, seed)
             roots = np.sqrt(errors.mean((1, 2)))
             far = mean_interval((roots > 10.0).astype(float))
             data[f"{reading} {limit:g}"] = runs.armse(errors) | {"far": list(far)}
@@ -371,69 +371,53 @@ _STEP, _TARGET_STEP = "time step k", "time step k (0.1 s each)"
 _THIN, _WIDE = 1.3, 2.0
 
 
-class CurveLine(NamedTuple):
-    """A curve over time with its name, colour and dashes; ``values`` (H,), or (3, H) with ends."""
+# Name, colour, dashes and width of each filter's curves, and of what they stand beside.
+_STYLES: dict[str, tuple[str, str, str, float]] = {
+    "unaware": ("FTKF (bias ignored)", palette.PURPLE, "--", _WIDE),
+    "aware": ("FTKF-DB (fused)", palette.FUSED, "-", _WIDE),
+    "fused": ("FTKF-DB (fused)", palette.FUSED, "-", _WIDE),
+    "truth": ("true", palette.TRUTH, "-", _THIN),
+    "least": ("√Ξ: no filter lies below", palette.CENTRAL, ":", _WIDE),
+    **{
+        f"{name}_{i}": (f"LTKF-DB-S{i + 1}", palette.SENSORS[i], "-", _THIN)
+        for name in _LOCAL
+        for i in range(2)
+    },
+}
 
-    label: str
-    values: Array
-    colour: str
-    style: str = "-"
-    width: float = _WIDE
 
-
-def _lines(data: Data, kind: str, state: int, *names: str) -> list[CurveLine]:
-    """The curves of some filters and of the true values."""
-    styles: dict[str, tuple[Any, ...]] = {
-        "unaware": ("FTKF (bias ignored)", palette.PURPLE, "--", _WIDE),
-        "aware": ("FTKF-DB (fused)", palette.FUSED, "-", _WIDE),
-        "fused": ("FTKF-DB (fused)", palette.FUSED, "-", _WIDE),
-        "truth": ("true", palette.TRUTH, "-", _THIN),
-    }
-    lines = []
-    for name in names:
-        values = data[name if name == "truth" else f"{name}_{kind}"][..., state]
-        label, *style = styles[name]
-        lines.append(CurveLine(label, values, *style))
-    return lines
+def _curve(data: Data, kind: str, name: str, state: int) -> Array:
+    """A curve (1, H), or (3, H) with the ends of its interval."""
+    if name == "least":
+        return np.full((1, data["aware_rmse"].shape[1]), data["bias_deviation"])
+    values: Array = np.atleast_2d(data[name if name == "truth" else f"{name}_{kind}"][..., state])
+    return values[:1] if name.startswith("node") else values  # their bands are those of the fused
 
 
 def _draw_curves(
     figure: Any,
-    panels: Sequence[tuple[str, Sequence[CurveLine]]],
+    data: Data,
+    kind: str,
+    panels: Sequence[tuple[str, int]],
+    names: Sequence[str],
     step: str = _STEP,
-    from_zero: bool = False,
 ) -> None:
-    """Panels one over another over a common time, each with the name of its axis."""
+    """Panels one over another over a common time, each with the name of its axis and a state."""
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-    for axis, (name, lines) in zip(axes, panels, strict=True):
-        for line in lines:
-            curve = np.atleast_2d(line.values)
+    for axis, (label, state) in zip(axes, panels, strict=True):
+        for name in names:
+            line, colour, style, width = _STYLES[name]
+            curve = _curve(data, kind, name, state)
             time = np.arange(1, curve.shape[1] + 1)
-            axis.plot(
-                time, curve[0], color=line.colour, linestyle=line.style, linewidth=line.width,
-                label=line.label,
-            )  # fmt: skip
+            axis.plot(time, curve[0], color=colour, linestyle=style, linewidth=width, label=line)
             if len(curve) > 1:
-                axis.fill_between(
-                    time, curve[1], curve[2], color=line.colour, alpha=0.18, linewidth=0
-                )
-        axis.set_ylabel(name)
+                axis.fill_between(time, *curve[1:], color=colour, alpha=0.18, linewidth=0)
+        axis.set_ylabel(label)
         axis.margins(x=0.01)
-        if from_zero:
+        if kind == "rmse":
             axis.set_ylim(bottom=0.0)
     axes[-1].set_xlabel(step)
-    _legend(figure, axes)
-
-
-def _legend(figure: Any, axes: Sequence[Any]) -> None:
-    """Below the axes, each name once."""
-    entries: dict[str, Any] = {}
-    for axis in axes:
-        handles, labels = axis.get_legend_handles_labels()
-        entries.update(zip(labels, handles, strict=True))
-    figure.legend(
-        entries.values(), entries.keys(), loc="outside lower center", ncols=min(4, len(entries))
-    )
+    legend(figure, axes, 4, "lower")
 
 
 def _draw_measurements(figure: Any, data: Data) -> None:
@@ -453,51 +437,7 @@ def _draw_measurements(figure: Any, data: Data) -> None:
         axis.set_ylabel(f"measurement\nof x{number + 1} (sensor {number + 1})")
         axis.margins(x=0.01)
     axes[-1].set_xlabel(_STEP)
-    _legend(figure, axes)
-
-
-def _draw_estimates(figure: Any, data: Data) -> None:
-    names = ("unaware", "aware", "truth")
-    _draw_curves(figure, [(f"x{i + 1}", _lines(data, "mean", i, *names)) for i in range(2)])
-
-
-def _draw_bias(figure: Any, data: Data) -> None:
-    _draw_curves(figure, [("bias b", _lines(data, "mean", 2, "aware", "truth"))])
-
-
-def _draw_state_errors(figure: Any, data: Data, labels: Sequence[str], step: str) -> None:
-    names = ("unaware", "aware")
-    panels = [(label, _lines(data, "rmse", i, *names)) for i, label in enumerate(labels)]
-    _draw_curves(figure, panels, step, from_zero=True)
-
-
-def _draw_bias_error(figure: Any, data: Data, label: str, step: str) -> None:
-    least = np.full(data["aware_rmse"].shape[1], data["bias_deviation"])
-    line = CurveLine("√Ξ: no filter lies below", least, palette.CENTRAL, ":", _WIDE)
-    _draw_curves(figure, [(label, [*_lines(data, "rmse", 2, "aware"), line])], step, from_zero=True)
-
-
-def _node_lines(data: Data, name: str, kind: str, state: int, *others: str) -> list[CurveLine]:
-    lines = []
-    for i, colour in enumerate(palette.SENSORS[:2]):
-        values = data[f"{name}_{i}_{kind}"][..., state]
-        if name == "node" and kind == "rmse":  # their bands are those of the fused
-            values = values[0]
-        lines.append(CurveLine(f"LTKF-DB-S{i + 1}", values, colour, "-", _THIN))
-    return lines + _lines(data, kind, state, "fused", *others)
-
-
-def _draw_node_states(figure: Any, data: Data, name: str) -> None:
-    panels = [(f"RMSE{i + 1} (of x{i + 1})", _node_lines(data, name, "rmse", i)) for i in range(2)]
-    _draw_curves(figure, panels, from_zero=True)
-
-
-def _draw_node_bias(figure: Any, data: Data, name: str) -> None:
-    _draw_curves(figure, [("bias b", _node_lines(data, name, "mean", 2, "truth"))])
-
-
-def _draw_node_bias_error(figure: Any, data: Data, name: str) -> None:
-    _draw_curves(figure, [("RMSE3 (of b)", _node_lines(data, name, "rmse", 2))], from_zero=True)
+    legend(figure, axes, 4, "lower")
 
 
 def _draw_table(figure: Any, data: Data, name: str) -> None:
@@ -535,12 +475,16 @@ def _draw_table(figure: Any, data: Data, name: str) -> None:
         axis.set_title(f"ARMSE{state + 1} (of {('x1', 'x2', 'b')[state]})")
         axis.set_ylim(bottom=0.0)
         axis.set_xlim(-0.6, len(rows) - 0.4)
-    _legend(figure, axes)
+    legend(figure, axes, 4, "lower")
 
 
-def _figure(piece: str, draw: Any, height: float, **keywords: Any) -> PaperFigure:
-    without = ("interval", "variance") if piece == "target" else ()
-    return PaperFigure(piece, partial(draw, **keywords), (7.2, height), without=without)
+def _curves_of(
+    piece: str, kind: str, height: float, panels: Sequence[tuple[str, int]], *names: str
+) -> PaperFigure:
+    target = piece == "target"
+    step, without = (_TARGET_STEP, ("interval", "variance")) if target else (_STEP, ())
+    draw = partial(_draw_curves, kind=kind, panels=panels, names=names, step=step)
+    return PaperFigure(piece, draw, (7.2, height), without=without)
 
 
 def _table(name: str) -> PaperFigure:
@@ -548,6 +492,7 @@ def _table(name: str) -> PaperFigure:
     return PaperFigure("tables", draw, (7.2, 3.8), {"tables": [name]})
 
 
+_RMSES = (("RMSE1 (of x1)", 0), ("RMSE2 (of x2)", 1), ("RMSE3 (of b)", 2))
 PAPER = Paper(
     "round_robin_tobit",
     (
@@ -560,29 +505,30 @@ PAPER = Paper(
         Piece("bounds", theorems.simulate_bounds, theorems.summarise_bounds, 30.0, 100),
     ),
     {
-        "figure_2": _figure("oscillator", _draw_measurements, 4.6),
-        "figure_3": _figure("oscillator", _draw_estimates, 4.8),
-        "figure_4": _figure("oscillator", _draw_bias, 3.4),
-        "figure_5": _figure(
-            "oscillator", _draw_state_errors, 4.8,
-            labels=("RMSE1 (of x1)", "RMSE2 (of x2)"), step=_STEP,
+        "figure_2": PaperFigure("oscillator", _draw_measurements, (7.2, 4.6)),
+        "figure_3": _curves_of(
+            "oscillator", "mean", 4.8, (("x1", 0), ("x2", 1)), "unaware", "aware", "truth"
         ),
-        "figure_6": _figure("oscillator", _draw_bias_error, 3.4, label="RMSE3 (of b)", step=_STEP),
+        "figure_4": _curves_of("oscillator", "mean", 3.4, (("bias b", 2),), "aware", "truth"),
+        "figure_5": _curves_of("oscillator", "rmse", 4.8, _RMSES[:2], "unaware", "aware"),
+        "figure_6": _curves_of("oscillator", "rmse", 3.4, _RMSES[2:], "aware", "least"),
         **{
-            f"figure_{number}{suffix}": _figure("nodes", draw, height, name=name)
+            f"figure_{number}{suffix}": _curves_of(
+                "nodes", kind, height, panels, f"{name}_0", f"{name}_1", "fused", *others
+            )
             for name, suffix in zip(_LOCAL, ("", "_nodes"), strict=True)
-            for number, draw, height in (
-                (7, _draw_node_states, 4.8), (8, _draw_node_bias, 3.4),
-                (9, _draw_node_bias_error, 3.4),
+            for number, kind, height, panels, others in (
+                (7, "rmse", 4.8, _RMSES[:2], ()), (8, "mean", 3.4, (("bias b", 2),), ("truth",)),
+                (9, "rmse", 3.4, _RMSES[2:], ()),
             )
         },
         "table_2": _table("table_2"), "table_3": _table("table_3"),
-        "figure_10": _figure(
-            "target", _draw_state_errors, 4.8,
-            labels=("position RMSE (m)", "velocity RMSE (m/s)"), step=_TARGET_STEP,
+        "figure_10": _curves_of(
+            "target", "rmse", 4.8, (("position RMSE (m)", 0), ("velocity RMSE (m/s)", 1)),
+            "unaware", "aware",
         ),
-        "figure_11": _figure(
-            "target", _draw_bias_error, 3.4, label="acceleration RMSE (m/s²)", step=_TARGET_STEP
+        "figure_11": _curves_of(
+            "target", "rmse", 3.4, (("acceleration RMSE (m/s²)", 2),), "aware", "least"
         ),
     },
     runs.OSCILLATOR,

@@ -1,6 +1,6 @@
 """Runs of the biased oscillator and the biased target, and the measures of their errors."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -9,18 +9,15 @@ import numpy as np
 import fusion_gym
 from fusion_gym import gaussian
 from fusion_gym.arrays import Array
-from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.runs import Outcome
-from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.episodes import BATCH
-from fusion_gym.policies.base import Policy, Requests
+from fusion_gym.policies.base import Policy
 from fusion_gym.systems.tobit.centre import FeedbackCentre
 from fusion_gym.systems.tobit.filters import Expectation
 from fusion_gym.systems.tobit.system import CensoredSystem
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 from .numbers import Number, Verdict
+from .walk import walk, walk_in_parts
 
 OSCILLATOR = "fusion_gym/BiasedOscillator-v0"
 TRACKING = "fusion_gym/BiasedTracking-v0"
@@ -32,88 +29,37 @@ _MOST = 0.5  # share of the points
 FREE = {"censoring_threshold": -np.inf, "censoring_upper": np.inf}
 
 
-@dataclass
-class SingleSensor:
-    """Another policy's requests of one sensor; the others never transmit."""
-
-    policy: Policy
-    sensor: int
-    knowledge: Any = "clock"
-
-    def reset(self, runs: int, seed: int = 0) -> None:
-        """Forget everything."""
-        self.policy.reset(runs, seed)
-
-    def __call__(self, signals: Signals) -> Requests:
-        """Return the requests (sensors, N)."""
-        requests = self.policy(signals)
-        return requests & (np.arange(len(requests))[:, None] == self.sensor)
-
-
-def round_robin(task: Task) -> Policy:
-    """Return the policy that the paper runs."""
-    return fusion_gym.make_policy("round_robin", task)
-
-
 def censored(task: Task) -> CensoredSystem:
     """Return the task's system, known for what it is."""
     assert isinstance(task.system, CensoredSystem)
     return task.system
 
 
-def walk(
-    task: Task,
-    policy: Policy,
-    episodes: int,
-    seed: int,
-    look: Callable[[EpisodeBatch, Outcome, int, slice], None],
-    before: Callable[[EpisodeBatch, int, slice], None] | None = None,
-) -> None:
-    """Run episodes in batches; ``look`` after every step, ``before`` it what was sensed.
-
-    Both get the batch, the step from 0, and which of the episodes the batch holds.
-    """
-    for first in range(0, episodes, BATCH):
-        count = min(BATCH, episodes - first)
-        runs = slice(first, first + count)
-        batch = EpisodeBatch.seeded(task, count, seed + first)
-        policy.reset(count, seed + first)
-        for step in range(task.horizon):
-            requests = policy(batch.signals())
-            if before is not None:
-                before(batch, step, runs)
-            look(batch, batch.step(requests), step, runs)
-
-
-def squares(task: Task, policy: Policy, episodes: int, seed: int) -> Array:
+def squares(task: Task, policy: Policy | str, episodes: int, seed: int) -> Array:
     """Return squared errors (episodes, H, states) of the fused estimate."""
     values = np.empty((episodes, task.horizon, STATES))
-
-    def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
-        values[runs, step] = outcome.squared_error.T
-
-    walk(task, policy, episodes, seed, look)
+    for step, runs, batch, requests in walk_in_parts(task, policy, episodes, seed):
+        values[runs, step] = batch.step(requests).squared_error.T
     return values
 
 
-def node_squares(task: Task, policy: Policy, episodes: int, seed: int) -> tuple[Array, Array]:
+def node_squares(task: Task, policy: Policy | str, episodes: int, seed: int) -> tuple[Array, Array]:
     """Return squared errors, fused and (episodes, H, sensors, states) of the nodes."""
     fused = np.empty((episodes, task.horizon, STATES))
     local = np.empty((episodes, task.horizon, task.sensors, STATES))
-
-    def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
-        fused[runs, step] = outcome.squared_error.T
+    for step, runs, batch, requests in walk_in_parts(task, policy, episodes, seed):
+        fused[runs, step] = batch.step(requests).squared_error.T
         error = task.system.truth(batch.delivered) - task.system.local_means(batch.delivered)
         local[runs, step] = (error**2).transpose(2, 0, 1)
-
-    walk(task, policy, episodes, seed, look)
     return fused, local
 
 
-def held_values(task: Task, policy: Policy, seed: int) -> Array:
+def held_values(task: Task, policy: str, seed: int) -> Array:
     """Return what the estimators hold (H, sensors) in the first run, by equation (4)."""
     rows: list[Array] = []
-    walk(task, policy, 1, seed, lambda batch, *_: rows.append(batch.delivered.held[:, 0, 0].copy()))
+    for batch, requests in walk(task, policy, 1, seed):
+        batch.step(requests)
+        rows.append(batch.delivered.held[:, 0, 0].copy())
     return np.array(rows)
 
 
@@ -132,13 +78,8 @@ def armse(squared: Array) -> dict[str, list[float]]:
     standard deviation of what so many runs as the paper's would give.
     """
     drawn = _drawn(squared)
-    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
     spread = drawn.std(0) * np.sqrt(len(squared) / PAPER_RUNS)
-    mean = np.sqrt(squared.mean(0)).mean(0)
-    return {
-        "mean": mean.tolist(), "low": low.tolist(), "high": high.tolist(),
-        "spread": spread.tolist(),
-    }  # fmt: skip
+    return _with_ends(np.sqrt(squared.mean(0)), drawn) | {"spread": spread.tolist()}
 
 
 def increase(before: Array, after: Array) -> dict[str, list[float]]:
@@ -146,9 +87,13 @@ def increase(before: Array, after: Array) -> dict[str, list[float]]:
 
     ``mean``, ``low`` and ``high`` of the 95 % bootstrap interval of the paired difference.
     """
-    low, high = np.quantile(_drawn(after) - _drawn(before), [0.025, 0.975], axis=0)
-    mean = (np.sqrt(after.mean(0)) - np.sqrt(before.mean(0))).mean(0)
-    return {"mean": mean.tolist(), "low": low.tolist(), "high": high.tolist()}
+    rise = np.sqrt(after.mean(0)) - np.sqrt(before.mean(0))
+    return _with_ends(rise, _drawn(after) - _drawn(before))
+
+
+def _with_ends(curve: Array, drawn: Array) -> dict[str, list[float]]:
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+    return {"mean": curve.mean(0).tolist(), "low": low.tolist(), "high": high.tolist()}
 
 
 def medians(squared: Array, state: int = 0) -> tuple[float, Array]:
@@ -194,15 +139,13 @@ def floor(env: str, **options: Any) -> list[float]:
     are, and a clipped packet says no more than the whole one. They follow from the matrices alone.
     """
     task = fusion_gym.make_task(env, filter="kalman", **(FREE | options))
-    policy = fusion_gym.make_policy("always" if task.access == "any" else "round_robin", task)
-    deviations = np.empty((task.horizon, STATES))
-
-    def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
+    policy = "always" if task.access == "any" else "round_robin"
+    deviations = []
+    for batch, requests in walk(task, policy, 1, 0):
+        batch.step(requests)
         covariance = task.system.fused(batch.delivered)[1]
-        deviations[step] = np.sqrt(np.diagonal(covariance[..., 0]))
-
-    walk(task, policy, 1, 0, look)
-    return [float(value) for value in deviations.mean(0)]
+        deviations.append(np.sqrt(np.diagonal(covariance[..., 0])))
+    return [float(value) for value in np.array(deviations).mean(0)]
 
 
 class Comparison(NamedTuple):

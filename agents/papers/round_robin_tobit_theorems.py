@@ -11,7 +11,6 @@ import fusion_gym
 from fusion_gym import gaussian, linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.base import Policy
@@ -25,9 +24,9 @@ from .round_robin_tobit_runs import (
     OSCILLATOR,
     TRACKING,
     PrintedTobitFilter,
-    SingleSensor,
     censored,
 )
+from .walk import SomeSensors, walk_in_parts
 
 PLACES = (-7.0, -5.0, -4.0, 0.0, 4.5, 5.0, 6.0)  # true x1 at which Lemma 1 is tried
 _DRAWS = 200  # measurements an episode, at each of them
@@ -105,7 +104,7 @@ def _errors(env: str, episodes: int, seed: int) -> dict[str, Any]:
     values = {name: np.zeros(episodes) for name in names}
     last = np.zeros((episodes, 3))
 
-    def before(batch: EpisodeBatch, step: int, runs: slice) -> None:
+    for step, runs, batch, requests in walk_in_parts(task, "round_robin", episodes, seed):
         error = batch.state.truth - batch.state.prior_mean
         if step:
             earlier = last[runs].T
@@ -122,14 +121,11 @@ def _errors(env: str, episodes: int, seed: int) -> dict[str, Any]:
         values["uncensored"][runs] += free
         values["sure"][runs] += np.where(sure, inside, 0.0)
         values["surprised"][runs] += sure & free
-
-    def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
-        assert np.all(np.argmax(outcome.granted, axis=0) == step % task.sensors)
+        outcome = batch.step(requests)
+        assert np.all(np.argmax(outcome.granted, axis=0) == sensor)
         mean, covariance = task.system.fused(batch.delivered)
         error = task.system.truth(batch.delivered) - mean
         values["nees"][runs] += linalg.dot(error, linalg.solve_vector(covariance, error)) / 3.0
-
-    measures.walk(task, measures.round_robin(task), episodes, seed, look, before)
     for name in ("nees", "predicted", "uncensored"):
         values[name] /= task.horizon
     return values
@@ -158,11 +154,9 @@ def _fusion(episodes: int, seed: int) -> dict[str, Any]:
 
 def _means(task: Any, episodes: int, seed: int, policy: str = "round_robin") -> Array:
     values = np.empty((task.horizon, 3, episodes))
-
-    def look(batch: EpisodeBatch, outcome: Outcome, step: int, runs: slice) -> None:
+    for step, runs, batch, requests in walk_in_parts(task, policy, episodes, seed):
+        batch.step(requests)
         values[step, :, runs] = task.system.fused(batch.delivered)[0]
-
-    measures.walk(task, fusion_gym.make_policy(policy, task), episodes, seed, look)
     return values
 
 
@@ -175,7 +169,7 @@ def _worth(episodes: int, seed: int) -> dict[str, Any]:
     data: dict[str, Any] = {}
     for name, options in settings.items():
         task = fusion_gym.make_task(OSCILLATOR, **options)
-        errors = measures.squares(task, measures.round_robin(task), episodes, seed)
+        errors = measures.squares(task, "round_robin", episodes, seed)
         data[f"mse_{name}"] = errors.sum(2).mean(1)
         data[f"armse_{name}"] = measures.armse(errors)["mean"]
     return data
@@ -193,76 +187,62 @@ class Censoring(NamedTuple):
 
 
 @dataclass
-class BoundRecursion:
+class MatrixBound:
     """A bound (states, states, N) of a sensor, beside the covariance P⁻ that it is to bound.
 
-    ``inflation`` is 1 for a single filter and ε⁻¹ for a node, whose process covariance is
-    Q/ε by (27).
+    P^u or P^l of Theorem 4, in a ``reading`` of :data:`UPPER` or :data:`LOWER`. ``inflation`` is 1
+    for a single filter and ε⁻¹ for a node, whose process covariance is Q/ε by (27).
     """
 
     task: Task
     sensor: int
     inflation: float
+    upper: bool
+    reading: tuple[Any, bool]
     value: Array = field(default_factory=lambda: np.zeros(0), init=False)
 
-    def moved(self, stored: Array, share: Array | float = 1.0) -> Array:
-        """Return A ``stored`` Aᵀ and a ``share`` of the process covariance."""
-        model = censored(self.task).model
-        process = model.process_covariance * self.inflation
-        return linalg.congruence(model.transition, stored) + share * process
-
-
-@dataclass
-class Upper(BoundRecursion):
-    """P^u of Theorem 4, in a reading of :data:`UPPER`."""
-
-    sign: float
-    own: bool
-
     def begin(self, covariance: Array) -> None:
-        """At the first step: P^u = P⁻, as the proof has it."""
-        self.value = covariance.copy()
+        """At the first step: P^u = P⁻ and P^l = 0, as the proof has it."""
+        self.value = covariance.copy() if self.upper else np.zeros_like(covariance)
 
     def holds(self, covariance: Array) -> NDArray[np.bool_]:
         """Return whether (N,) it bounds P⁻."""
-        return matrix_below(covariance, self.value)
+        least, most = (covariance, self.value) if self.upper else (self.value, covariance)
+        return matrix_below(least, most)
 
     def advance(self, covariance: Array, observed: Censoring, turn: bool) -> None:
         """Go to the next step, from P⁻, what is expected, and whether it is this sensor's turn."""
-        sensors, stored = censored(self.task).centre.sensors, self.value
-        if turn:
-            row = sensors.measurement_matrix[self.sensor, 0]
-            cross = linalg.matvec(self.value if self.own else covariance, row)
-            noise = sensors.variance[self.sensor, 0] * (1.0 + self.sign * observed.narrowing)
-            weight = (1.0 - observed.left) ** 2
-            innovation = weight * linalg.dot(row, cross) + noise
-            stored = stored - linalg.outer(cross, cross) * weight / innovation
-        self.value = self.moved(stored)
+        system = censored(self.task)
+        stored, share = (self._updated_upper if self.upper else self._updated_lower)(
+            covariance, observed, turn
+        )
+        process = system.model.process_covariance * self.inflation
+        self.value = linalg.congruence(system.model.transition, stored) + share * process
 
+    def _updated_upper(
+        self, covariance: Array, observed: Censoring, turn: bool
+    ) -> tuple[Array, Array | float]:
+        sign, own = self.reading
+        sensors = censored(self.task).centre.sensors
+        if not turn:
+            return self.value, 1.0
+        row = sensors.measurement_matrix[self.sensor, 0]
+        cross = linalg.matvec(self.value if own else covariance, row)
+        noise = sensors.variance[self.sensor, 0] * (1.0 + sign * observed.narrowing)
+        weight = (1.0 - observed.left) ** 2
+        innovation = weight * linalg.dot(row, cross) + noise
+        return self.value - linalg.outer(cross, cross) * weight / innovation, 1.0
 
-@dataclass
-class Lower(BoundRecursion):
-    """P^l of Theorem 4, in a reading of :data:`LOWER`."""
-
-    turns: bool
-    part: bool
-
-    def begin(self, covariance: Array) -> None:
-        """At the first step: P^l = 0, as the proof has it."""
-        self.value = np.zeros_like(covariance)
-
-    def holds(self, covariance: Array) -> NDArray[np.bool_]:
-        """Return whether (N,) it bounds P⁻."""
-        return matrix_below(self.value, covariance)
-
-    def advance(self, covariance: Array, observed: Censoring, turn: bool) -> None:
-        """Go to the next step, from P⁻, what is expected, and whether it is this sensor's turn."""
-        inside = observed.inside**2 if turn or not self.turns else np.zeros_like(observed.inside)
-        self.value = self.moved((1.0 - inside) * self.value, inside if self.part else 1.0)
+    def _updated_lower(
+        self, covariance: Array, observed: Censoring, turn: bool
+    ) -> tuple[Array, Array | float]:
+        turns, part = self.reading
+        inside = observed.inside**2 if turn or not turns else np.zeros_like(observed.inside)
+        return (1.0 - inside) * self.value, inside if part else 1.0
 
 
 def failures(
-    task: Task, policy: Policy, episodes: int, seed: int, bounds: Sequence[Upper | Lower]
+    task: Task, policy: Policy | str, episodes: int, seed: int, bounds: Sequence[MatrixBound]
 ) -> tuple[Array, Array]:
     """Return shares of an episode's steps in which a bound fails.
 
@@ -272,7 +252,7 @@ def failures(
     pairs = [bounds[i : i + 2] for i in range(0, len(bounds) - 1, 2)]
     local, fused = np.zeros((len(bounds), episodes)), np.zeros((len(pairs), episodes))
 
-    def before(batch: EpisodeBatch, step: int, runs: slice) -> None:
+    for step, runs, batch, requests in walk_in_parts(task, policy, episodes, seed):
         covariance = batch.state.prior_covariance
         observed = [_seen(task, batch, sensor) for sensor in range(task.sensors)]
         for place, bound in enumerate(bounds):
@@ -282,21 +262,22 @@ def failures(
             local[place, runs] += ~bound.holds(own)
         for place, pair in enumerate(pairs if step else []):
             ends = _joined([item.value for item in pair]), covariance[:2, :2]
-            low, high = ends if isinstance(pair[0], Lower) else ends[::-1]
+            low, high = ends[::-1] if pair[0].upper else ends
             fused[place, runs] += ~matrix_below(low, high)
         for bound in bounds:
             turn = step % task.sensors == bound.sensor
             bound.advance(covariance * bound.inflation, observed[bound.sensor], turn)
-
-    measures.walk(task, policy, episodes, seed, lambda *_: None, before)
+        batch.step(requests)
     return local / (task.horizon - 1), fused / (task.horizon - 1)
 
 
-def _of(task: Task, sensor: int, inflation: float) -> dict[str, Upper | Lower]:
+def _of(task: Task, sensor: int, inflation: float) -> dict[str, MatrixBound]:
     """Both bounds of a sensor in all their readings."""
-    uppers = {f"upper/{name}": Upper(task, sensor, inflation, *how) for name, how in UPPER.items()}
-    lowers = {f"lower/{name}": Lower(task, sensor, inflation, *how) for name, how in LOWER.items()}
-    return {**uppers, **lowers}
+    return {
+        f"{end}/{name}": MatrixBound(task, sensor, inflation, end == "upper", reading)
+        for end, readings in (("upper", UPPER), ("lower", LOWER))
+        for name, reading in readings.items()
+    }
 
 
 def _seen(task: Task, batch: EpisodeBatch, sensor: int) -> Censoring:
@@ -330,13 +311,13 @@ def simulate_bounds(episodes: int, seed: int, settings: Settings) -> Data:
         task = fusion_gym.make_task(env, **options)
         for sensor in range(2):
             single = _of(task, sensor, 1.0)
-            policy = SingleSensor(measures.round_robin(task), sensor)
+            policy = SomeSensors(fusion_gym.make_policy("round_robin", task), {sensor})
             local, _ = failures(task, policy, episodes, seed, list(single.values()))
             for name, sample in zip(single, local, strict=True):
                 data[f"{example}:4/{name}/{sensor}"] = sample
         nodes = [_of(task, sensor, 1.0 / SHARE) for sensor in range(2)]
         bounds = [node[name] for name in nodes[0] for node in nodes]
-        _, fused = failures(task, measures.round_robin(task), episodes, seed, bounds)
+        _, fused = failures(task, "round_robin", episodes, seed, bounds)
         for name, sample in zip(nodes[0], fused, strict=True):
             data[f"{example}:5/{name}"] = sample
     return data

@@ -17,9 +17,11 @@ from fusion_gym.policies.registry import make_policy
 from ..output.palette import FUSED, INK, MEASURED, TRUTH
 from ..output.palette import SENSORS as COLOURS
 from . import tobit_token_bucket_runs as runs
+from .drawing import legend_of
 from .numbers import below, estimate, grid, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
 from .tobit_token_bucket_runs import SENSORS, TRIGGER, History, record_history, scheme
+from .walk import SomeSensors
 
 _NODES = range(SENSORS)
 _NODE_NAMES = tuple(f"node {m + 1}" for m in _NODES)
@@ -41,8 +43,9 @@ READINGS: dict[str, dict[str, Any]] = {
 
 
 def _record(episodes: int, seed: int, settings: Settings, **options: Any) -> History:
-    task = scheme(**(settings["options"] | options))
-    return record_history(task, episodes, seed, make_policy(settings["policy"], task))
+    return record_history(
+        scheme(**(settings["options"] | options)), episodes, seed, settings["policy"]
+    )
 
 
 # --- tokens, events and measurements --------------------------------------------------------------
@@ -209,16 +212,18 @@ def simulate_bucket_theorems(episodes: int, seed: int, settings: Settings) -> Da
     eigenvalues, deviations = zip(*map(runs.claimed, gaps, bounds), strict=True)
     recorded = record_history(task, few, seed)
     parts = runs.terms(task, recorded)
-    never = record_history(task, few, seed, make_policy("never", task))
+    never = record_history(task, few, seed, "never")
     long = record_history(scheme(horizon=_LONG), few, seed)
     windows, traces = (
         values.reshape(-1, _WINDOW, few).mean(1) for values in (long.fused_error, long.fused_trace)
     )
     failed = [
-        record_history(task, episodes, seed, runs.Failing(make_policy(TRIGGER, task), m))
+        record_history(
+            task, episodes, seed, SomeSensors(make_policy(TRIGGER, task), {*_NODES} - {m})
+        )
         for m in _NODES
     ]
-    silent = record_history(task, episodes, seed, make_policy("never", task))
+    silent = record_history(task, episodes, seed, "never")
     gains = runs.perturbed(parts, recorded, seed)
     return {
         "eigenvalue": np.array(eigenvalues), "eigenvalue_error": np.array(deviations),
@@ -320,13 +325,6 @@ _CENSORED = "#e4e6ea"  # opaque, so that grid and palette leave it as it is
 _TIME = "time t (steps)"
 
 
-def _legend(figure: Any, handles: Sequence[Any], columns: int) -> None:
-    figure.legend(
-        handles=handles, loc="outside upper center", ncols=columns, handlelength=1.6,
-        columnspacing=1.2, handletextpad=0.5,
-    )  # fmt: skip
-
-
 def _draw_tokens(figure: Any, data: Data) -> None:
     level, requested, granted = (data[name] for name in ("level", "requested", "granted"))
     requested, granted = requested.astype(bool), granted.astype(bool)
@@ -355,7 +353,7 @@ def _draw_tokens(figure: Any, data: Data) -> None:
     lower.grid(axis="y", visible=False)
     lower.set_xlabel(_TIME)
     (line,) = upper.plot([], [], color=INK, lw=1.6, label="tokens")
-    _legend(figure, [line, least, sent, refused], 4)
+    legend_of(figure, [line, least, sent, refused], 4)
 
 
 def _draw_measurements(figure: Any, data: Data, component: int) -> None:
@@ -374,7 +372,7 @@ def _draw_measurements(figure: Any, data: Data, component: int) -> None:
     axes[-1].set_xlabel(_TIME)
     label = "after: held by the filter, " + r"$\bar{y}$"
     (after,) = axes[0].plot([], [], color=INK, lw=1.7, label=label)
-    _legend(figure, [before, after], 1)
+    legend_of(figure, [before, after], 1)
 
 
 def _draw_states(figure: Any, data: Data, sensor: int) -> None:
@@ -397,7 +395,7 @@ def _draw_states(figure: Any, data: Data, sensor: int) -> None:
         axis.set_ylabel(f"$x_{state + 1}$ (no unit)")
     axes[-1].set_xlabel(_TIME)
     handles.append(Patch(color=_CENSORED, lw=0, label="censored"))
-    _legend(figure, handles, 4)
+    legend_of(figure, handles, 4)
 
 
 def _draw_errors(figure: Any, data: Data, sensor: int) -> None:
@@ -424,7 +422,7 @@ def _draw_errors(figure: Any, data: Data, sensor: int) -> None:
         axis.set_title(title, loc="left")
         axis.set_ylabel("lg (no unit)")
     axes[-1].set_xlabel(_TIME)
-    _legend(figure, handles, 2)
+    legend_of(figure, handles, 2)
 
 
 _SIZE, _TALL = (7.2, 4.4), (7.2, 4.8)

@@ -1,6 +1,5 @@
 """Recorded episodes of the token-bucket paper, and its theorems computed on them."""
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,12 +8,12 @@ from numpy.typing import NDArray
 import fusion_gym
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Policy, Requests
+from fusion_gym.policies.base import Policy
 from fusion_gym.policies.rules.dynamic_event import DynamicEvent
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
+
+from .walk import walk
 
 TRIGGER = "dynamic_event"
 SENSORS = 3
@@ -71,25 +70,6 @@ class History(NamedTuple):
         return np.trace(self.bound, axis1=1, axis2=2)
 
 
-@dataclass
-class Failing:
-    """The paper's trigger, but one sensor never sends: it has failed."""
-
-    policy: Policy
-    sensor: int
-    knowledge: Any = "own_memory"
-
-    def reset(self, runs: int, seed: int = 0) -> None:
-        """Forget everything."""
-        self.policy.reset(runs, seed)
-
-    def __call__(self, signals: Signals) -> Requests:
-        """Return the trigger's requests, none of the failed sensor."""
-        requests = self.policy(signals).copy()
-        requests[self.sensor] = False
-        return requests
-
-
 def scheme(**options: Any) -> Task:
     """Return the paper's example with other ``options`` where they are named."""
     return fusion_gym.make_task(TobitOscillatorOptions(**options))
@@ -107,15 +87,12 @@ def single_sensor(sensor: int) -> Task:
     )  # fmt: skip
 
 
-def record_history(task: Task, episodes: int, seed: int, policy: Policy | None = None) -> History:
+def record_history(task: Task, episodes: int, seed: int, policy: Policy | str = TRIGGER) -> History:
     """Run the paper's trigger, or another policy, and keep everything."""
-    policy = fusion_gym.make_policy(TRIGGER, task) if policy is None else policy
-    batch = EpisodeBatch.seeded(task, episodes, seed)
-    policy.reset(episodes, seed)
     rows = []
-    for _ in range(task.horizon):
+    for batch, requests in walk(task, policy, episodes, seed):
         before, tokens = batch.state, batch.tokens
-        outcome = batch.step(policy(batch.signals()))
+        outcome = batch.step(requests)
         state, granted = batch.delivered, outcome.granted
         planned, expected = state.prediction.outcomes, state.prediction.expectation
         bounds = (planned.delivered_covariance, planned.silent_covariance)

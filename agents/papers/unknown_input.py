@@ -8,12 +8,10 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullLocator
 from numpy.typing import NDArray
 
 import fusion_gym
 from fusion_gym.arrays import Array
-from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
 from fusion_gym.systems.unknown_input.environment import UnknownInputOptions
@@ -22,9 +20,11 @@ from fusion_gym.systems.unknown_input.system import UnknownInputSystem
 
 from ..output import palette
 from . import unknown_input_recursion as recursion
+from .drawing import legend, set_ticks
 from .numbers import Number, below, estimate, grid, verdict
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
 from .unknown_input_recursion import EXACT_CUTOFF
+from .walk import walk
 
 PRINTED, CARTS = "paper", "two_carts"
 EXAMPLES = (PRINTED, CARTS)
@@ -80,14 +80,10 @@ def make_example(**options: Any) -> tuple[Task, UnknownInputSystem]:
 
 def record_run(task: Task, policy: str, episodes: int, seed: int) -> Record:
     """Run a policy and record what the figures show."""
-    rule = fusion_gym.make_policy(policy, task)
-    batch = EpisodeBatch.seeded(task, episodes, seed)
-    rule.reset(episodes, seed)
     rows = []
-    for _ in range(task.horizon):
+    for batch, requests in walk(task, policy, episodes, seed):
         apart = batch.state.measurement - batch.state.held
-        outcome = batch.step(rule(batch.signals()))
-        state = batch.delivered
+        outcome, state = batch.step(requests), batch.delivered
         means = state.estimates.mean, state.estimates.fused_mean
         values = (state.truth, *means, state.held, (apart**2).sum(1), outcome.granted)
         rows.append([np.array(value) for value in values])
@@ -398,18 +394,12 @@ def _grid(figure: Any, data: Data, rows: int) -> Any:
     return axes
 
 
-def _legend(figure: Any, axes: Any, columns: int) -> None:
-    """Over all axes, each label once: the truth, the fused estimate, the nodes, the rest."""
-    entries: dict[str, Any] = {}
-    for axis in np.asarray(axes).ravel():
-        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
-    ranks = {"true value": 0, "fused": 1}
-    order = sorted(entries, key=lambda label: ranks.get(label, 2 if label[:4] == "node" else 3))
-    handles = [entries[label] for label in order]
-    figure.legend(
-        handles, order, loc="outside upper center", ncols=columns, fontsize=9, columnspacing=1.0
-    )
+def _rank(label: str) -> int:
+    """The truth, the fused estimate, the nodes, the rest."""
+    return {"true value": 0, "fused": 1}.get(label, 2 if label.startswith("node") else 3)
+
+
+_legend = partial(legend, rank=_rank, fontsize=9, columnspacing=1.0)
 
 
 def _draw_estimates(figure: Any, data: Data, entries: Entries) -> None:
@@ -450,11 +440,6 @@ def _draw_bounds(figure: Any, data: Data, entries: Entries, label: str, unit: st
     _legend(figure, axes, 7)
 
 
-def _draw_state_bound(figure: Any, data: Data, place: int) -> None:
-    entries = {example: _STATES[example][place : place + 1] for example in EXAMPLES}
-    _draw_bounds(figure, data, entries, "{}: squared error", " (m²)")
-
-
 def _draw_input_bounds(figure: Any, data: Data) -> None:
     axes = _grid(figure, data, 1)
     for column, example in enumerate(EXAMPLES):
@@ -469,9 +454,7 @@ def _draw_input_bounds(figure: Any, data: Data) -> None:
                 axis.plot([], [], style, color=palette.INK, label=name)
         axis.set_yscale("log")
         axis.set_ylabel("bound" + (" (N²)" if example == CARTS else ""))
-    axes[0, 1].yaxis.set_major_locator(FixedLocator([5.0, 7.0, 10.0, 14.0]))
-    axes[0, 1].yaxis.set_major_formatter(FormatStrFormatter("%g"))
-    axes[0, 1].yaxis.set_minor_locator(NullLocator())
+    set_ticks(axes[0, 1], [5.0, 7.0, 10.0, 14.0])
     _legend(figure, axes, 7)
 
 
@@ -501,8 +484,16 @@ PAPER = Paper(
     {
         "figure_1": _figure(partial(_draw_estimates, entries=_STATES), 5.0, WALK),
         "figure_2": _figure(partial(_draw_estimates, entries=_INPUTS), 5.0, WALK),
-        "figure_3": _figure(partial(_draw_state_bound, place=0), 3.6),
-        "figure_4": _figure(partial(_draw_state_bound, place=1), 3.6),
+        **{
+            f"figure_{3 + place}": _figure(
+                partial(
+                    _draw_bounds, label="{}: squared error", unit=" (m²)",
+                    entries={name: states[place : place + 1] for name, states in _STATES.items()},
+                ),
+                3.6,
+            )
+            for place in range(2)
+        },
         "figure_5": _figure(_draw_input_bounds, 3.6), "figure_6": _figure(
             partial(_draw_bounds, entries=_INPUTS, label="trace", unit=" (N²)"), 3.6
         ),

@@ -54,7 +54,7 @@ def models(system: UnknownInputSystem, factor: float, rho_bar: float) -> list[Mo
 
 
 def gains(model: Model, bound: Array, silent: NDArray[np.bool_], cutoff: float) -> dict[str, Array]:
-    """Return L, N, Ξ_d, Ξ_x of (17)-(20) from Ξ_x (E, n, n) of the last time; δ is ``silent``.
+    """Return L, N, Ξ_x of (17)-(20) from Ξ_x (E, n, n) of the last time; δ is ``silent``.
 
     ``best`` is the gain that minimises the same bound (18) among all that meet (14).
     """
@@ -83,7 +83,7 @@ def gains(model: Model, bound: Array, silent: NDArray[np.bool_], cutoff: float) 
 
     return {
         "input": onto_input, "gain": gain, "best": best, "state_bound": spread(gain),
-        "best_bound": spread(best), "input_bound": onto_input @ omega @ onto_input.swapaxes(1, 2),
+        "best_bound": spread(best),
     }  # fmt: skip
 
 

@@ -65,17 +65,6 @@ def load_checked(kind: type[Model], name: str | Path, option: str = "config") ->
     return parse(kind, read_yaml(name, option), str(name), option)
 
 
-def load_changed(kind: type[Model], name: str | Path, changes: Mapping[str, Any]) -> Model:
-    """The config of a path or shipped name with these entries instead, checked.
-
-    Raises:
-        ConfigurationError: as :func:`load_checked`.
-    """
-    plain = read_yaml(name)
-    changed = isinstance(plain, dict)  # all else is refused
-    return parse(kind, plain | dict(changes) if changed else plain, str(name))
-
-
 def read_yaml(name: str | Path, option: str = "config") -> Any:
     """What the config of a path or shipped name holds.
 

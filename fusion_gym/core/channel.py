@@ -127,7 +127,5 @@ def _choose(probability: Array, noise: Array) -> NDArray[np.int64]:
 def _probabilities(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     result = validation.not_negative(field, value, shape)
     if np.any(result > 1.0):
-        raise ConfigurationError(
-            f"{field} = {validation.display(value)} is not allowed: it must be between 0 and 1"
-        )
+        raise validation.refusal(field, value, "between 0 and 1")
     return result

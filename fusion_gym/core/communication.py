@@ -4,22 +4,19 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, get_args
 
 from fusion_gym import validation
-from fusion_gym.core.options import Broadcast, Feature, Scenario
+from fusion_gym.core.options import Feature, Scenario
 from fusion_gym.core.system import System
 from fusion_gym.validation import ConfigurationError
 
-BROADCASTS: tuple[str, ...] = get_args(Broadcast)
 FEATURES: tuple[str, ...] = get_args(Feature)
 
 
 class Communication(NamedTuple):
-    """A scenario's model: ``packet`` and ``broadcast`` of the options, the latter never ``None``;
-    whether there is ``memory``, and its ``features`` in the observation; ``memory_system``, the
-    system that remembers beside the run, ``None`` where it is not needed."""
+    """A scenario's model beside its options: ``broadcast``, never ``None``; ``memory_system``, the
+    system that remembers beside the run, ``None`` where it is not needed; the memory's ``features``
+    in the observation."""
 
-    packet: str
     broadcast: str
-    memory: bool
     memory_system: System[Any] | None
     features: tuple[str, ...]
 
@@ -31,8 +28,7 @@ def communication(scenario: Scenario) -> Communication:
         ConfigurationError: a value that is not allowed, alone or with the others.
     """
     options = scenario.options
-    remembers, packet = options.memory, options.packet
-    memory_system = scenario.memory_system
+    remembers, memory_system = options.memory, scenario.memory_system
     if memory_system is None and not scenario.nodes_remember:
         memory_system = scenario.system
     if remembers and options.information == "centre":
@@ -51,15 +47,9 @@ def communication(scenario: Scenario) -> Communication:
         raise validation.refusal(
             "memory_filter", options.memory_filter, "None here, for this system has one filter"
         )
-    if packet == "estimate":
+    if options.packet == "estimate":
         _check_estimates(scenario, remembers)
-    return Communication(
-        packet,
-        _broadcast(scenario),
-        remembers,
-        memory_system if remembers else None,
-        features,
-    )
+    return Communication(_broadcast(scenario), memory_system if remembers else None, features)
 
 
 def _check_estimates(scenario: Scenario, remembers: bool) -> None:
@@ -69,9 +59,7 @@ def _check_estimates(scenario: Scenario, remembers: bool) -> None:
     elif scenario.system.offers("arriving") or not scenario.system.offers("adopt"):
         reason = reason or "this system's centre cannot go on from an estimate that is sent to it"
     if reason is not None:
-        raise ConfigurationError(
-            f"packet = 'estimate' is not allowed here: it must be 'measurement', for {reason}"
-        )
+        raise validation.refusal("packet", "estimate", f"'measurement', for {reason}", "here")
 
 
 def _broadcast(scenario: Scenario) -> str:

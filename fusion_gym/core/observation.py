@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from fusion_gym import deprecation
 from fusion_gym.arrays import Array
@@ -118,59 +118,46 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
         return _VALUE * np.sign(both) * np.sqrt(np.abs(both))
 
     states, nodes = task.system.state_names, numbered(task.sensors)
-    of_difference: dict[str, ArrayLike] = {"open-loop deviations": deviation[:, 0]}
-    of_value: dict[str, ArrayLike] = {
-        "open loop": whole,
-        "squared norm": task.relative_weights[:, 0],
-    }
-    apart = (
-        f"arsinh of {_DIFFERENCE:g} times what is believed beyond the centre's estimate, in "
-        "open-loop deviations"
+    differences = partial(
+        Block,
+        meaning=f"arsinh of {_DIFFERENCE:g} times what is believed beyond the centre's estimate, "
+        "in open-loop deviations",
+        limit=_DIFFERENCE_LIMIT,
+        constants={"open-loop deviations": deviation[:, 0]},
     )
-    worth = (
-        f"{_VALUE:g} times the signed root of the squared norm of that, and of what a packet is "
-        "expected to take off it, over open loop"
+    values = partial(
+        Block,
+        meaning=f"{_VALUE:g} times the signed root of the squared norm of that, and of what a "
+        "packet is expected to take off it, over open loop",
+        limit=_VALUE_LIMIT,
+        constants={"open loop": whole, "squared norm": task.relative_weights[:, 0]},
     )
     if owner == "own":
-        known: Knowledge = "own_memory" if task.memory else "own"
-        own = partial(Block, knowledge=known, node="own")
+        own: Any = {"knowledge": "own_memory" if task.memory else "own", "node": "own"}
+        each, itself = (nodes, states), (nodes, ("nobody", "itself"))
         result = {
-            "difference": own(
-                "own_difference",
-                apart,
-                difference,
-                (nodes, states),
-                limit=_DIFFERENCE_LIMIT,
-                constants=of_difference,
-            ),
-            "value": own(
-                "own_value",
-                worth,
-                value,
-                (nodes, ("nobody", "itself")),
-                limit=_VALUE_LIMIT,
-                constants=of_value,
-            ),
+            "difference": differences("own_difference", value=difference, labels=each, **own),
+            "value": values("own_value", value=value, labels=itself, **own),
         }
     else:
-        known = "scheduler_memory" if task.memory else "scheduler"
-        every = partial(Block, knowledge=known)
+        known: Knowledge = "scheduler_memory" if task.memory else "scheduler"
+
+        def one_by_one(beliefs: Beliefs) -> Array:
+            silent, sent = value(beliefs).swapaxes(0, 1)
+            return np.concatenate((silent[:1], sent))
+
         result = {
-            "difference": every(
+            "difference": differences(
                 "belief_difference",
-                apart,
-                lambda b: difference(b)[0],
-                (states,),
-                limit=_DIFFERENCE_LIMIT,
-                constants=of_difference,
+                value=lambda beliefs: difference(beliefs)[0],
+                labels=(states,),
+                knowledge=known,
             ),
-            "value": every(
+            "value": values(
                 "transmission_value",
-                worth,
-                lambda b: np.concatenate((value(b)[:1, 0], value(b)[:, 1])),
-                (("nobody", *nodes),),
-                limit=_VALUE_LIMIT,
-                constants=of_value,
+                value=one_by_one,
+                labels=(("nobody", *nodes),),
+                knowledge=known,
             ),
         }
     return tuple(result[name] for name in task.belief_features)

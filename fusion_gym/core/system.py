@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Generic, Literal, Self, TypeVar, cast, get_arg
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fusion_gym import deprecation, validation
+from fusion_gym import deprecation, linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature
 
@@ -68,6 +68,7 @@ def least_covering(classes: Iterable[Knowledge]) -> Knowledge:
 SignalArray = NDArray[Any]
 
 StateT = TypeVar("StateT")
+PredictionT = TypeVar("PredictionT")
 
 
 @dataclass(frozen=True)
@@ -194,6 +195,25 @@ def age_block(sensors: tuple[str, ...]) -> Block:
     return Block(
         "age", meaning, lambda state: state.age / (state.age + 10.0), (sensors,), node="own"
     )
+
+
+def sensed(prediction: PredictionT | None) -> PredictionT:
+    """Return the prediction of a state, which it has after :meth:`System.sense`.
+
+    Raises:
+        RuntimeError: the state was never sensed.
+    """
+    if prediction is None:
+        raise RuntimeError("the state has no measurements yet: call sense first")
+    return prediction
+
+
+def log_deviation(covariance: Array, reference: Array) -> Array:
+    """Return ln √(variance/reference) (..., n, N) of covariances (..., n, n, N).
+
+    ``reference`` (n,) are variances.
+    """
+    return 0.5 * np.log(linalg.diagonal(covariance) / reference[:, None])
 
 
 def numbered(count: int) -> tuple[str, ...]:

@@ -1,6 +1,5 @@
 """The live episode as a picture: states and estimates, requests and their answers, tokens."""
 
-import importlib.util
 from collections import deque
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -13,7 +12,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
-from fusion_gym.errors import ConfigurationError
+from fusion_gym.importing import require
 
 Frame = NDArray[np.uint8]  # (height, width, 3)
 WINDOW = 60  # steps that are shown
@@ -44,7 +43,7 @@ class Film:
     """
 
     def __init__(self, task: Task, runs: int) -> None:
-        _require("matplotlib")
+        require("render_mode", "render", "matplotlib")
         self.task = task
         self._steps: deque[_Step] = deque(maxlen=WINDOW)
         self._ages = np.zeros(runs, dtype=np.int64)  # steps of each run's episode
@@ -204,7 +203,7 @@ class Window:
     """
 
     def __init__(self, title: str, fps: int) -> None:
-        _require("pygame")
+        require("render_mode", "render", "pygame")
         self._title, self._fps = title, fps
         self._screen: Any = None
 
@@ -229,10 +228,3 @@ class Window:
 
             pygame.quit()
             self._screen = None
-
-
-def _require(package: str) -> None:
-    if importlib.util.find_spec(package) is None:
-        raise ConfigurationError(
-            f"render_mode needs {package}, which is absent: pip install 'fusion-gym[render]'"
-        )

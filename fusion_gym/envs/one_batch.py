@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from fusion_gym.core.options import plain_options
 from fusion_gym.envs.registration import base_of
 from fusion_gym.envs.sb3 import FusionSB3VecEnv, make_sb3_vec_env
-from fusion_gym.validation import ConfigurationError, display
+from fusion_gym.validation import ConfigurationError, display, refusal
 
 
 def one_batch(envs: VecEnv, **options: Any) -> FusionSB3VecEnv:
@@ -45,9 +45,7 @@ def one_batch(envs: VecEnv, **options: Any) -> FusionSB3VecEnv:
         )
     arguments = dict(spec.kwargs)
     if arguments.pop("render_mode", None) == "human":
-        raise ConfigurationError(
-            "render_mode = 'human' is not allowed in one batch: it must be None or 'rgb_array'"
-        )
+        raise refusal("render_mode", "human", "None or 'rgb_array'", "in one batch")
     (task,) = envs.get_attr("task", indices=0)
     if spec.max_episode_steps is not None and spec.max_episode_steps < task.horizon:
         arguments["max_episode_steps"] = spec.max_episode_steps  # a limit of gym.make

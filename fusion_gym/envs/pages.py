@@ -39,45 +39,7 @@ A star marks what only the sensors know: `information="centre"` leaves it out. T
 tells what a sensor that decides by itself sees of these entries; with `broadcast="estimate"` it
 sees all without a star that belong to no sensor, with `broadcast="packets"` all without a star."""
 
-_PAGE = """\
-{description}
-
-## Action space
-`{actions}`. Of a `MultiBinary(sensors)` a 1 is a request. The options `action` and `access` change
-the space.
-
-## Observation space
-A `Box` of {entries} float32 numbers, clipped to their ranges; `env.unwrapped.observation_names`
-names them in order. Sensors: {sensors}. States: {states}.
-
-{legend}
-
-{table}
-
-## Reward
--(`error_weight` · Σ wᵢ eᵢ² + `cost_weight` · tokens spent), with e the error of the fused estimate
-at the time of the request. The weights w, the option `state_weights`, are here
-{weights}, so that never transmitting costs about {open_loop} a step. The options `error` and
-`cost_weight` have other terms.
-
-## Episode end
-Truncation after `horizon` steps, here {horizon}; with `clock=True` it is a termination.
-
-## Info
-`cost` = `cost_tokens` (tokens spent, never negative), `reward_error` and `reward_cost` (the two
-terms of the reward), `granted` and `denied` (one flag a sensor), `squared_error` (one number a
-state), `diverged` (a squared error above 100 times its open-loop mean, or not finite).
-
-## Arguments
-The fields of `{options}`, of which `fusion_gym.make_task` also takes an object, then what every
-environment takes.
-
-{arguments}
-
-## Version history
-{history}
-"""
-
+_PAGE = Path(__file__).with_name("page.md")  # with the names of what page() fills in
 # Blocks of the network that not every task has, and when they are there.
 _NETWORK = {
     "admitted": 'only with `access="round_robin"` or `"random"`',
@@ -121,7 +83,7 @@ def page(env_id: str, task: Task | None = None) -> str:
     description = _paragraphs(kind) or [env_id]
     versions = [text for text in description if re.match(r"v\d+: ", text)]
     weights = task.reward.state_weights[:, 0]
-    return _PAGE.format(
+    return _PAGE.read_text(encoding="utf-8").format(
         description="\n\n".join(text for text in description if text not in versions),
         actions=view.actions,
         entries=len(view.names),

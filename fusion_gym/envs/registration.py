@@ -100,9 +100,7 @@ def register(env_id: str | None = None, build: str | Build | None = None) -> Non
     """
     if env_id is not None:
         if build is None:
-            raise ConfigurationError(
-                f"build = None is not allowed for {env_id!r}: it must be a function or its name"
-            )
+            raise validation.refusal("build", None, "a function or its name", f"for {env_id!r}")
         parse_env_id(str(env_id))
         if ENVIRONMENTS.get(env_id, build) != build:
             raise ConfigurationError(

@@ -280,6 +280,3 @@ def make_sb3_vec_env(
     if seed is not None:
         env.seed(seed)
     return env
-
-
-__all__: Sequence[str] = ["FusionSB3VecEnv", "make_sb3_vec_env"]

@@ -234,9 +234,7 @@ def refuse_vector_reward(task: Task, where: str) -> None:
         ConfigurationError: the task's reward has two.
     """
     if task.vector_reward:
-        raise validation.ConfigurationError(
-            f"reward = 'vector' is not allowed {where}: it must be 'scalar'"
-        )
+        raise validation.refusal("reward", "vector", "'scalar'", where)
 
 
 def reward_space() -> Box:
@@ -260,17 +258,11 @@ def step_infos(outcome: Outcome) -> Infos:
 
 def reset_infos(task: Task, num_envs: int) -> Infos:
     """The info of a reset: nothing was spent, granted or denied, and no error was made."""
-    sensors, states = task.sensors, len(task.system.state_names)
-    return {
-        "cost": np.zeros(num_envs),
-        "cost_tokens": np.zeros(num_envs),
-        "reward_error": np.zeros(num_envs),
-        "reward_cost": np.zeros(num_envs),
-        "granted": np.zeros((num_envs, sensors), dtype=np.bool_),
-        "denied": np.zeros((num_envs, sensors), dtype=np.bool_),
-        "squared_error": np.zeros((num_envs, states)),
-        "diverged": np.zeros(num_envs, dtype=np.bool_),
-    }
+    none, never = np.zeros(num_envs), np.zeros(num_envs, dtype=np.bool_)
+    nobody = np.zeros((task.sensors, num_envs), dtype=np.bool_)
+    error = np.zeros((len(task.system.state_names), num_envs))
+    outcome = Outcome(none, none, none, none, nobody, nobody, error, error, never, never)
+    return step_infos(outcome)
 
 
 def _cleared(infos: Infos, runs: NDArray[np.bool_]) -> Infos:

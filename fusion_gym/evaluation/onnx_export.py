@@ -5,11 +5,12 @@ from typing import NamedTuple
 
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.onnx_check import Agreement, Latency, latency, onnx_agreement
+from fusion_gym.importing import require
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.policies.onnx_card import onnx_card
-from fusion_gym.policies.onnx_graph import DecisionGraph, Shapes, require_onnx, save_graph
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.policies.onnx_graph import DecisionGraph, Shapes, save_graph
+from fusion_gym.validation import ConfigurationError, refusal
 
 
 class Exported(NamedTuple):
@@ -38,11 +39,9 @@ def export_onnx(
             of at least 10,000 observations, which is removed.
         OSError: the file cannot be written.
     """
-    require_onnx("onnx")
+    require("onnx", "onnx", "onnx", "onnxruntime")
     if not isinstance(agent, ModelPolicy):
-        raise ConfigurationError(
-            f"agent = {agent!r} is not allowed: it must be a saved agent, zoo:NAME or model:PATH"
-        )
+        raise refusal("agent", agent, "a saved agent, zoo:NAME or model:PATH")
     path, graph = Path(path), DecisionGraph(agent)
     save_graph(graph, path, onnx_card(agent, graph, environment, model))
     result = onnx_agreement(agent, graph, path, task)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.fusion.rules import Fused, FusionRule, own_covariances
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import refusal
 
 _ORTHOGONAL = 1e-13  # cosine below which two rows count as orthogonal
 _SWEEPS = 30  # cap of the rotations; sizes up to 6 need fewer than 10 sweeps
@@ -159,11 +159,16 @@ def covariance_intersection(
     Source: adaptive_innovation, equations (37), (38) and (42); S. J. Julier and J. K. Uhlmann, "A
     non-divergent estimation algorithm in the presence of unknown correlations", 1997.
     """
+    pair, weight, total = _intersect(covariance_a, covariance_b)
+    return _join(mean_a, mean_b, pair, pair.ratio / total, (1.0 - weight) / total, weight)
+
+
+def _intersect(covariance_a: Array, covariance_b: Array) -> tuple[DiagonalPair, Array, Array]:
+    """The pair, the weight ω of the smallest trace, and ω d + 1 - ω."""
     pair = diagonalise(covariance_a, covariance_b)
     d = pair.ratio
     weight = best_weight(pair.power * d, np.ones_like(d), d)
-    total = weight * d + (1.0 - weight)
-    return _join(mean_a, mean_b, pair, d / total, (1.0 - weight) / total, weight)
+    return pair, weight, weight * d + (1.0 - weight)
 
 
 def best_of_pair(covariances: Array, selected: NDArray[np.bool_]) -> tuple[Array, Array]:
@@ -177,10 +182,8 @@ def best_of_pair(covariances: Array, selected: NDArray[np.bool_]) -> tuple[Array
     a, b = (
         np.take_along_axis(covariances, which[None, None, None], 0)[0] for which in (first, second)
     )
-    pair = diagonalise(a, b)
-    d = pair.ratio
-    share = best_weight(pair.power * d, np.ones_like(d), d)
-    scaled = pair.basis * np.sqrt(d / (share * d + (1.0 - share)))[:, None]
+    pair, share, total = _intersect(a, b)
+    scaled = pair.basis * np.sqrt(pair.ratio / total)[:, None]
     weights = np.zeros(selected.shape)
     inside = np.arange(selected.shape[-1])
     weights[first, inside], weights[second, inside] = share, 1.0 - share
@@ -321,9 +324,8 @@ class SequentialIntersection(FusionRule):
         )
         if not whole or not value or sorted(value) != list(range(count or len(value))):
             last = "l - 1" if count is None else f"{count - 1}"
-            raise ConfigurationError(
-                f"order = {value!r} is not allowed: it must be a tuple that holds each of the "
-                f"estimates 0 to {last} exactly once"
+            raise refusal(
+                "order", value, f"a tuple that holds each of the estimates 0 to {last} exactly once"
             )
 
 

@@ -116,7 +116,7 @@ def covariance_intersection_many(
         taking_part = _of(selected, lanes)
         start = taking_part / np.abs(_of(linalg.trace(covariances), lanes))
         np.copyto(start, 0.0, where=~taking_part)
-        start /= _sum(start)
+        start /= sum_rows(start)
         weights[:, lanes], fused[..., lanes] = _search(_of(information, lanes), start)
     vector = np.zeros_like(means[0])
     for weight, item, mean, takes_part in zip(weights, information, means, selected, strict=True):
@@ -145,7 +145,7 @@ def _of(array: NDArray[Any], lanes: NDArray[np.intp]) -> NDArray[Any]:
     return array.take(lanes, axis=-1)
 
 
-def _sum(rows: Array) -> Array:
+def sum_rows(rows: Array) -> Array:
     """Sum over the first axis, in the same order for every number of lanes."""
     total: Array = rows[0].copy()
     for row in rows[1:]:
@@ -158,7 +158,7 @@ def _total(terms: Array) -> Array:
     if terms.shape[-1] > 1:
         total: Array = terms.sum(-2)
         return total
-    return _sum(np.moveaxis(terms, -2, 0))  # NumPy would sum what is contiguous in pairs
+    return sum_rows(np.moveaxis(terms, -2, 0))  # NumPy would sum what is contiguous in pairs
 
 
 def _best_alone(
@@ -276,7 +276,7 @@ def _newton(information: Array, weights: Array, root: Array, fused: Array, gain:
         trial = _model_minimum(_of(curvature, lanes), _of(gain, lanes), mask)
         free[:, lanes], target[:, lanes] = mask, trial
         lanes = lanes[(trial < 0.0).any(0)]
-    target /= _sum(target)
+    target /= sum_rows(target)
     sound = (linalg.dot(target - weights, gain) > 0.0) & (target >= 0.0).all(0)
     unsound = np.flatnonzero(~sound)
     if unsound.size:
@@ -336,7 +336,7 @@ def _model_minimum(curvature: Array, gain: Array, free: NDArray[np.bool_]) -> Ar
         if k:
             work[:k, count:] -= work[:k, k, None] * work[k, count:]
     pull, level = work[:, count], work[:, count + 1]
-    excess = (_sum(pull) - 1.0) / _sum(level)
+    excess = (sum_rows(pull) - 1.0) / sum_rows(level)
     minimum: Array = pull - excess * level
     return minimum
 

@@ -143,6 +143,12 @@ def model_card(algorithm: str, model: BaseAlgorithm, task: Task, local: bool) ->
     return {"format": FORMAT} | entries | plain
 
 
+def algorithm_name(model: BaseAlgorithm) -> str:
+    """Return the algorithm of a model, one of :data:`ALGORITHMS`, of which its class may be."""
+    names = {kind: name for name, kind in ALGORITHMS.items()}
+    return next(names[kind] for kind in type(model).__mro__ if kind in names)
+
+
 def algorithm_of(data: Mapping[str, Any]) -> str | None:
     """The algorithm that the card names, or whose policy class the archive's plain entries name.
 

@@ -17,8 +17,15 @@ from fusion_gym import validation
 from fusion_gym.core.task import ACTION_KINDS, Task
 from fusion_gym.envs.views import View, make_view
 from fusion_gym.policies.archive import NeedsTrust, read_plain, read_weights
-from fusion_gym.policies.card import ACTIVATIONS, POLICIES, Blueprint, ModelView, algorithm_of
-from fusion_gym.policies.model import ALGORITHMS, ModelPolicy, priced
+from fusion_gym.policies.card import (
+    ACTIVATIONS,
+    ALGORITHMS,
+    POLICIES,
+    Blueprint,
+    ModelView,
+    algorithm_of,
+)
+from fusion_gym.policies.model import ModelPolicy, priced
 from fusion_gym.policies.network import NetworkShape
 from fusion_gym.validation import ConfigurationError
 

@@ -12,7 +12,7 @@ from fusion_gym.core.system import Knowledge, Signals, least_covering
 from fusion_gym.core.task import Task
 from fusion_gym.envs.views import Rows, make_view
 from fusion_gym.policies.base import Requests
-from fusion_gym.policies.card import ALGORITHMS, ENTRY, model_card
+from fusion_gym.policies.card import ENTRY, algorithm_name, model_card
 from fusion_gym.validation import ConfigurationError
 
 
@@ -22,9 +22,7 @@ def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
     ``local`` marks a policy that every sensor runs on its own view. A subclass of one of the
     ``ALGORITHMS`` saves models of that algorithm.
     """
-    names = {kind: name for name, kind in ALGORITHMS.items()}
-    algorithm = next(names[kind] for kind in type(model).__mro__ if kind in names)
-    setattr(model, ENTRY, model_card(algorithm, model, task, local))
+    setattr(model, ENTRY, model_card(algorithm_name(model), model, task, local))
 
 
 class ModelPolicy:

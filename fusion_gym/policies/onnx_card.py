@@ -14,7 +14,8 @@ from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.options import plain_options
 from fusion_gym.core.system import MEANING, Block, numbered
 from fusion_gym.envs.views import SensorView
-from fusion_gym.policies.model import ALGORITHMS, ModelPolicy
+from fusion_gym.policies.card import algorithm_name
+from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.policies.onnx_graph import DecisionGraph, Shapes
 from fusion_gym.version import __version__
 
@@ -63,7 +64,7 @@ def onnx_card(
         "format": FORMAT,
         "fusion_gym_version": __version__,
         "model": model,
-        "algorithm": _algorithm(agent),
+        "algorithm": algorithm_name(agent.model),
         "environment": environment,
         "decides": "each sensor by itself" if local else "a scheduler of all sensors",
         "knows": MEANING[agent.knowledge],
@@ -120,11 +121,6 @@ def _fixed_price(agent: ModelPolicy) -> float | None:
         return None
     low, high = span
     return float(low * (high / low) ** agent.price)
-
-
-def _algorithm(agent: ModelPolicy) -> str:
-    names = {kind: name for name, kind in ALGORITHMS.items()}
-    return next(names[kind] for kind in type(agent.model).__mro__ if kind in names)
 
 
 def _finite(value: Any) -> Any:

@@ -1,7 +1,6 @@
 """A saved agent as an ONNX graph: what a sensor or a scheduler runs without this library."""
 
 import importlib
-import importlib.util
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,22 +17,8 @@ from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.validation import ConfigurationError
 
 OPSET = 17  # of ONNX 1.12, 2022: all that these networks need, and what older runtimes know
-PACKAGES = ("onnx", "onnxruntime")
 Shapes = dict[str, tuple[str | int, ...]]  # by name; "batch" is the number of rows
 _CLOSED = -1e8  # the logit that MaskablePPO gives to what is not open
-
-
-def require_onnx(option: str) -> None:
-    """Whether what writes and runs ONNX graphs is installed.
-
-    Raises:
-        ConfigurationError: it is not; names the option that needs it.
-    """
-    for package in PACKAGES:
-        if importlib.util.find_spec(package) is None:
-            raise ConfigurationError(
-                f"{option} needs {package}, which is absent: pip install 'fusion-gym[onnx]'"
-            )
 
 
 class DecisionGraph(torch.nn.Module):
@@ -180,10 +165,8 @@ def save_graph(graph: DecisionGraph, path: Path, received: Mapping[str, str]) ->
     """Write the graph as an ONNX file, with ``received`` as its metadata.
 
     Raises:
-        ConfigurationError: ONNX is not installed.
         OSError: the file cannot be written.
     """
-    require_onnx("onnx")
     onnx: Any = importlib.import_module("onnx")
     shapes = {**graph.inputs, **graph.outputs}
     with torch.no_grad(), warnings.catch_warnings():

@@ -29,7 +29,7 @@ Maker = Callable[..., Policy]
 class Context(TypedDict):
     """What whoever asks for a policy gives to its maker, and its text never does."""
 
-    task: Task | None
+    task: Task
     trust: bool
 
 
@@ -93,9 +93,7 @@ def register_policy(name: str, maker: Maker, kind: Kind = "rule") -> None:
         ConfigurationError: a name that exists or cannot be written, or no callable.
     """
     if not isinstance(name, str) or not name.isidentifier():
-        raise ConfigurationError(
-            f"name = {name!r} is not allowed: it must be a word of letters, digits and '_'"
-        )
+        raise refusal("name", name, "a word of letters, digits and '_'")
     if name in _ROWS:
         raise ConfigurationError(f"name = {name!r} is not allowed: there is a policy of that name")
     choice("kind", kind, get_args(Kind))
@@ -160,19 +158,6 @@ def make_policy(spec: str, task: Task, *, trust: bool = False) -> Policy:
     if _kind(_asked(spec)[1]) != "agent":  # loading it has checked all that it sees
         _try_out(spec, policy, task)
     return policy
-
-
-def make_rule(spec: str, defaults: dict[str, dict[str, Any]] | None = None) -> Policy:
-    """The rule that ``NAME`` or ``NAME:key=value,…`` names, for no task in particular.
-
-    ``defaults`` are a scenario's own parameters by policy name.
-
-    Raises:
-        ConfigurationError: an unknown rule or parameter, or a value that is not allowed.
-    """
-    if _kind(_asked(spec)[1]) != "rule":
-        raise ConfigurationError(f"policy {spec!r} is no rule: make_policy makes it for a task")
-    return _make(spec, defaults or {}, {"task": None, "trust": False})
 
 
 def _make(spec: str, defaults: dict[str, dict[str, Any]], context: Context) -> Policy:

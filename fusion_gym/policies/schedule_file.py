@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from fusion_gym import validation
 from fusion_gym.core.system import System
-from fusion_gym.validation import ConfigurationError
 from fusion_gym.version import __version__
 
 Patterns = NDArray[np.bool_]
@@ -81,9 +80,7 @@ def store_schedule(cache: str, key: str, schedule: Schedule) -> None:
         finally:
             Path(name).unlink(missing_ok=True)
     except OSError as error:
-        raise ConfigurationError(
-            f"cache = {cache!r} is not allowed: it must be a file that can be written ({error})"
-        ) from None
+        raise validation.refusal("cache", cache, f"a file that can be written ({error})") from None
 
 
 def _feed(digest: Any, value: Any) -> None:

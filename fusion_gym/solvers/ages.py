@@ -7,11 +7,13 @@ from numpy.typing import NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
+from fusion_gym.solvers.iteration import iterate_values
 from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.validation import ConfigurationError
 
 _LAZINESS = 0.3  # share of the old value that is kept: optimal schedules are periodic
 _MOST_STATES = 300_000
+_TOLERANCE, _ITERATIONS = 1e-8, 100_000
 
 
 @dataclass(frozen=True)
@@ -38,8 +40,6 @@ def solve_ages(
     problems: tuple[SourceProblem, ...],
     at_most: int | None = None,
     longest: int | None = None,
-    tolerance: float = 1e-8,
-    iterations: int = 100_000,
 ) -> AgeSolution:
     """Least average cost of policies that know ages and losses only, by relative value iteration.
 
@@ -66,21 +66,16 @@ def solve_ages(
         )
     sets = [s for s in range(2**count) if s.bit_count() <= limit]
     costs = [_step_cost(problems, size, selected) for selected in sets]
-    value = np.zeros((size,) * count)
-    for _ in range(iterations):
+
+    def decide(value: Array) -> tuple[Array, NDArray[np.int64]]:
         options = np.stack(
             [cost + _ahead(problems, value, s) for cost, s in zip(costs, sets, strict=True)]
         )
-        change = options.min(0) - value
-        lower, upper = float(change.min()), float(change.max())
-        if upper - lower <= tolerance * max(abs(upper), 1e-300):
-            choice = np.array(sets)[options.argmin(0)]
-            return AgeSolution(0.5 * (lower + upper), lower, upper, choice)
-        value = value + (1.0 - _LAZINESS) * (change - change.flat[0])
-    raise ConfigurationError(
-        f"iterations = {iterations} are not enough: the average cost is only known to lie between "
-        f"{lower:.6g} and {upper:.6g}"
-    )
+        return options.min(0), options.argmin(0)
+
+    shape = (size,) * count
+    lower, upper, best = iterate_values(decide, shape, _TOLERANCE, _ITERATIONS, _LAZINESS)
+    return AgeSolution(0.5 * (lower + upper), lower, upper, np.array(sets)[best])
 
 
 def _default_length(problem: SourceProblem, sharing: float) -> int:

@@ -9,7 +9,6 @@ from scipy.special import ndtri
 
 from fusion_gym.arrays import Array
 
-NEGLIGIBLE = 1e-10  # probability of what the default grid of one source leaves out
 _MOST_POINTS = 1500
 
 
@@ -65,7 +64,7 @@ def default_reach(
     drop: Array,
     wait: float,
     horizon: int | None,
-    negligible: float = NEGLIGIBLE,
+    negligible: float,
 ) -> float:
     """An error that is exceeded with a ``negligible`` probability.
 

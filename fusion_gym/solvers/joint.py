@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.token_bucket import TokenBucket
-from fusion_gym.solvers.grid import ErrorGrid, default_reach, gaussian_rows
-from fusion_gym.solvers.source import SourceProblem
+from fusion_gym.solvers.grid import ErrorGrid, gaussian_rows
+from fusion_gym.solvers.iteration import iterate_values
+from fusion_gym.solvers.source import Resolution, SourceProblem
 from fusion_gym.solvers.tokens import TokenLevels
 from fusion_gym.validation import ConfigurationError
 
-_FINEST, _COARSEST = 20.0, 4.0  # points of the default grid a deviation of the noise
-_POINTS = 160  # that it has about, between these
-_POINTS_TOKENS = 110  # the same where tokens are limited
-_NEGLIGIBLE = 1e-5  # probability of what the default grid leaves out
+_RESOLUTION = Resolution(finest=20.0, coarsest=4.0, points=160, negligible=1e-5)
+_RESOLUTION_TOKENS = _RESOLUTION._replace(points=110)  # where tokens are limited
+_TOLERANCE, _ITERATIONS = 1e-6, 20_000  # of relative value iteration
 
 
 @dataclass(frozen=True)
@@ -66,38 +66,19 @@ class JointProblem:
         small = np.array([selected.bit_count() <= self.at_most for selected in range(4)])
         return self.tokens.affordable & small
 
-    def grids(
-        self, horizon: int | None = None, step: float | None = None
-    ) -> tuple[ErrorGrid, ErrorGrid]:
-        """A grid for each source's error, in steps of ``step`` deviations of the noise."""
+    def grids(self, horizon: int | None = None) -> tuple[ErrorGrid, ErrorGrid]:
+        """Return a grid for each source's error, coarser than the grid of one source."""
         tokens = self.tokens
         wait = 2.0 / self.at_most
         if len(tokens.level) > 1:
             rate = float((tokens.level[tokens.following[:, 0]] - tokens.level).max())
             wait = max(wait, float(tokens.spent[3]) / max(rate, 1e-12))
-        return self._grid(0, wait, horizon, step), self._grid(1, wait, horizon, step)
-
-    def _grid(self, which: int, wait: float, horizon: int | None, step: float | None) -> ErrorGrid:
-        source = self.sources[which]
-        deviation = source.deviation
-        threshold = max(source.scale, deviation * float(np.sqrt(wait)))
-        reach = default_reach(
-            source.coefficient,
-            deviation,
-            threshold,
-            source.transition,
-            source.drop,
-            wait,
-            horizon,
-            _NEGLIGIBLE,
+        resolution = _RESOLUTION if len(tokens.level) == 1 else _RESOLUTION_TOKENS
+        first, second = self.sources
+        return (
+            first.grid(horizon, wait=wait, resolution=resolution),
+            second.grid(horizon, wait=wait, resolution=resolution),
         )
-        points = _POINTS if len(self.tokens.level) == 1 else _POINTS_TOKENS
-        selection = (
-            min(max(reach / points, deviation / _FINEST), deviation / _COARSEST)
-            if step is None
-            else step * deviation
-        )
-        return ErrorGrid.create(source.coefficient, deviation, reach, selection)
 
 
 class JointBellman:
@@ -150,28 +131,15 @@ class JointAverageSolution:
 
 def solve_joint_average(
     problem: JointProblem,
-    grids: tuple[ErrorGrid, ErrorGrid] | None = None,
-    tolerance: float = 1e-6,
-    iterations: int = 20_000,
 ) -> JointAverageSolution:
-    """Least average cost by relative value iteration, until its bounds are that close relatively.
+    """Least average cost by relative value iteration, until its bounds agree to 1e-6 relatively.
 
     Raises:
         ConfigurationError: no convergence.
     """
-    bellman = JointBellman(problem, grids or problem.grids())
-    value = np.zeros(bellman.shape)
-    for _ in range(iterations):
-        new, choice = bellman.decide(value)
-        change = new - value
-        lower, upper = float(change.min()), float(change.max())
-        value = new - new[0, 0, 0]
-        if upper - lower <= tolerance * max(abs(upper), 1e-300):
-            return JointAverageSolution(0.5 * (lower + upper), lower, upper, choice, bellman.grids)
-    raise ConfigurationError(
-        f"iterations = {iterations} are not enough: the average cost is only known to lie between "
-        f"{lower:.6g} and {upper:.6g}"
-    )
+    bellman = JointBellman(problem, problem.grids())
+    lower, upper, choice = iterate_values(bellman.decide, bellman.shape, _TOLERANCE, _ITERATIONS)
+    return JointAverageSolution(0.5 * (lower + upper), lower, upper, choice, bellman.grids)
 
 
 @dataclass(frozen=True)
@@ -190,11 +158,10 @@ def solve_joint_finite(
     problem: JointProblem,
     horizon: int,
     initial_deviation: tuple[float, float] = (0.0, 0.0),
-    grids: tuple[ErrorGrid, ErrorGrid] | None = None,
 ) -> JointFiniteSolution:
     """Least expected cost of ``horizon`` steps by dynamic programming."""
     steps = validation.integer("horizon", horizon, at_least=1)
-    bellman = JointBellman(problem, grids or problem.grids(steps))
+    bellman = JointBellman(problem, problem.grids(steps))
     value = np.zeros(bellman.shape)
     choices = np.empty((steps, *bellman.shape), dtype=np.int8)
     for step in reversed(range(steps)):

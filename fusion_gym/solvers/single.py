@@ -12,8 +12,8 @@ import numpy as np
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.solvers.grid import ErrorGrid, gaussian_rows
+from fusion_gym.solvers.iteration import iterate_values
 from fusion_gym.solvers.source import SourceProblem
-from fusion_gym.validation import ConfigurationError
 
 
 class Bellman:
@@ -114,20 +114,7 @@ def solve_average(
             lost too often.
     """
     bellman = Bellman(problem, grid or problem.grid())
-    value = np.zeros(bellman.shape)
-    lower = upper = 0.0
-    for _ in range(iterations):
-        new, advantage = bellman.decide(value)
-        change = new - value
-        lower, upper = float(change.min()), float(change.max())
-        value = new - new[0, 0, 0]
-        if upper - lower <= tolerance * max(abs(upper), 1e-300):
-            break
-    else:
-        raise ConfigurationError(
-            f"iterations = {iterations} are not enough: the average cost is only known to lie "
-            f"between {lower:.6g} and {upper:.6g}"
-        )
+    lower, upper, advantage = iterate_values(bellman.decide, bellman.shape, tolerance, iterations)
     threshold, ordered = source_thresholds(advantage, bellman.grid.points)
     cost = 0.5 * (lower + upper)
     rate = _rate(bellman, threshold, tolerance, iterations)

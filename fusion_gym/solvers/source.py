@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,8 +15,19 @@ from fusion_gym.solvers.grid import ErrorGrid, default_reach
 from fusion_gym.solvers.tokens import TokenLevels
 from fusion_gym.validation import ConfigurationError
 
-_FINEST, _COARSEST = 40.0, 5.0  # points of the default grid a deviation of the noise
-_POINTS = 600  # that it has about, between these; half of them where tokens are limited
+
+class Resolution(NamedTuple):
+    """What a default grid has: from ``coarsest`` to ``finest`` points a deviation of the noise,
+    between these about so many ``points``; it leaves out a ``negligible`` probability."""
+
+    finest: float
+    coarsest: float
+    points: int
+    negligible: float
+
+
+_RESOLUTION = Resolution(finest=40.0, coarsest=5.0, points=600, negligible=1e-10)
+_RESOLUTION_TOKENS = _RESOLUTION._replace(points=300)  # where tokens are limited
 
 
 @dataclass(frozen=True)
@@ -62,15 +74,10 @@ class SourceProblem:
         """
         matrix = validation.array("transition", transition, (None, None))
         if matrix.shape[0] != matrix.shape[1] or not np.allclose(matrix.sum(1), 1.0):
-            raise ConfigurationError(
-                f"transition = {matrix.tolist()} is not allowed: it must be a square matrix whose "
-                "rows sum to 1"
-            )
+            raise validation.refusal("transition", matrix, "a square matrix whose rows sum to 1")
         loss = validation.not_negative("drop", drop, matrix.shape[:1])
         if np.any(loss > 1.0):
-            raise ConfigurationError(
-                f"drop = {loss.tolist()} is not allowed: it must be at most 1 everywhere"
-            )
+            raise validation.refusal("drop", loss, "at most 1 everywhere")
         if bucket is None:
             bucket = TokenBucket.create(1.0, 1.0, 1.0, 1.0, sensors=1, unlimited=True)
         return cls(
@@ -99,28 +106,40 @@ class SourceProblem:
         return max(1.0, float(tokens.spent[1]) / max(rate, 1e-12))
 
     def grid(
-        self, horizon: int | None = None, reach: float | None = None, step: float | None = None
+        self,
+        horizon: int | None = None,
+        reach: float | None = None,
+        step: float | None = None,
+        wait: float | None = None,
+        resolution: Resolution | None = None,
     ) -> ErrorGrid:
         """A grid of errors up to ``reach`` in steps of ``step``.
 
         The default goes beyond what is reached with a probability of 1e-10, in about 600 points
         (300 with limited tokens), but at most 40 and at least 5 a deviation of the noise.
+        Sources that share the network give their own ``wait`` and ``resolution``.
         """
+        if resolution is None:
+            resolution = _RESOLUTION if len(self.tokens.level) == 1 else _RESOLUTION_TOKENS
         if reach is None:
-            threshold = max(self.scale, self.deviation * float(np.sqrt(self.wait)))
+            wait = self.wait if wait is None else wait
+            threshold = max(self.scale, self.deviation * float(np.sqrt(wait)))
             reach = default_reach(
                 self.coefficient,
                 self.deviation,
                 threshold,
                 self.transition,
                 self.drop,
-                self.wait,
+                wait,
                 horizon,
+                resolution.negligible,
             )
         if step is None:
-            finest, coarsest = self.deviation / _FINEST, self.deviation / _COARSEST
-            points = _POINTS if len(self.tokens.level) == 1 else _POINTS / 2
-            step = min(max(reach / points, finest), coarsest)
+            finest, coarsest = (
+                self.deviation / resolution.finest,
+                self.deviation / resolution.coarsest,
+            )
+            step = min(max(reach / resolution.points, finest), coarsest)
         return ErrorGrid.create(self.coefficient, self.deviation, reach, step)
 
 
@@ -132,9 +151,7 @@ def _initial_law(transition: Array, values: ArrayLike | None) -> Array:
             "initial", validation.array("initial", values, (states,)), (states,)
         )
         if not np.isclose(law.sum(), 1.0, rtol=0.0, atol=1e-9):
-            raise ConfigurationError(
-                f"initial = {law.tolist()} is not allowed: it must be probabilities that sum to 1"
-            )
+            raise validation.refusal("initial", law, "probabilities that sum to 1")
         return law
     balance = np.vstack((transition.T - np.eye(states), np.ones(states)))
     law, _, rank, _ = np.linalg.lstsq(balance, np.append(np.zeros(states), 1.0))

@@ -55,13 +55,9 @@ def source_problems(task: Task) -> tuple[SourceProblem, ...]:
     """
     system, reward = _system(task), task.reward
     if reward.error != "squared":
-        raise ConfigurationError(
-            f"error = {reward.error_kind!r} is not allowed for the optimum: it must be 'squared'"
-        )
+        raise validation.refusal("error", reward.error_kind, "'squared'", "for the optimum")
     if reward.price.fixed is None:
-        raise ConfigurationError(
-            "cost_weight = 'random' is not allowed for the optimum: it must be a number"
-        )
+        raise validation.refusal("cost_weight", "random", "a number", "for the optimum")
     weights = reward.error_weight * reward.state_weights[:, 0]
     return tuple(
         SourceProblem.create(
@@ -138,9 +134,8 @@ def _solve_pair(task: Task, problems: tuple[SourceProblem, ...], criterion: str)
             "access: it must be 1 or 2"
         )
     if task.access not in ("any", "single"):
-        raise ConfigurationError(
-            f"access = {task.access!r} is not allowed for the optimum of two sources: it must be "
-            "'any' or 'single'"
+        raise validation.refusal(
+            "access", task.access, "'any' or 'single'", "for the optimum of two sources"
         )
     at_most = 1 if task.access == "single" else 2
     problem = JointProblem.create(problems, task.bucket, at_most)

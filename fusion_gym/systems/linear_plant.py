@@ -23,14 +23,12 @@ def covariance_factor(matrix: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class LinearPlant:
-    """x(t+1) = A x(t) + w(t), w ~ N(0, W), x(0) ~ N(initial_mean, initial_covariance).
+class Plant:
+    """What linear plants have in common: A, the noise w ~ N(0, W), the law of x(0).
 
-    Shapes: ``transition`` (n, n, 1), ``process_covariance`` (n, n, 1), ``process_factor``
+    Shapes: ``transition`` A (n, n, 1), ``process_covariance`` W (n, n, 1), ``process_factor``
     (n, r, 1) with r the rank of W, ``initial_mean`` (n, 1), ``initial_covariance`` (n, n, 1),
-    ``initial_factor`` (n, r₀, 1). Build one with :meth:`create`, which checks its arguments.
-
-    Source: tobit_token_bucket, equation (1).
+    ``initial_factor`` (n, r₀, 1).
     """
 
     transition: Array
@@ -39,6 +37,39 @@ class LinearPlant:
     initial_mean: Array
     initial_covariance: Array
     initial_factor: Array
+
+    @property
+    def size(self) -> int:
+        """Number of states n."""
+        return self.transition.shape[0]
+
+    @property
+    def noise_channels(self) -> int:
+        """Standard normals that one step consumes: the rank of the process covariance."""
+        return self.process_factor.shape[1]
+
+    def true_radius(self, factor: float) -> float:
+        """Spectral radius of I + c (A - I)."""
+        still = np.eye(self.size)
+        moved = still + factor * (self.transition[..., 0] - still)
+        return float(np.abs(np.linalg.eigvals(moved)).max())
+
+    @property
+    def unmoved(self) -> tuple[str, ...]:
+        """The options of the true plant that can change nothing."""
+        still = np.array_equal(self.transition[..., 0], np.eye(self.size))
+        result = {"true_process_noise": not self.process_factor.any(), "true_transition": still}
+        return tuple(name for name, absent in result.items() if absent)
+
+
+@dataclass(frozen=True)
+class LinearPlant(Plant):
+    """x(t+1) = A x(t) + w(t), w ~ N(0, W), x(0) ~ N(initial_mean, initial_covariance).
+
+    Build one with :meth:`create`, which checks its arguments.
+
+    Source: tobit_token_bucket, equation (1).
+    """
 
     @classmethod
     def create(
@@ -54,9 +85,8 @@ class LinearPlant:
             ConfigurationError: a wrong shape, a non-finite entry, or a covariance that is not
                 symmetric positive semi-definite (``initial_covariance``: definite).
         """
-        matrix = validation.array("transition", transition, (None, None))
+        matrix = validation.square("transition", transition)
         size = len(matrix)
-        matrix = validation.array("transition", transition, (size, size))
         process = validation.covariance("process_covariance", process_covariance, size)
         start = validation.covariance("initial_covariance", initial_covariance, size, definite=True)
         return cls(
@@ -67,16 +97,6 @@ class LinearPlant:
             initial_covariance=start[..., None],
             initial_factor=covariance_factor(start)[..., None],
         )
-
-    @property
-    def size(self) -> int:
-        """Number of states n."""
-        return self.transition.shape[0]
-
-    @property
-    def noise_channels(self) -> int:
-        """Standard normals that one step consumes: the rank of the process covariance."""
-        return self.process_factor.shape[1]
 
     def start(self, mean: Array, noise: Array) -> Array:
         """Draw x(0), shape (n, N), about ``mean`` (n, N) from standard normals (n, N)."""
@@ -91,19 +111,6 @@ class LinearPlant:
         if not self.noise_channels:
             return moved
         return moved + linalg.matvec(self.process_factor, noise)
-
-    def true_radius(self, factor: float) -> float:
-        """Spectral radius of I + c (A - I)."""
-        still = np.eye(self.size)
-        moved = still + factor * (self.transition[..., 0] - still)
-        return float(np.abs(np.linalg.eigvals(moved)).max())
-
-    @property
-    def unmoved(self) -> tuple[str, ...]:
-        """The options of the true plant that can change nothing."""
-        still = np.array_equal(self.transition[..., 0], np.eye(self.size))
-        result = {"true_process_noise": not self.process_factor.any(), "true_transition": still}
-        return tuple(name for name, absent in result.items() if absent)
 
     def predict(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Prior mean (n, N) and covariance A P Aᵀ + W (n, n, N) of the next state.

@@ -279,6 +279,25 @@ def test_an_unknown_option_is_named(case: Case) -> None:
         fusion_gym.make_task(case.env_id, information="nobody")
 
 
+# Options that may be negative.
+SIGNED = {"true_threshold_shift", "censoring_threshold", "censoring_upper", "noise_coupling"}
+SIGNED |= {"coefficient", "input_phase", "input_amplitude"}
+
+
+@each_id
+@pytest.mark.parametrize("value", ["no such word", float("nan"), {}, ((1.0,), (2.0, 3.0)), -1.0])
+def test_what_an_option_cannot_be_is_refused_by_name(env_id: str, value: Any) -> None:
+    """Where the library checks the options."""
+    for option in (field.name for field in fields(options_of(env_id))):
+        if env_id != OWN_ID and not (value == -1.0 and option in SIGNED):
+            with pytest.raises(ConfigurationError, match=rf"^{option}(\[\d\])? = ") as caught:
+                fusion_gym.make_task(env_id, **{option: value})
+            message = str(caught.value)
+            assert " allowed" in message
+            assert "\n" not in message
+            assert not isinstance(value, str) or f"{option} = {value!r}" in message
+
+
 def test_an_environment_of_ones_own_is_registered_once() -> None:
     fusion_gym.register(OWN_ID, build)
     assert fusion_gym.make_task(WalkOptions(q=2.0)).settings["q"] == 2.0

@@ -2,15 +2,16 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any
+from functools import partial
+from typing import Any, get_args
 
 import numpy as np
 import pytest
-from cases import FREE, Array, Case, each_case, each_id, requests
+from cases import FREE, Array, Case, each_case, each_id, read, requests
 
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.communication import BROADCASTS
+from fusion_gym.core.options import Broadcast
 from fusion_gym.core.runs import Runs
 from fusion_gym.core.system import SignalError, Signals, covers
 from fusion_gym.core.task import Task
@@ -156,7 +157,7 @@ def differs(value: Array, base: Any) -> Array:
     return np.asarray(apart.reshape(len(value), -1, value.shape[-1]).any(1))
 
 
-# --- what is believed -----------------------------------------------------------------------------
+# --- what a delivery brings -----------------------------------------------------------------------
 
 
 def after(system: Any, state: Any, *sensors: int) -> tuple[Array, Array]:
@@ -167,6 +168,94 @@ def after(system: Any, state: Any, *sensors: int) -> tuple[Array, Array]:
     granted[list(sensors)] = True
     result: tuple[Array, Array] = system.fused(system.deliver(state, granted))
     return result
+
+
+def fused_trace(batch: EpisodeBatch, weights: Array, *sensors: int) -> Array:
+    """The weighted trace (N,) after these packets."""
+    variances = np.einsum("iir->ir", after(batch.task.system, batch.state, *sensors)[1])
+    return np.asarray((weights.reshape(-1, 1) * variances).sum(0))
+
+
+def check_greedy(greedy: Array, trace: Callable[..., Array]) -> None:
+    """The best sensors come first, with the trace before each; those without a sample are zero."""
+    for run, order in enumerate(np.argsort(-greedy, axis=0).T):
+        for place, sensor in enumerate(order):
+            if greedy[sensor, run] > 0.0:
+                assert greedy[sensor, run] == pytest.approx(trace(*order[:place])[run], rel=1e-7)
+                each = [trace(*order[:place], other)[run] for other in order[place:]]
+                assert each[0] == pytest.approx(min(each), rel=1e-7)
+
+
+def deterministic_variance(case: Case) -> bool:
+    """Whether covariances do not depend on what is measured, lost, or was fused before."""
+    settings = case.task().settings
+    return (
+        "Biased" not in case.env_id
+        and settings.get("filter") not in ("adf", "imm")
+        and settings.get("channel", "perfect") == "perfect"
+        and not ("UnknownInput" in case.env_id and settings["fusion"] == "ci")
+    )
+
+
+@each_case
+def test_variance_signals_are_what_a_delivery_brings(case: Case) -> None:
+    """The traces if nobody delivers, if one sensor does, and those before it in greedy order."""
+    batch = case.batch(**FREE)
+    system: Any = batch.task.system
+    if not deterministic_variance(case) or "variance_reduction" not in read(batch):
+        return
+    for request in requests(batch.task, 3, 2 * STEPS):
+        signals, weights = read(batch), system.state_weights
+        assert (weights == 1.0).all() or np.all(weights == batch.task.reward.state_weights.ravel())
+        silent = signals["silent_variance"]
+        np.testing.assert_allclose(silent, fused_trace(batch, weights), rtol=1e-9)
+        each = [fused_trace(batch, weights, sensor) for sensor in range(batch.task.sensors)]
+        np.testing.assert_allclose(signals["variance_reduction"], silent - each, 1e-7, 1e-9)
+        if "greedy_variance" in signals:
+            prior, greedy = signals["prior_covariance"], np.array(signals["greedy_variance"])
+            np.testing.assert_array_equal(prior, after(system, batch.state)[1])
+            np.testing.assert_allclose(greedy.max(0), signals["centre_variance"], rtol=1e-9)
+            check_greedy(greedy, partial(fused_trace, batch, np.ones_like(weights)))
+        batch.step(request)
+
+
+# Filters that are exact, or nearly: the input of the second is one that its filter knows.
+EXACT: list[tuple[str, dict[str, Any]]] = [
+    ("TobitOscillator", {"filter": "kalman", "censoring_threshold": -np.inf}),
+    (
+        "UnknownInput",
+        {"input_signal": "random_walk", "input_amplitude": 0.7, "input_period": 10.0}
+        | {"input_memory": np.exp(-0.1), "input_change": 0.7 * (1.0 - np.exp(-0.2)) ** 0.5}
+        | {"input_deviation": 0.7},
+    ),
+    ("CorrelatedTracking", {}),
+    *(("MarkovJumpTracking", {"filter": kind}) for kind in ("local", "centralised", "imm")),
+    ("BiasedOscillator", {"filter": "adf"}),
+    ("BiasedTracking", {}),
+    ("LinearFusion", {}),
+    ("RemoteEstimation", {"coefficient": 0.9, "initial_deviation": 3.0}),
+]
+
+
+@pytest.mark.parametrize(("name", "options"), EXACT)
+def test_innovations_have_the_variance_that_is_claimed(name: str, options: dict[str, Any]) -> None:
+    """Under random requests: the mean square of each channel that is sampled at a step is 1."""
+    task = fusion_gym.make_task(f"fusion_gym/{name}-v0", **options)
+    batch, squares = EpisodeBatch.seeded(task, 8000, 0), []
+    for request in requests(task, 8000, 12, rate=0.3):
+        signals = read(batch)
+        deviation = np.broadcast_to(signals["innovation_deviation"], signals["innovation"].shape)
+        unknown = (deviation < 1e-6) | ~np.array(signals.get("sampled", request | True))[:, None]
+        assert np.abs(signals["innovation"][deviation < 1e-9]).max(initial=0.0) < 1e-6
+        whitened = np.ma.array(signals["innovation"] / np.maximum(deviation, 1e-9), mask=unknown)
+        squares.append((whitened**2).mean(-1).compressed())
+        batch.step(request)
+    every = np.concatenate(squares)
+    np.testing.assert_allclose(every, 1.0, atol=0.07)  # a standard error is about 0.016
+    assert every.mean() == pytest.approx(1.0, abs=0.015)
+
+
+# --- what is believed -----------------------------------------------------------------------------
 
 
 def joined(item: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -196,7 +285,7 @@ class Beside:
             other.step(sent(granted))
 
 
-@pytest.mark.parametrize("broadcast", BROADCASTS)
+@pytest.mark.parametrize("broadcast", get_args(Broadcast))
 @each_id
 def test_a_sensor_believes_by_what_it_measured_and_received(env_id: str, broadcast: str) -> None:
     """x*, x̂ and x̂(s) are estimates of runs in which just that is delivered."""

@@ -30,6 +30,19 @@ def test_a_denied_request_changes_nothing(case: Case) -> None:
     assert denied
 
 
+@each_case
+def test_grantable_is_what_the_network_grants_alone(case: Case) -> None:
+    for scarce in ({}, SCARCE | {"token_cost": 4.0}, SCARCE | {"sharing": "rotating"}):
+        batch = case.batch(**scarce)
+        for request in requests(batch.task, 3, STEPS, rate=0.8):
+            grantable = batch.grantable()
+            for sensor, single in enumerate(np.eye(batch.task.sensors, dtype=np.bool_)):
+                alone = np.repeat(single[:, None], 3, axis=1)
+                granted = batch.answer(alone).granted[sensor]
+                np.testing.assert_array_equal(granted, grantable[sensor])
+            batch.step(request)
+
+
 @pytest.mark.parametrize("access", ACCESS_RULES)
 @each_id
 def test_only_who_is_admitted_is_granted(env_id: str, access: str) -> None:

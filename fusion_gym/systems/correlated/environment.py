@@ -23,7 +23,6 @@ from fusion_gym.systems.correlated.filters import JointErrorCovariance, RobustKa
 from fusion_gym.systems.correlated.sensors import CorrelatedSensors
 from fusion_gym.systems.correlated.system import CorrelatedTrackingSystem
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
-from fusion_gym.validation import ConfigurationError
 
 _T = 0.01  # the paper's sampling time
 _STRUCTURE = Structure(common="all contain the same process noise", prediction=True)
@@ -156,10 +155,7 @@ def _noise_scale(value: float | str) -> float | None:
     if isinstance(value, str):
         if value == "random":
             return None
-        raise ConfigurationError(
-            f"noise_scale = {validation.display(value)} is not allowed: it must be a number > 0 "
-            "and <= 1, or 'random'"
-        )
+        raise validation.refusal("noise_scale", value, "a number > 0 and <= 1, or 'random'")
     return validation.number("noise_scale", value, above=0.0, at_most=1.0)
 
 

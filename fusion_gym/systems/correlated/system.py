@@ -23,7 +23,9 @@ from fusion_gym.core.system import (
     System,
     age_block,
     common_signals,
+    log_deviation,
     numbered,
+    sensed,
 )
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.systems.correlated.filters import (
@@ -32,7 +34,7 @@ from fusion_gym.systems.correlated.filters import (
     RobustOutcomes,
 )
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.validation import refusal
 
 _RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
 RANDOM_SCALE = (0.4, 1.0)  # range of an episode's noise scale where it is drawn
@@ -135,7 +137,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
             block(
                 "local_log_deviation",
                 deviation,
-                lambda s: self._log_deviation(s.prior_covariance[1:]),
+                lambda s: log_deviation(s.prior_covariance[1:], self.reference),
                 (nodes, states),
                 node="own",
                 constants=open_loop,
@@ -143,7 +145,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
             block(
                 "log_deviation",
                 "the same of the fused prediction",
-                lambda s: self._log_deviation(s.prior_covariance[0]),
+                lambda s: log_deviation(s.prior_covariance[0], self.reference),
                 (states,),
                 constants=open_loop,
             ),
@@ -212,7 +214,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
 
         Source: adaptive_innovation, equations (12), (37)-(41) or (47)-(53).
         """
-        outcomes = _sensed(state)
+        outcomes = sensed(state.outcomes)
         grant = granted[:, None]
         mean, covariance = state.prior_mean.copy(), state.prior_covariance.copy()
         correction = linalg.matvec(outcomes.gain, state.measurement - state.expected)
@@ -237,7 +239,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
         self, state: CorrelatedTrackingState
     ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
         """The signals named in ``SIGNALS``."""
-        outcomes = _sensed(state)
+        outcomes = sensed(state.outcomes)
         return {
             "measurement": state.measurement,
             "innovation": lambda: state.measurement - state.expected,
@@ -300,9 +302,7 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
             ConfigurationError: they are not tracked.
         """
         if state.joint is None:
-            raise ConfigurationError(
-                "track_actual = False is not allowed here: it must be True for actual covariances"
-            )
+            raise refusal("track_actual", False, "True for actual covariances", "here")
         return state.joint
 
     def with_actual_covariance(self) -> CorrelatedTrackingSystem:
@@ -333,16 +333,12 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
         return low + (high - low) * ndtr(noise)
 
     def _whitened(self, state: CorrelatedTrackingState) -> Array:
-        deviation = _deviation(_sensed(state).innovation_covariance)
+        deviation = _deviation(sensed(state.outcomes).innovation_covariance)
         return (state.measurement - state.expected) / deviation
 
     def _fused_innovation(self, state: CorrelatedTrackingState) -> Array:
         deviation = _deviation(self.filter.innovation_covariance(state.prior_covariance[0]))
         return (state.measurement - self.filter.expect(state.prior_mean[0])) / deviation
-
-    def _log_deviation(self, covariance: Array) -> Array:
-        """ln √(variance/reference) (..., n, N) of covariances (..., n, n, N)."""
-        return 0.5 * np.log(linalg.diagonal(covariance) / self.reference[:, None])
 
     def _variance_reduction(
         self, state: CorrelatedTrackingState, outcomes: RobustOutcomes
@@ -366,9 +362,3 @@ def _with_prediction(granted: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _deviation(covariance: Array) -> Array:
     """Square roots of the diagonals: (..., m, m, N) to (..., m, N)."""
     return np.sqrt(linalg.diagonal(covariance))
-
-
-def _sensed(state: CorrelatedTrackingState) -> RobustOutcomes:
-    if state.outcomes is None:
-        raise RuntimeError("the state has no measurements yet: call sense first")
-    return state.outcomes

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
-from fusion_gym.core.reward import equal_weights
-from fusion_gym.core.system import Block, SignalArray, age_block, common_signals, numbered
+from fusion_gym.core.nature import AS_ASSUMED, Nature
+from fusion_gym.core.system import Block, SignalArray, age_block, common_signals, numbered, sensed
 from fusion_gym.systems.markov_jump.centralised_linear import (
     Belief,
     CentralisedLinearFilter,
@@ -31,7 +30,6 @@ from fusion_gym.systems.markov_jump.sensors import FadingSensors
 from fusion_gym.systems.markov_jump.state import (
     OF_FAMILY,
     MarkovJumpFamily,
-    move,
     sampling_blocks,
 )
 
@@ -115,22 +113,10 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
 
         Weights of ``None`` make open loop cost one.
         """
-        model = AugmentedModel.create(plant, sensors)
-        linear = CentralisedLinearFilter.create(model, horizon)
-        reference, magnitude = model.scales(horizon)
-        equal = equal_weights(reference)
-        return cls(
-            plant=plant,
-            sensors=sensors,
-            model=model,
-            estimator=InteractingModels.create(plant, sensors) if interacting else linear,
-            state_names=state_names,
-            state_weights=equal if state_weights is None else state_weights,
-            magnitude=magnitude,
-            reference=reference,
-            scale=_measured(linear, horizon),
-            nature=nature,
-        )
+        common = cls._common_fields(plant, sensors, state_names, state_weights, horizon, nature)
+        linear = CentralisedLinearFilter.create(common["model"], horizon)
+        estimator = InteractingModels.create(plant, sensors) if interacting else linear
+        return cls(**common, estimator=estimator, scale=_measured(linear, horizon))
 
     def offers(self, capability: str) -> bool:
         """See :class:`System`; covariances of interacting models depend on the data."""
@@ -175,7 +161,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
             block(
                 "innovation_log_deviation",
                 deviation,
-                lambda s: np.log(self._deviation(_sensed(s)) / scale),
+                lambda s: np.log(self._deviation(sensed(s.prediction)) / scale),
                 (nodes,),
                 constants=measured,
             ),
@@ -189,7 +175,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
             block(
                 "estimate",
                 "prediction over the state's root mean square",
-                lambda s: _sensed(s).mean[:n] / self.magnitude[:, None],
+                lambda s: sensed(s.prediction).mean[:n] / self.magnitude[:, None],
                 (self.state_names,),
                 constants={"root mean square": self.magnitude},
             ),
@@ -199,9 +185,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
     def start(self, noise: Array) -> MarkovJumpCentralState:
         """Time 0: nothing is measured; what is held is what would be expected."""
         runs, n = noise.shape[-1], self.plant.size
-        noise, departure = self.nature.begin(noise)
-        truth, mode = self.plant.start(noise[: n + 1])
-        process = true_noise(departure, noise[n + 1 :], noise[:0])[0]
+        truth, mode, process_noise, departure = self._start(noise)
         belief, time = self.estimator.start(runs), np.zeros(runs, dtype=np.int64)
         mean, covariance = self.estimator.estimate(belief)
         held = self.estimator.prediction(belief, time).mean[n:]
@@ -209,7 +193,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
             time=time,
             truth=truth,
             mode=mode,
-            process_noise=self.plant.process_noise(process),
+            process_noise=process_noise,
             measurement=held,
             held=held,
             age=np.zeros((self.sensor_count, runs)),
@@ -225,15 +209,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
 
         Source: markov_jump, equations (3), (4).
         """
-        truth, mode, process_noise, measurement = move(
-            self.plant,
-            self.sensors,
-            state.truth,
-            state.mode,
-            state.process_noise,
-            noise,
-            state.departure,
-        )
+        truth, mode, process_noise, measurement = self._move(state, noise)
         time = state.time + 1
         belief = self.estimator.predict(state.belief, state.time)
         return replace(
@@ -252,7 +228,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
         self, state: MarkovJumpCentralState, granted: NDArray[np.bool_]
     ) -> MarkovJumpCentralState:
         """The centre updates with the samples that were granted, all at once."""
-        _sensed(state)
+        sensed(state.prediction)
         taken = granted & self.sensors.sampled(state.time)
         # What is not taken counts for nothing, and may be no number where it is not visible.
         measurement = np.where(taken, state.measurement, state.held)
@@ -271,7 +247,7 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
         self, state: MarkovJumpCentralState
     ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
         """The signals named in ``CENTRAL_SIGNALS``."""
-        prediction, n = _sensed(state), self.plant.size
+        prediction, n = sensed(state.prediction), self.plant.size
         prior = prediction.covariance[:n, :n]
         return {
             "measurement": state.measurement[:, None],
@@ -296,11 +272,11 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
         return np.repeat(state.mean[None], self.sensor_count, axis=0)
 
     def _whitened(self, state: MarkovJumpCentralState) -> Array:
-        prediction = _sensed(state)
+        prediction = sensed(state.prediction)
         return self._innovation(state, prediction) / self._deviation(prediction)
 
     def _log_deviation(self, state: MarkovJumpCentralState) -> Array:
-        variance = linalg.diagonal(_sensed(state).covariance)[: self.plant.size]
+        variance = linalg.diagonal(sensed(state.prediction).covariance)[: self.plant.size]
         return 0.5 * np.log(variance / self.reference[:, None])
 
     def _innovation(self, state: MarkovJumpCentralState, prediction: ModePrediction) -> Array:
@@ -348,9 +324,3 @@ def _measured(linear: CentralisedLinearFilter, horizon: int) -> Array:
             total += ((model.faded @ step.moment) * model.faded).sum(1)
             total += linear.variance[:, min(time, linear.variance.shape[1] - 1)]
     return np.asarray(np.sqrt(total / horizon + ((coupling @ noise) * coupling).sum(1)))
-
-
-def _sensed(state: MarkovJumpCentralState) -> ModePrediction:
-    if state.prediction is None:
-        raise RuntimeError("the state has no measurements yet: call sense first")
-    return state.prediction

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.nature import true_noise
+from fusion_gym.core.nature import Nature, true_noise
+from fusion_gym.core.reward import equal_weights
 from fusion_gym.core.system import Block, Signal, System, common_signals, numbered
 from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagCovariances
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, Times
@@ -31,32 +32,6 @@ class Motion(NamedTuple):
     mode: Modes
     process_noise: Array
     measurement: Array
-
-
-def move(
-    plant: MarkovJumpPlant,
-    sensors: FadingSensors,
-    truth: Array,
-    mode: Modes,
-    process_noise: Array,
-    noise: Array,
-    departure: Array | None = None,
-) -> Motion:
-    """The plant moves and jumps, the sensors measure.
-
-    ``noise`` (channels, N) holds the normals of the process noise, the mode, the sensors;
-    ``process_noise`` is as it really is, and so is what is returned.
-
-    Source: markov_jump, equations (3), (4).
-    """
-    moving = plant.noise_channels
-    fading, own = np.split(noise[moving + 1 :], (sensors.count,))
-    process, own = true_noise(departure, noise[:moving], own)
-    following = plant.advance(truth, mode, process_noise, departure)
-    jumped = plant.jump(mode, noise[moving])
-    drawn = plant.process_noise(process)
-    measurement = sensors.measure(following, jumped, drawn, np.concatenate((fading, own)))
-    return Motion(following, jumped, drawn, measurement)
 
 
 @dataclass(slots=True)
@@ -145,6 +120,30 @@ class MarkovJumpFamily(System[AnyState]):
     sensors: FadingSensors
     model: AugmentedModel
 
+    @staticmethod
+    def _common_fields(
+        plant: MarkovJumpPlant,
+        sensors: FadingSensors,
+        state_names: tuple[str, ...],
+        state_weights: Array | None,
+        horizon: int,
+        nature: Nature,
+    ) -> dict[str, Any]:
+        """Return the fields that both systems have; weights of ``None`` make open loop cost one."""
+        model = AugmentedModel.create(plant, sensors)
+        reference, magnitude = model.scales(horizon)
+        equal = equal_weights(reference)
+        return {
+            "plant": plant,
+            "sensors": sensors,
+            "model": model,
+            "state_names": state_names,
+            "state_weights": equal if state_weights is None else state_weights,
+            "magnitude": magnitude,
+            "reference": reference,
+            "nature": nature,
+        }
+
     @property
     def sensor_count(self) -> int:
         """Number of sensors."""
@@ -159,6 +158,31 @@ class MarkovJumpFamily(System[AnyState]):
     def start_channels(self) -> int:
         """Normals of a start: the state, the mode, the first process noise, nature's."""
         return self.plant.size + 1 + self.plant.noise_channels + self.nature.channels
+
+    def _start(self, noise: Array) -> tuple[Array, Modes, Array, Array | None]:
+        """The truth (n, N), mode (N,) and process noise (r, N) of time 0, and the departure."""
+        noise, departure = self.nature.begin(noise)
+        first = self.plant.size + 1
+        truth, mode = self.plant.start(noise[:first])
+        process = true_noise(departure, noise[first:], noise[:0])[0]
+        return truth, mode, self.plant.process_noise(process), departure
+
+    def _move(self, state: AnyState, noise: Array) -> Motion:
+        """The plant moves and jumps, the sensors measure.
+
+        ``noise`` (channels, N) holds the normals of the process noise, the mode, the sensors; the
+        state's process noise is as it really is, and so is what is returned.
+
+        Source: markov_jump, equations (3), (4).
+        """
+        plant, sensors, moving = self.plant, self.sensors, self.plant.noise_channels
+        fading, own = np.split(noise[moving + 1 :], (sensors.count,))
+        process, own = true_noise(state.departure, noise[:moving], own)
+        following = plant.advance(state.truth, state.mode, state.process_noise, state.departure)
+        jumped = plant.jump(state.mode, noise[moving])
+        drawn = plant.process_noise(process)
+        measurement = sensors.measure(following, jumped, drawn, np.concatenate((fading, own)))
+        return Motion(following, jumped, drawn, measurement)
 
     def visible(self, state: AnyState) -> AnyState:
         """Return the state without the truth, the mode and the noise that moves the plant next."""

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
-from fusion_gym.core.reward import equal_weights
-from fusion_gym.core.system import Block, SignalArray, age_block, numbered
+from fusion_gym.core.nature import AS_ASSUMED, Nature
+from fusion_gym.core.system import Block, SignalArray, age_block, log_deviation, numbered, sensed
 from fusion_gym.fusion.rules import FusionRule, MatrixWeightedFusion
 from fusion_gym.systems.markov_jump.lag_errors import JointPrediction, LagRecursion
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, LocalFilters
@@ -27,7 +26,6 @@ from fusion_gym.systems.markov_jump.state import (
     SIGNALS,
     MarkovJumpFamily,
     MarkovJumpState,
-    move,
     sampling_blocks,
 )
 
@@ -69,23 +67,10 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         nature: Nature = AS_ASSUMED,
     ) -> MarkovJumpSystem:
         """Tables for ``horizon`` steps; weights of ``None`` make open loop cost one."""
-        model = AugmentedModel.create(plant, sensors)
-        filters = LocalFilters.create(model, horizon)
-        reference, magnitude = model.scales(horizon)
-        equal = equal_weights(reference)
-        return cls(
-            plant=plant,
-            sensors=sensors,
-            model=model,
-            filters=filters,
-            recursion=LagRecursion.create(filters, plant.size),
-            fusion=fusion,
-            state_names=state_names,
-            state_weights=equal if state_weights is None else state_weights,
-            magnitude=magnitude,
-            reference=reference,
-            nature=nature,
-        )
+        common = cls._common_fields(plant, sensors, state_names, state_weights, horizon, nature)
+        filters = LocalFilters.create(common["model"], horizon)
+        recursion = LagRecursion.create(filters, plant.size)
+        return cls(**common, filters=filters, recursion=recursion, fusion=fusion)
 
     @property
     def covariance_cycle(self) -> int:
@@ -125,7 +110,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
             fused(
                 "log_deviation",
                 "the same of the fused estimate if nobody transmits",
-                lambda s: self._log_deviation(s.prior_covariance),
+                lambda s: log_deviation(s.prior_covariance, self.reference),
                 constants=open_loop,
             ),
             fused(
@@ -139,9 +124,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
     def start(self, noise: Array) -> MarkovJumpState:
         """Time 0: all estimates are the mean of ζ(0); nothing is measured, nothing lags behind."""
         runs, n, count = noise.shape[-1], self.plant.size, self.sensor_count
-        noise, departure = self.nature.begin(noise)
-        truth, mode = self.plant.start(noise[: n + 1])
-        process = true_noise(departure, noise[n + 1 :], noise[:0])[0]
+        truth, mode, process_noise, departure = self._start(noise)
         first = self.model.initial_mean
         mean = np.broadcast_to(first[:, None], (count, len(first), runs)).copy()
         noise_mean = np.zeros((count, self.plant.process_gain.shape[1], runs))
@@ -151,7 +134,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
             time=np.zeros(runs, dtype=np.int64),
             truth=truth,
             mode=mode,
-            process_noise=self.plant.process_noise(process),
+            process_noise=process_noise,
             innovation=np.zeros((count, runs)),
             node_mean=mean,
             node_noise=noise_mean,
@@ -174,15 +157,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
 
         Source: markov_jump, equations (3), (4), (12)-(22), (36)-(39).
         """
-        truth, mode, process_noise, measurement = move(
-            self.plant,
-            self.sensors,
-            state.truth,
-            state.mode,
-            state.process_noise,
-            noise,
-            state.departure,
-        )
+        truth, mode, process_noise, measurement = self._move(state, noise)
         time = state.time + 1
         before, place = self.filters.at(state.time), self.filters.at(time)
         prior = self.filters.predict(state.node_mean, state.node_noise, before)
@@ -217,7 +192,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         """
         grant = granted[:, None]
         copy_mean = np.where(grant, state.node_mean, state.copy_mean)
-        fused = self.fusion.fuse(self._collapse(copy_mean), _sensed(state).joint(granted))
+        fused = self.fusion.fuse(self._collapse(copy_mean), sensed(state.prediction).joint(granted))
         return replace(
             state,
             copy_mean=copy_mean,
@@ -231,7 +206,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
 
     def read(self, state: MarkovJumpState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
         """The signals named in ``SIGNALS``."""
-        prediction = _sensed(state)
+        prediction = sensed(state.prediction)
         place = self.filters.at(state.time)
         return {
             "measurement": lambda: self._collapse(state.node_mean),
@@ -278,7 +253,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
 
     def _difference(self, state: MarkovJumpState) -> Array:
         lag = self._collapse(state.node_mean - state.copy_mean)
-        return lag / self._lag_deviation(_sensed(state))
+        return lag / self._lag_deviation(sensed(state.prediction))
 
     def _whitened_innovation(self, state: MarkovJumpState) -> Array:
         nodes, place = np.arange(self.sensor_count), self.filters.at(state.time)
@@ -290,12 +265,9 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
         return 0.5 * np.log(trace / self.reference.sum())
 
     def _copy_log_deviation(self, state: MarkovJumpState) -> Array:
-        prediction, nodes = _sensed(state), np.arange(self.sensor_count)
-        return self._log_deviation(prediction.local[nodes, nodes] + prediction.lag[nodes, nodes])
-
-    def _log_deviation(self, covariance: Array) -> Array:
-        """ln √(variance/reference) (..., n, N) of covariances (..., n, n, N)."""
-        return 0.5 * np.log(linalg.diagonal(covariance) / self.reference[:, None])
+        prediction, nodes = sensed(state.prediction), np.arange(self.sensor_count)
+        covariance = prediction.local[nodes, nodes] + prediction.lag[nodes, nodes]
+        return log_deviation(covariance, self.reference)
 
     def _lag_deviation(self, prediction: JointPrediction) -> Array:
         """Predicted deviations (l, n, N) of node minus copy, never zero."""
@@ -334,9 +306,3 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
             more[sensor] = True
             each.append(self.fusion.fuse(means, prediction.joint(more)).covariance)
         return each
-
-
-def _sensed(state: MarkovJumpState) -> JointPrediction:
-    if state.prediction is None:
-        raise RuntimeError("the state has no measurements yet: call sense first")
-    return state.prediction

@@ -15,24 +15,23 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 
 from fusion_gym import validation
-from fusion_gym.arrays import Array
 from fusion_gym.core.options import AccessRule, Scenario, Tokens
 from fusion_gym.core.reward import equal_weights
-from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
+from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.options import (
     FILTERS,
     FeedbackOptions,
     at_the_nodes,
     classes,
     make_centre,
+    make_system,
     memory_filter_system,
     stochastic_defaults,
-    true_nature,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
-from fusion_gym.systems.tobit.system import CensoredSystem
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 _ANGLE = 0.052 * math.pi
@@ -163,17 +162,11 @@ def _build(options: BiasedOscillatorOptions) -> Scenario:
         options.censoring_upper,
     )
     biases = plant.size - states
-    system = CensoredSystem(
-        plant=plant,
-        model=model,
-        centre=make_centre(options.filter, _FILTERS, options, sensors),
-        random_start=options.random_start,
-        state_names=tuple(f"x{i + 1}" for i in range(states))
-        + (("b",) if biases == 1 else tuple(f"b{i + 1}" for i in range(biases))),
-        scale=typical_magnitude(plant, horizon, options.random_start),
-        reference=plant.open_loop(min(horizon, _REFERENCE_HORIZON)),
-        nature=true_nature(options, plant, sensors, horizon),
-    )
+    centre = make_centre(options.filter, _FILTERS, options, sensors)
+    names = [f"x{i + 1}" for i in range(states)]
+    names += ["b"] if biases == 1 else [f"b{i + 1}" for i in range(biases)]
+    random = options.random_start
+    system = make_system(options, plant, centre, tuple(names), _REFERENCE_HORIZON, model, random)
     weights = equal_weights(system.open_loop(horizon))
     remembering = memory_filter_system(system, options.memory_filter, _FILTERS, options, sensors)
     return Scenario(
@@ -191,9 +184,8 @@ def _augmented(options: BiasedOscillatorOptions, aware: bool) -> tuple[LinearPla
 
     A filter that ignores the bias believes that it has no effect on x.
     """
-    transition = validation.array("transition", options.transition, (None, None))
+    transition = validation.square("transition", options.transition)
     states = len(transition)
-    transition = validation.array("transition", options.transition, (states, states))
     gain = validation.array("bias_gain", options.bias_gain, (states, None))
     biases = gain.shape[1]
     process = validation.covariance("process_covariance", options.process_covariance, states)
@@ -210,15 +202,8 @@ def _augmented(options: BiasedOscillatorOptions, aware: bool) -> tuple[LinearPla
     joint = np.block([[transition, gain if aware else 0.0 * gain], [np.zeros_like(gain.T), inner]])
     plant = LinearPlant.create(
         joint,
-        _diagonal(process, noise),
+        block_diag(process, noise),
         np.concatenate([mean, bias_mean]),
-        _diagonal(start, bias_start),
+        block_diag(start, bias_start),
     )
     return plant, states
-
-
-def _diagonal(first: Array, second: Array) -> Array:
-    size = len(first)
-    result = np.zeros((size + len(second),) * 2)
-    result[:size, :size], result[size:, size:] = first, second
-    return result

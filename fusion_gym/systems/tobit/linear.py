@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.core.options import Scenario, plain_options
-from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
+from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.joint import JointCentre, joint_centre
 from fusion_gym.systems.tobit.linear_sensors import linear_sensors
 from fusion_gym.systems.tobit.options import (
@@ -21,12 +21,11 @@ from fusion_gym.systems.tobit.options import (
     at_the_nodes,
     classes,
     make_centre,
+    make_system,
     memory_filter_system,
     stochastic_defaults,
-    true_nature,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
-from fusion_gym.systems.tobit.system import CensoredSystem
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 _FILTERS = {
@@ -106,7 +105,7 @@ def build_linear(choice: LinearFusionOptions) -> Scenario:
     Raises:
         ConfigurationError: a value that is not allowed.
     """
-    horizon = validation.horizon(choice.horizon)
+    validation.horizon(choice.horizon)
     plant = _plant(choice)
     sensors = _sensors(choice, plant.size)
     correlated = sensors.noise_correlation is not None
@@ -115,16 +114,9 @@ def build_linear(choice: LinearFusionOptions) -> Scenario:
         choice = replace(choice, filter=default if sensors.unlimited else "adf")
     if correlated:
         _check_rules(choice)
-    system = CensoredSystem(
-        plant=plant,
-        model=plant,
-        centre=make_centre(str(choice.filter), _FILTERS, choice, sensors),
-        random_start=False,
-        state_names=_names(choice.state_names, plant.size),
-        scale=typical_magnitude(plant, horizon, random_start=False),
-        reference=plant.open_loop(min(horizon, _REFERENCE_HORIZON)),
-        nature=true_nature(choice, plant, sensors, horizon),
-    )
+    centre = make_centre(str(choice.filter), _FILTERS, choice, sensors)
+    names = _names(choice.state_names, plant.size)
+    system = make_system(choice, plant, centre, names, _REFERENCE_HORIZON)
     return Scenario(
         choice,
         system,

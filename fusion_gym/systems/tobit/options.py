@@ -12,7 +12,7 @@ from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import CommonOptions, plain_options
 from fusion_gym.errors import ConfigurationError, display
 from fusion_gym.fusion.table import Structure, choose_rule
-from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
 from fusion_gym.systems.tobit.centre import Centre, Feedback, FeedbackCentre, SequentialCentre
 from fusion_gym.systems.tobit.filters import KalmanFilter, NodeFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -85,18 +85,36 @@ def make_centre(
     return filters[kind].make(options, sensors)
 
 
-def true_nature(
-    options: FeedbackOptions, plant: LinearPlant, sensors: CensoredSensors, horizon: int
-) -> Nature:
-    """How the truth departs from this plant and these sensors.
+def make_system(
+    options: FeedbackOptions,
+    plant: LinearPlant,
+    centre: Centre,
+    state_names: tuple[str, ...],
+    reference_horizon: int,
+    model: LinearPlant | None = None,
+    random_start: bool = False,
+) -> CensoredSystem:
+    """Return the system of a plant and a centre, whose filters believe in ``model``.
+
+    By default the model is the plant. Observed variances are relative to the open loop after
+    ``reference_horizon`` steps.
 
     Raises:
-        ConfigurationError: a departure that is not allowed, or that can change nothing.
+        ConfigurationError: a departure of the truth that is not allowed, or can change nothing.
     """
-    absent = (*plant.unmoved, *(("true_threshold_shift",) if sensors.unlimited else ()))
-    nature = Nature.create(options, absent)
-    nature.check_growth(plant.true_radius, horizon)
-    return nature
+    absent = ("true_threshold_shift",) if centre.sensors.unlimited else ()
+    nature = Nature.create(options, (*plant.unmoved, *absent))
+    nature.check_growth(plant.true_radius, options.horizon)
+    return CensoredSystem(
+        plant=plant,
+        model=plant if model is None else model,
+        centre=centre,
+        random_start=random_start,
+        state_names=state_names,
+        scale=typical_magnitude(plant, options.horizon, random_start),
+        reference=plant.open_loop(min(options.horizon, reference_horizon)),
+        nature=nature,
+    )
 
 
 def memory_filter_system(

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.core.options import Scenario, SharingRule
-from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
+from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.bound_filter import BoundConstants, BoundTobitFilter, EventError
 from fusion_gym.systems.tobit.options import (
     FILTERS,
@@ -28,12 +28,11 @@ from fusion_gym.systems.tobit.options import (
     classes,
     feedback_centre,
     make_centre,
+    make_system,
     memory_filter_system,
     stochastic_defaults,
-    true_nature,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
-from fusion_gym.systems.tobit.system import CensoredSystem
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 from fusion_gym.validation import ConfigurationError
 
@@ -143,16 +142,9 @@ def build_tobit(options: TobitOscillatorOptions) -> Scenario:
     remembering = options.memory_filter
     if remembering is None and options.filter == "paper":
         remembering = "adf"  # the paper's minimises a bound; with every measurement it errs thrice
-    system = CensoredSystem(
-        plant=plant,
-        model=plant,
-        centre=centre,
-        random_start=options.random_start,
-        state_names=tuple(f"x{i + 1}" for i in range(plant.size)),
-        scale=typical_magnitude(plant, horizon, options.random_start),
-        reference=plant.open_loop(horizon),
-        nature=true_nature(options, plant, sensors, horizon),
-    )
+    names = tuple(f"x{i + 1}" for i in range(plant.size))
+    random = options.random_start
+    system = make_system(options, plant, centre, names, horizon, random_start=random)
     defaults = {"dynamic_event": trigger} | stochastic_defaults(options)
     return Scenario(
         options,

@@ -23,6 +23,7 @@ from fusion_gym.core.system import (
     age_block,
     common_signals,
     numbered,
+    sensed,
 )
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.tobit.centre import Centre, CentrePrediction
@@ -150,7 +151,7 @@ class CensoredSystem(System[CensoredState]):
             own(
                 "uncensored_probability",
                 uncensored,
-                lambda s: _prediction(s).expectation.uncensored_probability,
+                lambda s: sensed(s.prediction).expectation.uncensored_probability,
             ),
             age_block(nodes),
             shared(
@@ -243,9 +244,8 @@ class CensoredSystem(System[CensoredState]):
 
         Source: tobit_token_bucket, equations (20), (22), (30), (50).
         """
-        posterior = self.centre.update(
-            state.prior_mean, state.prior_covariance, _prediction(state), state.measurement, granted
-        )
+        prior, prediction = (state.prior_mean, state.prior_covariance), sensed(state.prediction)
+        posterior = self.centre.update(*prior, prediction, state.measurement, granted)
         return replace(
             state,
             held=np.where(granted[:, None], state.measurement, state.held),
@@ -258,18 +258,17 @@ class CensoredSystem(System[CensoredState]):
     def fused_alone(self, state: CensoredState) -> tuple[Array, Array]:
         """See :class:`System`."""
         return self.centre.single(
-            state.prior_mean, state.prior_covariance, _prediction(state), state.measurement
+            state.prior_mean, state.prior_covariance, sensed(state.prediction), state.measurement
         )
 
     def read(self, state: CensoredState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
         """The signals named in ``SIGNALS``."""
-        expectation, deviation, _ = _prediction(state)
+        expectation, deviation, _ = sensed(state.prediction)
 
         @functools.cache
         def variances() -> tuple[Array, Array]:
-            return self.centre.variances(
-                state.prior_mean, state.prior_covariance, _prediction(state), self.state_weights
-            )
+            prior = state.prior_mean, state.prior_covariance
+            return self.centre.variances(*prior, sensed(state.prediction), self.state_weights)
 
         return {
             "measurement": state.measurement,
@@ -325,11 +324,5 @@ class CensoredSystem(System[CensoredState]):
 
 
 def _whitened(state: CensoredState) -> Array:
-    expectation, deviation, _ = _prediction(state)
+    expectation, deviation, _ = sensed(state.prediction)
     return (state.measurement - expectation.value) / deviation
-
-
-def _prediction(state: CensoredState) -> CentrePrediction:
-    if state.prediction is None:
-        raise RuntimeError("the state has no measurements yet: call sense first")
-    return state.prediction

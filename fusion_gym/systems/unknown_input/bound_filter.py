@@ -88,9 +88,7 @@ class BoundTables:
         count = sensors.count
         limit = validation.not_negative("rho_bar", rho_bar, (count,))
         if np.any(limit > 1.0):
-            raise ConfigurationError(
-                f"rho_bar = {validation.display(rho_bar)} is not allowed: it must be >= 0 and <= 1"
-            )
+            raise validation.refusal("rho_bar", rho_bar, ">= 0 and <= 1")
         epsilon = validation.positive("young_factor", young_factor, (count,))[:, None, None, None]
         plain = (1.0 + epsilon) * sensors.covariance
         square = limit[:, None, None, None] * linalg.identity(sensors.size)

@@ -7,9 +7,9 @@ Information Technology & Electronic Engineering 24, 2023.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, ClassVar, Literal, NamedTuple, get_args
+from typing import Annotated, ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,19 +41,10 @@ _STRUCTURE = Structure(common="all contain the same process noise", holds=("trac
 Signal = Literal["sinusoids", "steps", "random_walk"]
 
 
-class _Filter(NamedTuple):
-    """A filter's class, whose docstring declares it, and the nodes that it makes."""
-
-    kind: type
-    make: Callable[[UnknownInputOptions, _Parts], Nodes]
-
-
-FILTERS = {
-    "random_walk": _Filter(
-        RandomWalkInputFilter, lambda choice, parts: _random_walk(choice, parts)
-    ),
-    "predict": _Filter(ExactInputStateFilter, lambda selection, parts: _predict(parts)),
-    "paper": _Filter(BoundTables, lambda selection, parts: _paper(selection, parts)),
+FILTERS: dict[str, type] = {
+    "random_walk": RandomWalkInputFilter,
+    "predict": ExactInputStateFilter,
+    "paper": BoundTables,
 }
 
 
@@ -76,7 +67,7 @@ class UnknownInputOptions(CommonOptions):
     :mod:`fusion_gym.systems.unknown_input.examples` lists; a number that is given goes before it.
     """
 
-    filters: ClassVar[Mapping[str, type]] = {name: row.kind for name, row in FILTERS.items()}
+    filters: ClassVar[Mapping[str, type]] = FILTERS
     structure: ClassVar[Structure | None] = _STRUCTURE
     example: Annotated[str, EXAMPLES] = "two_carts"
     """Example that gives the numbers of all options that are ``None``."""
@@ -259,10 +250,7 @@ def _signal(options: UnknownInputOptions, inputs: int, horizon: int) -> InputSig
     if not isinstance(kind, str):
         for name, value in shape.items():
             if value is not None:
-                raise ConfigurationError(
-                    f"{name} = {validation.display(value)} is not allowed with an array as "
-                    "input_signal: it must be None"
-                )
+                raise validation.refusal(name, value, "None", "with an array as input_signal")
         return ArrayInput.create(inputs, kind, horizon)
     amplitude, period, phase = shape.values()
     if kind == "sinusoids":
@@ -291,44 +279,22 @@ def _nodes(
     joint = JointGain.create(plant, sensors)
     rule = choose_rule(options.fusion, _STRUCTURE, sensors.count)
     fusion = NodeFusion(rule, plant.size, tracked=options.fusion == "ci")
-    if options.hold_variance is not None and kind != "random_walk":
+    hold = options.hold_variance
+    if hold is not None and kind != "random_walk":
         raise ConfigurationError(
-            f"hold_variance = {validation.display(options.hold_variance)} is not allowed with "
-            f"filter={kind!r}: it belongs to filter='random_walk'"
+            f"hold_variance = {validation.display(hold)} is not allowed with filter={kind!r}: it "
+            "belongs to filter='random_walk'"
         )
-    return FILTERS[kind].make(options, _Parts(model, sensors, joint, fusion, factor, horizon))
-
-
-class _Parts(NamedTuple):
-    """What nodes are made of; ``factor`` (sensors,) is that of Young's inequality."""
-
-    model: InputModel
-    sensors: InputSensors
-    joint: JointGain
-    fusion: NodeFusion
-    factor: Array
-    horizon: int
-
-
-def _random_walk(options: UnknownInputOptions, parts: _Parts) -> Nodes:
-    hold = None
-    if options.hold_variance is not None:
-        shape = (parts.sensors.count,)
-        hold = validation.not_negative("hold_variance", options.hold_variance, shape)
+    if kind == "paper":
+        bound = _given(options.rho_bar)
+        tables = BoundTables.create(joint, model, bound, factor, horizon)
+        return TableNodes.create(model, sensors, tables, fusion)
+    if kind == "predict":
+        return RunNodes(model, sensors, ExactInputStateFilter(model, joint), fusion)
+    if hold is not None:
+        hold = validation.not_negative("hold_variance", hold, (sensors.count,))
         hold = hold[:, None, None, None]
-    node = RandomWalkInputFilter(parts.model, parts.sensors)
-    return RunNodes(parts.model, parts.sensors, node, parts.fusion, hold)
-
-
-def _predict(parts: _Parts) -> Nodes:
-    node = ExactInputStateFilter(parts.model, parts.joint)
-    return RunNodes(parts.model, parts.sensors, node, parts.fusion)
-
-
-def _paper(options: UnknownInputOptions, parts: _Parts) -> Nodes:
-    bound = _given(options.rho_bar)
-    tables = BoundTables.create(parts.joint, parts.model, bound, parts.factor, parts.horizon)
-    return TableNodes.create(parts.model, parts.sensors, tables, parts.fusion)
+    return RunNodes(model, sensors, RandomWalkInputFilter(model, sensors), fusion, hold)
 
 
 def _trigger(options: UnknownInputOptions, sensors: int) -> dict[str, tuple[float, ...]]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.fusion.rules import Fused, FusionRule, own_covariances
-from fusion_gym.fusion.several import CovarianceIntersection
+from fusion_gym.fusion.several import CovarianceIntersection, sum_rows
 
 _GAP = 0.01  # relative gap at which the tracked weights rest
 _STEPS = 4  # evaluations of the tracked weights at a time, at most
@@ -113,33 +113,25 @@ def tracked_intersection(mean: Array, covariance: Array, weights: Array) -> Fuse
     nodes, n = mean.shape[:2]
     vectors = linalg.matvec(information, mean)
     weights = np.maximum(weights, _FLOOR)
-    weights /= _sum(weights)
+    weights /= sum_rows(weights)
     lanes: slice | np.ndarray = slice(None)
     fused = np.empty(covariance.shape[1:])
     for step in range(_STEPS):
         part, some = information[..., lanes], weights[:, lanes]
-        bound = linalg.inverse(_sum(some[:, None, None] * part))
+        bound = linalg.inverse(sum_rows(some[:, None, None] * part))
         fused[..., lanes] = bound
         if step == _STEPS - 1:
             break
         square = linalg.matmul(bound, bound)
-        gain = _sum((part * square).reshape(nodes, n * n, -1).swapaxes(0, 1))
+        gain = sum_rows((part * square).reshape(nodes, n * n, -1).swapaxes(0, 1))
         total = linalg.trace(bound)
         still = gain.max(0) > (1.0 + _GAP) * total
         if not still.any():
             break
         lanes = np.flatnonzero(still) if isinstance(lanes, slice) else lanes[still]
         moved = np.maximum(some[:, still] * np.sqrt(gain[:, still]), _FLOOR**2)
-        weights[:, lanes] = moved / _sum(moved)
-    joined = linalg.matvec(fused, _sum(weights[:, None] * vectors))
+        weights[:, lanes] = moved / sum_rows(moved)
+    joined = linalg.matvec(fused, sum_rows(weights[:, None] * vectors))
     return Fused(
         joined, fused, lambda: linalg.matmul(fused, weights[:, None, None] * information), weights
     )
-
-
-def _sum(a: Array) -> Array:
-    """Sum over the first axis, in ascending order."""
-    total: Array = a[0].copy()
-    for k in range(1, len(a)):
-        total += a[k]
-    return total

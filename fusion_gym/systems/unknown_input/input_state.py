@@ -20,7 +20,6 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
 from fusion_gym.systems.unknown_input.sensors import InputSensors
-from fusion_gym.validation import ConfigurationError
 
 
 @dataclass(frozen=True)
@@ -119,10 +118,7 @@ class InputModel:
         n, q = plant.size, plant.inputs
         retention = validation.not_negative("input_memory", memory, (q,))
         if np.any(retention > 1.0):
-            raise ConfigurationError(
-                f"input_memory = {validation.display(memory)} is not allowed: it must be >= 0 and "
-                "<= 1"
-            )
+            raise validation.refusal("input_memory", memory, ">= 0 and <= 1")
         steps = validation.positive("input_change", change, (q,))
         first = validation.positive("input_deviation", deviation, (q,))
         b = plant.input_matrix[..., 0]

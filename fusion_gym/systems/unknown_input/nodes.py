@@ -8,8 +8,9 @@ Source: unknown_input, equations (8), (24), (25).
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,27 +51,22 @@ class NodePrediction(NamedTuple):
     covariance: Array | None
 
 
-class Nodes(Protocol):
-    """Nodes and centre."""
+@dataclass(frozen=True)
+class Nodes(ABC):
+    """Nodes and centre, with what the nodes believe of plant and input."""
 
-    @property
-    def model(self) -> InputModel:
-        """What the nodes believe of plant and input."""
-        ...
+    model: InputModel
+    sensors: InputSensors
 
-    @property
-    def sensors(self) -> InputSensors:
-        """The sensors."""
-        ...
-
+    @abstractmethod
     def start(self, runs: int) -> Estimates:
         """Before any measurement."""
-        ...
 
+    @abstractmethod
     def predict(self, estimates: Estimates, time: Array) -> NodePrediction:
         """Predictions for the measurements at ``time`` (N,)."""
-        ...
 
+    @abstractmethod
     def update(
         self,
         estimates: Estimates,
@@ -80,16 +76,16 @@ class Nodes(Protocol):
         time: Array,
     ) -> Estimates:
         """Posteriors; ``held`` (l, m, N) are the last delivered measurements, the new included."""
-        ...
 
+    @abstractmethod
     def prior_covariance(self, prediction: NodePrediction, time: Array) -> Array:
         """The nodes' covariances (l, s, s, N or 1) before the update at ``time``."""
-        ...
 
+    @abstractmethod
     def fused_covariance(self, estimates: Estimates, time: Array) -> Array:
         """The centre's covariance (s, s, N or 1) of the posterior at ``time``."""
-        ...
 
+    @abstractmethod
     def variances(
         self, estimates: Estimates, prediction: NodePrediction, weights: Array, time: Array
     ) -> tuple[Array, Array]:
@@ -97,27 +93,22 @@ class Nodes(Protocol):
 
         ``weights`` (s,) weigh the entries of the trace.
         """
-        ...
 
+    def _start(self, runs: int) -> tuple[Array, Array, Array]:
+        """Means (l, s, N) and (s, N) and a covariance (s, s, N), all the initial ones."""
+        first, initial = self.model.initial_mean, self.model.initial_covariance
+        fused = np.broadcast_to(first, (len(first), runs)).copy()
+        mean = np.broadcast_to(fused, (self.sensors.count, *fused.shape)).copy()
+        return mean, fused, np.broadcast_to(initial, (*fused.shape[:1] * 2, runs)).copy()
 
-def _start(model: InputModel, sensors: InputSensors, runs: int) -> tuple[Array, Array, Array]:
-    """Means (l, s, N) and (s, N) and a covariance (s, s, N), all the initial ones."""
-    fused = np.broadcast_to(model.initial_mean, (len(model.initial_mean), runs)).copy()
-    mean = np.broadcast_to(fused, (sensors.count, *fused.shape)).copy()
-    covariance = np.broadcast_to(model.initial_covariance, (*fused.shape[:1] * 2, runs)).copy()
-    return mean, fused, covariance
-
-
-def _predicted(
-    model: InputModel, sensors: InputSensors, estimates: Estimates, covariance: Array | None
-) -> NodePrediction:
-    every = np.concatenate((estimates.mean, estimates.fused_mean[None]))
-    prior = model.predict(every)
-    return NodePrediction(prior[:-1], prior[-1], sensors.expect(prior[:-1]), covariance)
+    def _predict(self, estimates: Estimates, covariance: Array | None) -> NodePrediction:
+        """Predictions with these covariances (l, s, s, N) of the nodes."""
+        prior = self.model.predict(np.concatenate((estimates.mean, estimates.fused_mean[None])))
+        return NodePrediction(prior[:-1], prior[-1], self.sensors.expect(prior[:-1]), covariance)
 
 
 @dataclass(frozen=True)
-class TableNodes:
+class TableNodes(Nodes):
     """Nodes that hold the last measurement; gains, bounds and fusion come from tables over time.
 
     ``tables`` hold the nodes' gains and bounds. ``state_gain`` (l, n, n, T + 1) and ``input_gain``
@@ -127,8 +118,6 @@ class TableNodes:
     one with :meth:`create`.
     """
 
-    model: InputModel
-    sensors: InputSensors
     tables: BoundTables
     state_gain: Array
     input_gain: Array
@@ -164,12 +153,12 @@ class TableNodes:
 
     def start(self, runs: int) -> Estimates:
         """Before any measurement; covariances stay in the tables."""
-        mean, fused, _ = _start(self.model, self.sensors, runs)
+        mean, fused, _ = self._start(runs)
         return Estimates(mean, fused, None, None, None)
 
     def predict(self, estimates: Estimates, time: Array) -> NodePrediction:
         """See :class:`Nodes`."""
-        return _predicted(self.model, self.sensors, estimates, None)
+        return self._predict(estimates, None)
 
     def update(
         self,
@@ -221,7 +210,7 @@ class TableNodes:
 
 
 @dataclass(frozen=True)
-class RunNodes:
+class RunNodes(Nodes):
     """Nodes whose covariances depend on what arrived: each run carries its own.
 
     A node that receives nothing predicts. With ``hold_variance`` h (l, 1, 1, 1) it instead takes
@@ -229,15 +218,13 @@ class RunNodes:
     random-walk filter.
     """
 
-    model: InputModel
-    sensors: InputSensors
     filter: RandomWalkInputFilter | ExactInputStateFilter
     fusion: NodeFusion
     hold_variance: Array | None = None
 
     def start(self, runs: int) -> Estimates:
         """Before any measurement; all nodes are alike."""
-        mean, fused, covariance = _start(self.model, self.sensors, runs)
+        mean, fused, covariance = self._start(runs)
         every = np.broadcast_to(covariance, (self.sensors.count, *covariance.shape)).copy()
         return Estimates(
             mean, fused, every, covariance, self.fusion.start(self.sensors.count, runs)
@@ -246,7 +233,7 @@ class RunNodes:
     def predict(self, estimates: Estimates, time: Array) -> NodePrediction:
         """See :class:`Nodes`."""
         prior = self.model.predict_covariance(_own(estimates.covariance))
-        return _predicted(self.model, self.sensors, estimates, prior)
+        return self._predict(estimates, prior)
 
     def update(
         self,

@@ -15,14 +15,14 @@ from scipy.special import ndtr
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_motion
-from fusion_gym.systems.linear_plant import covariance_factor
+from fusion_gym.systems.linear_plant import Plant, covariance_factor
 from fusion_gym.systems.unknown_input.signals import InputSignal
 
 _LONGEST_PERIOD = 1000  # small steps between two instants
 
 
 @dataclass(frozen=True)
-class UnknownInputPlant:
+class UnknownInputPlant(Plant):
     """x(k + 1) = 𝒜 x(k) + ℬ d(k) + w(k), w ~ N(0, 𝒲), from one sampling instant to the next.
 
     Between two instants the plant makes ``sampling_period`` a small steps
@@ -30,22 +30,14 @@ class UnknownInputPlant:
     𝒲 = Σ Aʲ W Aʲᵀ over j = 0..a - 1, and moving by them at once with one draw is exact: no
     filter and no sensor looks at the small steps.
 
-    Shapes: ``transition`` 𝒜 (n, n, 1), ``input_matrix`` ℬ (n, q, 1), ``process_covariance`` 𝒲
-    (n, n, 1), ``process_factor`` (n, r, 1), ``initial_mean`` (n, 1), ``initial_covariance``
-    (n, n, 1), which the filters believe, ``initial_factor`` (n, r₀, 1), and
-    ``initial_half_width`` (n, 1): if given, x(0) is uniform about the mean instead of normal.
-    Build one with :meth:`create`.
+    Beside the shapes of :class:`~fusion_gym.systems.linear_plant.Plant`, with 𝒜 and 𝒲:
+    ``input_matrix`` ℬ (n, q, 1), and ``initial_half_width`` (n, 1): if given, x(0) is uniform
+    about the mean, where filters believe that it is normal. Build one with :meth:`create`.
 
     Source: unknown_input, equations (1), (3) and (4), lifted with a constant input.
     """
 
-    transition: Array
     input_matrix: Array
-    process_covariance: Array
-    process_factor: Array
-    initial_mean: Array
-    initial_covariance: Array
-    initial_factor: Array
     initial_half_width: Array | None = None
 
     @classmethod
@@ -66,9 +58,8 @@ class UnknownInputPlant:
                 not from 1 to 1000, more inputs than states, or a covariance that is not one
                 (``initial_covariance``: not definite).
         """
-        small = validation.array("transition", transition, (None, None))
+        small = validation.square("transition", transition)
         n = len(small)
-        small = validation.array("transition", transition, (n, n))
         inputs = validation.array("input_matrix", input_matrix, (n, None))
         process = validation.covariance("process_covariance", process_covariance, n)
         start = validation.covariance("initial_covariance", initial_covariance, n, definite=True)
@@ -97,24 +88,9 @@ class UnknownInputPlant:
         )
 
     @property
-    def size(self) -> int:
-        """Number of states n."""
-        return self.transition.shape[0]
-
-    @property
     def inputs(self) -> int:
         """Number of inputs q."""
         return self.input_matrix.shape[1]
-
-    @property
-    def noise_channels(self) -> int:
-        """Standard normals from one instant to the next: the rank of 𝒲."""
-        return self.process_factor.shape[1]
-
-    @property
-    def start_channels(self) -> int:
-        """Standard normals that :meth:`start` consumes."""
-        return self.size
 
     def start(self, noise: Array) -> Array:
         """Draw x(0), shape (n, N), from standard normals (n, N)."""
@@ -135,19 +111,6 @@ class UnknownInputPlant:
         if self.noise_channels:
             moved += linalg.matvec(self.process_factor, noise)
         return moved
-
-    def true_radius(self, factor: float) -> float:
-        """Spectral radius of I + c (𝒜 - I)."""
-        still = np.eye(self.size)
-        moved = still + factor * (self.transition[..., 0] - still)
-        return float(np.abs(np.linalg.eigvals(moved)).max())
-
-    @property
-    def unmoved(self) -> tuple[str, ...]:
-        """The options of the true plant that can change nothing."""
-        still = np.array_equal(self.transition[..., 0], np.eye(self.size))
-        result = {"true_process_noise": not self.process_factor.any(), "true_transition": still}
-        return tuple(name for name, absent in result.items() if absent)
 
     def open_loop(self, signal: InputSignal, horizon: int) -> Array:
         """Mean squared error (n + q,) over k = 1..horizon of a centre that takes the input for 0.

@@ -6,8 +6,9 @@ that episode's noise, so that nobody can know it in advance.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +19,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.validation import ConfigurationError
 
 
-class InputSignal(Protocol):
+class InputSignal(ABC):
     """q inputs over time, for N runs at once (batch axis last).
 
     ``start`` turns standard normals (start_channels, N) into a memory (rows, N), ``value`` reads
@@ -27,43 +28,43 @@ class InputSignal(Protocol):
     """
 
     @property
+    @abstractmethod
     def size(self) -> int:
         """Number of inputs q."""
-        ...
 
     @property
     def start_channels(self) -> int:
         """Standard normals that :meth:`start` consumes."""
-        ...
+        return 0
 
     @property
     def noise_channels(self) -> int:
         """Standard normals that :meth:`advance` consumes."""
-        ...
+        return 0
 
+    @abstractmethod
     def start(self, noise: Array) -> Array:
         """Memory (rows, N) of new episodes."""
-        ...
 
+    @abstractmethod
     def value(self, memory: Array, time: Array) -> Array:
         """The input (q, N) from the instant ``time`` (N,) to the next."""
-        ...
 
     def advance(self, memory: Array, noise: Array) -> Array:
         """The memory one instant later."""
-        ...
+        return memory
 
     def mean(self, horizon: int) -> Array:
         """Expectation (horizon, q) of d(0), ..., d(horizon - 1) over episodes."""
-        ...
+        return np.zeros((horizon, self.size))
 
     def covariance(self, horizon: int) -> Array:
         """Cov(d(k), d(k + lag)) for lag = 0..horizon - 1, (horizon, q, q), the same for all k."""
-        ...
+        return np.zeros((horizon, self.size, self.size))
 
 
 @dataclass(frozen=True)
-class Sinusoids:
+class Sinusoids(InputSignal):
     """d_j(k) = Σ_i a_ji sin(2π k / p_ji + φ_ji), its phases drawn evenly or given.
 
     ``amplitude`` a, in the input's unit, and ``period`` p, in sampling instants, are (q, terms, 1);
@@ -87,10 +88,7 @@ class Sinusoids:
         """
         random = isinstance(phase, str)
         if random and phase != "random":
-            raise ConfigurationError(
-                f"input_phase = {validation.display(phase)} is not allowed: it must be 'random' "
-                "or radians"
-            )
+            raise validation.refusal("input_phase", phase, "'random' or radians")
         shape = (size, _terms(amplitude, period, 0.0 if random else phase))
         return cls(
             amplitude=validation.spread("input_amplitude", amplitude, shape)[..., None],
@@ -108,11 +106,6 @@ class Sinusoids:
         """One for each phase that is drawn."""
         return self.amplitude.size if self.phase is None else 0
 
-    @property
-    def noise_channels(self) -> int:
-        """None: a phase fixes the whole episode."""
-        return 0
-
     def start(self, noise: Array) -> Array:
         """The phases (q·terms, N), in radians."""
         if self.phase is None:
@@ -128,20 +121,16 @@ class Sinusoids:
             total += terms[:, term]
         return total
 
-    def advance(self, memory: Array, noise: Array) -> Array:
-        """The phases stay."""
-        return memory
-
     def mean(self, horizon: int) -> Array:
         """(horizon, q): zero if phases are drawn, else the signal itself."""
         if self.phase is None:
-            return np.zeros((horizon, self.size))
+            return super().mean(horizon)
         memory = np.broadcast_to(self.phase.reshape(-1, 1), (self.phase.size, horizon))
         return self.value(memory, np.arange(horizon, dtype=np.float64)).T
 
     def covariance(self, horizon: int) -> Array:
         """(horizon, q, q): Σ a²/2 cos(2π lag / p) for phases that are drawn, else zero."""
-        result = np.zeros((horizon, self.size, self.size))
+        result = super().covariance(horizon)
         if self.phase is None:
             angle = 2.0 * np.pi / self.period * np.arange(horizon)
             own = (0.5 * self.amplitude**2 * np.cos(angle)).sum(1)
@@ -162,7 +151,7 @@ def _terms(*values: ArrayLike) -> int:
 
 
 @dataclass(frozen=True)
-class _Stationary:
+class _Stationary(InputSignal):
     """What signals share whose memory is their value, drawn from a stationary distribution.
 
     ``amplitude`` (q, 1) is its standard deviation in the input's unit, its mean is zero; ``period``
@@ -198,10 +187,6 @@ class _Stationary:
     def value(self, memory: Array, time: Array) -> Array:
         """The values (q, N)."""
         return memory
-
-    def mean(self, horizon: int) -> Array:
-        """Zero, (horizon, q)."""
-        return np.zeros((horizon, self.size))
 
 
 @dataclass(frozen=True)
@@ -263,7 +248,7 @@ def _geometric(amplitude: Array, ratio: Array, horizon: int) -> Array:
 
 
 @dataclass(frozen=True)
-class ArrayInput:
+class ArrayInput(InputSignal):
     """The same inputs in every episode: ``values`` (rows, q, 1), one row a sampling instant.
 
     After the last row the input stays where it is.
@@ -285,16 +270,6 @@ class ArrayInput:
         """Number of inputs q."""
         return self.values.shape[1]
 
-    @property
-    def start_channels(self) -> int:
-        """None."""
-        return 0
-
-    @property
-    def noise_channels(self) -> int:
-        """None."""
-        return 0
-
     def start(self, noise: Array) -> Array:
         """Nothing to remember: (0, N)."""
         return np.empty((0, noise.shape[-1]))
@@ -304,14 +279,6 @@ class ArrayInput:
         rows = np.minimum(time.astype(np.intp), len(self.values) - 1)
         return np.ascontiguousarray(self.values[rows, :, 0].T)
 
-    def advance(self, memory: Array, noise: Array) -> Array:
-        """Nothing to move."""
-        return memory
-
     def mean(self, horizon: int) -> Array:
         """The rows themselves, (horizon, q)."""
         return self.values[np.minimum(np.arange(horizon), len(self.values) - 1), :, 0]
-
-    def covariance(self, horizon: int) -> Array:
-        """Zero, (horizon, q, q): nothing is drawn."""
-        return np.zeros((horizon, self.size, self.size))

@@ -16,7 +16,16 @@ from scipy.special import ndtr
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
-from fusion_gym.core.system import Block, SignalArray, System, age_block, common_signals, numbered
+from fusion_gym.core.system import (
+    Block,
+    SignalArray,
+    System,
+    age_block,
+    common_signals,
+    log_deviation,
+    numbered,
+    sensed,
+)
 from fusion_gym.systems.unknown_input.nodes import Estimates, NodePrediction, Nodes, RunNodes
 from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
 from fusion_gym.systems.unknown_input.signals import InputSignal
@@ -89,7 +98,7 @@ class UnknownInputSystem(System[UnknownInputState]):
     def start_channels(self) -> int:
         """Normals of a start: the initial state, the first measurements' noise, the signal,
         nature's."""
-        own = self.plant.start_channels + self.nodes.sensors.noise_channels
+        own = self.plant.size + self.nodes.sensors.noise_channels
         return own + self.signal.start_channels + self.nature.channels
 
     def offers(self, capability: str) -> bool:
@@ -146,7 +155,7 @@ class UnknownInputSystem(System[UnknownInputState]):
             fused(
                 "estimate",
                 "fused prediction over the root mean square",
-                lambda s: _sensed(s).fused_mean / self.magnitude[:, None],
+                lambda s: sensed(s.prediction).fused_mean / self.magnitude[:, None],
                 constants={"root mean square": self.magnitude},
             ),
         )
@@ -197,19 +206,20 @@ class UnknownInputSystem(System[UnknownInputState]):
 
         Source: unknown_input, equations (8), (24), (25).
         """
+        prediction = sensed(state.prediction)
         held = np.where(granted[:, None], state.measurement, state.held)
         return replace(
             state,
             held=held,
             age=np.where(granted, 0.0, state.age),
-            estimates=self.nodes.update(state.estimates, _sensed(state), held, granted, state.time),
+            estimates=self.nodes.update(state.estimates, prediction, held, granted, state.time),
         )
 
     def read(
         self, state: UnknownInputState
     ) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
         """The signals named in ``SIGNALS``."""
-        prediction = _sensed(state)
+        prediction = sensed(state.prediction)
 
         @functools.cache
         def variances() -> tuple[Array, Array]:
@@ -295,7 +305,7 @@ class UnknownInputSystem(System[UnknownInputState]):
     def _deviation(self, state: UnknownInputState) -> Array:
         """The innovation's deviation (l, m, N or 1)."""
         n, sensors = self.plant.size, self.nodes.sensors
-        prior = self.nodes.prior_covariance(_sensed(state), state.time)
+        prior = self.nodes.prior_covariance(sensed(state.prediction), state.time)
         spread = linalg.matmul(sensors.matrix, prior[:, :n, :n])
         variance = spread[..., 0, :] * sensors.matrix[..., 0, :]
         for column in range(1, n):
@@ -309,15 +319,15 @@ class UnknownInputSystem(System[UnknownInputState]):
         return np.sqrt(2.0 * linalg.diagonal(self.nodes.sensors.covariance))
 
     def _whitened(self, state: UnknownInputState) -> Array:
-        return (state.measurement - _sensed(state).expected) / self._deviation(state)
+        return (state.measurement - sensed(state.prediction).expected) / self._deviation(state)
 
     def _local_log_deviation(self, state: UnknownInputState) -> Array:
-        prior = self.nodes.prior_covariance(_sensed(state), state.time)
-        return _lanes(_log_deviation(prior, self.reference), len(state.time))
+        prior = self.nodes.prior_covariance(sensed(state.prediction), state.time)
+        return _lanes(log_deviation(prior, self.reference), len(state.time))
 
     def _log_deviation(self, state: UnknownInputState) -> Array:
         before = self.nodes.fused_covariance(state.estimates, state.time - 1.0)
-        return _lanes(_log_deviation(before, self.reference), len(state.time))
+        return _lanes(log_deviation(before, self.reference), len(state.time))
 
     def _fused_prior(self, state: UnknownInputState) -> Array:
         n = self.plant.size
@@ -325,20 +335,6 @@ class UnknownInputSystem(System[UnknownInputState]):
         return self.nodes.model.predict_covariance(before)[:n, :n]
 
 
-def _log_deviation(covariance: Array, reference: Array) -> Array:
-    """ln √(variance/reference) (..., s, N) of covariances (..., s, s, N)."""
-    ratio = linalg.diagonal(covariance) / reference[:, None]
-    np.log(ratio, out=ratio)
-    ratio *= 0.5
-    return ratio
-
-
 def _lanes(value: Array, runs: int) -> Array:
     """One lane for all, or a lane each, to (..., runs)."""
     return np.broadcast_to(value, (*value.shape[:-1], runs))
-
-
-def _sensed(state: UnknownInputState) -> NodePrediction:
-    if state.prediction is None:
-        raise RuntimeError("the state has no measurements yet: call sense first")
-    return state.prediction

@@ -1,0 +1,38 @@
+"""What the figures of several papers share: legends over all axes, and ticks at given values."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+
+def legend(
+    figure: Any,
+    axes: Any,
+    columns: int,
+    place: str = "upper",
+    rank: Callable[[str], int] = lambda label: 0,
+    **style: Any,
+) -> None:
+    """Draw one legend above or below all axes, with each label once, ordered by its rank."""
+    entries: dict[str, Any] = {}
+    for axis in np.ravel(axes):
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    labels = sorted(entries, key=rank)
+    handles, ncols = [entries[label] for label in labels], min(columns, len(labels))
+    figure.legend(handles, labels, loc=f"outside {place} center", ncols=ncols, **style)
+
+
+def legend_of(figure: Any, handles: Sequence[Any], columns: int, length: float = 1.6) -> None:
+    """Draw a legend of these handles above all axes."""
+    figure.legend(
+        handles=handles, loc="outside upper center", ncols=columns, handlelength=length,
+        columnspacing=1.2, handletextpad=0.5,
+    )  # fmt: skip
+
+
+def set_ticks(axis: Any, values: Sequence[float]) -> None:
+    """Label a logarithmic vertical axis at these values alone."""
+    axis.set_yticks(values, [f"{value:g}" for value in values])
+    axis.minorticks_off()

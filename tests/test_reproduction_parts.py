@@ -1,0 +1,332 @@
+"""What the pages of the papers are computed by: recordings, measures, printed equations, bounds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from reproduction_checks import SEED
+from scipy import stats
+
+import fusion_gym
+from fusion_gym.agents.papers import round_robin_tobit_runs as biased
+from fusion_gym.agents.papers import tobit_token_bucket_runs as runs
+from fusion_gym.agents.papers import unknown_input
+from fusion_gym.agents.papers.adaptive_innovation_runs import _largest, _whitened
+from fusion_gym.agents.papers.markov_jump import example, period_of, run_markov_jump, trigger
+from fusion_gym.agents.papers.markov_jump_covariances import covariances
+from fusion_gym.agents.papers.numbers import cite, percent, verdict
+from fusion_gym.agents.papers.round_robin_tobit_theorems import Censoring, MatrixBound, matrix_below
+from fusion_gym.agents.papers.unknown_input_recursion import gains, models
+from fusion_gym.agents.papers.walk import SomeSensors
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation import run_episodes
+from fusion_gym.evaluation.intervals import Interval
+
+RECORDED = ("markov_jump", "tobit_token_bucket", "unknown_input", "round_robin_tobit")
+
+
+def record(paper: str) -> tuple[Task, str, NDArray[np.float64], NDArray[np.float64] | None]:
+    """A paper's task and policy, the squared errors (H, n, E) recorded of it, and the rates."""
+    if paper == "markov_jump":
+        task, policy = example(), trigger(0.9)
+        run = run_markov_jump(task, policy, 4, SEED)
+        return task, policy, run.squared, np.tile(run.sent.mean(0), (4, 1))
+    if paper == "tobit_token_bucket":
+        task, policy = runs.scheme(), runs.TRIGGER
+        history = runs.record_history(task, 4, SEED)
+        square = np.square(history.truth - history.mean)
+        return task, policy, square, history.granted.mean(0).T
+    if paper == "unknown_input":
+        task, policy = unknown_input.make_example()[0], "adaptive_threshold"
+        stored = unknown_input.record_run(task, policy, 4, SEED)
+        return task, policy, np.square(stored.errors[:, 0]), stored.granted.mean(0).T
+    task, policy = fusion_gym.make_task(biased.OSCILLATOR), "round_robin"
+    return task, policy, biased.squares(task, policy, 4, SEED).transpose(1, 2, 0), None
+
+
+@pytest.mark.parametrize("paper", RECORDED)
+def test_recorded_episodes_are_those_of_the_evaluation(paper: str) -> None:
+    task, policy, square, rate = record(paper)
+    results = run_episodes(task, fusion_gym.make_policy(policy, task), 4, SEED)
+    size = results.squared_error.shape[-1]
+    np.testing.assert_allclose(square[:, :size].mean(2), results.squared_error, rtol=1e-12)
+    if rate is not None:
+        np.testing.assert_array_equal(rate, results.rate)
+
+
+# --- the token bucket ---------------------------------------------------------------------------
+
+
+def test_a_wrong_gain_is_reported_from_the_best() -> None:
+    task = runs.scheme()
+    history = runs.record_history(task, 3, 0)
+    results = runs.terms(task, history)
+    least = results.bound(results.gain)
+    assert np.all(results.bound(1.01 * results.gain) > least)
+    assert np.all(results.bound(np.zeros_like(results.gain)) > least)
+    result = runs.perturbed(results, history, 0)
+    assert result["larger"] == pytest.approx(np.ones(3))
+    assert result["difference"].max() < 1e-9
+
+
+def test_a_bound_that_is_too_small_is_found() -> None:
+    rng = np.random.default_rng(0)
+    root = np.array([[2.0, 0.0], [1.0, 0.5]])
+    error = (root @ rng.normal(size=(2, 20_000)))[None]
+    bound = np.broadcast_to((root @ root.T)[None, :, :, None], (1, 2, 2, 20_000))
+    for factor in (0.5, 1.0, 2.0):
+        value, deviation = runs.claimed(error, factor * bound)
+        assert value[0] == pytest.approx(1.0 / factor, abs=5.0 * deviation[0] + 0.02 / factor)
+        assert 0.0 < deviation[0] < 0.03 / factor
+
+
+def test_verdicts_and_their_words() -> None:
+    assert verdict([True, True]) == "holds"
+    assert verdict([True, False]) == "holds partly"
+    assert verdict([False]) == "does not hold"
+    assert cite(Interval(0.7, 0.6991, 100.0)) == "0.700 [0.699, 100]"
+    assert percent((0.0, 0.4567, 0.9996, 1.0)) == "0 %, 46 %, 99.96 %, 100 %"
+    assert percent(0.0004) == "0.04 %"
+
+
+# --- the biased oscillator ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sensors", [{0}, {1}, {0, 1}])
+def test_some_sensors_transmit_as_in_the_whole_policy_and_the_others_never(
+    sensors: set[int],
+) -> None:
+    task = fusion_gym.make_task(biased.OSCILLATOR)
+    policy = SomeSensors(fusion_gym.make_policy("round_robin", task), sensors)
+    rate = run_episodes(task, policy, 2, 0).rate
+    np.testing.assert_allclose(rate, [[0.5 * (sensor in sensors) for sensor in range(2)]] * 2)
+
+
+def test_no_filter_is_below_the_floor() -> None:
+    """The floor is the Riccati equation's; uncensored, the Kalman filter has it."""
+    task = fusion_gym.make_task(biased.TRACKING)
+    system = biased.censored(task)
+    transition = system.plant.transition[..., 0]
+    covariance, process = system.plant.initial_covariance[..., 0], system.plant.process_covariance
+    roots = []
+    for step in range(task.horizon):
+        covariance = transition @ covariance @ transition.T + process[..., 0]
+        row = system.centre.sensors.measurement_matrix[step % 2, 0, :, 0]
+        gain = covariance @ row / (row @ covariance @ row + (0.1, 0.3)[step % 2])
+        covariance = covariance - np.outer(gain, row @ covariance)
+        roots.append(np.sqrt(np.diag(covariance)))
+    np.testing.assert_allclose(biased.floor(biased.TRACKING), np.mean(roots, axis=0), rtol=1e-9)
+    result = biased.armse(biased.squares(task, "round_robin", 400, SEED))
+    np.testing.assert_allclose(result["mean"], biased.floor(biased.TRACKING), rtol=0.08)
+    assert biased.floor(biased.OSCILLATOR)[2] > 0.5  # √Ξ
+    assert np.all(
+        np.less(biased.floor(biased.OSCILLATOR, access="any"), biased.floor(biased.OSCILLATOR))
+    )
+
+
+def test_intervals_of_the_armse_cover() -> None:
+    """Gaussian errors of deviation 2: the ARMSE is 2; 4.5 errors of 100 samples."""
+    rng, covered, spreads, visible = np.random.default_rng(3), 0, [], []
+    for _ in range(100):
+        result = biased.armse((2.0 * rng.normal(size=(400, 3, 1))) ** 2)
+        covered += result["low"][0] <= 2.0 <= result["high"][0]
+        spreads.append(result["spread"][0])
+        visible.append(result["mean"][0])
+    assert covered >= 95 - 4.5 * np.sqrt(100 * 0.95 * 0.05)
+    # Of 1,000 runs, where these have 400.
+    assert np.mean(spreads) == pytest.approx(np.std(visible) * np.sqrt(0.4), rel=4.5 / np.sqrt(200))
+
+
+def test_a_paired_increase_is_reported_from_none() -> None:
+    rng = np.random.default_rng(4)
+    errors = rng.normal(size=(300, 5, 3)) ** 2
+    values = biased.increase(errors, errors * np.array([1.0, 1.02, 0.98]))
+    assert values["low"][0] == values["high"][0] == 0.0
+    assert values["low"][1] > 0.0
+    assert values["high"][2] < 0.0
+
+
+def test_one_point_above_is_told_from_all_below() -> None:
+    error = np.full((100, 2), 1.0)
+    one_above = np.where(np.arange(100)[:, None] == 3, 5.0, -5.0) * error
+    assert biased.always_below(np.stack([one_above, error]))[0] == "holds partly"
+    assert biased.always_below(np.stack([5 * error, error]))[0] == "does not hold"
+    assert biased.explained([1.0, 3.0], [2.0, 3.0]) == pytest.approx([0.75, 0.0])
+
+
+@pytest.mark.parametrize("latent", [-6.0, -1.0, 0.2, 5.5])
+def test_printed_equations_are_as_printed(latent: float) -> None:
+    """Against plain normal distributions, for the oscillator's R = 0.6 and ±5."""
+    sensors = biased.censored(fusion_gym.make_task(biased.OSCILLATOR)).centre.sensors
+    mean = np.zeros((2, 3, 1))
+    mean[:, 0] = mean[:, 1] = latent
+    root = np.sqrt(0.6)
+
+    def printed(name: str) -> tuple[float, float]:
+        result = biased.PrintedTobitFilter(sensors, name).expect(mean)
+        return float(result.value[0, 0, 0]), float(result.truncated_variance[0, 0, 0])
+
+    for name, scale in (("theta", 0.6), ("sign", root), ("argument", root), ("variance", root)):
+        low, high = (-5 - latent) / scale, (5 - latent) / scale
+        inside = stats.norm.cdf(high) - stats.norm.cdf(low)
+        ratio = (stats.norm.pdf(high) - stats.norm.pdf(low)) / inside  # (14)
+        if name == "argument":
+            width = high - low
+            ratio = stats.norm.pdf(width) / stats.norm.sf(width)
+        sign = 1.0 if name in ("sign", "argument") else -1.0
+        value = -5 * stats.norm.cdf(low) + 5 * stats.norm.sf(high)
+        value += inside * (latent + sign * root * ratio)
+        assert printed(name)[0] == pytest.approx(value, rel=1e-6)
+    drawn = np.clip(latent + root * np.random.default_rng(0).normal(size=400_000), -5, 5)
+    assert 0.6 * printed("variance")[1] == pytest.approx(drawn.var(), rel=0.03)
+
+
+def test_readings_are_run() -> None:
+    """Each is another filter or another system; the first is the environment's own."""
+    errors = {}
+    for reading in biased.ROUND_ROBIN_READINGS:
+        task = biased.reading_task(reading)
+        name = "always" if task.access == "any" else "round_robin"
+        errors[reading] = biased.squares(task, name, 3, 0).mean()
+    assert len(set(errors.values())) == len(biased.ROUND_ROBIN_READINGS)
+    own = fusion_gym.make_task(biased.OSCILLATOR)
+    assert errors["corrected equations"] == biased.squares(own, "round_robin", 3, 0).mean()
+
+
+def test_bounds_of_a_filter_that_is_never_censored() -> None:
+    """With ᾱ = β̄ = 0 the upper bound in its own correction is the Riccati equation itself."""
+    task = fusion_gym.make_task(biased.TRACKING)
+    system = biased.censored(task)
+    covariance = system.plant.initial_covariance.copy()
+    upper = MatrixBound(task, 0, 1.0, True, (-1.0, True))
+    lower = MatrixBound(task, 0, 1.0, False, (False, False))
+    observed = Censoring(np.zeros(1), np.ones(1), np.zeros(1))
+    upper.begin(covariance)
+    lower.begin(covariance)
+    transition, process = system.plant.transition[..., 0], system.plant.process_covariance[..., 0]
+    for step in range(6):
+        plain = covariance[..., 0]
+        if step % 2 == 0:
+            gain = plain[:, 0] / (plain[0, 0] + 0.1)
+            plain = plain - np.outer(gain, plain[0])
+        upper.advance(covariance, observed, step % 2 == 0)
+        lower.advance(covariance, observed, step % 2 == 0)
+        covariance = (transition @ plain @ transition.T + process)[..., None]
+        np.testing.assert_allclose(upper.value, covariance, rtol=1e-9)
+        np.testing.assert_allclose(lower.value[..., 0], process, atol=1e-12)
+        assert upper.holds(covariance).all()
+        assert lower.holds(covariance).all()
+        assert not upper.holds(1.001 * covariance).any()
+        other = replace(lower)
+        other.value = 1.001 * covariance
+        assert not other.holds(covariance).any()
+
+
+def test_matrices_are_ordered_by_their_eigenvalues() -> None:
+    rng = np.random.default_rng(0)
+    first, gap = rng.normal(size=(2, 40, 3, 3))
+    first, gap = first @ first.transpose(0, 2, 1), gap + gap.transpose(0, 2, 1)
+    value = matrix_below(
+        np.moveaxis(first, 0, -1), np.moveaxis(first + gap + 1.5 * np.eye(3), 0, -1)
+    )
+    expected = np.linalg.eigvalsh(gap + 1.5 * np.eye(3))[:, 0] >= 0
+    assert 0 < expected.sum() < 40
+    np.testing.assert_array_equal(value, expected)
+    assert not matrix_below(np.eye(3)[..., None], np.full((3, 3, 1), np.nan)).any()
+
+
+# --- the Markov jump system ---------------------------------------------------------------------
+
+
+def test_the_trigger_is_a_schedule_that_no_seed_changes() -> None:
+    task = example(horizon=30)
+    for m in (0.9, 1.3):
+        first, second = (run_markov_jump(task, trigger(m), 2, seed) for seed in (0, 99))
+        np.testing.assert_array_equal(first.sent, second.sent)
+        np.testing.assert_array_equal(first.trace, second.trace)
+
+
+def test_printed_recursion_is_exact_where_its_third_term_is_put_right() -> None:
+    task = example(horizon=20)
+    system = task.system
+    everything = np.ones((20, 3), dtype=bool)
+    place = system.filters.at(np.arange(21))  # type: ignore[attr-defined]
+    exact = system.recursion.local[..., place]  # type: ignore[attr-defined]
+    exact = exact.transpose(4, 0, 2, 1, 3).reshape(21, 6, 6)
+    np.testing.assert_allclose(covariances(system, everything, False), exact, atol=1e-13)
+    assert np.abs(covariances(system, everything, True) - exact).max() > 1e-3
+    silent = run_markov_jump(task, trigger(0.9), 1, 0).sent
+    printed = covariances(system, silent, False)
+    np.testing.assert_allclose(printed, printed.transpose(0, 2, 1), atol=1e-13)
+    assert np.linalg.eigvalsh(printed).min() < -1.0
+
+
+@pytest.mark.parametrize("period", [1, 4, 6])
+def test_period_is_found(period: int) -> None:
+    pattern = np.random.default_rng(0).normal(size=period)
+    values = np.resize(pattern, 300)
+    start = np.exp(-np.arange(300.0))
+    assert period_of(values + start) == period
+    assert period_of(values + 1e-3 * np.arange(300)) is None
+
+
+# --- adaptive innovation, unknown input ----------------------------------------------------------
+
+
+def test_a_bound_is_reported_from_what_is_none() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(3, 3))
+    claimed = root @ root.T + np.eye(3)
+    direction = rng.normal(size=3)
+    more = claimed + 0.3 * np.outer(direction, direction)
+    ratio = 1.0 + 0.3 * direction @ np.linalg.solve(claimed, direction)
+    both = np.stack((0.7 * claimed, more), axis=-1)
+    values = _largest(both, np.stack((claimed, claimed), axis=-1))
+    assert values == pytest.approx([0.7, ratio])
+
+
+def test_whitened_errors_sum_to_the_normalised_square() -> None:
+    rng = np.random.default_rng(1)
+    root, error = rng.normal(size=(3, 3)), rng.normal(size=(3, 1))
+    claimed = root @ root.T + np.eye(3)
+    square = _whitened(error, claimed[..., None])
+    assert np.trace(square[..., 0]) == pytest.approx(
+        float(error[:, 0] @ np.linalg.solve(claimed, error[:, 0]))
+    )
+
+
+def test_errors_of_the_bound_itself_fill_it() -> None:
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(2, 2, 40))
+    bounds = np.einsum("ijh,kjh->ikh", roots, roots) + np.eye(2)[..., None]
+    draws = rng.standard_normal((40, 2, 2000))
+    errors = np.linalg.cholesky(np.moveaxis(bounds, -1, 0)) @ draws
+    # 80,000 squares of standard normals have a mean within 0.03 of 1, the larger of two too.
+    assert unknown_input.leading(errors, bounds).mean() == pytest.approx(1.0, abs=0.03)
+    assert unknown_input.leading(0.5 * errors, bounds).mean() == pytest.approx(0.25, abs=0.01)
+
+
+def test_no_gain_that_hides_the_input_has_a_smaller_bound() -> None:
+    """(18) under random gains that meet (14), against the best one and the printed one."""
+    _, system = unknown_input.make_example(example=unknown_input.CARTS, filter="paper")
+    model = models(system, 0.2, 0.09)[0]
+    values = gains(model, model.covariance[None], np.array([False]), 0.5)
+    a, b, c = model.transition, model.inputs, model.matrix
+    phi = 1.2 * a @ model.covariance @ a.T + model.process
+    noise = model.noise + 6.0 * 0.09 * np.eye(2)
+    free = np.linalg.svd(c @ b)[0][:, 1:]
+
+    def trace(gain: np.ndarray) -> float:
+        retention = np.eye(4) - gain @ c
+        return float(np.trace(retention @ phi @ retention.T + gain @ noise @ gain.T))
+
+    best = values["best"][0]
+    assert trace(best) == pytest.approx(float(np.trace(values["best_bound"][0])))
+    assert best @ c @ b == pytest.approx(b)
+    assert values["gain"][0] @ c @ b == pytest.approx(b)
+    rng = np.random.default_rng(1)
+    for _ in range(200):
+        other = best + 0.3 * rng.normal(size=(4, 1)) @ free.T
+        assert trace(other) >= trace(best)
+    assert trace(values["gain"][0]) > trace(best)
