@@ -155,7 +155,7 @@ def test_a_fresh_demo_removes_nothing_but_a_demo(here: Path) -> None:
     (here / "local" / "agent" / "config.yaml").rename(here / "local" / "notes")
     ended = call("demo", ["--fresh", "--output", "."])
     assert (ended.status, ended.trace) == (1, "")
-    assert "fresh = True is not allowed: 'alone' holds no results of a demo" in ended.err
+    assert "fresh = True is not allowed: 'local' holds no results of a demo" in ended.err
     assert (here / "local" / "notes").exists()
     assert (here / "scheduler" / "agent" / "config.yaml").exists()
 

@@ -133,7 +133,8 @@ def use(programs: Path, folder: Path) -> None:
     quick = ("--episodes", "2", "--timesteps", "8192")
     call(program, "demo", *quick, "--output", "demo", cwd=folder)
     assert (folder / "demo" / "scheduler" / "front.png").exists()
-    table = call(program, "table", "--episodes", "2", "--markdown", cwd=folder).stdout
+    maintenance = (python, "-m", "fusion_gym.agents.maintenance")
+    table = call(*maintenance, "table", "--episodes", "2", "--markdown", cwd=folder).stdout
     assert table.startswith("| setting |"), table
     small_suite(folder, training_seeds=1, classes=["sensors"])
     suite = ("--config", "suite.yaml", "--results", "results", "--work", "work", "--workers", "1")
@@ -141,7 +142,7 @@ def use(programs: Path, folder: Path) -> None:
     again = call(program, "benchmark", *suite, cwd=folder, status=1).stderr
     assert "--resume" in again.splitlines()[-1], again
     assert "`fusion-gym benchmark`" in (folder / "results" / "README.md").read_text()
-    call(program, "zoo", "--work", "work", "--zoo", "zoo", cwd=folder)
+    call(*maintenance, "zoo", "--work", "work", "--zoo", "zoo", cwd=folder)
     assert (folder / "zoo" / "small_sensors.zip").exists()
 
 
