@@ -1,5 +1,6 @@
 """The token bucket against a scalar loop, its properties, and what it refuses."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fusion_gym import ConfigurationError
+from fusion_gym import ConfigurationError, make_task
 from fusion_gym.core.token_bucket import SHARING_RULES, TokenBucket
 
 PAPER = {"rate": 5.0, "capacity": 30.0, "initial": 10.0, "cost": 3.0, "sensors": 3}
@@ -117,6 +118,33 @@ def test_turns_favour_nobody_who_requests_alike(bucket: TokenBucket, seed: int, 
         grants.append(answer.granted[:2, 0])
     ahead = np.cumsum([0, *(int(a) - int(b) for a, b in grants)])
     assert ahead.max() - ahead.min() <= 1
+
+
+@given(sensors=st.integers(2, 6), cost=st.integers(1, 12), rate=st.integers(1, 12))
+@settings(max_examples=200, deadline=None)
+def test_round_robin_access_resonates_where_grants_differ(
+    sensors: int, cost: int, rate: int
+) -> None:
+    bucket = TokenBucket.create(rate / 8, 3 * cost / 8 + sensors * cost, 0.0, cost / 8, sensors)
+    bucket = dataclasses.replace(bucket, sharing="fixed")
+    tokens, grants, rounds = bucket.start(1), np.zeros(sensors), 40 * cost
+    for step in range(rounds * sensors):
+        request = (np.arange(sensors) == step % sensors)[:, None]
+        granted, _, tokens, _ = bucket.grant(tokens, request, np.full(1, step))
+        grants += granted[:, 0] * (step >= rounds * sensors // 2)
+    assert bucket.resonates == (np.ptp(grants) > 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"token_capacity": 8.0, "initial_tokens": 1.0, "sharing": "turns"}, "below 9, the cost"),
+        ({"access": "round_robin", "token_rate": 1.0}, "some of the 3 sensors more often"),
+    ],
+)
+def test_a_bucket_that_favours_sensors_is_warned_of(options: dict[str, Any], message: str) -> None:
+    with pytest.warns(UserWarning, match=message):
+        make_task("fusion_gym/TobitOscillator-v0", **options)
 
 
 @given(

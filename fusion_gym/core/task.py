@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import warnings
 from dataclasses import asdict, dataclass, field
 from typing import Any, get_args
 
@@ -182,10 +183,13 @@ class Task:
 def make_bucket(options: CommonOptions, sensors: int) -> TokenBucket:
     """The token bucket of the options.
 
+    Warns:
+        UserWarning: it favours some sensors, or never pays for a packet of each.
+
     Raises:
         ConfigurationError: a value that is not allowed.
     """
-    return TokenBucket.create(
+    bucket = TokenBucket.create(
         rate=options.token_rate,
         capacity=options.token_capacity,
         initial=options.initial_tokens,
@@ -194,3 +198,18 @@ def make_bucket(options: CommonOptions, sensors: int) -> TokenBucket:
         sharing=options.sharing,
         unlimited=options.tokens == "unlimited",
     )
+    whole = float(bucket.cost.sum())
+    if not bucket.unlimited and bucket.capacity < whole:
+        warnings.warn(
+            f"token_capacity = {bucket.capacity:g} is below {whole:g}, the cost of a packet of "
+            f"each of the {sensors} sensors: they never transmit together",
+            stacklevel=2,
+        )
+    if options.access == "round_robin" and bucket.resonates:
+        warnings.warn(
+            f"token_rate = {bucket.rate:g} and token_cost = {bucket.cost.max():g} with "
+            f"access='round_robin' grant some of the {sensors} sensors more often than others "
+            "where all request; access='any' with sharing='turns' does not",
+            stacklevel=2,
+        )
+    return bucket

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import NamedTuple, get_args
 
 import numpy as np
@@ -105,6 +107,19 @@ class TokenBucket:
             sharing=rule,
             unlimited=validation.boolean("unlimited", unlimited),
         )
+
+    @property
+    def resonates(self) -> bool:
+        """Whether round-robin access grants some sensors more often than others if all request.
+
+        A packet is paid for every p/q steps, in lowest terms. With d = gcd(p, sensors) the grants
+        fall on q of d groups of sensors in turn, evenly where d divides q.
+        """
+        costs = np.unique(self.cost)
+        if self.unlimited or len(costs) > 1 or not 0.0 < self.rate < costs[0]:
+            return False
+        steps = Fraction(float(costs[0]) / self.rate).limit_denominator(1000)
+        return steps.denominator % math.gcd(steps.numerator, len(self.cost)) != 0
 
     def start(self, num_envs: int) -> Array:
         """Tokens at the start of an episode, shape (num_envs,)."""
