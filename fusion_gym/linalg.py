@@ -102,7 +102,7 @@ def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _by_lane(function: Callable[..., FloatArray], *matrices: FloatArray) -> FloatArray:
-    """Apply a function of stacks ``(..., lanes, n, m)``, which takes each lane by itself."""
+    """Apply a function of stacks ``(..., lanes, n, m)``, which takes the lanes one by one."""
     lanes = max(matrix.shape[-1] for matrix in matrices)
     parts = []
     for first in range(0, lanes, _CHUNK):

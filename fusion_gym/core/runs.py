@@ -66,7 +66,7 @@ class Runs:
 
     ``state`` is the system's after sensing, ``delivered`` its state after the last delivery,
     for metrics and figures; ``memory`` moves along beside them; ``tokens``, ``price`` of a token
-    and ``steps`` taken are (N,); ``queue`` (sensors, N) is that of the token bucket.
+    and ``steps`` taken are (N,); ``queue`` (sensors, N) is the token bucket's.
     """
 
     state: Any

@@ -138,7 +138,7 @@ class TokenBucket:
     ) -> Grants:
         """Answer the requests (sensors, N) with the tokens (N,).
 
-        ``step`` (N,) turns the order of ``"rotating"``, ``queue`` (sensors, N) is that of
+        ``step`` (N,) turns the order of ``"rotating"``, ``queue`` (sensors, N) is the order of
         ``"turns"``; by default sensor 0 is first.
 
         Source: tobit_token_bucket, equations (16)-(18).
