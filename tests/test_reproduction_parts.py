@@ -152,7 +152,6 @@ def test_one_point_above_is_told_from_all_below() -> None:
     one_above = np.where(np.arange(100)[:, None] == 3, 5.0, -5.0) * error
     assert biased.always_below(np.stack([one_above, error]))[0] == "holds partly"
     assert biased.always_below(np.stack([5 * error, error]))[0] == "does not hold"
-    assert biased.explained([1.0, 3.0], [2.0, 3.0]) == pytest.approx([0.75, 0.0])
 
 
 @pytest.mark.parametrize("latent", [-6.0, -1.0, 0.2, 5.5])
@@ -268,7 +267,7 @@ def test_period_is_found(period: int) -> None:
     values = np.resize(pattern, 300)
     start = np.exp(-np.arange(300.0))
     assert period_of(values + start) == period
-    assert period_of(values + 1e-3 * np.arange(300)) is None
+    assert period_of(values + 1e-3 * np.arange(300)) == 0
 
 
 # --- adaptive innovation, unknown input ----------------------------------------------------------
