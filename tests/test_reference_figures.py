@@ -340,11 +340,9 @@ def misinformed_task(factor: float, **options: Any) -> Task:
     task = make_task(filter="tobit", **options)
     centre = task.system.centre
     sensors = centre.sensors
+    matrix, variance, threshold = sensors.measurement_matrix, sensors.variance, sensors.threshold
     believed = CensoredSensors.create(
-        sensors.measurement_matrix[..., 0],
-        factor * sensors.variance[..., 0],
-        sensors.threshold[..., 0],
-        2,
+        matrix[..., 0], factor * variance[..., 0], threshold[..., 0], 2
     )
     node_filter = WronglyInformed(sensors, TobitKalmanFilter(believed))
     centre = dataclasses.replace(centre, filter=node_filter)
