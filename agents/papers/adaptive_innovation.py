@@ -19,7 +19,7 @@ from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
 
 from ..output import palette
 from .adaptive_innovation_runs import ELLIPSES, SENSORS, STEPS, Ask, ErrorRecord, Lane, steps, top
-from .drawing import legend, set_ticks
+from .drawing import legend, set_ticks, stack
 from .numbers import Number, grid
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_of
 
@@ -310,7 +310,7 @@ _SUM = "sum over states (SI units)"
 
 def _draw_thresholds(figure: Any, data: Data) -> None:
     time, requested = _TIME[WINDOW], data["requested"].astype(bool)[WINDOW]
-    axes = figure.subplots(len(SENSORS), 1, sharex=True, sharey=True)
+    axes = stack(figure, len(SENSORS), "step k", sharey=True)
     for i, (axis, name) in enumerate(zip(axes, SENSORS, strict=True)):
         colour, requests = palette.SENSORS[i], requested[:, i]
         axis.step(time, data["levels"][WINDOW, i], where="mid", color=colour, lw=1.6)
@@ -318,13 +318,12 @@ def _draw_thresholds(figure: Any, data: Data) -> None:
         axis.set_title(f"({'abc'[i]}) {name}", loc="left", color=colour)
         axis.set_ylim(0.0, 1.02 * data["ceiling"] or 1.0)
         axis.set_ylabel("θ (m²)" if i == 0 else "θ (m²/s²)" if i == 1 else "θ (m²/s⁴)")
-    axes[-1].set_xlabel("step k")
     axes[-1].set_xlim(time[0], time[-1])
 
 
 def _draw_tracking(figure: Any, data: Data) -> None:
     lanes = _Lanes(data)
-    axes = figure.subplots(3, 1, sharex=True)
+    axes = stack(figure, 3, "step k")
     for state, axis in enumerate(axes):
         truth = lanes("sci", "truth", AT_BOUND)[:, state]
         axis.plot(_TIME, truth, color=palette.TRUTH, lw=3.0, label="true value")
@@ -335,14 +334,13 @@ def _draw_tracking(figure: Any, data: Data) -> None:
             )  # fmt: skip
         axis.set_title(f"({'abc'[state]}) {STATES[state]}", loc="left")
         axis.set_ylabel(f"$x_{state + 1}$ ({UNITS[state]})")
-    axes[-1].set_xlabel("step k")
     axes[-1].set_xlim(0, STEPS)
     legend(figure, axes[0], 3)
 
 
 def _draw_traces(figure: Any, data: Data) -> None:
     lanes = _Lanes(data)
-    axes = figure.subplots(2, 1, sharex=True, sharey=True)
+    axes = stack(figure, 2, "step k", sharey=True)
     for place, (fusion, axis) in enumerate(zip(FUSIONS, axes, strict=True)):
         for name, colour, label in (
             ("conservative", palette.BLACK, "trace of conservative variance"),
@@ -357,16 +355,14 @@ def _draw_traces(figure: Any, data: Data) -> None:
         axis.legend(loc="upper right", ncols=3, fontsize=9, columnspacing=1.0)
         axis.set_ylim(0.2, 4.0)
         set_ticks(axis, [0.2, 0.3, 0.5, 1.0, 2.0, 4.0])
-    axes[-1].set_xlabel("step k")
     axes[-1].set_xlim(0, STEPS)
 
 
 def _draw_comparison(figure: Any, data: Data) -> None:
-    axis = figure.subplots()
+    (axis,) = stack(figure, 1, "step k")
     for fusion in FUSIONS:
         mse = _Lanes(data)(fusion, "mse_steps", AT_BOUND)[_LATE]
         axis.plot(_TIME[_LATE], mse, color=_COLOURS[fusion], lw=1.8, label=NAMES[fusion])
-    axis.set_xlabel("step k")
     axis.set_ylabel(f"MSE, {_SUM}")
     axis.set_xlim(_TIME[_LATE][0], STEPS)
     axis.set_ylim(bottom=0.0)

@@ -17,7 +17,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingOptions
 
 from ..output.palette import BLACK, BLUE, GREEN, ORANGE, PURPLE, SENSORS, SKY, TRUTH, VERMILLION
-from .drawing import legend_of
+from .drawing import legend_of, stack
 from .markov_jump_covariances import covariances
 from .numbers import Number, below, grid
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_list
@@ -337,7 +337,7 @@ def _draw_instants(figure: Any, data: Data) -> None:
     """A panel a threshold, without m = 0 unless it stands alone."""
     lanes = list(zip(data["labels"], data["sent"].astype(bool)[:, :_INSTANTS], strict=True))
     lanes = [lane for lane in lanes if lane[0] != "m = 0"] or lanes
-    axes = figure.subplots(len(lanes), 1, sharex=True, squeeze=False)[:, 0]
+    axes = stack(figure, len(lanes), _TIME)
     for place, (axis, (label, sent)) in enumerate(zip(axes, lanes, strict=True)):
         time, count = np.arange(1, len(sent) + 1), sent.shape[-1]
         for sensor in range(count):
@@ -356,39 +356,35 @@ def _draw_instants(figure: Any, data: Data) -> None:
         axis.set_ylim(-0.5, _LANE * count - 0.2)
         axis.set_title(f"({chr(ord('a') + place)}) {label}", loc="left")
     axes[len(lanes) // 2].set_ylabel("received (1) or not (0)")
-    axes[-1].set_xlabel(_TIME)
 
 
 def _draw_tracking(figure: Any, data: Data) -> None:
-    axes = figure.subplots(len(STATES), 1, sharex=True)
+    axes = stack(figure, len(STATES), _TIME)
     truth = data["truth"]
     time = np.arange(1, len(truth) + 1)
     for state, axis in enumerate(axes):
         handles = axis.plot(time, truth[:, state], color=TRUTH, lw=1.8, label="state")
         handles += _curves(axis, data, data["means"][..., state])
         _title(axis, state, STATES[state])
-    axes[-1].set_xlabel(_TIME)
     legend_of(figure, handles, len(handles), 1.8)
 
 
 def _draw_errors(figure: Any, data: Data) -> None:
     """RMSE over as many runs as in the paper, and over all."""
-    axes = figure.subplots(len(STATES), 1, sharex=True)
+    axes = stack(figure, len(STATES), _TIME)
     for state, axis in enumerate(axes):
         _curves(axis, data, data["few"][..., state], width=0.7, alpha=0.55)
         handles = _curves(axis, data, data["every"][..., state], width=2.0)
         axis.set_ylim(bottom=0.0)
         _title(axis, state, f"RMSE of {STATES[state]}")
-    axes[-1].set_xlabel(_TIME)
     legend_of(figure, handles, len(handles), 1.8)
 
 
 def _draw_traces(figure: Any, data: Data) -> None:
-    axis = figure.subplots()
+    (axis,) = stack(figure, 1, _TIME)
     handles = _curves(axis, data, data["trace"][:, :_SHOWN], width=1.8)
     axis.set_ylabel("trace of $P_0$ (m² and m²/s²)")
     axis.set_ylim(bottom=0.0)
-    axis.set_xlabel(_TIME)
     legend_of(figure, handles, len(handles), 1.8)
 
 

@@ -21,7 +21,7 @@ from fusion_gym.policies.registry import make_policy
 from ..output import palette
 from . import round_robin_tobit_runs as runs
 from . import round_robin_tobit_theorems as theorems
-from .drawing import legend
+from .drawing import legend, stack
 from .numbers import Number
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_of
 from .walk import SomeSensors
@@ -372,7 +372,7 @@ def _draw_curves(
     step: str = _STEP,
 ) -> None:
     """Panels one over another over a common time, each with the name of its axis and a state."""
-    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    axes = stack(figure, len(panels), step)
     for axis, (label, state) in zip(axes, panels, strict=True):
         for name in names:
             line, colour, style, width = _STYLES[name]
@@ -385,13 +385,12 @@ def _draw_curves(
         axis.margins(x=0.01)
         if kind == "rmse":
             axis.set_ylim(bottom=0.0)
-    axes[-1].set_xlabel(step)
     legend(figure, axes, 4, "lower")
 
 
 def _draw_measurements(figure: Any, data: Data) -> None:
     whole, clipped, limit = data["held_whole"], data["held_clipped"], data["interval"]
-    axes = figure.subplots(whole.shape[1], 1, sharex=True)
+    axes = stack(figure, whole.shape[1], _STEP)
     steps = np.arange(1, len(whole) + 1)
     for number, axis in enumerate(axes):
         for values, colour, width, label in (
@@ -405,7 +404,6 @@ def _draw_measurements(figure: Any, data: Data) -> None:
             axis.axhline(side, color=palette.INK, linewidth=0.8, linestyle="--")
         axis.set_ylabel(f"measurement\nof x{number + 1} (sensor {number + 1})")
         axis.margins(x=0.01)
-    axes[-1].set_xlabel(_STEP)
     legend(figure, axes, 4, "lower")
 
 

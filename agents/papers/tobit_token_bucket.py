@@ -17,7 +17,7 @@ from fusion_gym.policies.registry import make_policy
 from ..output.palette import FUSED, INK, MEASURED, TRUTH
 from ..output.palette import SENSORS as COLOURS
 from . import tobit_token_bucket_runs as runs
-from .drawing import legend_of
+from .drawing import legend_of, stack
 from .numbers import below, grid
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
 from .tobit_token_bucket_runs import SENSORS, TRIGGER, History, record_history, scheme
@@ -271,7 +271,7 @@ _TIME = "time t (steps)"
 def _draw_tokens(figure: Any, data: Data) -> None:
     level, requested, granted = (data[name] for name in ("level", "requested", "granted"))
     requested, granted = requested.astype(bool), granted.astype(bool)
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+    upper, lower = stack(figure, 2, _TIME, height_ratios=(2, 1))
     upper.step(np.arange(len(level)), level, where="post", color=INK, lw=1.6)
     least = upper.axhline(
         data["needed"], color=MEASURED, lw=1.6, ls="--", label="needed for a grant"
@@ -294,7 +294,6 @@ def _draw_tokens(figure: Any, data: Data) -> None:
     lower.set_yticks(range(1, SENSORS + 1), _NODE_NAMES[::-1])
     lower.set_ylim(0.4, SENSORS + 0.6)
     lower.grid(axis="y", visible=False)
-    lower.set_xlabel(_TIME)
     (line,) = upper.plot([], [], color=INK, lw=1.6, label="tokens")
     legend_of(figure, [line, least, sent, refused], 4)
 
@@ -302,7 +301,7 @@ def _draw_tokens(figure: Any, data: Data) -> None:
 def _draw_measurements(figure: Any, data: Data, component: int) -> None:
     """A panel a node."""
     measured, held = (data[name][..., component] for name in ("measured", "held"))
-    axes = figure.subplots(SENSORS, 1, sharex=True, sharey=True)
+    axes = stack(figure, SENSORS, _TIME, sharey=True)
     time = np.arange(1, len(measured) + 1)
     for sensor, axis in enumerate(axes):
         (before,) = axis.plot(
@@ -312,7 +311,6 @@ def _draw_measurements(figure: Any, data: Data, component: int) -> None:
         axis.step(time, held[:, sensor], where="post", color=COLOURS[sensor], lw=1.7)
         axis.set_ylabel(_NODE_NAMES[sensor])
     figure.supylabel(f"component {component + 1} of the measurement (no unit)", fontsize=11)
-    axes[-1].set_xlabel(_TIME)
     label = "after: held by the filter, " + r"$\bar{y}$"
     (after,) = axes[0].plot([], [], color=INK, lw=1.7, label=label)
     legend_of(figure, [before, after], 1)
@@ -321,7 +319,7 @@ def _draw_measurements(figure: Any, data: Data, component: int) -> None:
 def _draw_states(figure: Any, data: Data, sensor: int) -> None:
     """A panel a state."""
     truth, local, fused = data["truth"], data["local"][:, sensor], data["fused"]
-    axes = figure.subplots(truth.shape[1], 1, sharex=True)
+    axes = stack(figure, truth.shape[1], _TIME)
     time = np.arange(1, len(truth) + 1)
     for state, axis in enumerate(axes):
         handles = [
@@ -336,14 +334,13 @@ def _draw_states(figure: Any, data: Data, sensor: int) -> None:
         axis.axhspan(low, 0.0, color=_CENSORED, lw=0)
         axis.set_ylim(low, high)
         axis.set_ylabel(f"$x_{state + 1}$ (no unit)")
-    axes[-1].set_xlabel(_TIME)
     handles.append(Patch(color=_CENSORED, lw=0, label="censored"))
     legend_of(figure, handles, 4)
 
 
 def _draw_errors(figure: Any, data: Data, sensor: int) -> None:
     """The logarithm of squared errors and of the traces of the bounds, of a run and the mean."""
-    axes = figure.subplots(2, 1, sharex=True)
+    axes = stack(figure, 2, _TIME)
     own, dashes = COLOURS[sensor], (0, (2.5, 0.8))
     kinds = (("one", "one episode"), ("mean", "mean over all episodes"))
     for axis, (kind, title) in zip(axes, kinds, strict=True):
@@ -364,7 +361,6 @@ def _draw_errors(figure: Any, data: Data, sensor: int) -> None:
         ]
         axis.set_title(title, loc="left")
         axis.set_ylabel("lg (no unit)")
-    axes[-1].set_xlabel(_TIME)
     legend_of(figure, handles, 2)
 
 
