@@ -18,13 +18,7 @@ from fusion_gym.systems.tobit.tobit_filter import expect_censored
 from . import round_robin_tobit_runs as measures
 from .numbers import Number
 from .paper import Data, Settings
-from .round_robin_tobit_runs import (
-    FREE,
-    OSCILLATOR,
-    TRACKING,
-    PrintedTobitFilter,
-    censored,
-)
+from .round_robin_tobit_runs import FREE, OSCILLATOR, TRACKING, PrintedTobitFilter, censored
 from .walk import SomeSensors, walk_in_parts
 
 PLACES = (-7.0, -5.0, -4.0, 0.0, 4.5, 5.0, 6.0)  # true x1 at which Lemma 1 is tried
@@ -75,12 +69,8 @@ def _lemma(episodes: int, seed: int) -> dict[str, Any]:
     truth = np.zeros((3, len(places)))
     truth[0] = places
     noise = np.random.default_rng(seed).standard_normal((sensors.noise_channels, draws))
-    drawn = np.stack(
-        [
-            sensors.measure(np.repeat(truth[:, [i]], draws, axis=1), noise)[0, 0]
-            for i in range(len(places))
-        ]
-    )
+    repeated = (np.repeat(truth[:, [i]], draws, axis=1) for i in range(len(places)))
+    drawn = np.stack([sensors.measure(state, noise)[0, 0] for state in repeated])
     spread = drawn.var(1, ddof=1)
     fourth = ((drawn - drawn.mean(1, keepdims=True)) ** 4).mean(1)
     means = np.broadcast_to(truth, (sensors.count, *truth.shape))
@@ -131,19 +121,11 @@ def _errors(env: str, episodes: int, seed: int) -> dict[str, Any]:
 
 def _fusion(episodes: int, seed: int) -> dict[str, Any]:
     """How far the fused estimate moves with the shares ε, and with B = 0 with the bias."""
-    means = []
-    for shares in SHARES:
-        task = fusion_gym.make_task(OSCILLATOR, information_shares=list(shares))
-        means.append(_means(task, episodes, seed))
-    without = [
-        _means(
-            fusion_gym.make_task(
-                OSCILLATOR, access="any", bias_gain=[[0.0], [0.0]], bias_aware=aware
-            ),
-            episodes, seed, "always",
-        )[..., :2, :]
-        for aware in (True, False)
-    ]  # fmt: skip
+    split = [fusion_gym.make_task(OSCILLATOR, information_shares=[*each]) for each in SHARES]
+    means = [_means(task, episodes, seed) for task in split]
+    no_bias: dict[str, Any] = {"access": "any", "bias_gain": [[0.0], [0.0]]}
+    tasks = [fusion_gym.make_task(OSCILLATOR, bias_aware=own, **no_bias) for own in (True, False)]
+    without = [_means(task, episodes, seed, "always")[..., :2, :] for task in tasks]
     return {
         "shares_gap": float(max(np.abs(other - means[0]).max() for other in means[1:])),
         "without_gap": float(np.abs(without[0] - without[1]).max()),
@@ -389,13 +371,9 @@ def _summarise_bound(data: Data, bound: str) -> Data:
     by: dict[str, list[float]] = {}
     for reading in UPPER if bound.endswith("upper") else LOWER:
         for example in EXAMPLES:
-            start = f"{example}:{bound}/{reading}"
-            shares = [
-                float(sample.mean())
-                for key, sample in data.items()
-                if key == start or key.startswith(f"{start}/")
-            ]
-            by.setdefault(reading, []).append(max(shares))
+            start = f"{example}:{bound}/{reading}/"
+            shares = [data[key].mean() for key in data if f"{key}/".startswith(start)]
+            by.setdefault(reading, []).append(float(max(shares)))
     best = min(by, key=lambda reading: sum(by[reading]))
     return {
         "printed": by["as printed"], "readings": len(by), "best": best, "shares": by[best],

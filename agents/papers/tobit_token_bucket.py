@@ -189,12 +189,8 @@ def simulate_bucket_theorems(episodes: int, seed: int, settings: Settings) -> Da
     windows, traces = (
         values.reshape(-1, _WINDOW, few).mean(1) for values in (long.fused_error, long.fused_trace)
     )
-    failed = [
-        record_history(
-            task, episodes, seed, SomeSensors(make_policy(TRIGGER, task), {*_NODES} - {m})
-        )
-        for m in _NODES
-    ]
+    others = [SomeSensors(make_policy(TRIGGER, task), {*_NODES} - {m}) for m in _NODES]
+    failed = [record_history(task, episodes, seed, policy) for policy in others]
     silent = record_history(task, episodes, seed, "never")
     gains = runs.perturbed(parts, recorded, seed)
     return {

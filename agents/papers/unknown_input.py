@@ -182,11 +182,7 @@ def _under_the_trigger(system: UnknownInputSystem, rule: AdaptiveThreshold, reco
         "each": halves((errors**2).mean(0), n, 1), "filled": np.array(filled),
         "power": halves((record.truth**2).mean(0), n, 0), "steady": np.array(steady),
         "within": float((record.square <= high)[silent].mean()),
-        "rho_range": [
-            float(np.diff(rho, axis=0).min()),
-            float((rho / low).min()),
-            float((rho / high).max()),
-        ],
+        "rho_range": [np.diff(rho, axis=0).min(), (rho / low).min(), (rho / high).max()],
         "settled": (rho < 0.99 * limit).sum(0).max(0).astype(float), "radius": nodes.tables.radius,
     }  # fmt: skip
 
