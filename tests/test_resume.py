@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from training_configs import small_config
+from training_configs import ENV, read_records, small_config
 
 from fusion_gym.agents.training import run
 from fusion_gym.agents.training.algorithms import TABLE
@@ -21,6 +21,7 @@ from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
+PRICED = {"cost_weight": "random", "price_range": [0.01, 0.1]}
 
 
 class Killed(BaseException):
@@ -34,7 +35,7 @@ def experiment_of(folder: Path, kind: str, price: str = "fixed", **training: Any
     content["training"] |= {"timesteps": 1024, **training}
     content["validation"] = {"every": 256, "episodes": 2}
     if price == "drawn":
-        content["environment"]["options"] |= {"cost_weight": "random", "price_range": [0.01, 0.1]}
+        content["environment"]["options"] |= PRICED
         content["training"]["price_exponent"] = 0.5
     path.write_text(yaml.safe_dump(content))
     return load_checked(Experiment, path)
@@ -194,6 +195,9 @@ def test_a_finished_training_is_not_repeated_and_its_files_are_mended(tmp_path: 
     folder = Path(experiment.output)
     summary = run.train(experiment, quiet=True)
     expected = outcome(folder, "ppo")
+    returns = [record["return"] for record in read_records(folder)]
+    assert max(returns) == summary["best_validation"]["return"]
+    assert list((folder / "tensorboard").glob("events*"))
     for name in ("best_model.zip", "final_model.zip", "summary.json", "validation.jsonl"):
         (folder / name).write_text("damaged")
     assert run.train(experiment, quiet=True, resume=True) == summary
@@ -223,21 +227,36 @@ def test_two_trainings_in_one_folder_are_refused(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"trainig": {}}, "trainig"),
+        ({"training": {"timesteps": 0}}, "training.timesteps = 0"),
+        ({"environment": {}}, "environment.id"),
+        ({"training": {"timesteps": 1000, "num_envs": True}}, "training.num_envs = True"),
+        ({"algorithm": {"name": "ppo", "network": {"hidden": [64.0]}}}, "hidden.0 = 64.0"),
         ({"algorithm": {"name": "ppo", "batch_size": 1}}, "algorithm.batch_size = 1"),
+        ({"algorithm": {"name": "dqn"}}, "action: discrete"),
         (
             {
-                "environment": {
-                    "id": "fusion_gym/TobitOscillator-v0",
-                    "options": {"access": "single"},
-                },
+                "environment": {"id": ENV, "options": {"access": "single"}},
                 "algorithm": {"name": "ppo", "initial_rate": 0.9},
             },
             "initial_rate = 0.9",
         ),
-        ({"training": {"timesteps": 64, "num_envs": 1}, "algorithm": {"name": "ppo", "n_steps": 1}},
-         "algorithm = 'ppo' is not allowed with these settings"),
+        (
+            {
+                "environment": {"id": ENV, "options": PRICED},
+                "training": {"timesteps": 64, "num_envs": 8, "target_rate": 0.1},
+            },
+            "target_rate = 0.1 is not allowed",
+        ),
+        (
+            {
+                "training": {"timesteps": 64, "num_envs": 1},
+                "algorithm": {"name": "ppo", "n_steps": 1},
+            },
+            "algorithm = 'ppo' is not allowed with these settings",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_refused_config_leaves_no_folder(
     tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:
