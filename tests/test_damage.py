@@ -1,6 +1,5 @@
 """Files of a run that are damaged: the command says what is wrong or goes on, and loses nothing."""
 
-import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,8 +8,7 @@ from typing import Any
 import pytest
 from command_runs import call, succeed
 from hostile_folder import contents
-from small_suite import ENV, small_suite
-from training_configs import small_config
+from small_runs import arguments, meaning
 
 pytestmark = pytest.mark.usefixtures("few_resamples")
 DAMAGES: dict[str, Callable[[bytes, bytes], bytes]] = {
@@ -41,23 +39,6 @@ WRITTEN = {
     "benchmark": ("results/small/verdict.csv", "work/small/sensors_0/latest.zip", "work/pieces"),
     "evaluate": (),
 }
-
-
-def arguments(command: str, folder: Path, seed: int = 0) -> list[str]:
-    """A short run of the command into the folder; the seed makes another run."""
-    if command == "evaluate":
-        options = ["--env", ENV, "--set", "horizon=5", "--policies", "always", "never"]
-        return [*options, "--episodes", "3", "--seed", str(seed), "--json", f"{folder}/result.json"]
-    if command == "benchmark":
-        config = small_suite(folder, training_seeds=1, classes=["sensors"], seed=seed)
-        places = ["--results", str(folder / "results"), "--work", str(folder / "work")]
-        return ["--config", str(config), *places, "--workers", "1", "--parts", "agents"]
-    training = {"timesteps": 256, "num_envs": 8, "seed": seed}
-    every = {"every": 128, "episodes": 2}
-    config = small_config(folder, training=training, validation=every)
-    if command == "tune":
-        return ["--config", str(config), "--trials", "1", "--output", str(folder / "study")]
-    return ["--config", str(config)]
 
 
 @pytest.fixture(scope="module")
@@ -117,21 +98,3 @@ def test_a_damaged_file_is_reported_or_mended(
 def files(folder: Path) -> dict[str, bytes | None]:
     """Return all that is in the folder, but for locks."""
     return {name: raw for name, raw in contents(folder).items() if not name.endswith(".lock")}
-
-
-def meaning(folder: Path) -> dict[str, Any]:
-    """What the results of a run say, without what says where and how fast it was."""
-    result: dict[str, Any] = {}
-    jsons = (path for path in folder.rglob("*.json*") if path.name != "metadata.json")  # seconds
-    for path in sorted(jsons):
-        lines = [json.loads(line) for line in path.read_text().splitlines()] if (
-            path.suffix == ".jsonl"
-        ) else [json.loads(path.read_text())]  # fmt: skip
-        for line in lines:
-            for key in ("seconds", "steps_per_second"):
-                line.pop(key, None)
-        result[str(path.relative_to(folder))] = json.dumps(lines).replace(str(folder), "")
-    for path in sorted(folder.rglob("*.csv")):
-        if path.stem != "runs":  # with seconds
-            result[str(path.relative_to(folder))] = path.read_text()
-    return result
