@@ -102,7 +102,9 @@ def test_an_unknown_option() -> None:
 
 # What a process noise of rank one leaves of it is no covariance that could be inverted.
 SINGULAR = ((0.0, 0.01, 5e-05), (0.0, 1.0, 0.01), (0.0, 0.0, 1.0))
-# Options of other environments.
+GILBERT_ELLIOTT, MEMORY = {"channel": "gilbert_elliott"}, {"memory": True}
+ESTIMATE = {"packet": "estimate"}
+# Options of all environments.
 ELSEWHERE: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     ("RemoteEstimation", {"sensors": 17, "action": "discrete"}, ("'discrete'", "17 sensors")),
     ("RemoteEstimation", {"token_capacity": 0.5}, ("token_capacity = 0.5", "initial_tokens = 1.0")),
@@ -111,6 +113,65 @@ ELSEWHERE: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     ("CorrelatedTracking", {"transition": SINGULAR}, ("((0.0, 0.01, 5e-05)", "singular")),
     ("UnknownInput", {"input_amplitude": 0.0}, ("input_amplitude = 0.0", "nothing to estimate")),
     ("BiasedOscillator", {"censoring_threshold": 1e9}, ("1000000000.0", "censoring_upper")),
+    ("BiasedOscillator", {"censoring_threshold": 5.0}, ("is not allowed",)),
+    ("BiasedOscillator", {"bias_gain": [[0.1]]}, ("is not allowed",)),
+    ("BiasedOscillator", {"information_shares": [0.5, 0.5], "filter": "adf"}, ("is not allowed",)),
+    ("RemoteEstimation", {"coefficient": 100.0}, ()),
+    ("RemoteEstimation", {"drop_probability": 0.1}, ()),
+    ("RemoteEstimation", {"channel_transition": np.eye(2), "channel": "independent"}, ()),
+    ("RemoteEstimation", GILBERT_ELLIOTT | {"channel_transition": ((0.5, 0.4), (0, 1))}, ()),
+    (
+        "RemoteEstimation",
+        GILBERT_ELLIOTT | {"channel_transition": np.eye(2)},
+        ("initial_channel",),
+    ),
+    # Packets and memory
+    ("TobitOscillator", {"broadcast": "none"}, ("broadcast = 'none'", "'estimate' or 'packets'")),
+    ("TobitOscillator", MEMORY | {"information": "centre"}, ("memory = True", "must be False")),
+    ("TobitOscillator", {"memory_filter": "adf"}, ("= 'adf'", "unless memory=True")),
+    (
+        "TobitOscillator",
+        {"belief_features": ["value"], "information": "centre"},
+        ("belief_features = ['value']", "information='centre'"),
+    ),
+    ("TobitOscillator", {"memory_filter": "best"} | MEMORY, ("= 'best'", "'adf'")),
+    ("TobitOscillator", {"belief_features": "x"} | MEMORY, ("= 'x'", "'difference'")),
+    ("TobitOscillator", {"packet": "estimate", "filter": "tobit"}, ("= 'estimate'", "memory=True")),
+    ("TobitOscillator", ESTIMATE | MEMORY, ("packet = 'estimate'", "silent='hold'")),
+    ("MarkovJumpTracking", ESTIMATE | MEMORY, ("packet = 'estimate'", "already")),
+    ("UnknownInput", ESTIMATE | MEMORY, ("packet = 'estimate'", "anew")),
+    ("RemoteEstimation", ESTIMATE | MEMORY, ("packet = 'estimate'", "itself")),
+    ("CorrelatedTracking", {"memory_filter": "imm"} | MEMORY, ("= 'imm'", "one filt")),
+    ("RemoteEstimation", {"memory_filter": "adf"} | MEMORY, ("= 'adf'", "one filter")),
+    # Systems of one's own
+    ("LinearFusion", {"measurement_matrices": []}, ("measurement_matrices = []",)),
+    ("LinearFusion", {"measurement_matrices": 3}, ("a list with a matrix for each sensor",)),
+    (
+        "LinearFusion",
+        {"measurement_matrices": [[1, 0], [[1, 0, 0]]]},
+        ("measurement_matrices[1]",),
+    ),
+    ("LinearFusion", {"state_names": ["a", "a"]}, ("2 different words",)),
+    ("LinearFusion", {"state_names": ["a", "b", "a"]}, ("2 different words",)),
+    ("LinearFusion", {"state_names": ["a", "b,c"]}, ("2 different words",)),
+    ("LinearFusion", {"measurement_covariances": [1.0]}, ("each of the 2 sensors",)),
+    (
+        "LinearFusion",
+        {"measurement_covariances": [1.0, [[1, 2], [2, 1]]]},
+        ("measurement_covariances[1]",),
+    ),
+    (
+        "LinearFusion",
+        {
+            "measurement_covariances": [[[1, 0.5], [0.5, 1]]],
+            "measurement_matrices": [[[1, 0], [0, 1]]],
+            "censoring_threshold": 0.0,
+        },
+        ("diagonal",),
+    ),
+    ("LinearFusion", {"censoring_threshold": [0.0, [1.0, 2.0]]}, ("censoring_threshold[1]",)),
+    ("LinearFusion", {"censoring_threshold": 1.0, "censoring_upper": 0.0}, ()),
+    ("LinearFusion", {"transition": [[2.0, 0.0], [0.0, 1.5]]}, ()),
 ]
 
 

@@ -19,6 +19,7 @@ from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
+SHORT = {"timesteps": 64, "num_envs": 4}
 PRICED = {"cost_weight": "random", "price_range": [0.01, 0.1]}
 
 
@@ -216,7 +217,7 @@ def test_two_trainings_in_one_folder_are_refused(
         (
             {
                 "environment": {"id": ENV, "options": PRICED},
-                "training": {"timesteps": 64, "num_envs": 8, "target_rate": 0.1},
+                "training": SHORT | {"target_rate": 0.1},
             },
             "target_rate = 0.1 is not allowed",
         ),
@@ -227,6 +228,22 @@ def test_two_trainings_in_one_folder_are_refused(
             },
             "algorithm = 'ppo' is not allowed with these settings",
         ),
+        (
+            {
+                "environment": {"id": ENV, "options": {"action": "discrete"}},
+                "algorithm": {"name": "counterfactual_ppo", "alternatives": "flips"},
+            },
+            "an action is one number",
+        ),
+        (
+            {
+                "environment": {"id": ENV, "local": True},
+                "algorithm": {"name": "counterfactual_ppo", "alternatives": "all"},
+            },
+            "sensors decide by themselves",
+        ),
+        ({"training": SHORT | {"error": "mismatch", "error_filter": "none such"}}, "filter"),
+        ({"training": SHORT | {"error_filter": "adf"}}, "error_filter"),
     ],
 )
 def test_a_refused_config_leaves_no_folder(

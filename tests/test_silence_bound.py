@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_runs import call
+from command_runs import refusal, succeed
 from scipy import stats
 from scipy.optimize import brentq
 
@@ -295,13 +295,10 @@ def test_the_command_writes_what_it_prints(tmp_path: Path) -> None:
     file = tmp_path / "bound.json"
     words = ["--env", "fusion_gym/TobitOscillator-v0", "--set", "filter=tobit", "horizon=5"]
     words += ["--episodes", "8", "--filters", "tobit", "adf", "--json", str(file)]
-    ended = call("bound", [*words, "--rates", "0.1", "--accuracy", "0.1"])
-    assert (ended.status, ended.trace) == (0, "")
+    ended = succeed("bound", [*words, "--rates", "0.1", "--accuracy", "0.1"])
     report = json.loads(file.read_text())
     assert report["everything_delivered"].keys() == {"tobit", "adf"}
     row = report["bounds"][0]
     assert report["floor"] < row["bound"]
     assert f"{row['bound']:.5g}" in ended.out
-    refused = call("bound", ["--env", "fusion_gym/UnknownInput-v0", "--rates", "0.1"])
-    assert refused.status == 1
-    assert refused.err.count("\n") == 1
+    refusal("bound", ["--env", "fusion_gym/UnknownInput-v0", "--rates", "0.1"])
