@@ -115,19 +115,19 @@ def test_training_to_a_target_rate_moves_the_price(tmp_path: Path) -> None:
 
 
 def test_validation_counts_episodes_by_their_price(tmp_path: Path) -> None:
-    """The record's return is the weighted one: cheap and dear episodes count alike."""
+    """A record's return is the weighted one, by which the best model is chosen."""
     path = small_config(tmp_path)
     content = yaml.safe_load(path.read_text())
     content["environment"]["options"] |= {"cost_weight": "random", "price_range": [0.01, 1.0]}
-    content["training"]["price_exponent"] = 1.0
+    content["training"] |= {"price_exponent": 1.0, "timesteps": 2048}
     path.write_text(yaml.safe_dump(content))
     train.train(load_checked(Experiment, path), quiet=True)
-    record = read_records(tmp_path / "run")[-1]
+    record = max(read_records(tmp_path / "run"), key=lambda record: record["return"])
     task = fusion_gym.make_task(ENV, **content["environment"]["options"])
     batch = EpisodeBatch.seeded(task, 4, 500_000_000)
     price = batch.price.copy()
-    final = make_policy(f"model:{tmp_path / 'run' / 'final_model.zip'}", task)
-    results = run_episodes(task, final, 4, 500_000_000)
+    best = make_policy(f"model:{tmp_path / 'run' / 'best_model.zip'}", task)
+    results = run_episodes(task, best, 4, 500_000_000)
     assert record["return"] == pytest.approx(float((results.returns * 0.1 / price).mean()))
     assert record["return"] != pytest.approx(float(results.returns.mean()), rel=0.01)
 

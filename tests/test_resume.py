@@ -168,8 +168,6 @@ def test_a_finished_training_is_not_repeated_and_its_files_are_mended(tmp_path: 
     folder = Path(experiment.output)
     summary = run.train(experiment, quiet=True)
     expected = meaning(folder)
-    returns = [record["return"] for record in read_records(folder)]
-    assert max(returns) == summary["best_validation"]["return"]
     assert list((folder / "tensorboard").glob("events*"))
     for name in ("best_model.zip", "final_model.zip", "summary.json", "validation.jsonl"):
         (folder / name).write_text("damaged")
