@@ -104,6 +104,7 @@ def test_an_unknown_option() -> None:
 SINGULAR = ((0.0, 0.01, 5e-05), (0.0, 1.0, 0.01), (0.0, 0.0, 1.0))
 GILBERT_ELLIOTT, MEMORY = {"channel": "gilbert_elliott"}, {"memory": True}
 ESTIMATE = {"packet": "estimate"}
+UNSTABLE = (((1.1, 0.0), (0.0, 1.0)),) * 2
 # Options of all environments.
 ELSEWHERE: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     ("RemoteEstimation", {"sensors": 17, "action": "discrete"}, ("'discrete'", "17 sensors")),
@@ -172,6 +173,32 @@ ELSEWHERE: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     ("LinearFusion", {"censoring_threshold": [0.0, [1.0, 2.0]]}, ("censoring_threshold[1]",)),
     ("LinearFusion", {"censoring_threshold": 1.0, "censoring_upper": 0.0}, ()),
     ("LinearFusion", {"transition": [[2.0, 0.0], [0.0, 1.5]]}, ()),
+    # Correlated and jumping plants
+    ("CorrelatedTracking", {"noise_scale": 0.0}, ("noise_scale = 0.0", "> 0")),
+    ("CorrelatedTracking", {"noise_scale": 1.5}, ("noise_scale = 1.5", "<= 1")),
+    ("CorrelatedTracking", {"fusion": "information"}, ("= 'information'", "process noise")),
+    ("CorrelatedTracking", {"fusion": "federated"}, ("fusion = 'federated'", "'sici'")),
+    ("CorrelatedTracking", {"fusion": "scii"}, ("did you mean 'sci",)),
+    ("CorrelatedTracking", {"order": (0, 1, 2), "fusion": "ci"}, ("order = ", "fusion='ci'")),
+    ("CorrelatedTracking", {"order": (0, 1, 1)}, ("order = (0, 1, 1)", "once")),
+    ("CorrelatedTracking", {"order": (1, 2, 3)}, ()),
+    ("CorrelatedTracking", {"transition": ((1.0, 0.1),)}, ()),
+    ("CorrelatedTracking", {"process_variance": 0.0}, ()),
+    ("CorrelatedTracking", {"initial_covariance": -np.eye(3)}, ()),
+    ("CorrelatedTracking", {"thresholds": 1.0}, ("unknown option", "trigger_threshold")),
+    ("MarkovJumpTracking", {"fusion": "information"}, ("= 'information'", "correlated")),
+    ("MarkovJumpTracking", {"fusion": "federated"}, ("fusion = 'federated'", "fed back")),
+    ("MarkovJumpTracking", {"fusion": "matrx"}, ("did you mean 'matrix'",)),
+    ("MarkovJumpTracking", {"mode_transition": ((0.6, 0.3), (0.4, 0.6))}, ("[0.9, 1.0]",)),
+    ("MarkovJumpTracking", {"transitions": UNSTABLE}, ("mean-square stable",)),
+    ("MarkovJumpTracking", {"sampling_periods": 0}, ()),
+    ("MarkovJumpTracking", {"fading_values": ((1.5, 0.5),) * 3}, ("from 0 to 1",)),
+    ("MarkovJumpTracking", {"fading_probabilities": ((0.5, 0.4, 0.0),) * 3}, ("add up to 1",)),
+    ("MarkovJumpTracking", {"initial_probabilities": (0.5, 0.4)}, ("add up to 1, not 0.9",)),
+    ("MarkovJumpTracking", {"sampling_period": 2}, ("unknown option", "sampling_periods")),
+    ("MarkovJumpTracking", {"filter": "central"}, ("did you mean 'centralised'",)),
+    ("MarkovJumpTracking", {"fusion": "matrix", "filter": "imm"}, ("filter='imm': ", "left out")),
+    ("MarkovJumpTracking", {"fusion": "ci", "filter": "centralised"}, ("filter='centralised'",)),
 ]
 
 
@@ -248,6 +275,41 @@ def test_calls(call: Callable[[], Any], parts: tuple[str, ...]) -> None:
 )
 def test_policies(spec: str, parts: tuple[str, ...]) -> None:
     refused(lambda: make_policy(spec, make_task(ENV_ID)), ConfigurationError, parts)
+
+
+TOBIT, VALUE, OPTIMUM = "TobitOscillator", "value_of_information", "periodic_optimum"
+CENTRE, MARKOV = {"information": "centre"}, "MarkovJumpTracking"
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "spec", "parts"),
+    [
+        (TOBIT, {}, "rollout", ("policy 'rollout' needs a parameter 'base': write base=",)),
+        (TOBIT, {}, "rollout:base=always:samples=3", ("of policy 'always' 'samples'",)),
+        (TOBIT, {}, "rollout:steps=0,base=never", ("steps = 0",)),
+        (TOBIT, {}, "rollout:base=dynamic_event", ("'dynamic_event'", "the present step alone")),
+        (TOBIT, {}, "rollout:base=rollout:base=never", ("base = 'rollout:base=never'",)),
+        (TOBIT, {}, "rollout:base=value_of_information:own=true", ("a scheduler's policy",)),
+        (TOBIT, CENTRE, "rollout:base=never", ("information = 'centre'",)),
+        (TOBIT, {}, f"{VALUE}:threshold=0.1,price=0.1", ("price = 0.1", "beside threshold")),
+        (TOBIT, {}, f"{VALUE}:own=true,at_most=2", ("at_most = 2", "own=True")),
+        (TOBIT, {}, f"{VALUE}:own=true,steps=2", ("steps = 2", "own=True")),
+        (TOBIT, {}, "estimate_difference:own=true,at_most=2", ("at_most = 2", "own=True")),
+        (TOBIT, {}, "kullback_leibler:own=true,at_most=3", ("at_most = 3", "own=True")),
+        (TOBIT, CENTRE, VALUE, ("information = 'centre'",)),
+        (MARKOV, {}, f"{OPTIMUM}:packets=19", ("packets = 19", "<= 18")),
+        (MARKOV, {}, f"{OPTIMUM}:packets=12,period=8", ("packets = 12", "2704156 schedules")),
+        (MARKOV, {}, f"{OPTIMUM}:cache=/dev/null/x,packets=1,period=1", ("cache = ", "written")),
+        (MARKOV, {"access": "single"}, OPTIMUM, ("access = 'single'", "'any'")),
+        (MARKOV, {"filter": "imm"}, OPTIMUM, ("CentralSystem", "not depend on the data")),
+    ],
+)
+def test_policies_elsewhere(
+    name: str, options: dict[str, Any], spec: str, parts: tuple[str, ...]
+) -> None:
+    task = make_task(f"fusion_gym/{name}-v0", **options)
+    message = refused(lambda: make_policy(spec, task), ConfigurationError, parts)
+    assert "\n" not in message
 
 
 # Hostile actions of every kind: test_fuzz_actions.py.
