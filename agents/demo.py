@@ -23,7 +23,7 @@ from rich.table import Table
 
 from fusion_gym.evaluation.envelope import best_mse, points_of
 from fusion_gym.evaluation.episodes import EpisodeResults, record_episode
-from fusion_gym.evaluation.intervals import Interval, mean_interval
+from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
@@ -41,13 +41,15 @@ from .experiments.envelopes import (
     rollout_of,
     run_test,
 )
+from .experiments.figures import envelope_series, fine_rates, limits_of
 from .experiments.learning import LearningSetup
 from .experiments.workers import Call, Folders, Pool, missing, run_training, side_by_side
 from .input.options import Episodes, OutputFolder, Steps
-from .output import figures, front_figure, tables
+from .output import figures, palette, tables
 from .output.ending import ended_like_by_ctrl_c
 from .output.files import write
 from .output.folders import alone_in
+from .output.pareto_figure import Differences, Panel, Series, draw_pareto
 from .output.progress import writing
 from .training.config import Experiment
 from .training.run import earlier, holds_training
@@ -273,31 +275,39 @@ def title_of(learner: Learner, report: Mapping[str, Any]) -> str:
 def draw_front(learner: Learner, report: Mapping[str, Any]) -> None:
     """The agent's front over everything that is known of its classes.
 
-    The proven bound and the rollout are a scheduler's.
+    The band and the strip below hold 95 % intervals over episodes. The proven bound and the rollout
+    are a scheduler's.
     """
-    plain, remembering = learner.rules("without"), learner.rules("with")
-    agent = [(point["rate"], Interval(**point["mse"])) for point in report["points"]]
-    rates = np.linspace(0.0, 1.2 * max(rate for rate, _ in agent), 200)
-    scheduler = not learner.experiment.environment.local
+    always = learner.setup.envelopes["always"]
+    rates, scheduler = fine_rates(always), not learner.experiment.environment.local
+    rules = {which: learner.rules(which) for which in learner.classes}
+    style = palette.AGENTS_MEMORY._replace(label="the agent, at seven prices")
     bound = bound_of(SHIPPED / SETTING) if scheduler else None
-    layers = front_figure.Layers(
-        single=single_rules(learner),
-        plain=[(point.rate, point.mse) for point in points_of(plain)],
-        with_memory=[(point.rate, point.mse) for point in points_of(remembering)],
-        rollout=simulations(remembering, report["episodes"]) if scheduler else [],
-        bound=[(rate, at_least(bound, rate)) for rate in rates] if bound else [],
-        agent=agent,
-    )
-    caption = (
-        f"{report['episodes']:,} test episodes, the same for all and under the same token bucket; "
-        "bars are 95 % intervals.\nSingle rules and simulations, which ran on other or fewer "
-        "episodes, are where they lie relative to the lines there."
-    )
-    front_figure.front(learner.folder / "front.png", title_of(learner, report), caption, layers)
+    points = sorted(report["points"], key=lambda point: float(point["rate"]))
+    marks = [(point["rate"], point["mse"]["mean"]) for point in points]
+    band = [(point["rate"], point["mse"]["low"], point["mse"]["high"]) for point in points]
+    simulated = simulations(rules["with"], report["episodes"]) if scheduler else []
+    series = [
+        envelope_series(palette.RULES, points_of(rules["without"]), rates),
+        envelope_series(palette.RULES_MEMORY, points_of(rules["with"]), rates),
+        *([Series(palette.ROLLOUT, [], simulated)] if simulated else []),
+        Series(style, marks, marks, band),
+    ]
+    panel = Panel(
+        learner.name, series, single_rules(learner),
+        [(rate, at_least(bound, rate)) for rate in rates] if bound else [], None,
+        [Differences(style, [
+            (point["rate"], *(own["difference"][end] for end in ("mean", "low", "high")))
+            for point in points
+            if (own := point["rules"].get(learner.classes["with"]))
+        ])],
+    )  # fmt: skip
+    title = f"{title_of(learner, report)}; {report['episodes']:,} test episodes"
+    draw_pareto([learner.folder / "front.png"], title, panel, [], limits_of(always, [panel]))
 
 
-def single_rules(learner: Learner) -> list[tuple[float, float]]:
-    """Return rate and error of every tuned rule without memory.
+def single_rules(learner: Learner) -> list[list[tuple[float, float]]]:
+    """Return rate and error of the tuned rules of each family without memory.
 
     Each is as far from its envelope as on tuning episodes, which are easier or harder than the
     test's.
@@ -306,11 +316,13 @@ def single_rules(learner: Learner) -> list[tuple[float, float]]:
     vertices = sorted(content["vertices"], key=lambda vertex: vertex["tuning_rate"])
     rates = [vertex["tuning_rate"] for vertex in vertices]
     harder = [v["test_mse"]["mean"] / v["tuning_mse"]["mean"] for v in vertices]
-    return [
-        (row["rate"], float(row["mse"] * np.interp(row["rate"], rates, harder)))
-        for row in learner.setup.envelopes["curves"]
-        if row["family"] in content["families"] and row["options"] in ({}, content["options"])
-    ]
+    curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for row in learner.setup.envelopes["curves"]:
+        if row["family"] in content["families"] and row["options"] in ({}, content["options"]):
+            error = float(row["mse"] * np.interp(row["rate"], rates, harder))
+            key = row["family"], str(row["options"])
+            curves.setdefault(key, []).append((row["rate"], error))
+    return list(curves.values())
 
 
 def simulations(rules: Mapping[str, EpisodeResults], episodes: int) -> list[tuple[float, float]]:
