@@ -12,6 +12,7 @@ from ..output.files import write_text
 from ..output.markup import page_of
 from ..output.overview_figure import Dot, OverviewRow
 from ..output.pareto_figure import Differences, Limits, Panel, Series
+from .envelopes import at_least, rollout_of
 from .learning import read_learning
 from .report import (
     KNOWING,
@@ -89,7 +90,7 @@ def panels_of(results: SettingResults) -> tuple[Panel, list[Panel]]:
     for name, content in results.known_classes.items():
         grouped.setdefault(kind_of(content), []).append(name)
     fine = fine_rates(results.always)
-    bound = [(rate, results.bound_at(rate)) for rate in fine] if results.bound else []
+    bound = [(rate, at_least(results.bound, rate)) for rate in fine] if results.bound else []
 
     def panel(title: str, names: list[str], known: Sequence[EnvelopePoint]) -> Panel:
         names = sorted(names, key=lambda name: results.known_classes[name]["memory"])
@@ -97,9 +98,10 @@ def panels_of(results: SettingResults) -> tuple[Panel, list[Panel]]:
         return Panel(title, series, single, bound, None, list(_differences(results, names)))
 
     main = panel("scheduler", grouped.pop(("sensors", "", "measurement"), []), results.ahead)
-    if results.rollout:
-        label = f"improved by simulation\n({results.rollout_episodes} episodes)"
-        points = [(point.rate, point.mse) for point in results.rollout]
+    rollout, episodes = rollout_of(results.folder)
+    if rollout:
+        label = f"improved by simulation\n({episodes} episodes)"
+        points = [(point.rate, point.mse) for point in rollout]
         style = palette.ROLLOUT._replace(label=label)
         main = main._replace(series=[*main.series, Series(style, [], points)])
     if results.genie and not bound:

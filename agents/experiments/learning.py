@@ -458,8 +458,8 @@ def judge_fronts(setup: Mapping[str, Any]) -> dict[str, Any] | None:
     worst = max(points, key=lambda point: float(point["difference"]["mean"]))
     return {
         "compared": len(points),
-        "above": [{key: p[key] for key in ("seed", "price", "difference")} for p in above],
-        "worst": {key: worst[key] for key in ("seed", "price", "difference")},
+        "above": above,
+        "worst": worst,
         "rates": [choose(point["rate"] for point in points) for choose in (min, max)],
         "mean": sum(p["difference"]["mean"] for p in points) / len(points),
         "closed": {name: gap_share(points, name) for name in ("rollout", "bound")},

@@ -31,6 +31,7 @@ from .envelopes import (
     read_tests,
     rule_tests,
     run_test,
+    tested_inputs,
 )
 from .tables import VERDICT, Row, write_rows
 from .verdict import ClassTests, at_rates, judge, worths
@@ -46,6 +47,7 @@ from .workers import (
 )
 
 VALIDATIONS = 2  # of a training
+_CLASS = ("mode", "memory", "broadcast", "packet", "knows")  # columns of a class
 _METRICS = ("mse", "return", "rate", "denied", "tokens", "nees")  # of each policy
 
 
@@ -98,11 +100,6 @@ class Agent(NamedTuple):
     work: Path
 
     @property
-    def name(self) -> str:
-        """Its name in the tables."""
-        return f"agent_{self.of.name}_{self.seed}"
-
-    @property
     def weight(self) -> float:
         """About how long it takes, in seconds on one core."""
         steps = self.suite.timesteps_of(self.setting, self.of.name, self.of.mode)
@@ -116,7 +113,7 @@ class Agent(NamedTuple):
     @property
     def inputs(self) -> dict[str, Any]:
         """All that its results depend on."""
-        return tested_inputs(self.suite, self.setting) | {
+        return tested_inputs(self.setting, self.suite.episodes, self.suite.seed) | {
             "training": training_of(self.experiment),
             "envelope": {"class": self.of.name, "sha256": self.sha256},
             "prices": self.suite.prices,
@@ -152,7 +149,9 @@ class HindsightSearch:
         assert self.setting.hindsight is not None
         hindsight = self.setting.hindsight.model_dump(mode="json")
         hindsight |= {"episodes": self.suite.hindsight_episodes}
-        return tested_inputs(self.suite, self.setting) | {"hindsight": hindsight}
+        return tested_inputs(self.setting, self.suite.episodes, self.suite.seed) | {
+            "hindsight": hindsight
+        }
 
 
 def search_in_hindsight(search: HindsightSearch) -> dict[str, EpisodeResults]:
@@ -166,15 +165,6 @@ def search_in_hindsight(search: HindsightSearch) -> dict[str, EpisodeResults]:
             task, price, hindsight.width, episodes, suite.seed
         )
         for price in hindsight.prices
-    }
-
-
-def tested_inputs(suite: Suite, setting: Setting) -> dict[str, Any]:
-    """Return what all results of a setting depend on."""
-    return {
-        "environment": setting.environment.model_dump(mode="json"),
-        "episodes": suite.episodes,
-        "seed": suite.seed,
     }
 
 
@@ -229,7 +219,7 @@ class SettingWork(NamedTuple):
 
     def inputs(self, run: str) -> dict[str, Any]:
         """Return all that the results of a run of rules or references depend on."""
-        result = tested_inputs(self.suite, self.setting)
+        result = tested_inputs(self.setting, self.suite.episodes, self.suite.seed)
         if run != "baselines":
             return result | {run: list(getattr(self.setting, run) or ())}
         genie = self.setting.genie and self.setting.genie.model_dump(mode="json")
@@ -287,7 +277,8 @@ class SettingWork(NamedTuple):
                     "training_seed": agent.seed,
                 }
                 tested = dict(zip(names, content.pop("results"), strict=True))
-                result.append(BenchmarkRun(agent.name, agent.inputs, tested, own | content))
+                name = f"agent_{agent.of.name}_{agent.seed}"
+                result.append(BenchmarkRun(name, agent.inputs, tested, own | content))
         return result
 
 
@@ -325,11 +316,7 @@ def judge_setting(work: SettingWork) -> None:
             classes[of.name] = {
                 **judge(agents, prices, envelope, ahead, always, clairvoyant, own["searches"]),
                 "at": at_rates(tested[of.name], always),
-                "mode": of.mode,
-                "memory": of.memory,
-                "broadcast": of.broadcast,
-                "packet": of.packet,
-                "knows": of.knows,
+                **{key: getattr(of, key) for key in _CLASS},
                 "sha256": own["sha256"],
                 "envelope": [point._asdict() for point in points_of(envelope)],
             }

@@ -23,7 +23,7 @@ from .config import Choices, Family, Range, Tuning
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 _RUNS = 1024  # beside each other; fixed, so that results do not depend on the machine
 _MOST = 3  # parameters of a rule that multiply its trials
-_WORST = 1e300  # the error of a policy whose error is no number
+WORST = 1e300  # the error of a policy whose error is no number
 
 
 class TuningTrial(NamedTuple):
@@ -196,7 +196,7 @@ def briefs_of(task: Task, policies: Sequence[str], episodes: int, seed: int) -> 
 
 def _means(brief: Brief) -> tuple[float, float]:
     mse = float(brief.mse.mean())
-    return float(brief.rate.mean()), mse if np.isfinite(mse) else _WORST
+    return float(brief.rate.mean()), mse if np.isfinite(mse) else WORST
 
 
 def near_hull(trials: Sequence[TuningTrial], near: float, finalists: int) -> list[str]:
