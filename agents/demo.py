@@ -11,14 +11,12 @@ and an interrupted training is gone on with.
 
 import hashlib
 import shutil
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from rich import box
 from rich.table import Table
 
 from fusion_gym.evaluation.envelope import best_mse, points_of
@@ -49,6 +47,7 @@ from .output import figures, palette, tables
 from .output.ending import ended_like_by_ctrl_c
 from .output.files import write
 from .output.folders import alone_in
+from .output.markup import NONE, share
 from .output.pareto_figure import Differences, Panel, Series, draw_pareto
 from .output.progress import writing
 from .training.config import Experiment
@@ -146,20 +145,19 @@ class Demo(Long):
                 if self.fresh and learner.folder.exists():
                     shutil.rmtree(learner.folder)
             writing(("models, figures and tables", self.output))
-            began = time.perf_counter()
             calls = [
                 Call(1.0, run_training, (learner.experiment,), learner.experiment)
                 for learner in learners
             ]
             side_by_side(calls, TEAM, "trainings")
-            trained = time.perf_counter()
             side_by_side([call for learner in learners for call in learner.calls()], TEAM, "tests")
-            tested = time.perf_counter()
             for learner in learners:
-                _conclude(learner)
-        seconds = (trained - began, tested - trained, time.perf_counter() - tested)
-        parts = "trainings {:.0f} s, tests {:.0f} s, tables and figures {:.0f} s".format(*seconds)
-        print(f"figures, tables and models are in {self.output}; {sum(seconds):.0f} s: {parts}")
+                report = report_of(learner)
+                write(learner.folder / "front.json", report)
+                tables.console().print(front_table(learner, report))
+                draw_front(learner, report)
+                draw_episodes(learner)
+        print(f"figures, tables and models are in {self.output}")
 
     def _check(self, learner: Learner) -> None:
         """Whether the learner's folder may be gone on with, or removed.
@@ -179,15 +177,6 @@ class Demo(Long):
     def interrupted(self) -> str:
         """Nothing is lost, unless it is begun afresh."""
         return f"interrupted; go on with: {self.again(without=('--fresh',))}"
-
-
-def _conclude(learner: Learner) -> None:
-    """Write, print and draw what an agent and its rules brought."""
-    report = report_of(learner)
-    write(learner.folder / "front.json", report)
-    tables.console().print(front_table(learner, report))
-    draw_front(learner, report)
-    draw_episodes(learner)
 
 
 def report_of(learner: Learner) -> dict[str, Any]:
@@ -240,25 +229,17 @@ def front_table(learner: Learner, report: Mapping[str, Any]) -> Table:
         "transmission. Rate per sensor and step; rules mixed to the agent's rate; paired "
         "differences to their MSE, with 95 % intervals over episodes."
     )
-    table = Table(title=title_of(learner, report), box=box.SIMPLE_HEAD, caption=caption)
-    for name in ("price", "rate", "MSE"):
-        table.add_column(name, justify="right", no_wrap=True)
+    heads = ["price", "rate", "MSE"]
     for which in learner.classes:
-        table.add_column(f"rules {which} memory", justify="right")
-        table.add_column("difference", justify="right", no_wrap=True)
+        heads += [f"rules\n{which}\nmemory", "difference"]
+    rows = []
     for point in report["points"]:
         row = [f"{point['price']:.3g}", f"{point['rate']:.4f}", f"{point['mse']['mean']:.4f}"]
         for name in learner.classes.values():
             below = point["rules"].get(name)
-            row += [f"{below['mse']:.4f}", _share(below["difference"])] if below else ["–", "–"]
-        table.add_row(*row)
-    return table
-
-
-def _share(interval: Mapping[str, float]) -> str:
-    """A relative difference with its interval, in per cent."""
-    mean, low, high = (100.0 * interval[key] for key in ("mean", "low", "high"))
-    return f"{mean:+.1f} % [{low:+.1f}, {high:+.1f}]"
+            row += [f"{below['mse']:.4f}", share(below["difference"])] if below else [NONE, NONE]
+        rows.append(row)
+    return tables.table_tables(title_of(learner, report), heads, rows, caption)
 
 
 def title_of(learner: Learner, report: Mapping[str, Any]) -> str:

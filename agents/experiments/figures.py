@@ -71,9 +71,11 @@ def write_report(results: Path, titles: Mapping[str, str], pages: Mapping[Path, 
 
 def report_text(settings: Mapping[str, SettingResults]) -> str:
     """Return the report, which names the panels of every figure."""
-    small = {name: panels_of(results)[1] for name, results in settings.items()}
-    titles = {name: [" ".join(p.title.split()) for p in panels] for name, panels in small.items()}
-    return text_of(settings, titles)
+    panels = {
+        name: [" ".join(panel.title.split()) for panel in panels_of(results)[1]]
+        for name, results in settings.items()
+    }
+    return text_of(list(settings.values()), panels)
 
 
 def draw_setting(folder: Path, results: SettingResults) -> None:

@@ -461,7 +461,6 @@ def judge_fronts(setup: Mapping[str, Any]) -> dict[str, Any] | None:
         "above": above,
         "worst": worst,
         "rates": [choose(point["rate"] for point in points) for choose in (min, max)],
-        "mean": sum(p["difference"]["mean"] for p in points) / len(points),
         "closed": {name: gap_share(points, name) for name in ("rollout", "bound")},
     }
 

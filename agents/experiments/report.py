@@ -322,9 +322,8 @@ def hulls_of(envelopes: Row) -> dict[str, dict[bool, list[EnvelopePoint]]]:
     return result
 
 
-def text_of(results: Mapping[str, SettingResults], panels: Mapping[str, Sequence[str]]) -> str:
+def text_of(settings: Sequence[SettingResults], panels: Mapping[str, Sequence[str]]) -> str:
     """Return the report in Markdown; ``panels`` has the small panels of each setting's figure."""
-    settings = list(results.values())
     fronts = [front for item in settings for front in item.classes.values()]
     return _render(
         "report.md",

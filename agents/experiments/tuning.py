@@ -133,7 +133,7 @@ def search_family(
     def run(requested: Iterable[dict[str, Any]]) -> None:
         texts = {policy_text(family, values, task.sensors): values for values in requested}
         new = [text for text in texts if text not in tried]
-        briefs = briefs_of(task, new, tuning.episodes, episodes_seed(tuning, seed))
+        briefs = briefs_of(task, new, tuning.episodes, tuning.seed + seed * tuning.episodes)
         for text, brief in zip(new, briefs, strict=True):
             tried[text] = TuningTrial(text, texts[text], *_means(brief))
 
@@ -148,11 +148,6 @@ def search_family(
             for place, slope in enumerate(slopes)
         )
     return list(tried.values())
-
-
-def episodes_seed(tuning: Tuning, seed: int) -> int:
-    """Seed of the first episode of a search."""
-    return tuning.seed + seed * tuning.episodes
 
 
 def error_per_rate(task: Task, price: float) -> float:
