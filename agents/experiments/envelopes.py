@@ -477,12 +477,6 @@ class EnvelopeStore(NamedTuple):
             )
         return dict(classes[name])
 
-    def vertices(self, setting: Setting, names: Sequence[str]) -> list[dict[str, Any]]:
-        """Return the rules of some classes, each once."""
-        classes = self.classes(setting)
-        result = {v["name"]: v for name in names for v in classes[name]["vertices"]}
-        return list(result.values())
-
     def missing(self, setting: Setting, names: Sequence[str]) -> list[Class]:
         """Return the missing ones of these classes, all of whose rules are made once.
 

@@ -21,7 +21,7 @@ from fusion_gym.policies.registry import make_policy
 
 from ..output.folders import fingerprint
 from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, ValidationConfig
-from .classes import Class, classes_of, trained_classes
+from .classes import Class, trained_classes
 from .config import Setting, Suite, front_prices
 from .envelopes import (
     EnvelopeStore,
@@ -192,15 +192,16 @@ class SettingWork(NamedTuple):
         Raises:
             ConfigurationError: a class that an agent would be compared with is not there.
         """
-        trained = {of.name for of in trained_classes(self.suite, self.setting)}
-        names = [of.name for of in classes_of(self.setting) if of.name in trained]
+        names = [of.name for of in trained_classes(self.suite, self.setting)]
         return {name: self.store.envelope(self.setting, name)["sha256"] for name in names}
 
     @property
     def vertices(self) -> list[Row]:
-        """The rules of the envelopes that agents are compared with."""
-        names = [of.name for of in trained_classes(self.suite, self.setting)]
-        return self.store.vertices(self.setting, names)
+        """The rules of the envelopes that agents are compared with, each once."""
+        classes = self.store.classes(self.setting)
+        trained = trained_classes(self.suite, self.setting)
+        result = {v["name"]: v for of in trained for v in classes[of.name]["vertices"]}
+        return list(result.values())
 
     def tests(self) -> dict[str, list[Test]]:
         """Return the tests of rules and references by the run that reports them."""
