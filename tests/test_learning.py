@@ -315,7 +315,7 @@ def test_seeds_and_prices_that_lie_above_are_counted(school: Path) -> None:
     assert result is not None
     assert result["compared"] == 2
     assert [(p["seed"], p["difference"]["low"]) for p in result["above"]] == [(0, 0.011)]
-    assert (result["worst"]["seed"], result["mean"]) == (1, pytest.approx(0.025))
+    assert result["worst"]["seed"] == 1
     assert result["rates"] == pytest.approx([0.14, 0.18])
     assert result["closed"] == {"rollout": None, "bound": pytest.approx((0.2 + 0.6) / 2.0)}
     assert fronts.gap_share([{"envelope": 1.0, "bound": 1.0, "mse": 1.0}], "bound") is None
