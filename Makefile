@@ -7,7 +7,7 @@ LOWEST := .venv-lowest
 # A part of the tests that touches every dependency.
 QUICK  := tests/laws/test_interfaces.py tests/test_bad_input.py tests/test_environment_api.py \
 	tests/test_evaluation.py tests/test_model_files.py \
-	tests/test_agents.py::test_training_writes_its_results_and_resumes \
+	tests/test_resume.py::test_a_resumed_training_is_the_uninterrupted_one \
 	tests/test_benchmark.py::test_from_tuning_to_report_and_zoo
 
 .PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films docs integrations \

@@ -34,7 +34,6 @@ from .experiments.training import SettingWork, run_benchmark
 from .experiments.workers import BackendName, Folders, Pool
 from .input.options import OutputFolder, Steps, Whole, writable_folder
 from .output.ending import ended_like_by_ctrl_c
-from .output.folders import refuse_earlier
 from .output.progress import writing
 from .output.tables import console
 
@@ -102,7 +101,8 @@ class Benchmark(Long):
             choice("classes", name, names_of(suite))
         pages = {path: read_text("pages", path) for path in self.pages}
         if set(self.parts) - {"report"}:
-            self._refuse_earlier(settings, folders)
+            if not self.resume:
+                self._refuse_earlier(settings, folders)
             self._work(suite, settings, folders, pool)
         if "report" in self.parts:
             write_report(folders.results, {item.name: item.title for item in suite.settings}, pages)
@@ -112,7 +112,7 @@ class Benchmark(Long):
         """Refuse to begin where results of these parts, or pieces of work, are already.
 
         Raises:
-            ConfigurationError: there are some, and no ``--resume``.
+            ConfigurationError: there are some.
         """
         last = {"envelopes": "{}/classes.csv", "agents": "{}/verdict.csv"}
         last |= {"robustness": "{}/robustness.csv", "learning": "learning/{}/learning.csv"}
@@ -123,8 +123,15 @@ class Benchmark(Long):
         ]
         there = [table for table in tables if (folders.results / table).exists()]
         pieces = list(folders.cache.folder.rglob("output.pkl"))
-        refuse_earlier("results", folders.results, len(there), self.resume)
-        refuse_earlier("work", folders.work, len(pieces), self.resume)
+        for option, folder, count in (
+            ("results", folders.results, len(there)),
+            ("work", folders.work, len(pieces)),
+        ):
+            if count:
+                raise ConfigurationError(
+                    f"{option} = {str(folder)!r} holds {count} finished pieces of work: go on with "
+                    "--resume, or give another --results and --work"
+                )
 
     def _work(
         self, suite: Suite, settings: Sequence[Setting], folders: Folders, pool: Pool

@@ -21,11 +21,11 @@ from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import BaselineComparison, compare_with_envelope, lower_envelope
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.evaluation.metrics import robust_summary, summarise
 from fusion_gym.policies.registry import make_policy, policy_names
 from fusion_gym.validation import refusal
 
 from .command_line import Long
+from .evaluate import evaluation_report
 from .experiments.config import Sweep
 from .input.options import Episodes, OutputFolder, Seed, Whole
 from .output import figures, tables
@@ -121,16 +121,7 @@ def compare(
     learned = run_all(task, list(agents), episodes, seed, "agent")
     result = {name: compare_with_envelope(item, baselines) for name, item in learned.items()}
     envelope = lower_envelope(baselines)
-    results = baselines | learned
-    report: dict[str, Any] = {
-        "env": env_id,
-        "episodes": episodes,
-        "seed": seed,
-        "horizon": task.horizon,
-        "settings": task.settings,
-        "policies": {name: summarise(result) for name, result in results.items()},
-        "quantiles": {name: robust_summary(result) for name, result in results.items()},
-    }
+    report = evaluation_report(env_id, task, episodes, seed, baselines | learned)
     write(folder / "evaluation.json", report)
     points = [_point(name, learned[name], comparison) for name, comparison in result.items()]
     write(folder / "comparison.json", {"points": points})

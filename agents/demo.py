@@ -11,19 +11,17 @@ and an interrupted training is gone on with.
 
 import hashlib
 import shutil
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from rich import box
 from rich.table import Table
 
 from fusion_gym.evaluation.envelope import best_mse, points_of
 from fusion_gym.evaluation.episodes import EpisodeResults, record_episode
-from fusion_gym.evaluation.intervals import Interval, mean_interval
+from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
@@ -41,13 +39,16 @@ from .experiments.envelopes import (
     rollout_of,
     run_test,
 )
+from .experiments.figures import envelope_series, fine_rates, limits_of
 from .experiments.learning import LearningSetup
 from .experiments.workers import Call, Folders, Pool, missing, run_training, side_by_side
 from .input.options import Episodes, OutputFolder, Steps
-from .output import figures, front_figure, tables
+from .output import figures, palette, tables
 from .output.ending import ended_like_by_ctrl_c
 from .output.files import write
 from .output.folders import alone_in
+from .output.markup import NONE, share
+from .output.pareto_figure import Differences, Panel, Series, draw_pareto
 from .output.progress import writing
 from .training.config import Experiment
 from .training.run import earlier, holds_training
@@ -144,20 +145,19 @@ class Demo(Long):
                 if self.fresh and learner.folder.exists():
                     shutil.rmtree(learner.folder)
             writing(("models, figures and tables", self.output))
-            began = time.perf_counter()
             calls = [
                 Call(1.0, run_training, (learner.experiment,), learner.experiment)
                 for learner in learners
             ]
             side_by_side(calls, TEAM, "trainings")
-            trained = time.perf_counter()
             side_by_side([call for learner in learners for call in learner.calls()], TEAM, "tests")
-            tested = time.perf_counter()
             for learner in learners:
-                _conclude(learner)
-        seconds = (trained - began, tested - trained, time.perf_counter() - tested)
-        parts = "trainings {:.0f} s, tests {:.0f} s, tables and figures {:.0f} s".format(*seconds)
-        print(f"figures, tables and models are in {self.output}; {sum(seconds):.0f} s: {parts}")
+                report = report_of(learner)
+                write(learner.folder / "front.json", report)
+                tables.console().print(front_table(learner, report))
+                draw_front(learner, report)
+                draw_episodes(learner)
+        print(f"figures, tables and models are in {self.output}")
 
     def _check(self, learner: Learner) -> None:
         """Whether the learner's folder may be gone on with, or removed.
@@ -177,15 +177,6 @@ class Demo(Long):
     def interrupted(self) -> str:
         """Nothing is lost, unless it is begun afresh."""
         return f"interrupted; go on with: {self.again(without=('--fresh',))}"
-
-
-def _conclude(learner: Learner) -> None:
-    """Write, print and draw what an agent and its rules brought."""
-    report = report_of(learner)
-    write(learner.folder / "front.json", report)
-    tables.console().print(front_table(learner, report))
-    draw_front(learner, report)
-    draw_episodes(learner)
 
 
 def report_of(learner: Learner) -> dict[str, Any]:
@@ -238,25 +229,17 @@ def front_table(learner: Learner, report: Mapping[str, Any]) -> Table:
         "transmission. Rate per sensor and step; rules mixed to the agent's rate; paired "
         "differences to their MSE, with 95 % intervals over episodes."
     )
-    table = Table(title=title_of(learner, report), box=box.SIMPLE_HEAD, caption=caption)
-    for name in ("price", "rate", "MSE"):
-        table.add_column(name, justify="right", no_wrap=True)
+    heads = ["price", "rate", "MSE"]
     for which in learner.classes:
-        table.add_column(f"rules {which} memory", justify="right")
-        table.add_column("difference", justify="right", no_wrap=True)
+        heads += [f"rules\n{which}\nmemory", "difference"]
+    rows = []
     for point in report["points"]:
         row = [f"{point['price']:.3g}", f"{point['rate']:.4f}", f"{point['mse']['mean']:.4f}"]
         for name in learner.classes.values():
             below = point["rules"].get(name)
-            row += [f"{below['mse']:.4f}", _share(below["difference"])] if below else ["–", "–"]
-        table.add_row(*row)
-    return table
-
-
-def _share(interval: Mapping[str, float]) -> str:
-    """A relative difference with its interval, in per cent."""
-    mean, low, high = (100.0 * interval[key] for key in ("mean", "low", "high"))
-    return f"{mean:+.1f} % [{low:+.1f}, {high:+.1f}]"
+            row += [f"{below['mse']:.4f}", share(below["difference"])] if below else [NONE, NONE]
+        rows.append(row)
+    return tables.table_tables(title_of(learner, report), heads, rows, caption)
 
 
 def title_of(learner: Learner, report: Mapping[str, Any]) -> str:
@@ -273,31 +256,39 @@ def title_of(learner: Learner, report: Mapping[str, Any]) -> str:
 def draw_front(learner: Learner, report: Mapping[str, Any]) -> None:
     """The agent's front over everything that is known of its classes.
 
-    The proven bound and the rollout are a scheduler's.
+    The band and the strip below hold 95 % intervals over episodes. The proven bound and the rollout
+    are a scheduler's.
     """
-    plain, remembering = learner.rules("without"), learner.rules("with")
-    agent = [(point["rate"], Interval(**point["mse"])) for point in report["points"]]
-    rates = np.linspace(0.0, 1.2 * max(rate for rate, _ in agent), 200)
-    scheduler = not learner.experiment.environment.local
+    always = learner.setup.envelopes["always"]
+    rates, scheduler = fine_rates(always), not learner.experiment.environment.local
+    rules = {which: learner.rules(which) for which in learner.classes}
+    style = palette.AGENTS_MEMORY._replace(label="the agent, at seven prices")
     bound = bound_of(SHIPPED / SETTING) if scheduler else None
-    layers = front_figure.Layers(
-        single=single_rules(learner),
-        plain=[(point.rate, point.mse) for point in points_of(plain)],
-        with_memory=[(point.rate, point.mse) for point in points_of(remembering)],
-        rollout=simulations(remembering, report["episodes"]) if scheduler else [],
-        bound=[(rate, at_least(bound, rate)) for rate in rates] if bound else [],
-        agent=agent,
-    )
-    caption = (
-        f"{report['episodes']:,} test episodes, the same for all and under the same token bucket; "
-        "bars are 95 % intervals.\nSingle rules and simulations, which ran on other or fewer "
-        "episodes, are where they lie relative to the lines there."
-    )
-    front_figure.front(learner.folder / "front.png", title_of(learner, report), caption, layers)
+    points = sorted(report["points"], key=lambda point: float(point["rate"]))
+    marks = [(point["rate"], point["mse"]["mean"]) for point in points]
+    band = [(point["rate"], point["mse"]["low"], point["mse"]["high"]) for point in points]
+    simulated = simulations(rules["with"], report["episodes"]) if scheduler else []
+    series = [
+        envelope_series(palette.RULES, points_of(rules["without"]), rates),
+        envelope_series(palette.RULES_MEMORY, points_of(rules["with"]), rates),
+        *([Series(palette.ROLLOUT, [], simulated)] if simulated else []),
+        Series(style, marks, marks, band),
+    ]
+    panel = Panel(
+        learner.name, series, single_rules(learner),
+        [(rate, at_least(bound, rate)) for rate in rates] if bound else [], None,
+        [Differences(style, [
+            (point["rate"], *(own["difference"][end] for end in ("mean", "low", "high")))
+            for point in points
+            if (own := point["rules"].get(learner.classes["with"]))
+        ])],
+    )  # fmt: skip
+    title = f"{title_of(learner, report)}; {report['episodes']:,} test episodes"
+    draw_pareto([learner.folder / "front.png"], title, panel, [], limits_of(always, [panel]))
 
 
-def single_rules(learner: Learner) -> list[tuple[float, float]]:
-    """Return rate and error of every tuned rule without memory.
+def single_rules(learner: Learner) -> list[list[tuple[float, float]]]:
+    """Return rate and error of the tuned rules of each family without memory.
 
     Each is as far from its envelope as on tuning episodes, which are easier or harder than the
     test's.
@@ -306,11 +297,13 @@ def single_rules(learner: Learner) -> list[tuple[float, float]]:
     vertices = sorted(content["vertices"], key=lambda vertex: vertex["tuning_rate"])
     rates = [vertex["tuning_rate"] for vertex in vertices]
     harder = [v["test_mse"]["mean"] / v["tuning_mse"]["mean"] for v in vertices]
-    return [
-        (row["rate"], float(row["mse"] * np.interp(row["rate"], rates, harder)))
-        for row in learner.setup.envelopes["curves"]
-        if row["family"] in content["families"] and row["options"] in ({}, content["options"])
-    ]
+    curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for row in learner.setup.envelopes["curves"]:
+        if row["family"] in content["families"] and row["options"] in ({}, content["options"]):
+            error = float(row["mse"] * np.interp(row["rate"], rates, harder))
+            key = row["family"], str(row["options"])
+            curves.setdefault(key, []).append((row["rate"], error))
+    return list(curves.values())
 
 
 def simulations(rules: Mapping[str, EpisodeResults], episodes: int) -> list[tuple[float, float]]:

@@ -8,6 +8,7 @@ written after each policy; with ``--resume`` the policies that it already holds 
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -15,8 +16,10 @@ from typing import Annotated, Any
 
 import pydantic
 
+from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.intervals import Interval
 from fusion_gym.evaluation.metrics import METRICS, paired_difference, robust_summary, summarise
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError, refusal
@@ -30,14 +33,6 @@ from .output.progress import progress_bar, remark, writing
 from .training.environment import environment_of
 
 
-class Ends(pydantic.BaseModel):
-    """A mean with its interval."""
-
-    mean: float
-    low: float
-    high: float
-
-
 class Quantiles(pydantic.BaseModel):
     """Quantiles of the episodes' error."""
 
@@ -47,7 +42,7 @@ class Quantiles(pydantic.BaseModel):
 # A policy in the JSON of an evaluation: an interval for a metric, or a list.
 _Row = Annotated[list[float], pydantic.Field(min_length=1)]
 _FIELDS: dict[str, Any] = {
-    name: (_Row if metric.axis else Ends, ...) for name, metric in METRICS.items()
+    name: (_Row if metric.axis else Interval, ...) for name, metric in METRICS.items()
 }
 EVALUATED = pydantic.create_model("EVALUATED", **_FIELDS)
 
@@ -114,16 +109,7 @@ def evaluate(command: Evaluate) -> dict[str, Any]:
             "differences need the episodes of every policy, and the JSON holds only their means"
         )
     policies = {name: make_policy(name, task) for name in names}
-    report: dict[str, Any] = {
-        "env": env_id,
-        "episodes": command.episodes,
-        "seed": command.seed,
-        "horizon": task.horizon,
-        "settings": task.settings,
-        "states": list(task.system.state_names),
-        "policies": {},
-        "quantiles": {},
-    }
+    report = evaluation_report(env_id, task, command.episodes, command.seed, {})
     done = finished(command.json, report) if command.resume else {"policies": {}}
     results: dict[str, EpisodeResults] = {}
     steps = command.episodes * task.horizon
@@ -161,6 +147,22 @@ def evaluate(command: Evaluate) -> dict[str, Any]:
     )
     console.print(tables.state_table(task.system.state_names, report["policies"]))
     return report
+
+
+def evaluation_report(
+    env_id: str, task: Task, episodes: int, seed: int, results: Mapping[str, EpisodeResults]
+) -> dict[str, Any]:
+    """Return what the JSON of an evaluation holds."""
+    return {
+        "env": env_id,
+        "episodes": episodes,
+        "seed": seed,
+        "horizon": task.horizon,
+        "settings": task.settings,
+        "states": list(task.system.state_names),
+        "policies": {name: summarise(result) for name, result in results.items()},
+        "quantiles": {name: robust_summary(result) for name, result in results.items()},
+    }
 
 
 def finished(path: Path | None, report: dict[str, Any]) -> dict[str, Any]:

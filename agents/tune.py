@@ -16,7 +16,6 @@ is made anew.
 """
 
 import contextlib
-import functools
 import sqlite3
 import time
 import warnings
@@ -52,6 +51,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "n_epochs": (2, 4, 8),
     "hidden": ("64,64", "128,128"),
 }
+_ENDED = (TrialState.COMPLETE, TrialState.PRUNED)
 _HEARTBEAT = 60  # seconds between two signs of life of who makes a trial in a shared study
 _OPENINGS, _PAUSE = 4, 0.3  # tries to open a storage, and seconds between them
 FACTORS = (0.25, 0.5, 1, 2)  # of the config's steps between two updates
@@ -142,10 +142,8 @@ def tune(
             open_study(experiment, folder)  # refuses before anything is made
         with alone_in(folder, "output"):
             writing(("study, trials and best.yaml", folder))
-            if shared is not None:
-                return together(shared, experiment, trials, folder)
-            study = open_study(experiment, folder)
-            search(study, experiment, trials, folder)
+            study = shared or open_study(experiment, folder)
+            search(study, experiment, trials, folder, shared is not None)
             return study
     except (sqlite3.Error, StorageInternalError) as error:
         reason = str(error.__cause__ or error).splitlines()[0]
@@ -202,19 +200,27 @@ def _study(
     )
 
 
-def search(study: optuna.Study, experiment: Experiment, trials: int, folder: Path) -> None:
-    """Run trials until so many have ended."""
-    for trial in study.get_trials(states=(TrialState.RUNNING,)):
-        study.tell(trial.number, state=TrialState.FAIL)  # its process is gone
-    done = min(ended(study), trials)
-    with progress_bar(trials, "tuning", done, unit="trials") as bar:
-        while ended(study) < trials:
+def search(
+    study: optuna.Study, experiment: Experiment, trials: int, folder: Path, shared: bool
+) -> None:
+    """Make trials until so many have ended, or are being made by others who share the study."""
+    if not shared:
+        for trial in study.get_trials(states=(TrialState.RUNNING,)):
+            study.tell(trial.number, state=TrialState.FAIL)  # its process is gone
+    active = (*_ENDED, TrialState.RUNNING)
+    with progress_bar(trials, "tuning", min(ended(study), trials), unit="trials") as bar:
+        while len(study.get_trials(deepcopy=False, states=active)) < trials:
             if not ended(study) and not study.get_trials(states=(TrialState.WAITING,)):
                 begin_with(study, experiment)
-            study.sampler = sampler(experiment, ended(study))
-            output = folder / f"trial_{ended(study)}"
-            work = functools.partial(run_trial, experiment=experiment, output=output, bar=bar)
-            study.optimize(work, 1)
+            place = ended(study)
+            if not shared:
+                study.sampler = sampler(experiment, place)
+
+            def run(trial: optuna.Trial, place: int = place) -> float:
+                output = folder / f"trial_{trial.number if shared else place}"
+                return run_trial(trial, experiment, output, bar)
+
+            study.optimize(run, 1)
             bar.reach(ended(study))
 
 
@@ -257,23 +263,6 @@ def _opened(storage: str) -> optuna.storages.RDBStorage:
     raise AssertionError
 
 
-def together(
-    study: optuna.Study, experiment: Experiment, trials: int, folder: Path
-) -> optuna.Study:
-    """Make trials beside other processes until so many have ended, or are being made by them."""
-    active = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.RUNNING)
-    if not study.get_trials(deepcopy=False):
-        begin_with(study, experiment)
-    with progress_bar(trials, "tuning", min(ended(study), trials), unit="trials") as bar:
-        while len(study.get_trials(deepcopy=False, states=active)) < trials:
-            study.optimize(
-                lambda trial: run_trial(trial, experiment, folder / f"trial_{trial.number}", bar),
-                n_trials=1,
-            )
-            bar.reach(ended(study))
-    return study
-
-
 def begin_with(study: optuna.Study, experiment: Experiment) -> None:
     """Let the config's own hyper-parameters be the first trial, where the search has them."""
     algorithm = experiment.algorithm.model_dump()
@@ -288,8 +277,7 @@ def begin_with(study: optuna.Study, experiment: Experiment) -> None:
 
 def ended(study: optuna.Study) -> int:
     """Number of trials that came to an end of their own, not by an interrupt."""
-    states = (TrialState.COMPLETE, TrialState.PRUNED)
-    return len(study.get_trials(deepcopy=False, states=states))
+    return len(study.get_trials(deepcopy=False, states=_ENDED))
 
 
 def sampler(experiment: Experiment, place: int) -> optuna.samplers.BaseSampler:

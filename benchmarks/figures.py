@@ -21,7 +21,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -34,6 +33,7 @@ import yaml
 
 from fusion_gym.agents.experiments.envelopes import read_envelopes
 from fusion_gym.agents.experiments.tables import read_rows
+from fusion_gym.agents.output.files import read_json, write
 
 TIMESTEPS = 100_000
 VALIDATION = {"every": 60_000, "episodes": 64}  # once on the way, and once at the end
@@ -43,23 +43,18 @@ Piece = Callable[[Path], bytes]
 Content = dict[str, Any]
 
 
-def command(name: str, *words: str) -> str:
+def command(name: str, *words: str, package: str = "fusion_gym.agents") -> str:
     """Run a command of the current directory on one thread; its standard output.
 
     Raises:
         RuntimeError: it failed; the message ends with what it said.
     """
-    line = [sys.executable, "-m", "fusion_gym.agents", name, *words]
+    line = [sys.executable, "-m", package, name, *words]
     env = os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(line, env=env, capture_output=True, text=True)
     if done.returncode != 0:
         raise RuntimeError(f"{name} ended with {done.returncode}: {done.stderr.strip()[-1000:]}")
     return done.stdout
-
-
-def read(path: Path) -> Any:
-    """The content of a JSON file."""
-    return json.loads(path.read_text())
 
 
 def evaluate(env: str, options: Content, names: list[str], episodes: int, folder: Path) -> bytes:
@@ -68,7 +63,7 @@ def evaluate(env: str, options: Content, names: list[str], episodes: int, folder
     if options:
         words += ["--set", *(f"{key}={value}" for key, value in options.items())]
     command("evaluate", *words, "--json", str(folder / "evaluation.json"))
-    report = read(folder / "evaluation.json")
+    report = read_json(folder / "evaluation.json", "json")
     selection = {key: report[key] for key in ("policies", "quantiles")}
     return json.dumps(selection, sort_keys=True).encode()
 
@@ -76,7 +71,7 @@ def evaluate(env: str, options: Content, names: list[str], episodes: int, folder
 def reproduce(config: Path, episodes: int, folder: Path) -> bytes:
     """The table that the maintainers' command ``table`` prints."""
     words = ("--config", str(config), "--episodes", str(episodes), "--markdown")
-    return command("table", *words).encode()
+    return command("table", *words, package="fusion_gym.agents.maintenance").encode()
 
 
 def train(plain: Content, folder: Path) -> bytes:
@@ -92,32 +87,18 @@ def train(plain: Content, folder: Path) -> bytes:
     return b"".join(tensors) + (output / "validation.jsonl").read_bytes()
 
 
-def numbers(content: Any) -> Iterator[float]:
-    """All numbers of a JSON document but the wall times, by sorted keys."""
-    if isinstance(content, dict):
-        content = [content[key] for key in sorted(content) if key != "seconds"]
-    if isinstance(content, list):
-        for entry in content:
-            yield from numbers(entry)
-    elif isinstance(content, (int, float)) and not isinstance(content, bool):
-        yield content
-
-
 def benchmark(setting: str, folder: Path) -> bytes:
-    """The numbers in every file that the quick benchmark of a setting writes."""
-    results, work = folder / "results", folder / "work"
+    """The tables that the quick benchmark of a setting writes, but that of the wall times."""
     words = ["--quick", "--envs", setting, "--workers", "1"]
-    command("benchmark", *words, "--results", str(results), "--work", str(work))
-    files = sorted(work.glob(f"{setting}/*.json"))
-    result: dict[str, Any] = {file.name: list(numbers(read(file))) for file in files}
-    tables = [path for path in sorted(results.glob(f"{setting}/*.csv")) if path.stem != "runs"]
-    return json.dumps(result | {path.name: path.read_text() for path in tables}).encode()
+    command("benchmark", *words, "--results", str(folder), "--work", str(folder / "work"))
+    tables = [path for path in sorted(folder.glob(f"{setting}/*.csv")) if path.stem != "runs"]
+    return json.dumps({path.name: path.read_text() for path in tables}).encode()
 
 
 def zoo_pieces(episodes: int) -> Iterator[tuple[str, Piece]]:
     """Every agent of the zoo at its prices, in its environment."""
     for path in sorted(Path("fusion_gym/zoo").glob("*.json")):
-        card = read(path)
+        card = read_json(path, "zoo")
         centre = {"information": "centre"} if card["mode"] == "centre" else {}
         low, high = card["training"]["environment"]["options"]["price_range"]
         prices = [min(max(price, low), high) for price in card["test"]["prices"]]
@@ -170,59 +151,44 @@ KINDS: dict[str, Callable[[int], Iterator[tuple[str, Piece]]]] = {
 }
 
 
-def fingerprint(work: Piece) -> tuple[str, float]:
-    """The SHA-256 of what the work gave, and the seconds that it took."""
-    began = time.perf_counter()
+def fingerprint(work: Piece) -> str:
+    """The SHA-256 of what the work gave."""
     with tempfile.TemporaryDirectory() as folder:
-        digest = hashlib.sha256(work(Path(folder))).hexdigest()
-    return digest, time.perf_counter() - began
+        return hashlib.sha256(work(Path(folder))).hexdigest()
 
 
 def run(output: Path, kinds: list[str], episodes: int, workers: int) -> int:
     """Fill the file with the pieces that it lacks; returns how many of them failed."""
-    result: dict[str, str] = read(output) if output.exists() else {}
+    result = read_json(output, "output") if output.exists() else {}
     pieces = {name: work for kind in kinds for name, work in KINDS[kind](episodes)}
     left = {name: work for name, work in pieces.items() if name not in result}
     print(f"{len(pieces)} pieces, {len(pieces) - len(left)} of them are finished", flush=True)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    unfinished, failed = output.with_name(output.name + ".part"), 0
-    pool = ThreadPoolExecutor(workers)
+    failed, pool = 0, ThreadPoolExecutor(workers)
     futures = {pool.submit(fingerprint, work): name for name, work in left.items()}
     try:
         for future in as_completed(futures):
             name, error = futures[future], future.exception()
-            if error is not None:
-                failed += 1
-                print(f"{name} failed: {error}", file=sys.stderr, flush=True)
-                continue
-            result[name], seconds = future.result()
-            unfinished.write_text(json.dumps(result, indent=1, sort_keys=True) + "\n")
-            unfinished.replace(output)
-            print(f"{name}: {result[name][:12]}, {seconds:.0f} s", flush=True)
+            if error is None:
+                result[name] = future.result()
+                write(output, dict(sorted(result.items())))
+            failed += error is not None
+            print(f"{name}: {error or result[name][:12]}", flush=True)
     finally:
         pool.shutdown(cancel_futures=True)
     return failed
 
 
 def main() -> None:
-    """Entry point; exit status 1 if a piece failed, 130 after an interrupt."""
+    """Entry point; exit status 1 if a piece failed."""
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.figures",
-        description="Fingerprints of the figures, to show that a change moves none.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        description="Fingerprints of the figures, to show that a change moves none."
     )
-    parser.add_argument(
-        "--output", type=Path, required=True, help="run what this JSON lacks, and add it"
-    )
+    parser.add_argument("--output", type=Path, required=True, help="run what this JSON lacks")
     parser.add_argument("--only", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--episodes", type=int, default=200, help="of evaluations and tables")
     parser.add_argument("--workers", type=int, default=2, help="commands side by side")
     arguments = parser.parse_args()
-    try:
-        failed = run(arguments.output, arguments.only, arguments.episodes, arguments.workers)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    sys.exit(failed > 0)
+    sys.exit(run(arguments.output, arguments.only, arguments.episodes, arguments.workers) > 0)
 
 
 if __name__ == "__main__":

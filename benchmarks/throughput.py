@@ -175,13 +175,10 @@ def main() -> None:
         "gym.make, paper's filter": single(paper),
         "gym.make, Tobit filter": single(tobit),
         "SB3 DummyVecEnv, 64 × gym.make, paper's filter": dummy_sb3(paper, 64),
-        "native SB3 VecEnv, 256, paper's filter": native_sb3(paper, 256),
         "native SB3 VecEnv, 1,024, paper's filter": native_sb3(paper, 1024),
         "native SB3 VecEnv, 1,024, Tobit filter": native_sb3(tobit, 1024),
-        "gym.make_vec, 64, paper's filter": vector(paper, 64),
         "gym.make_vec, 1,024, paper's filter": vector(paper, 1024),
         "gym.make_vec, 1,024, Tobit filter": vector(tobit, 1024),
-        "gym.make_vec, 4,096, Tobit filter": vector(tobit, 4096),
         "CorrelatedTracking, 1,024": vector({}, 1024, "fusion_gym/CorrelatedTracking-v0"),
         "CorrelatedTracking, 1,024, ci": vector(
             {"fusion": "ci"}, 1024, "fusion_gym/CorrelatedTracking-v0"

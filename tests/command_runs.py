@@ -64,6 +64,22 @@ def call(command: str, words: list[str], seconds: float = 60.0, limit: int | Non
     return Ended(status, out.getvalue(), err.getvalue(), trace)
 
 
+def succeed(command: str, words: list[str], seconds: float = 200.0) -> Ended:
+    """Run a command that must end well."""
+    ended = call(command, words, seconds)
+    assert (ended.status, ended.trace) == (0, ""), ended.err
+    return ended
+
+
+def refusal(command: str, words: list[str], limit: int | None = None) -> str:
+    """Run a command that must end with one line of error, and return the line."""
+    ended = call(command, words, limit=limit)
+    assert (ended.status, ended.trace) == (1, ""), ended.err
+    message = ended.err.splitlines()[-1]
+    assert message.startswith("error: ")
+    return message
+
+
 @contextlib.contextmanager
 def without_rights(requests: bool) -> Iterator[None]:
     """As somebody who may not enter a locked folder, even if the tests run as root."""

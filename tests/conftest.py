@@ -5,11 +5,13 @@ from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 
 from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.policies import registry
+from fusion_gym.policies.schedule_file import Schedule
 
 # Two test processes share two cores: more threads would only wait for each other.
 torch.set_num_threads(1)
@@ -20,6 +22,22 @@ os.environ["OMP_NUM_THREADS"] = "1"  # of the commands that tests start
 def own_table(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a test registers as a policy is gone after it."""
     monkeypatch.setattr(registry, "_ROWS", dict(registry._ROWS))
+
+
+@pytest.fixture
+def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the intervals of a verdict in no time."""
+    monkeypatch.setattr("fusion_gym.agents.experiments.verdict.RESAMPLES", 20)
+
+
+@pytest.fixture
+def unsearched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make policies without the search for their schedule, which takes minutes."""
+
+    def optimum(system: Any, packets: int, period: int, *_: Any) -> Schedule:
+        return Schedule(np.ones((period, system.sensor_count), dtype=np.bool_), float(packets))
+
+    monkeypatch.setattr("fusion_gym.policies.periodic_optimum.optimum", optimum)
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ command's own work. The end must be that of the undisturbed run, bit by bit.
 """
 
 import argparse
-import json
 import os
 import random
 import signal
@@ -15,73 +14,18 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import optuna
-import yaml
-from small_suite import small_suite
-from stable_baselines3 import PPO
-from training_configs import small_config
+from small_runs import arguments, meaning
 
 from fusion_gym.agents.__main__ import load
 from fusion_gym.agents.experiments import verdict
 
-Outcome = dict[str, Any]
+# Steps of a training, and trials of a study or trainings of a class.
+SIZES = {"train": (16_384, 1), "tune": (4096, 8), "benchmark": (4096, 2)}
 
 
-def weights(path: Path) -> list[Any]:
-    return [value.tolist() for value in PPO.load(path, device="cpu").policy.state_dict().values()]
-
-
-def train(folder: Path) -> tuple[list[str], Callable[[], Outcome]]:
-    training = {"timesteps": 16_384, "num_envs": 8}
-    config = small_config(folder, training=training, validation={"every": 1024, "episodes": 4})
-    run = folder / "run"
-
-    def outcome() -> Outcome:
-        summary = json.loads((run / "summary.json").read_text())
-        return {
-            "best": weights(run / "best_model.zip"),
-            "final": weights(run / "final_model.zip"),
-            "records": (run / "validation.jsonl").read_text(),
-            **{key: summary[key] for key in ("best_validation", "finished", "inputs")},
-        }
-
-    return ["--config", str(config)], outcome
-
-
-def tune(folder: Path) -> tuple[list[str], Callable[[], Outcome]]:
-    training = {"timesteps": 4096, "num_envs": 8}
-    config = small_config(folder, training=training, validation={"every": 1024, "episodes": 4})
-    output = folder / "study"
-
-    def outcome() -> Outcome:
-        study = optuna.load_study(study_name="tune", storage=f"sqlite:///{output / 'study.db'}")
-        ended = [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
-        return {
-            "trials": [(t.state.name, t.params, t.value, t.intermediate_values) for t in ended],
-            "best": yaml.safe_load((output / "best.yaml").read_text())["algorithm"],
-        }
-
-    return ["--config", str(config), "--trials", "8", "--output", str(output)], outcome
-
-
-def benchmark(folder: Path) -> tuple[list[str], Callable[[], Outcome]]:
-    results, work = folder / "results", folder / "work"
-
-    def outcome() -> Outcome:
-        tables = (path for path in results.rglob("*.csv") if path.stem != "runs")  # with seconds
-        result: Outcome = {path.name: path.read_text() for path in tables}
-        return result | {"pieces": sorted(path.parent.name for path in work.rglob("output.pkl"))}
-
-    config = small_suite(folder, timesteps=4096)
-    arguments = ["--config", str(config), "--results", str(results), "--work", str(work)]
-    return [*arguments, "--workers", "1", "--parts", "agents"], outcome
-
-
-def attempt(command: str, arguments: list[str], log: Path, seconds: float | None) -> str:
+def attempt(command: str, words: list[str], log: Path, seconds: float | None) -> str:
     """Run the command in a fork; "killed" after so many seconds, or how it ended."""
     child = os.fork()
     if child == 0:
@@ -89,7 +33,7 @@ def attempt(command: str, arguments: list[str], log: Path, seconds: float | None
             with log.open("w") as file:
                 os.dup2(file.fileno(), 1)
                 os.dup2(file.fileno(), 2)
-            sys.argv = [f"agents/{command}.py", *arguments]
+            sys.argv = [f"agents/{command}.py", *words]
             load(command).main()
             os._exit(0)
         except SystemExit as end:
@@ -121,11 +65,11 @@ def begun(command: str, folder: Path) -> bool:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("command", choices=("train", "tune", "benchmark"))
+    parser.add_argument("command", choices=SIZES)
     parser.add_argument("--kills", type=int, default=15)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    make = {"train": train, "tune": tune, "benchmark": benchmark}[args.command]
+    steps, repetitions = SIZES[args.command]
     load(args.command)
     moments = random.Random(args.seed)
     verdict.RESAMPLES = 20
@@ -133,24 +77,24 @@ def main() -> None:
         root = Path(place)
         log = root / "log"
         (root / "whole").mkdir()
-        arguments, outcome = make(root / "whole")
+        words = arguments(args.command, root / "whole", 0, steps, repetitions)
         began = time.perf_counter()
-        attempt(args.command, arguments, log, None)
+        attempt(args.command, words, log, None)
         lasts = time.perf_counter() - began
-        expected, kills, rounds = outcome(), 0, 0
+        expected, kills, rounds = meaning(root / "whole"), 0, 0
         while kills < args.kills or rounds == 0:
             rounds += 1
             folder = root / f"round_{rounds}"
             folder.mkdir()
-            arguments, outcome = make(folder)
+            words = arguments(args.command, folder, 0, steps, repetitions)
             ended = "killed"
             while ended == "killed":
                 again = ["--resume"] if begun(args.command, folder) else []
                 last = kills >= args.kills
                 seconds = None if last else moments.uniform(0.0, 0.6 * lasts)
-                ended = attempt(args.command, [*arguments, *again], log, seconds)
+                ended = attempt(args.command, [*words, *again], log, seconds)
                 kills += ended == "killed"
-            assert outcome() == expected, f"round {rounds}: not what the undisturbed run wrote"
+            assert meaning(folder) == expected, f"round {rounds}: another outcome"
             left = list(folder.rglob("*.part*"))
             assert not left, left
     print(f"{args.command}: {kills} kills in {rounds} rounds of {lasts:.1f} s, nothing lost")

@@ -102,7 +102,10 @@ def test_an_unknown_option() -> None:
 
 # What a process noise of rank one leaves of it is no covariance that could be inverted.
 SINGULAR = ((0.0, 0.01, 5e-05), (0.0, 1.0, 0.01), (0.0, 0.0, 1.0))
-# Options of other environments.
+GILBERT_ELLIOTT, MEMORY = {"channel": "gilbert_elliott"}, {"memory": True}
+ESTIMATE = {"packet": "estimate"}
+UNSTABLE = (((1.1, 0.0), (0.0, 1.0)),) * 2
+# Options of all environments.
 ELSEWHERE: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     ("RemoteEstimation", {"sensors": 17, "action": "discrete"}, ("'discrete'", "17 sensors")),
     ("RemoteEstimation", {"token_capacity": 0.5}, ("token_capacity = 0.5", "initial_tokens = 1.0")),
@@ -111,6 +114,91 @@ ELSEWHERE: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     ("CorrelatedTracking", {"transition": SINGULAR}, ("((0.0, 0.01, 5e-05)", "singular")),
     ("UnknownInput", {"input_amplitude": 0.0}, ("input_amplitude = 0.0", "nothing to estimate")),
     ("BiasedOscillator", {"censoring_threshold": 1e9}, ("1000000000.0", "censoring_upper")),
+    ("BiasedOscillator", {"censoring_threshold": 5.0}, ("is not allowed",)),
+    ("BiasedOscillator", {"bias_gain": [[0.1]]}, ("is not allowed",)),
+    ("BiasedOscillator", {"information_shares": [0.5, 0.5], "filter": "adf"}, ("is not allowed",)),
+    ("RemoteEstimation", {"coefficient": 100.0}, ()),
+    ("RemoteEstimation", {"drop_probability": 0.1}, ()),
+    ("RemoteEstimation", {"channel_transition": np.eye(2), "channel": "independent"}, ()),
+    ("RemoteEstimation", GILBERT_ELLIOTT | {"channel_transition": ((0.5, 0.4), (0, 1))}, ()),
+    (
+        "RemoteEstimation",
+        GILBERT_ELLIOTT | {"channel_transition": np.eye(2)},
+        ("initial_channel",),
+    ),
+    # Packets and memory
+    ("TobitOscillator", {"broadcast": "none"}, ("broadcast = 'none'", "'estimate' or 'packets'")),
+    ("TobitOscillator", MEMORY | {"information": "centre"}, ("memory = True", "must be False")),
+    ("TobitOscillator", {"memory_filter": "adf"}, ("= 'adf'", "unless memory=True")),
+    (
+        "TobitOscillator",
+        {"belief_features": ["value"], "information": "centre"},
+        ("belief_features = ['value']", "information='centre'"),
+    ),
+    ("TobitOscillator", {"memory_filter": "best"} | MEMORY, ("= 'best'", "'adf'")),
+    ("TobitOscillator", {"belief_features": "x"} | MEMORY, ("= 'x'", "'difference'")),
+    ("TobitOscillator", {"packet": "estimate", "filter": "tobit"}, ("= 'estimate'", "memory=True")),
+    ("TobitOscillator", ESTIMATE | MEMORY, ("packet = 'estimate'", "silent='hold'")),
+    ("MarkovJumpTracking", ESTIMATE | MEMORY, ("packet = 'estimate'", "already")),
+    ("UnknownInput", ESTIMATE | MEMORY, ("packet = 'estimate'", "anew")),
+    ("RemoteEstimation", ESTIMATE | MEMORY, ("packet = 'estimate'", "itself")),
+    ("CorrelatedTracking", {"memory_filter": "imm"} | MEMORY, ("= 'imm'", "one filt")),
+    ("RemoteEstimation", {"memory_filter": "adf"} | MEMORY, ("= 'adf'", "one filter")),
+    # Systems of one's own
+    ("LinearFusion", {"measurement_matrices": []}, ("measurement_matrices = []",)),
+    ("LinearFusion", {"measurement_matrices": 3}, ("a list with a matrix for each sensor",)),
+    (
+        "LinearFusion",
+        {"measurement_matrices": [[1, 0], [[1, 0, 0]]]},
+        ("measurement_matrices[1]",),
+    ),
+    ("LinearFusion", {"state_names": ["a", "a"]}, ("2 different words",)),
+    ("LinearFusion", {"state_names": ["a", "b", "a"]}, ("2 different words",)),
+    ("LinearFusion", {"state_names": ["a", "b,c"]}, ("2 different words",)),
+    ("LinearFusion", {"measurement_covariances": [1.0]}, ("each of the 2 sensors",)),
+    (
+        "LinearFusion",
+        {"measurement_covariances": [1.0, [[1, 2], [2, 1]]]},
+        ("measurement_covariances[1]",),
+    ),
+    (
+        "LinearFusion",
+        {
+            "measurement_covariances": [[[1, 0.5], [0.5, 1]]],
+            "measurement_matrices": [[[1, 0], [0, 1]]],
+            "censoring_threshold": 0.0,
+        },
+        ("diagonal",),
+    ),
+    ("LinearFusion", {"censoring_threshold": [0.0, [1.0, 2.0]]}, ("censoring_threshold[1]",)),
+    ("LinearFusion", {"censoring_threshold": 1.0, "censoring_upper": 0.0}, ()),
+    ("LinearFusion", {"transition": [[2.0, 0.0], [0.0, 1.5]]}, ()),
+    # Correlated and jumping plants
+    ("CorrelatedTracking", {"noise_scale": 0.0}, ("noise_scale = 0.0", "> 0")),
+    ("CorrelatedTracking", {"noise_scale": 1.5}, ("noise_scale = 1.5", "<= 1")),
+    ("CorrelatedTracking", {"fusion": "information"}, ("= 'information'", "process noise")),
+    ("CorrelatedTracking", {"fusion": "federated"}, ("fusion = 'federated'", "'sici'")),
+    ("CorrelatedTracking", {"fusion": "scii"}, ("did you mean 'sci",)),
+    ("CorrelatedTracking", {"order": (0, 1, 2), "fusion": "ci"}, ("order = ", "fusion='ci'")),
+    ("CorrelatedTracking", {"order": (0, 1, 1)}, ("order = (0, 1, 1)", "once")),
+    ("CorrelatedTracking", {"order": (1, 2, 3)}, ()),
+    ("CorrelatedTracking", {"transition": ((1.0, 0.1),)}, ()),
+    ("CorrelatedTracking", {"process_variance": 0.0}, ()),
+    ("CorrelatedTracking", {"initial_covariance": -np.eye(3)}, ()),
+    ("CorrelatedTracking", {"thresholds": 1.0}, ("unknown option", "trigger_threshold")),
+    ("MarkovJumpTracking", {"fusion": "information"}, ("= 'information'", "correlated")),
+    ("MarkovJumpTracking", {"fusion": "federated"}, ("fusion = 'federated'", "fed back")),
+    ("MarkovJumpTracking", {"fusion": "matrx"}, ("did you mean 'matrix'",)),
+    ("MarkovJumpTracking", {"mode_transition": ((0.6, 0.3), (0.4, 0.6))}, ("[0.9, 1.0]",)),
+    ("MarkovJumpTracking", {"transitions": UNSTABLE}, ("mean-square stable",)),
+    ("MarkovJumpTracking", {"sampling_periods": 0}, ()),
+    ("MarkovJumpTracking", {"fading_values": ((1.5, 0.5),) * 3}, ("from 0 to 1",)),
+    ("MarkovJumpTracking", {"fading_probabilities": ((0.5, 0.4, 0.0),) * 3}, ("add up to 1",)),
+    ("MarkovJumpTracking", {"initial_probabilities": (0.5, 0.4)}, ("add up to 1, not 0.9",)),
+    ("MarkovJumpTracking", {"sampling_period": 2}, ("unknown option", "sampling_periods")),
+    ("MarkovJumpTracking", {"filter": "central"}, ("did you mean 'centralised'",)),
+    ("MarkovJumpTracking", {"fusion": "matrix", "filter": "imm"}, ("filter='imm': ", "left out")),
+    ("MarkovJumpTracking", {"fusion": "ci", "filter": "centralised"}, ("filter='centralised'",)),
 ]
 
 
@@ -178,6 +266,7 @@ def test_calls(call: Callable[[], Any], parts: tuple[str, ...]) -> None:
         ("dynamic_event:threshold=0.1/-1/0.3", ("threshold = (0.1, -1, 0.3)", ">= 0")),
         ("information_gain:threshold=0.1/0.2/0.3,at_most=none", ("threshold = (0.1, 0.2, 0.3)",)),
         ("innovation_threshold:at_most=0", ("at_most = 0", "whole number >= 1")),
+        ("lookahead:price=-1", ("price = -1",)),
         ("round_robin:period=2.5", ("period = 2.5", "whole number >= 1")),
         ("model:", ("model ''", "no such file")),
         ("model:nowhere/agent.zip", ("'nowhere/agent.zip'", "no such file")),
@@ -186,6 +275,41 @@ def test_calls(call: Callable[[], Any], parts: tuple[str, ...]) -> None:
 )
 def test_policies(spec: str, parts: tuple[str, ...]) -> None:
     refused(lambda: make_policy(spec, make_task(ENV_ID)), ConfigurationError, parts)
+
+
+TOBIT, VALUE, OPTIMUM = "TobitOscillator", "value_of_information", "periodic_optimum"
+CENTRE, MARKOV = {"information": "centre"}, "MarkovJumpTracking"
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "spec", "parts"),
+    [
+        (TOBIT, {}, "rollout", ("policy 'rollout' needs a parameter 'base': write base=",)),
+        (TOBIT, {}, "rollout:base=always:samples=3", ("of policy 'always' 'samples'",)),
+        (TOBIT, {}, "rollout:steps=0,base=never", ("steps = 0",)),
+        (TOBIT, {}, "rollout:base=dynamic_event", ("'dynamic_event'", "the present step alone")),
+        (TOBIT, {}, "rollout:base=rollout:base=never", ("base = 'rollout:base=never'",)),
+        (TOBIT, {}, "rollout:base=value_of_information:own=true", ("a scheduler's policy",)),
+        (TOBIT, CENTRE, "rollout:base=never", ("information = 'centre'",)),
+        (TOBIT, {}, f"{VALUE}:threshold=0.1,price=0.1", ("price = 0.1", "beside threshold")),
+        (TOBIT, {}, f"{VALUE}:own=true,at_most=2", ("at_most = 2", "own=True")),
+        (TOBIT, {}, f"{VALUE}:own=true,steps=2", ("steps = 2", "own=True")),
+        (TOBIT, {}, "estimate_difference:own=true,at_most=2", ("at_most = 2", "own=True")),
+        (TOBIT, {}, "kullback_leibler:own=true,at_most=3", ("at_most = 3", "own=True")),
+        (TOBIT, CENTRE, VALUE, ("information = 'centre'",)),
+        (MARKOV, {}, f"{OPTIMUM}:packets=19", ("packets = 19", "<= 18")),
+        (MARKOV, {}, f"{OPTIMUM}:packets=12,period=8", ("packets = 12", "2704156 schedules")),
+        (MARKOV, {}, f"{OPTIMUM}:cache=/dev/null/x,packets=1,period=1", ("cache = ", "written")),
+        (MARKOV, {"access": "single"}, OPTIMUM, ("access = 'single'", "'any'")),
+        (MARKOV, {"filter": "imm"}, OPTIMUM, ("CentralSystem", "not depend on the data")),
+    ],
+)
+def test_policies_elsewhere(
+    name: str, options: dict[str, Any], spec: str, parts: tuple[str, ...]
+) -> None:
+    task = make_task(f"fusion_gym/{name}-v0", **options)
+    message = refused(lambda: make_policy(spec, task), ConfigurationError, parts)
+    assert "\n" not in message
 
 
 # Hostile actions of every kind: test_fuzz_actions.py.

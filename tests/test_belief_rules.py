@@ -13,11 +13,9 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.beliefs import Beliefs
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
-from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.estimate_difference import EstimateDifference
 from fusion_gym.policies.rules.kullback_leibler import KullbackLeibler
 from fusion_gym.policies.rules.value_of_information import ValueOfInformation
-from fusion_gym.validation import ConfigurationError
 
 TOBIT = "fusion_gym/TobitOscillator-v0"
 CORRELATED = "fusion_gym/CorrelatedTracking-v0"
@@ -200,20 +198,3 @@ def test_the_divergence_is_that_of_two_gaussians(own: bool, memory: bool) -> Non
     requests = KullbackLeibler(task, threshold=threshold, own=own)(batch.signals())
     share(requests)
     np.testing.assert_array_equal(requests, values >= threshold)
-
-
-@pytest.mark.parametrize(
-    ("spec", "options", "message"),
-    [
-        ("value_of_information:threshold=0.1,price=0.1", {}, "price = 0.1 .*beside threshold"),
-        ("value_of_information:own=true,at_most=2", {}, "at_most = 2 .*own=True"),
-        ("value_of_information:own=true,steps=2", {}, "steps = 2 .*own=True"),
-        ("estimate_difference:own=true,at_most=2", {}, "at_most = 2 .*own=True"),
-        ("kullback_leibler:own=true,at_most=3", {}, "at_most = 3 .*own=True"),
-        ("value_of_information", {"information": "centre"}, "information = 'centre'"),
-    ],
-)
-def test_what_cannot_be_decided_is_refused(spec: str, options: Any, message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message) as caught:
-        make_policy(spec, task_of(**options))
-    assert "\n" not in str(caught.value)

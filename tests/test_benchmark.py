@@ -13,14 +13,13 @@ import optuna
 import pandas as pd
 import pytest
 import yaml
-from command_runs import call
+from command_runs import call, refusal, succeed
 from small_results import small_results
 from small_suite import ENV, SMALL, small_suite
 from training_configs import small_config
 
 import fusion_gym
-from fusion_gym.agents import __main__ as everything
-from fusion_gym.agents import benchmark, tune
+from fusion_gym.agents import tune
 from fusion_gym.agents.experiments import training as jobs
 from fusion_gym.agents.experiments.classes import classes_of, trained_classes
 from fusion_gym.agents.experiments.config import load_suite
@@ -29,51 +28,34 @@ from fusion_gym.agents.experiments.figures import report_text
 from fusion_gym.agents.experiments.report import SettingResults, read_results
 from fusion_gym.agents.experiments.tables import read_rows, write_rows
 from fusion_gym.agents.experiments.workers import Folders
-from fusion_gym.agents.maintenance import zoo
 from fusion_gym.agents.output.markup import code, page_of
 from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.core.system import covers
 from fusion_gym.deprecation import replace_value
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.periodic_optimum import Schedule
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
 
 
-def run_main(monkeypatch: pytest.MonkeyPatch, module: Any, *arguments: str) -> None:
-    monkeypatch.setattr(sys, "argv", ["program", *arguments])
-    everything.load(module.__name__.rpartition(".")[2]).main()
-
-
-def test_from_tuning_to_report_and_zoo(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("fusion_gym.agents.experiments.verdict.RESAMPLES", 50)
+@pytest.mark.usefixtures("few_resamples")
+def test_from_tuning_to_report_and_zoo(tmp_path: Path) -> None:
     results, work = tmp_path / "results", tmp_path / "work"
     arguments = [
         "--config", str(small_suite(tmp_path)), "--results", str(results), "--work", str(work),
         "--workers", "1",
     ]  # fmt: skip
-    run_main(monkeypatch, benchmark, *arguments, "--seeds", "1", "--classes", "sensors")
+    succeed("benchmark", [*arguments, "--seeds", "1", "--classes", "sensors"])
     folder = work / "small"
     assert SettingResults(results / "small").classes["sensors"]["seeds"] == 1
     stamp = (folder / "sensors_0" / "latest.zip").stat().st_mtime_ns
-    with pytest.raises(SystemExit, match="--resume"):
-        run_main(monkeypatch, benchmark, *arguments)
-    run_main(monkeypatch, benchmark, *arguments, "--resume")
+    assert "--resume" in refusal("benchmark", arguments)
+    succeed("benchmark", [*arguments, "--resume"])
     assert (folder / "sensors_0" / "latest.zip").stat().st_mtime_ns == stamp
-    (tmp_path / "other").mkdir()
-    other = small_suite(tmp_path / "other", episodes=13)
-    for option, value, message in (
-        ("--timesteps", "512", "training.timesteps = 512 differs"),
-        ("--config", str(other), "episodes = 13 differs"),
-    ):
-        with pytest.raises(SystemExit, match=message) as caught:
-            run_main(monkeypatch, benchmark, *arguments, "--resume", option, value)
-        assert "\n" not in str(caught.value)
+    error = refusal("benchmark", [*arguments, "--resume", "--timesteps", "512"])
+    assert "training.timesteps = 512 differs" in error
     classes = SettingResults(results / "small").classes
     assert {name: front["seeds"] for name, front in classes.items()} == {
         "centre": 2, "local_estimate": 2, "local_packets_memory": 2, "sensors": 2,
@@ -114,18 +96,13 @@ def test_from_tuning_to_report_and_zoo(
         assert f'src="{figure}' not in page
         xml.etree.ElementTree.parse(results / f"{figure}.svg")
 
-    run_main(
-        monkeypatch, zoo, "--results", str(results), "--work", str(work), "--zoo",
-        str(tmp_path / "zoo"),
-    )  # fmt: skip
+    words = ["--results", str(results), "--work", str(work), "--zoo", str(tmp_path / "zoo")]
+    assert "zoo:small_local_estimate" in succeed("zoo", words).out
     card = json.loads((tmp_path / "zoo" / "small_sensors.json").read_text())
     assert card["env"] == ENV
     content = (tmp_path / "zoo" / "small_sensors.zip").read_bytes()
     assert card["sha256"] == hashlib.sha256(content).hexdigest()
     assert (tmp_path / "zoo" / "small_sensors.zip").stat().st_size < 300_000
-    assert card["command"].endswith("benchmark --envs small --classes sensors, training seed " + (
-        str(card["training"]["training"]["seed"])
-    ))  # fmt: skip
     journal_entry = json.loads((tmp_path / "zoo" / "small_local_packets_memory.json").read_text())
     task = fusion_gym.make_task(ENV, **journal_entry["options"])
     smaller = f"model:{tmp_path / 'zoo' / 'small_local_packets_memory.zip'},price=0.01"
@@ -133,16 +110,11 @@ def test_from_tuning_to_report_and_zoo(
     whole = f"model:{work / 'small' / f'local_packets_memory_{seed}' / 'best_model.zip'},price=0.01"
     first, second = (run_episodes(task, make_policy(p, task), 4, seed=0) for p in (smaller, whole))
     np.testing.assert_array_equal(first.mse, second.mse)
-    assert "zoo:small_local_estimate" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("unsearched")
 def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPatch) -> None:
-    def unsearched(system: Any, packets: int, period: int, *_: Any) -> Schedule:
-        return Schedule(np.ones((period, system.sensor_count), dtype=np.bool_), float(packets))
-
-    # The policies are made, but the schedules' searches would take minutes, and so would more than
-    # one optimum of two sources.
-    monkeypatch.setattr("fusion_gym.policies.periodic_optimum.optimum", unsearched)
+    # More than one optimum of two sources would take minutes.
     tasks: dict[str, Any] = {}
 
     def task_of(setting: Any, options: Any = ()) -> Any:
@@ -222,18 +194,6 @@ def test_trainings_of_the_committed_suite(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-def test_a_class_that_a_setting_has_not_is_refused(tmp_path: Path) -> None:
-    wrong = SMALL["settings"][0] | {"agents": ["local_none"]}
-    suite = load_suite(small_suite(tmp_path, settings=[wrong]))
-    with pytest.raises(ConfigurationError, match=r"agents of small = 'local_none' is not allowed"):
-        trained_classes(suite, suite.settings[0])
-    for field in ("envs", "lengths"):
-        wrong = SMALL["settings"][0] | {field: {"locale": 2}}
-        suite = load_suite(small_suite(tmp_path, settings=[wrong]))
-        with pytest.raises(ConfigurationError, match=f"{field} of small = 'locale' is not"):
-            trained_classes(suite, suite.settings[0])
-
-
 def test_a_work_folder_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
     (tmp_path / "work" / "small" / "tuned").mkdir(parents=True)
     with pytest.raises(ConfigurationError, match=r"of an earlier version: give another --work"):
@@ -245,17 +205,28 @@ def test_a_work_folder_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
     [
         ({"famlies": []}, "famlies"),
         ({"prices": 0}, "prices = 0"),
-        ({"settings": [SMALL["settings"][0] | {"families": ["none"]}]}, "'none' is none of"),
         (
             {"families": [SMALL["families"][0] | {"parameters": {"a": {"low": 2, "high": 1}}}]},
             "low = 2.0 must be below high = 1.0",
         ),
+        *(
+            ({"settings": [SMALL["settings"][0] | {field: value}]}, message)
+            for field, value, message in (
+                ("families", ["none"], "'none' is none of"),
+                ("agents", ["local_none"], "agents of small = 'local_none' is not allowed"),
+                ("envs", {"locale": 2}, "envs of small = 'locale' is not"),
+                ("lengths", {"locale": 2}, "lengths of small = 'locale' is not"),
+            )
+        ),
     ],
 )
 def test_a_suite_that_is_not_allowed(tmp_path: Path, changes: Any, message: str) -> None:
-    with pytest.raises(ConfigurationError) as caught:
-        load_suite(small_suite(tmp_path, **changes))
-    assert message in str(caught.value)
+    def check(path: Path) -> None:
+        suite = load_suite(path)
+        trained_classes(suite, suite.settings[0])
+
+    with pytest.raises(ConfigurationError, match=message):
+        check(small_suite(tmp_path, **changes))
 
 
 def test_the_report_shows_what_it_is_reported_as_text(tmp_path: Path) -> None:
@@ -296,17 +267,9 @@ def test_agents_of_the_zoo_reach_their_numbers(name: str) -> None:
     assert np.mean(received["rate"]) == pytest.approx(results.rate.mean(), abs=0.03)
 
 
-def small_tuning(folder: Path) -> Path:
-    training = {"timesteps": 512, "num_envs": 8}
+def small_tuning(folder: Path, seed: int = 0) -> Path:
+    training = {"timesteps": 512, "num_envs": 8, "seed": seed}
     return small_config(folder, training=training, validation={"every": 256, "episodes": 4})
-
-
-def other_seed(config: Path) -> Path:
-    content = yaml.safe_load(config.read_text())
-    content["training"]["seed"] = 7
-    other = config.with_name("other.yaml")
-    other.write_text(yaml.safe_dump(content))
-    return other
 
 
 def test_processes_share_a_study(tmp_path: Path) -> None:
@@ -342,11 +305,12 @@ def test_processes_share_a_study(tmp_path: Path) -> None:
             tune.tune(load_checked(Experiment, config), 1, tmp_path / "four", wrong)
 
 
-def test_tuning_goes_on_with_its_study(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_tuning_goes_on_with_its_study(tmp_path: Path) -> None:
     config, folder = small_tuning(tmp_path), tmp_path / "study"
-    arguments = ["--config", str(config), "--output"]
+
+    def words(folder: Path, trials: int, *more: str) -> list[str]:
+        given = ["--config", str(config), "--output", str(folder), "--trials", str(trials)]
+        return [*given, *more]
 
     def trials_of(folder: Path) -> list[Any]:
         study = optuna.load_study(study_name="tune", storage=f"sqlite:///{folder / 'study.db'}")
@@ -358,14 +322,13 @@ def test_tuning_goes_on_with_its_study(
     def killed(*_: Any) -> None:
         raise Killed
 
-    run_main(monkeypatch, tune, *arguments, str(folder), "--trials", "1")
-    with monkeypatch.context() as patch:
+    succeed("tune", words(folder, 1))
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fusion_gym.agents.training.monitor.Progress.finish", killed)
-        with pytest.raises(Killed):
-            run_main(monkeypatch, tune, *arguments, str(folder), "--trials", "3")
+        assert "Killed" in call("tune", words(folder, 3)).trace
     for trials in (2, 3, 3):
-        run_main(monkeypatch, tune, *arguments, str(folder), "--trials", str(trials))
-    run_main(monkeypatch, tune, *arguments, str(tmp_path / "whole"), "--trials", "3")
+        succeed("tune", words(folder, trials))
+    succeed("tune", words(tmp_path / "whole", 3))
     assert trials_of(folder) == trials_of(tmp_path / "whole")
     rates = {parameters["learning_rate"] for parameters, _ in trials_of(folder)}
     assert len(rates) == 3, "random trials are not repeated"
@@ -376,15 +339,11 @@ def test_tuning_goes_on_with_its_study(
     best = (folder / "best.yaml").read_text()
     assert best.startswith("# Found by fusion-gym tune --config")
     assert ": best of 3 trials, " in best.splitlines()[0]
-    for words, message in (
-        (["--timesteps", "256"], "timesteps = 256 differs"),
-        (["--config", str(other_seed(config))], "training.seed = 7 differs"),
-    ):
-        with pytest.raises(SystemExit, match=message):
-            run_main(monkeypatch, tune, *arguments, str(folder), "--trials", "4", *words)
+    shorter = refusal("tune", words(folder, 4, "--timesteps", "256"))
+    assert "timesteps = 256 differs" in shorter
+    small_tuning(tmp_path, seed=7)
+    assert "training.seed = 7 differs" in refusal("tune", words(folder, 4))
     assert trials_of(folder) == trials_of(tmp_path / "whole")
     algorithm = yaml.safe_load(best)["algorithm"]
     assert algorithm["learning_rate"] == study.best_params["learning_rate"]
-    with pytest.raises(SystemExit, match="trials = 0"):
-        run_main(monkeypatch, tune, "--config", str(config), "--trials", "0", "--output", "x")
-    capsys.readouterr()
+    assert "trials = 0" in refusal("tune", words(tmp_path / "x", 0))

@@ -15,7 +15,6 @@ from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
-from fusion_gym.validation import ConfigurationError
 
 OSCILLATOR = "fusion_gym/BiasedOscillator-v0"
 TRACKING = "fusion_gym/BiasedTracking-v0"
@@ -221,17 +220,3 @@ def test_divergence_is_reported() -> None:
     for level in (error, np.nextafter(error, 0.0)):
         vars(batch.task)["divergence_level"] = level
         assert (batch.branch().deliver(silent).diverged == (level < error).any()).all()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"censoring_threshold": 5.0}, "censoring_threshold"),
-        ({"bias_gain": [[0.1]]}, "bias_gain"),
-        ({"filter": "adf", "information_shares": [0.5, 0.5]}, "information_shares"),
-    ],
-)
-def test_bad_options_are_named(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigurationError, match="is not allowed") as error:
-        fusion_gym.make_task(OSCILLATOR, **options)
-    assert message in str(error.value)

@@ -53,18 +53,8 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.P
 
 def benchmark(suite: Path, folder: Path, *words: str) -> list[str]:
     places = ["--results", str(folder / "results"), "--work", str(folder / "work")]
-    return [
-        sys.executable,
-        "-m",
-        "fusion_gym.agents",
-        "benchmark",
-        "--parts",
-        "agents",
-        "--config",
-        str(suite),
-        *places,
-        *words,
-    ]
+    given = ["--parts", "agents", "--config", str(suite), *places, *words]
+    return [sys.executable, "-m", "fusion_gym.agents", "benchmark", *given]
 
 
 def find(folder: Path) -> dict[str, str]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from command_runs import call, flaw
+from command_runs import call, flaw, refusal
 from hostile_commands import BASES, Try, line, options, tries
 from hostile_folder import ROOT, contents, scratch
 
@@ -66,10 +66,8 @@ def test_all_that_is_not_allowed_is_reported_in_one_line(here: Path) -> None:
 
 def test_a_full_disk_in_a_training_is_reported(here: Path) -> None:
     """The config fits, the first model does not."""
-    ended = call("train", line("train", BASES["train"]), limit=2_000)
-    assert (ended.status, ended.trace) == (1, "")
-    assert ended.err.splitlines()[-1].startswith("error: ")
-    assert f"made/best_model.zip': {os.strerror(errno.EFBIG)}" in ended.err
+    error = refusal("train", line("train", BASES["train"]), limit=2_000)
+    assert f"made/best_model.zip': {os.strerror(errno.EFBIG)}" in error
     assert not [name for name in contents(here) if ".part" in name]
     assert call("train", [*line("train", BASES["train"]), "--resume"]).status == 0
 
@@ -81,10 +79,7 @@ def test_a_full_disk_is_reported_and_leaves_nothing_half_written(here: Path, nam
     words = line(name, BASES[name] | (report if name == "benchmark" else {}))
     before = contents(here)
     for limit, part in ((0, "is not allowed: it must be a f"), (16, os.strerror(errno.EFBIG))):
-        ended = call(name, words, limit=limit)
-        assert (ended.status, ended.trace) == (1, "")
-        last = ended.err.splitlines()[-1]
-        assert last.startswith("error: ")
+        last = refusal(name, words, limit=limit)
         assert part in last
         assert "made" in last or "results" in last
         assert {name for name, content in contents(here).items() if content is not None} == {
@@ -153,9 +148,8 @@ def test_a_fresh_demo_removes_nothing_but_a_demo(here: Path) -> None:
         (here / name / "agent").mkdir(parents=True)
         (here / name / "agent" / "config.yaml").touch()
     (here / "local" / "agent" / "config.yaml").rename(here / "local" / "notes")
-    ended = call("demo", ["--fresh", "--output", "."])
-    assert (ended.status, ended.trace) == (1, "")
-    assert "fresh = True is not allowed: 'local' holds no results of a demo" in ended.err
+    error = refusal("demo", ["--fresh", "--output", "."])
+    assert "fresh = True is not allowed: 'local' holds no results of a demo" in error
     assert (here / "local" / "notes").exists()
     assert (here / "scheduler" / "agent" / "config.yaml").exists()
 

@@ -107,34 +107,6 @@ def test_with_the_estimate_nothing_is_lost_by_silence() -> None:
     assert met > RUNS
 
 
-@pytest.mark.parametrize(
-    ("env_id", "options", "message"),
-    [
-        (TOBIT, {"broadcast": "none"}, "broadcast = 'none' .*'estimate' or 'packets'"),
-        (TOBIT, {"memory": True, "information": "centre"}, "memory = True .*it must be False"),
-        (TOBIT, {"memory_filter": "adf"}, "memory_filter = 'adf' .*unless memory=True"),
-        (
-            TOBIT,
-            {"belief_features": ["value"], "information": "centre"},
-            r"belief_features = \['value'\] .*information='centre'",
-        ),
-        (TOBIT, {"memory": True, "memory_filter": "best"}, "memory_filter = 'best' .*'adf'"),
-        (TOBIT, {"memory": True, "belief_features": "x"}, "belief_features = 'x' .*'difference'"),
-        (TOBIT, {"packet": "estimate", "filter": "tobit"}, "packet = 'estimate' .*memory=True"),
-        (TOBIT, {"packet": "estimate", "memory": True}, "packet = 'estimate' .*silent='hold'"),
-        (JUMP, {"packet": "estimate", "memory": True}, "packet = 'estimate' .*already"),
-        (INPUT, {"packet": "estimate", "memory": True}, "packet = 'estimate' .*anew"),
-        (REMOTE, {"packet": "estimate", "memory": True}, "packet = 'estimate' .*itself"),
-        (CORRELATED, {"memory": True, "memory_filter": "imm"}, "memory_filter = 'imm' .*one filt"),
-        (REMOTE, {"memory": True, "memory_filter": "adf"}, "memory_filter = 'adf' .*one filter"),
-    ],
-)  # fmt: skip
-def test_what_has_no_meaning_is_refused(env_id: str, options: Any, message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message) as caught:
-        fusion_gym.make_task(env_id, **options)
-    assert "\n" not in str(caught.value)
-
-
 def test_a_single_sensor_cannot_send_the_schedulers_estimate() -> None:
     options = {"memory": True, "packet": "estimate"}
     message = "packet = 'estimate' .*local view.* 'measurement'"

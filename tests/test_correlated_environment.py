@@ -2,7 +2,6 @@
 
 import math
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -90,28 +89,6 @@ def test_noise_scale_is_drawn_for_each_episode() -> None:
     np.testing.assert_array_equal(batch.state.scale, first)
     batch.reset()
     assert (batch.state.scale != first).all()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"noise_scale": 0.0}, r"noise_scale = 0.0 .* > 0"),
-        ({"noise_scale": 1.5}, r"noise_scale = 1.5 .* <= 1"),
-        ({"fusion": "information"}, r"fusion = 'information' .* process noise"),
-        ({"fusion": "federated"}, r"fusion = 'federated' .* 'sici'"),
-        ({"fusion": "scii"}, r"did you mean 'sci"),
-        ({"fusion": "ci", "order": (0, 1, 2)}, r"order = .* fusion='ci'"),
-        ({"order": (0, 1, 1)}, r"order = \(0, 1, 1\) .* once"),
-        ({"order": (1, 2, 3)}, "order"),
-        ({"transition": ((1.0, 0.1),)}, "transition"),
-        ({"process_variance": 0.0}, "process_variance"),
-        ({"initial_covariance": -np.eye(3)}, "initial_covariance"),
-        ({"thresholds": 1.0}, "unknown option .*trigger_threshold"),
-    ],
-)
-def test_what_is_not_allowed_is_said_in_one_error(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message):
-        build(**options)
 
 
 def test_trigger_options_are_the_policys_defaults() -> None:

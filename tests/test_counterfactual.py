@@ -249,34 +249,10 @@ def test_its_models_are_ordinary_ones(
     assert np.isfinite(results.mse).all()
 
 
-def test_flips_of_one_number_are_refused(tmp_path: Path) -> None:
-    for options, where, reason in (
-        ({"action": "discrete"}, {}, "an action is one number"),
-        ({}, {"local": True}, "sensors decide by themselves"),
-    ):
-        wrong = "flips" if not where else "all"
-        config = small_config(
-            tmp_path, "counterfactual_ppo",
-            environment={"id": ENV, "options": {"horizon": 20, **options}, **where},
-            algorithm={"name": "counterfactual_ppo", "alternatives": wrong},
-        )  # fmt: skip
-        with pytest.raises(ConfigurationError, match=f"alternatives = '{wrong}' .*{reason}"):
-            run.train(load_checked(Experiment, config), quiet=True)
-
-
 def test_it_needs_an_environment_that_can_branch() -> None:
     plain = FusionSB3VecEnv(fusion_gym.make_task(ENV), 2)
     with pytest.raises(ConfigurationError, match="env = FusionSB3VecEnv is not allowed"):
         CounterfactualPPO("MlpPolicy", plain)
-
-
-@pytest.mark.parametrize("filter_", [None, "adf"])
-def test_an_error_filter_needs_an_error_that_uses_it(tmp_path: Path, filter_: str | None) -> None:
-    training = {"timesteps": 64, "num_envs": 4, "error_filter": filter_ or "none such"}
-    error = {"error": "mismatch"} if filter_ is None else {}
-    config = small_config(tmp_path, "ppo", training=training | error)
-    with pytest.raises(ConfigurationError, match="filter"):
-        run.train(load_checked(Experiment, config), quiet=True)
 
 
 def test_it_learns_what_ppo_does_not_see_yet(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_runs import call
+from command_runs import succeed
 from training_configs import small_config
 
 from fusion_gym.agents.training.checked import load_checked
@@ -123,8 +123,7 @@ def test_the_command_writes_what_it_prints(tmp_path: Path) -> None:
     file = tmp_path / "cross.json"
     words = ["--env", OSCILLATOR, "--set", *(f"{key}={value}" for key, value in PAPER.items())]
     words += ["--filter", "paper", "--policies", "always", "never", "--episodes", "40"]
-    ended = call("mismatch", [*words, "--json", str(file)])
-    assert (ended.status, ended.trace) == (0, "")
+    ended = succeed("mismatch", [*words, "--json", str(file)])
     report = json.loads(file.read_text())
     assert (report["filter"], report["episodes"], report["compatible"]) == ("paper", 40, False)
     share = report["policies"]["always"]["share"]
@@ -138,11 +137,11 @@ def test_the_command_takes_a_trainings_environment_and_filter(tmp_path: Path) ->
     config = small_config(tmp_path, training=training)
     file = tmp_path / "cross.json"
     words = ["--config", str(config), "--set", "horizon=5", "--episodes", "4", "--json", str(file)]
-    assert call("mismatch", words).status == 0
+    succeed("mismatch", words)
     report = json.loads(file.read_text())
     assert (report["filter"], report["horizon"]) == ("adf", 5)
     assert len(report["policies"]) == 5
-    assert call("mismatch", [*words, "--filter", "tobit"]).status == 0
+    succeed("mismatch", [*words, "--filter", "tobit"])
     assert json.loads(file.read_text())["filter"] == "tobit"
 
 

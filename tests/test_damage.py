@@ -1,19 +1,16 @@
 """Files of a run that are damaged: the command says what is wrong or goes on, and loses nothing."""
 
-import json
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from small_suite import ENV, small_suite
-from training_configs import small_config
+from command_runs import call, succeed
+from hostile_folder import contents
+from small_runs import arguments, meaning
 
-from fusion_gym.agents.__main__ import load
-from fusion_gym.agents.experiments import verdict
-
+pytestmark = pytest.mark.usefixtures("few_resamples")
 DAMAGES: dict[str, Callable[[bytes, bytes], bytes]] = {
     "cut short": lambda content, other: content[: len(content) * 2 // 3],
     "empty": lambda content, other: b"",
@@ -34,49 +31,14 @@ READ: dict[str, tuple[str, ...]] = {
 }
 # Those that it writes anew.
 WRITTEN = {
-    "train": tuple(
-        f"run/{name}"
-        for name in (
-            *("config.yaml", "best_model.zip", "final_model.zip", "validation.jsonl"),
-            "summary.json",
-        )
+    "train": (
+        *("run/config.yaml", "run/best_model.zip", "run/final_model.zip"),
+        *("run/validation.jsonl", "run/summary.json"),
     ),
     "tune": ("study/best.yaml", "study/trial_0/latest.zip", "study/trial_0/config.yaml"),
-    "benchmark": (
-        *("results/small/verdict.csv", "work/small/sensors_0/latest.zip"),
-        "work/pieces",
-    ),
+    "benchmark": ("results/small/verdict.csv", "work/small/sensors_0/latest.zip", "work/pieces"),
     "evaluate": (),
 }
-
-
-def arguments(command: str, folder: Path, seed: int = 0) -> list[str]:
-    """A short run of the command into the folder; the seed makes another run."""
-    if command == "evaluate":
-        options = ["--env", ENV, "--set", "horizon=5", "--policies", "always", "never"]
-        return [*options, "--episodes", "3", "--seed", str(seed), "--json", f"{folder}/result.json"]
-    if command == "benchmark":
-        config = small_suite(folder, training_seeds=1, classes=["sensors"], seed=seed)
-        places = ["--results", str(folder / "results"), "--work", str(folder / "work")]
-        return ["--config", str(config), *places, "--workers", "1", "--parts", "agents"]
-    training = {"timesteps": 256, "num_envs": 8, "seed": seed}
-    every = {"every": 128, "episodes": 2}
-    config = small_config(folder, training=training, validation=every)
-    if command == "tune":
-        return ["--config", str(config), "--trials", "1", "--output", str(folder / "study")]
-    return ["--config", str(config)]
-
-
-def call(command: str, words: list[str]) -> str:
-    """Run the command; what it ended with, empty for success."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["program", *words])
-        patch.setattr(verdict, "RESAMPLES", 5)
-        try:
-            load(command).main()
-        except SystemExit as end:
-            return str(end.code)
-    return ""
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +49,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, int], Path]
     def find(command: str, seed: int) -> Path:
         if (command, seed) not in jobs:
             jobs[command, seed] = folder = tmp_path_factory.mktemp(command)
-            assert call(command, arguments(command, folder, seed)) == ""
+            succeed(command, arguments(command, folder, seed))
         return jobs[command, seed]
 
     return find
@@ -117,41 +79,22 @@ def test_a_damaged_file_is_reported_or_mended(
     if damaged.is_dir():  # all pieces in it
         for piece in damaged.rglob("output.pkl"):
             piece.write_bytes(DAMAGES[kind](piece.read_bytes(), b"another run's"))
-        assert call(command, [*words, "--resume"]) == ""
+        succeed(command, [*words, "--resume"])
         assert meaning(folder) == meaning(runs(command, 0))
         return
     damaged.write_bytes(DAMAGES[kind](damaged.read_bytes(), other.read_bytes()))
-    before = contents(folder)
-    output = call(command, words if command == "tune" else [*words, "--resume"])
-    if not output:
+    before = files(folder)
+    ended = call(command, words if command == "tune" else [*words, "--resume"])
+    assert ended.trace == ""
+    if ended.status == 0:
         assert file not in READ[command] or kind == "a changed byte", "it went unnoticed"
         assert meaning(folder) == meaning(runs(command, 0))
         return
-    assert file in READ[command], output
-    assert output.startswith("error: ")
-    assert "\n" not in output
-    assert contents(folder) == before, "the rest is untouched"
+    assert file in READ[command], ended.err
+    assert ended.err.splitlines()[-1].startswith("error: ")
+    assert files(folder) == before, "the rest is untouched"
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    """All that is in the folder, but for locks."""
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
-    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
-
-
-def meaning(folder: Path) -> dict[str, Any]:
-    """What the results of a run say, without what says where and how fast it was."""
-    result: dict[str, Any] = {}
-    files = (path for path in folder.rglob("*.json*") if path.name != "metadata.json")  # seconds
-    for path in sorted(files):
-        lines = [json.loads(line) for line in path.read_text().splitlines()] if (
-            path.suffix == ".jsonl"
-        ) else [json.loads(path.read_text())]  # fmt: skip
-        for line in lines:
-            for key in ("seconds", "steps_per_second"):
-                line.pop(key, None)
-        result[str(path.relative_to(folder))] = json.dumps(lines).replace(str(folder), "")
-    for path in sorted(folder.rglob("*.csv")):
-        if path.stem != "runs":  # with seconds
-            result[str(path.relative_to(folder))] = path.read_text()
-    return result
+def files(folder: Path) -> dict[str, bytes | None]:
+    """Return all that is in the folder, but for locks."""
+    return {name: raw for name, raw in contents(folder).items() if not name.endswith(".lock")}

@@ -1,15 +1,15 @@
 """Tuning and committed envelopes: what is searched, chosen, measured, hashed and compared."""
 
-import sys
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from command_runs import refusal, succeed
 from small_suite import ENV, SMALL, small_suite
 
 import fusion_gym
-from fusion_gym.agents.__main__ import load
 from fusion_gym.agents.experiments.classes import Class, classes_of
 from fusion_gym.agents.experiments.config import Choices, Family, Range, Tuning, load_suite
 from fusion_gym.agents.experiments.envelopes import merge_curves, read_envelopes, write_envelopes
@@ -116,14 +116,7 @@ def test_classes_contain_what_knows_less() -> None:
         assert all(c.packet == "estimate" for c in classes if not measured[-1].contains(c))
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
-    monkeypatch.setattr(sys, "argv", ["benchmark", "--parts", "envelopes", "report", *words])
-    load("benchmark").main()
-
-
-def test_envelopes_are_committed_and_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_envelopes_are_committed_and_kept(tmp_path: Path) -> None:
     own = {
         "label": "own", "policy": "value_of_information:own=true", "tuned_in": "local",
         "parameters": {"threshold": {"low": 0.01, "high": 1}},
@@ -132,14 +125,13 @@ def test_envelopes_are_committed_and_kept(
     config = str(small_suite(tmp_path, families=families))
     results = tmp_path / "results"
     words = ["--config", config, "--results", str(results), "--work", str(tmp_path / "work")]
-    words += ["--workers", "1"]
-    run(monkeypatch, *words, "--classes", "centre", "local_packets")
+    words += ["--workers", "1", "--parts", "envelopes", "report"]
+    succeed("benchmark", [*words, "--classes", "centre", "local_packets"])
     path = results / "small"
     first = read_envelopes(path)
     assert list(first["classes"]) == ["centre", "local_packets"]
-    with pytest.raises(SystemExit, match="--resume"):
-        run(monkeypatch, *words)
-    run(monkeypatch, *words, "--resume")
+    assert "--resume" in refusal("benchmark", words)
+    succeed("benchmark", [*words, "--resume"])
     envelopes = read_envelopes(path)
     for name, content in first["classes"].items():
         assert envelopes["classes"][name] == content, "what is committed stays"
@@ -173,27 +165,18 @@ def test_envelopes_are_committed_and_kept(
     vertices = read_rows(path, "vertices")
     vertices[0]["test_mse"]["mean"] *= 0.9
     write_rows(path, "vertices", vertices)
-    with pytest.raises(SystemExit, match=r"sha256 = .* of the class 'centre' .* were changed"):
-        run(monkeypatch, *words, "--resume")
+    error = refusal("benchmark", [*words, "--resume"])
+    assert re.search(r"sha256 = .* of the class 'centre' .* were changed", error)
     write_envelopes(path, envelopes)
-    other = tmp_path / "other"
-    other.mkdir()
-    words[1] = str(small_suite(other, families=families, episodes=13))
-    with pytest.raises(SystemExit, match="episodes = 13 differs"):
-        run(monkeypatch, *words, "--resume")
-    capsys.readouterr()
+    small_suite(tmp_path, families=families, episodes=13)
+    assert "episodes = 13 differs" in refusal("benchmark", [*words, "--resume"])
 
 
-def test_a_family_that_does_not_fit_is_reported_before_anything_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_family_that_does_not_fit_is_reported_before_anything_runs(tmp_path: Path) -> None:
     wrong = [{"label": "gap", "policy": "paced:rat=1", "parameters": {}}]
     words = ["--config", str(small_suite(tmp_path, families=wrong)), "--results"]
     words += [str(tmp_path / "results"), "--work", str(tmp_path / "work")]
-    with pytest.raises(SystemExit) as caught:
-        run(monkeypatch, *words)
-    assert "family = 'gap' is not allowed in small" in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert "family = 'gap' is not allowed in small" in refusal("benchmark", words)
     assert not list((tmp_path / "work").rglob("*.json"))
 
 

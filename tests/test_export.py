@@ -15,9 +15,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from sb3_contrib import MaskablePPO, RecurrentPPO
-from stable_baselines3 import A2C, DQN, PPO
-from stable_baselines3.common.base_class import BaseAlgorithm
+from small_models import ENV, MODELS
 
 import fusion_gym
 from fusion_gym import zoo
@@ -33,43 +31,10 @@ from fusion_gym.policies.onnx_graph import DecisionGraph, save_graph
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-ENV = "fusion_gym/TobitOscillator-v0"
-OPTIONS: dict[str, Any] = {"filter": "tobit", "horizon": 20}
-DISCRETE, LOCAL = {"action": "discrete"}, {"local": True}
-RELU = {"net_arch": {"pi": [8], "vf": [6, 5]}, "activation_fn": torch.nn.GELU}
-LSTM = {"lstm_hidden_size": 6, "n_lstm_layers": 2, "shared_lstm": True, "enable_critic_lstm": False}
-# Algorithm, kind of policy, options of the environment, arguments.
-MODELS: dict[str, tuple[Any, str, dict[str, Any], dict[str, Any]]] = {
-    "ppo": (PPO, "MlpPolicy", {}, {}),
-    "ppo_memory": (PPO, "MlpPolicy", {"memory": True}, {}),
-    "ppo_discrete": (PPO, "MlpPolicy", DISCRETE, {"policy_kwargs": RELU}),
-    "ppo_local_memory": (PPO, "MlpPolicy", {"memory": True} | LOCAL, {}),
-    "a2c_centre": (A2C, "MlpPolicy", {"information": "centre"}, {}),
-    "dqn": (DQN, "MlpPolicy", DISCRETE, {"buffer_size": 10}),
-    "dqn_local": (DQN, "MlpPolicy", LOCAL, {"buffer_size": 10, "seed": 2}),
-    "maskable_binary": (MaskablePPO, "MlpPolicy", {}, {}),
-    "maskable_single": (MaskablePPO, "MlpPolicy", {"access": "single"}, {}),
-    "maskable_discrete": (MaskablePPO, "MlpPolicy", DISCRETE, {}),
-    "maskable_local": (MaskablePPO, "MlpPolicy", LOCAL, {}),
-    "recurrent": (RecurrentPPO, "MlpLstmPolicy", {}, {"policy_kwargs": LSTM}),
-    "recurrent_local": (RecurrentPPO, "MlpLstmPolicy", LOCAL, {}),
-}
-
-
-def build_parts(name: str) -> tuple[BaseAlgorithm, Task, bool]:
-    """A new model whose weights are far enough from zero that decisions differ."""
-    kind, policy, options, arguments = MODELS[name]
-    env = fusion_gym.make_sb3_vec_env(ENV, 2, **OPTIONS, **options)
-    model = kind(policy, env, device="cpu", **{"seed": 0} | arguments)
-    with torch.no_grad():
-        for weight in model.policy.parameters():
-            weight.mul_(3.0)
-    return model, env.task, options.get("local", False)
-
 
 def requests_at(name: str) -> tuple[ModelPolicy, Task]:
-    model, task, local = build_parts(name)
-    return ModelPolicy(model, task, local=local), task
+    model, task = MODELS[name].build()
+    return ModelPolicy(model, task, local="local" in MODELS[name].options), task
 
 
 def written(agent: ModelPolicy, path: Path) -> DecisionGraph:
@@ -290,7 +255,7 @@ def test_one_price_is_inside_the_file(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("few")
 def test_a_training_of_ones_own_says_its_environment(tmp_path: Path) -> None:
-    model, task, _ = build_parts("ppo")
+    model, task = MODELS["ppo"].build()
     tag_model(model, task)
     model.save(tmp_path / "best_model.zip")
     text = f"environment: {{id: {ENV}, options: {{filter: tobit, horizon: 20}}}}\n"
@@ -345,15 +310,12 @@ def test_a_file_that_decides_otherwise_is_not_kept(
     assert len(list(tmp_path.iterdir())) == 2
 
 
-@pytest.mark.parametrize("package", ["onnxruntime"])
-def test_a_missing_extra_is_named(
-    package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    result = importlib.util.find_spec
+def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    find, absent = importlib.util.find_spec, "onnxruntime"
     monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name == package else result(name)
+        importlib.util, "find_spec", lambda name: None if name == absent else find(name)
     )
-    with pytest.raises(ConfigurationError, match=rf"{package}, .*'fusion-gym\[onnx\]'"):
+    with pytest.raises(ConfigurationError, match=r"onnxruntime, .*'fusion-gym\[onnx\]'"):
         command("zoo:tobit_oscillator_centre", tmp_path / "agent.onnx")
 
 

@@ -121,37 +121,6 @@ def test_a_plant_that_no_noise_moves() -> None:
     assert results.nees.mean() == pytest.approx(1.0, abs=0.2)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"measurement_matrices": []}, "measurement_matrices = []"),
-        ({"state_names": ["a", "a"]}, "2 different words"),
-        ({"state_names": ["a", "b", "a"]}, "2 different words"),
-        ({"state_names": ["a", "b,c"]}, "2 different words"),
-        ({"measurement_matrices": 3}, "a list with a matrix for each sensor"),
-        ({"measurement_matrices": [[1, 0], [[1, 0, 0]]]}, "measurement_matrices[1]"),
-        ({"measurement_covariances": [1.0]}, "each of the 2 sensors"),
-        ({"measurement_covariances": [1.0, [[1, 2], [2, 1]]]}, "measurement_covariances[1]"),
-        ({"censoring_threshold": [0.0, [1.0, 2.0]]}, "censoring_threshold[1]"),
-        ({"censoring_threshold": 1.0, "censoring_upper": 0.0}, "censoring_threshold"),
-        ({"transition": [[2.0, 0.0], [0.0, 1.5]]}, "transition"),
-        (
-            {
-                "measurement_matrices": [[[1, 0], [0, 1]]],
-                "measurement_covariances": [[[1, 0.5], [0.5, 1]]],
-                "censoring_threshold": 0.0,
-            },
-            "diagonal",
-        ),
-    ],
-)
-def test_bad_systems_are_reported_in_one_error(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigurationError) as caught:
-        fusion_gym.make_task(LINEAR, **options)
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
 FILE = """\
 transition: [[0.99, 0.1], [0.0, 0.95]]
 process_covariance: [[0.001, 0.0], [0.0, 0.05]]

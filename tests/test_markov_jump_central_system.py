@@ -1,7 +1,6 @@
 """Systems that filter at the centre of the Markov jump example: signals, leaks, environment."""
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -76,19 +75,6 @@ def test_a_request_without_a_sample_costs_and_delivers_nothing(where: str) -> No
 
 
 # --- the environment -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"filter": "central"}, r"filter = 'central' .*did you mean 'centralised'"),
-        ({"filter": "imm", "fusion": "matrix"}, r"fusion = 'matrix' .* filter='imm': .* left out"),
-        ({"filter": "centralised", "fusion": "ci"}, r"fusion = 'ci' .* filter='centralised'"),
-    ],
-)
-def test_what_is_not_allowed_is_said_in_one_error(arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message):
-        build(**arguments)
 
 
 def test_the_nodes_trigger_has_no_meaning_at_the_centre() -> None:

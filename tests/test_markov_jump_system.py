@@ -1,7 +1,6 @@
 """The Markov jump system, its environment and its triggers from the outside."""
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.rules.centre_variance import CentreVariance
 from fusion_gym.policies.rules.local_variance import LocalVariance
-from fusion_gym.validation import ConfigurationError
 
 build = partial(make_task, "fusion_gym/MarkovJumpTracking-v0")
 
@@ -62,26 +60,6 @@ def test_open_loop_is_what_never_costs() -> None:
     np.testing.assert_allclose(results.squared_error.mean(0), expected, rtol=0.05)
     assert results.bound_trace.mean() == pytest.approx(expected.sum(), rel=1e-9)
     assert results.returns.mean() / task.horizon == pytest.approx(-1.0, rel=0.05)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"fusion": "information"}, r"fusion = 'information' .* correlated"),
-        ({"fusion": "federated"}, r"fusion = 'federated' .* fed back"),
-        ({"fusion": "matrx"}, r"did you mean 'matrix'"),
-        ({"mode_transition": ((0.6, 0.3), (0.4, 0.6))}, r"mode_transition .* \[0.9, 1.0\]"),
-        ({"transitions": (((1.1, 0.0), (0.0, 1.0)),) * 2}, "mean-square stable"),
-        ({"sampling_periods": 0}, "sampling_periods"),
-        ({"fading_values": ((1.5, 0.5),) * 3}, r"fading_values .* from 0 to 1"),
-        ({"fading_probabilities": ((0.5, 0.4, 0.0),) * 3}, r"fading_probabilities .* add up to 1"),
-        ({"initial_probabilities": (0.5, 0.4)}, r"initial_probabilities .* add up to 1, not 0.9"),
-        ({"sampling_period": 2}, "unknown option .*sampling_periods"),
-    ],
-)
-def test_what_is_not_allowed_is_said_in_one_error(arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message):
-        build(**arguments)
 
 
 # --- the triggers --------------------------------------------------------------------------------

@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from sb3_contrib import QRDQN, MaskablePPO, RecurrentPPO
-from stable_baselines3 import A2C, DQN, PPO
+from sb3_contrib import QRDQN
+from small_models import DISCRETE, ENV, MODELS, OPTIONS, Recipe
+from stable_baselines3 import DQN, PPO
 from stable_baselines3.common import save_util
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -29,46 +30,9 @@ from fusion_gym.agents.maintenance import table
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.policies import archive
-from fusion_gym.policies.card import ALGORITHMS
 from fusion_gym.policies.model import tag_model
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
-
-ENV = "fusion_gym/TobitOscillator-v0"
-OPTIONS: dict[str, Any] = {"filter": "tobit", "horizon": 20}
-DISCRETE = {"action": "discrete"}
-RELU = {"net_arch": {"pi": [8], "vf": [6, 5]}, "activation_fn": torch.nn.ReLU}
-SHARED = {"lstm_hidden_size": 6, "n_lstm_layers": 2, "shared_lstm": True}
-LINEAR = {"lstm_hidden_size": 6, "net_arch": []}
-# Algorithm, kind of policy, options of the environment, arguments.
-MODELS: dict[str, tuple[type[BaseAlgorithm], str, dict[str, Any], dict[str, Any]]] = {
-    "ppo": (PPO, "MlpPolicy", {}, {}),
-    "ppo_relu": (PPO, "MlpPolicy", DISCRETE, {"policy_kwargs": RELU}),
-    "a2c": (A2C, "MlpPolicy", {"information": "centre"}, {}),
-    "dqn": (DQN, "MlpPolicy", DISCRETE, {"buffer_size": 10}),
-    "maskable_ppo": (MaskablePPO, "MlpPolicy", {"access": "single"}, {}),
-    "recurrent_ppo": (RecurrentPPO, "MlpLstmPolicy", DISCRETE, {}),
-    "recurrent_ppo_shared": (
-        RecurrentPPO,
-        "MlpLstmPolicy",
-        DISCRETE,
-        {"policy_kwargs": SHARED | {"enable_critic_lstm": False}},
-    ),
-    "recurrent_ppo_linear": (
-        RecurrentPPO,
-        "MlpLstmPolicy",
-        DISCRETE,
-        {"policy_kwargs": LINEAR | {"enable_critic_lstm": False}},
-    ),
-}
-
-
-def build_parts(
-    algorithm: type[BaseAlgorithm], policy: Any, options: dict[str, Any], arguments: dict[str, Any]
-) -> tuple[BaseAlgorithm, Task]:
-    env = fusion_gym.make_sb3_vec_env(ENV, 2, **OPTIONS, **options)
-    kind: Any = algorithm
-    return kind(policy, env, seed=0, device="cpu", **arguments), env.task
 
 
 class Saved(NamedTuple):
@@ -85,12 +49,9 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Saved]:
 
     def get(name: str) -> Saved:
         if name not in done:
-            model, task = build_parts(*MODELS[name])
+            model, task = MODELS[name].build()
             if isinstance(model, DQN):
                 model.exploration_rate = 0.5  # a coin that decisions by chance throw
-            with torch.no_grad():  # far enough from zero that decisions differ
-                for weight in model.policy.parameters():
-                    weight.mul_(3.0)
             plain, carded = folder / f"{name}_plain.zip", folder / f"{name}.zip"
             model.save(plain)
             tag_model(model, task)
@@ -139,7 +100,7 @@ def decisions(policy: Any, task: Task) -> list[Any]:
 
 
 @pytest.mark.parametrize("carded", [True, False], ids=["card", "plain"])
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", [n for n, of in MODELS.items() if "local" not in of.options])
 @pytest.mark.usefixtures("no_unpickling")
 def test_a_rebuilt_policy_decides_as_the_model_did(
     saved: Callable[[str], Saved], name: str, carded: bool
@@ -164,7 +125,7 @@ def test_a_rebuilt_policy_decides_as_the_model_did(
 
 
 def test_the_file_with_a_card_is_an_ordinary_one(saved: Callable[[str], Saved]) -> None:
-    agent = saved("ppo_relu")
+    agent = saved("ppo_discrete")
     again = PPO.load(agent.carded, device="cpu")
     assert all(
         torch.equal(weight, again.policy.state_dict()[name])
@@ -173,27 +134,8 @@ def test_the_file_with_a_card_is_an_ordinary_one(saved: Callable[[str], Saved]) 
     card_entry = again.fusion_gym_model
     assert card_entry["network"] == {"pi": [8], "vf": [6, 5]}
     assert (card_entry["activation"], card_entry["actions"]) == ("relu", "Discrete(8)")
-    memory = saved("recurrent_ppo_shared").model.fusion_gym_model["network"]["memory"]  # type: ignore[attr-defined]
+    memory = saved("recurrent_shared").model.fusion_gym_model["network"]["memory"]  # type: ignore[attr-defined]
     assert memory == {"size": 6, "layers": 2, "critic": "shared"}
-
-
-@pytest.mark.parametrize("name", fusion_gym.zoo.names())
-def test_agents_of_the_zoo_decide_as_stable_baselines_loads_them(
-    name: str, request: pytest.FixtureRequest
-) -> None:
-    card_entry = fusion_gym.zoo.card(name)
-    task = fusion_gym.make_task(card_entry["env"], **card_entry["options"])
-    algorithm = card_entry["training"]["algorithm"]["name"].removeprefix("counterfactual_")
-    loaded = ALGORITHMS[algorithm].load(fusion_gym.zoo.model_path(name), device="cpu")
-    request.getfixturevalue("no_unpickling")
-    policy: Any = make_policy(f"zoo:{name}", task)
-    loaded.observation_space.seed(0)
-    observed = np.array([loaded.observation_space.sample() for _ in range(500)])
-    first, second = (
-        model.predict(observed, deterministic=True)[0] for model in (loaded, policy.model)
-    )
-    np.testing.assert_array_equal(first, second)
-    assert len(np.unique(first, axis=0)) > 1
 
 
 class Payload:
@@ -291,27 +233,28 @@ class OwnExtractor(FlattenExtractor):
         return -super().forward(observations)
 
 
+FOREIGN = Recipe(QRDQN, options=DISCRETE, arguments={"buffer_size": 10})
+
+
+def with_policy(**kwargs: Any) -> Recipe:
+    return Recipe(PPO, arguments={"policy_kwargs": kwargs})
+
+
 @pytest.mark.parametrize("carded", [True, False], ids=["card", "plain"])
 @pytest.mark.parametrize(
-    ("value", "reason"),
+    ("recipe", "reason"),
     [
-        ((QRDQN, "MlpPolicy", DISCRETE, {"buffer_size": 10}), "its policy is none of"),
-        ((PPO, OwnPolicy, {}, {}), "its policy is none of"),
-        (
-            (PPO, "MlpPolicy", {}, {"policy_kwargs": {"features_extractor_class": OwnExtractor}}),
-            "features_extractor_class",
-        ),
-        (
-            (PPO, "MlpPolicy", {}, {"policy_kwargs": {"activation_fn": torch.nn.Softplus}}),
-            "Softplus",
-        ),
+        (FOREIGN, "its policy is none of"),
+        (Recipe(PPO, OwnPolicy), "its policy is none of"),
+        (with_policy(features_extractor_class=OwnExtractor), "features_extractor_class"),
+        (with_policy(activation_fn=torch.nn.Softplus), "Softplus"),
     ],
     ids=["algorithm", "policy", "extractor", "activation"],
 )
 def test_what_weights_do_not_make_needs_trust(
-    tmp_path: Path, value: Any, reason: str, carded: bool
+    tmp_path: Path, recipe: Recipe, reason: str, carded: bool
 ) -> None:
-    model, task = build_parts(*value)
+    model, task = recipe.build()
     if carded:
         tag_model(model, task)
     path = tmp_path / "model.zip"
@@ -450,7 +393,7 @@ def test_a_damaged_file_is_refused_or_harmless(
 def test_commands_load_foreign_code_with_trust_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, _ = build_parts(QRDQN, "MlpPolicy", DISCRETE, {"buffer_size": 10})
+    model, _ = FOREIGN.build()
     policy = f"model:{tmp_path / 'model.zip'}"
     model.save(tmp_path / "model.zip")
     files: dict[str, Any] = {

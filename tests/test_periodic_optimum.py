@@ -163,21 +163,6 @@ def test_an_entry_that_cannot_be_true_is_reproduced(
 # --- refusals ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("spec", "options", "message"),
-    [
-        ("packets=19", {}, "packets = 19 .* <= 18"),
-        ("packets=12,period=8", {}, "packets = 12 .* 2704156 schedules"),
-        ("cache=/dev/null/schedules.json,packets=1,period=1", {}, "cache = .* written"),
-        ("", {"access": "single"}, "access = 'single' .* 'any'"),
-        ("", {"filter": "imm"}, "MarkovJumpCentralSystem.* not depend on the data"),
-    ],
-)
-def test_what_is_not_allowed(spec: str, options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message):
-        make_policy(f"periodic_optimum:{spec}" if spec else "periodic_optimum", markov(**options))
-
-
 def test_systems_whose_covariances_depend_on_the_data_are_refused() -> None:
     task = fusion_gym.make_task("fusion_gym/TobitOscillator-v0")
     with pytest.raises(ConfigurationError, match=r"CensoredSystem.* not depend on the data"):

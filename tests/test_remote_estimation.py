@@ -224,24 +224,6 @@ def test_stationary_policy_loses_nothing_in_long_episodes() -> None:
 @pytest.mark.parametrize(
     ("options", "field"),
     [
-        ({"coefficient": 100.0}, "coefficient"),
-        ({"drop_probability": 0.1}, "drop_probability"),
-        ({"channel": "independent", "channel_transition": np.eye(2)}, "channel_transition"),
-        (
-            {"channel": "gilbert_elliott", "channel_transition": ((0.5, 0.4), (0, 1))},
-            "channel_transition",
-        ),
-        ({"channel": "gilbert_elliott", "channel_transition": np.eye(2)}, "initial_channel"),
-    ],
-)
-def test_bad_options_are_refused(options: dict[str, Any], field: str) -> None:
-    with pytest.raises(ConfigurationError, match=field):
-        build(**options)
-
-
-@pytest.mark.parametrize(
-    ("options", "field"),
-    [
         ({"error": "trace"}, "error"),
         ({"cost_weight": "random", "price_range": (1.0, 9.0)}, "cost_weight"),
         ({"sensors": 3, "access": "single"}, "sensors"),

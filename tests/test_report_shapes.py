@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from command_runs import Ended, call
+from command_runs import call, refusal, succeed
 from hostile_folder import contents
 from hypothesis import given
 from hypothesis import strategies as st
@@ -27,11 +27,7 @@ from fusion_gym.evaluation.intervals import Interval
 from fusion_gym.policies.registry import make_policy
 
 ABSENT = "ABSENT"
-
-
-def report(results: Path) -> Ended:
-    """Write the pages of the results."""
-    return call("benchmark", ["--parts", "report", "--results", str(results)])
+REPORT = ["--parts", "report", "--results"]
 
 
 def change(file: Path, column: str, value: str) -> None:
@@ -49,12 +45,7 @@ def change(file: Path, column: str, value: str) -> None:
     [
         ("verdict", "title", ABSENT, "has other columns than the table 'verdict': 'title'"),
         ("verdict", "always", "0.0", "always = [0.0] is not allowed"),
-        (
-            "fronts",
-            "mode",
-            "nobody",
-            "mode = 'nobody' is not allowed: Input should be 'centre', 'local' or",
-        ),
+        ("fronts", "mode", "nobody", "mode = 'nobody' is not allowed: Input should be 'centre',"),
         ("fronts", "rates", "[1", "rates = '[1' is not allowed: Invalid JSON"),
         ("fronts", "seeds", "1.5", "seeds = '1.5' is not allowed: Input should be a valid integer"),
         ("worth", "rules_low", "", "rules.low is not allowed: Field required"),
@@ -67,18 +58,17 @@ def test_results_of_another_shape(
     setting = small_results(tmp_path / "results")
     change(setting / f"{table}.csv", column, value)
     before = contents(setting)
-    ended = report(setting.parent)
-    assert (ended.status, ended.trace, ended.err.count("\n")) == (1, "", 1)
+    error = refusal("benchmark", [*REPORT, str(setting.parent)])
     assert contents(setting) == before
-    assert ended.err.startswith("error: results = ")
-    assert message in ended.err
+    assert error.startswith("error: results = ")
+    assert message in error
 
 
 def test_json_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
     (tmp_path / SETTING).mkdir()
     (tmp_path / SETTING / "verdict.json").write_text("{}")
-    ended = report(tmp_path)
-    assert (ended.status, "and not JSON of an earlier version" in ended.err) == (1, True)
+    error = refusal("benchmark", [*REPORT, str(tmp_path)])
+    assert "and not JSON of an earlier version" in error
 
 
 @given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1))
@@ -97,9 +87,7 @@ def test_the_zoo_takes_all_agents_or_none(tmp_path: Path) -> None:
         small_results(results, name, classes=["sensors"], seeds=1)
     small_model(work / SETTING / "sensors_0" / "best_model.zip")
     words = ["--results", str(results), "--work", str(work), "--zoo", str(tmp_path / "zoo")]
-    ended = call("zoo", words)
-    assert (ended.status, ended.trace) == (1, "")
-    assert "best_model.zip is missing" in ended.err
+    assert "best_model.zip is missing" in refusal("zoo", words)
     assert not (tmp_path / "zoo").exists()
     shutil.copytree(work / SETTING, work / "zz")
     assert call("zoo", words).status == 0
@@ -128,13 +116,9 @@ def test_the_zoo_takes_a_choice_and_removes_what_is_not_in_it(
     left = {f"{SETTING}_{name}.{end}" for name in ("centre", "sensors") for end in ("zip", "json")}
     assert {path.name for path in folder.iterdir()} == left | {"notes.json"}
     for wrong, message in ((["--classes", "sensor"], "sensors"), (["--envs", "x"], "envs = 'x'")):
-        ended = call("zoo", [*words, *wrong])
-        assert (ended.status, ended.trace) == (1, "")
-        assert message in ended.err
+        assert message in refusal("zoo", [*words, *wrong])
     monkeypatch.setattr("fusion_gym.agents.maintenance.zoo.MOST", 200)
-    ended = call("zoo", words)
-    assert (ended.status, ended.trace) == (1, "")
-    assert "all together must have at most 200; name fewer" in ended.err
+    assert "all together must have at most 200; name fewer" in refusal("zoo", words)
     assert {path.name for path in folder.iterdir()} == left | {"notes.json"}
 
 
@@ -143,7 +127,7 @@ def test_what_is_not_there_yet_is_said(tmp_path: Path) -> None:
     folder = small_results(tmp_path, classes=[])
     policies = read_rows(folder, "policies")
     write_rows(folder, "policies", [row for row in policies if row["run"] != "informed"])
-    assert report(tmp_path).status == 0
+    succeed("benchmark", [*REPORT, str(tmp_path)])
     text = (tmp_path / "README.md").read_text()
     assert "Agents of a class: none so far." in text
     assert "nothing to remember" in text
@@ -164,12 +148,11 @@ def test_an_evaluation_goes_on_with_whole_policies_alone(tmp_path: Path) -> None
         above, name, *inner = place.split("/")
         del (content[above][name] if inner else content[above])[inner[0] if inner else name]
         file.write_text(json.dumps(content), encoding="utf-8")
-        ended = call("evaluate", [*words, "--resume"])
-        assert (ended.status, ended.trace) == (1, "")
-        assert message in ended.err
+        assert message in refusal("evaluate", [*words, "--resume"])
     file.write_text(json.dumps(whole), encoding="utf-8")
     assert call("evaluate", [*words, "--resume"]).status == 0
     assert json.loads(file.read_text(encoding="utf-8")) == whole
+    assert "another evaluation" in refusal("evaluate", [*words, "--resume", "--seed", "1"])
 
 
 @pytest.mark.filterwarnings("error")

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from reproduction_checks import SEED
 from scipy import stats
 
 import fusion_gym
@@ -16,6 +15,7 @@ from fusion_gym.agents.papers.adaptive_innovation_runs import _largest, _whitene
 from fusion_gym.agents.papers.markov_jump import example, period_of, run_markov_jump, trigger
 from fusion_gym.agents.papers.markov_jump_covariances import covariances
 from fusion_gym.agents.papers.numbers import cite, percent, verdict
+from fusion_gym.agents.papers.paper import NAMES
 from fusion_gym.agents.papers.round_robin_tobit_theorems import Censoring, MatrixBound, matrix_below
 from fusion_gym.agents.papers.unknown_input_recursion import gains, models
 from fusion_gym.agents.papers.walk import SomeSensors
@@ -23,10 +23,10 @@ from fusion_gym.core.task import Task
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.evaluation.intervals import Interval
 
-RECORDED = ("markov_jump", "tobit_token_bucket", "unknown_input", "round_robin_tobit")
+SEED = 1_000_000
 
 
-def record(paper: str) -> tuple[Task, str, NDArray[np.float64], NDArray[np.float64] | None]:
+def record(paper: str) -> tuple[Task, str, NDArray[np.float64], NDArray[np.float64]]:
     """A paper's task and policy, the squared errors (H, n, E) recorded of it, and the rates."""
     if paper == "markov_jump":
         task, policy = example(), trigger(0.9)
@@ -35,24 +35,23 @@ def record(paper: str) -> tuple[Task, str, NDArray[np.float64], NDArray[np.float
     if paper == "tobit_token_bucket":
         task, policy = runs.scheme(), runs.TRIGGER
         history = runs.record_history(task, 4, SEED)
-        square = np.square(history.truth - history.mean)
-        return task, policy, square, history.granted.mean(0).T
+        return task, policy, np.square(history.truth - history.mean), history.granted.mean(0).T
     if paper == "unknown_input":
         task, policy = unknown_input.make_example()[0], "adaptive_threshold"
         stored = unknown_input.record_run(task, policy, 4, SEED)
         return task, policy, np.square(stored.errors[:, 0]), stored.granted.mean(0).T
     task, policy = fusion_gym.make_task(biased.OSCILLATOR), "round_robin"
-    return task, policy, biased.squares(task, policy, 4, SEED).transpose(1, 2, 0), None
+    square = biased.squares(task, policy, 4, SEED).transpose(1, 2, 0)
+    return task, policy, square, np.full((4, 2), 0.5)
 
 
-@pytest.mark.parametrize("paper", RECORDED)
+@pytest.mark.parametrize("paper", [name for name in NAMES if name != "adaptive_innovation"])
 def test_recorded_episodes_are_those_of_the_evaluation(paper: str) -> None:
     task, policy, square, rate = record(paper)
     results = run_episodes(task, fusion_gym.make_policy(policy, task), 4, SEED)
     size = results.squared_error.shape[-1]
     np.testing.assert_allclose(square[:, :size].mean(2), results.squared_error, rtol=1e-12)
-    if rate is not None:
-        np.testing.assert_array_equal(rate, results.rate)
+    np.testing.assert_array_equal(rate, results.rate)
 
 
 # --- the token bucket ---------------------------------------------------------------------------
@@ -116,13 +115,13 @@ def test_no_filter_is_below_the_floor() -> None:
         gain = covariance @ row / (row @ covariance @ row + (0.1, 0.3)[step % 2])
         covariance = covariance - np.outer(gain, row @ covariance)
         roots.append(np.sqrt(np.diag(covariance)))
-    np.testing.assert_allclose(biased.floor(biased.TRACKING), np.mean(roots, axis=0), rtol=1e-9)
+    floor = biased.floor(biased.TRACKING)
+    np.testing.assert_allclose(floor, np.mean(roots, axis=0), rtol=1e-9)
     result = biased.armse(biased.squares(task, "round_robin", 400, SEED))
-    np.testing.assert_allclose(result["mean"], biased.floor(biased.TRACKING), rtol=0.08)
-    assert biased.floor(biased.OSCILLATOR)[2] > 0.5  # √Ξ
-    assert np.all(
-        np.less(biased.floor(biased.OSCILLATOR, access="any"), biased.floor(biased.OSCILLATOR))
-    )
+    np.testing.assert_allclose(result["mean"], floor, rtol=0.08)
+    turns, any_time = (biased.floor(biased.OSCILLATOR, access=a) for a in ("single", "any"))
+    assert turns[2] > 0.5  # √Ξ
+    assert np.all(np.less(any_time, turns))
 
 
 def test_intervals_of_the_armse_cover() -> None:
@@ -152,7 +151,6 @@ def test_one_point_above_is_told_from_all_below() -> None:
     one_above = np.where(np.arange(100)[:, None] == 3, 5.0, -5.0) * error
     assert biased.always_below(np.stack([one_above, error]))[0] == "holds partly"
     assert biased.always_below(np.stack([5 * error, error]))[0] == "does not hold"
-    assert biased.explained([1.0, 3.0], [2.0, 3.0]) == pytest.approx([0.75, 0.0])
 
 
 @pytest.mark.parametrize("latent", [-6.0, -1.0, 0.2, 5.5])
@@ -268,7 +266,7 @@ def test_period_is_found(period: int) -> None:
     values = np.resize(pattern, 300)
     start = np.exp(-np.arange(300.0))
     assert period_of(values + start) == period
-    assert period_of(values + 1e-3 * np.arange(300)) is None
+    assert period_of(values + 1e-3 * np.arange(300)) == 0
 
 
 # --- adaptive innovation, unknown input ----------------------------------------------------------

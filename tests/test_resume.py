@@ -1,6 +1,5 @@
 """A training that was interrupted or killed ends as an undisturbed one does, bitwise."""
 
-import json
 import os
 import signal
 import subprocess
@@ -9,18 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 import yaml
-from training_configs import small_config
+from small_runs import meaning
+from training_configs import ENV, read_records, small_config
 
 from fusion_gym.agents.training import run
-from fusion_gym.agents.training.algorithms import TABLE
 from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
+SHORT = {"timesteps": 64, "num_envs": 4}
+PRICED = {"cost_weight": "random", "price_range": [0.01, 0.1]}
 
 
 class Killed(BaseException):
@@ -34,7 +34,7 @@ def experiment_of(folder: Path, kind: str, price: str = "fixed", **training: Any
     content["training"] |= {"timesteps": 1024, **training}
     content["validation"] = {"every": 256, "episodes": 2}
     if price == "drawn":
-        content["environment"]["options"] |= {"cost_weight": "random", "price_range": [0.01, 0.1]}
+        content["environment"]["options"] |= PRICED
         content["training"]["price_exponent"] = 0.5
     path.write_text(yaml.safe_dump(content))
     return load_checked(Experiment, path)
@@ -54,32 +54,6 @@ def end_at(monkeypatch: pytest.MonkeyPatch, step: int, how: str) -> None:
         return before(self)
 
     monkeypatch.setattr(FusionSB3VecEnv, "step_wait", step_wait)
-
-
-def outcome(folder: Path, kind: str) -> dict[str, Any]:
-    """Weights of the models, validations, and what the summary says of them."""
-    summary = json.loads((folder / "summary.json").read_text())
-    models = {
-        name: TABLE[kind].model.load(folder / f"{name}_model.zip", device="cpu").policy.state_dict()
-        for name in ("best", "final")
-    }
-    return {
-        "timesteps": summary["timesteps"],
-        "best": summary["best_validation"],
-        "records": (folder / "validation.jsonl").read_text(),
-        **{
-            f"{name} {key}": value for name, model in models.items() for key, value in model.items()
-        },
-    }
-
-
-def assert_same(content: dict[str, Any], expected: dict[str, Any]) -> None:
-    assert content.keys() == expected.keys()
-    for key, value in expected.items():
-        if isinstance(value, torch.Tensor):
-            assert torch.equal(content[key], value), key
-        else:
-            assert content[key] == value, key
 
 
 CASES = [
@@ -115,8 +89,8 @@ def test_a_resumed_training_is_the_uninterrupted_one(
         with pytest.raises(Killed):
             run.train(parts, quiet=True, resume=True)
     run.train(parts, quiet=True, resume=True)
-    assert_same(outcome(Path(parts.output), kind), outcome(Path(whole.output), kind))
-    assert len(outcome(Path(whole.output), kind)["records"].splitlines()) == 4
+    assert meaning(Path(parts.output)) == meaning(Path(whole.output))
+    assert len(read_records(Path(whole.output))) == 4
 
 
 @pytest.mark.slow
@@ -170,7 +144,7 @@ def test_the_best_model_outlives_a_kill_between_its_validation_and_the_checkpoin
     run.train(experiment, quiet=True, resume=True)
     whole = experiment_of(tmp_path / "b", "ppo", timesteps=512)
     run.train(whole, quiet=True)
-    assert_same(outcome(folder, "ppo"), outcome(Path(whole.output), "ppo"))
+    assert meaning(folder) == meaning(Path(whole.output))
 
 
 def die_with_records(count: int) -> Any:
@@ -193,11 +167,12 @@ def test_a_finished_training_is_not_repeated_and_its_files_are_mended(tmp_path: 
     experiment = experiment_of(tmp_path / "a", "ppo", timesteps=256)
     folder = Path(experiment.output)
     summary = run.train(experiment, quiet=True)
-    expected = outcome(folder, "ppo")
+    expected = meaning(folder)
+    assert list((folder / "tensorboard").glob("events*"))
     for name in ("best_model.zip", "final_model.zip", "summary.json", "validation.jsonl"):
         (folder / name).write_text("damaged")
     assert run.train(experiment, quiet=True, resume=True) == summary
-    assert_same(outcome(folder, "ppo"), expected)
+    assert meaning(folder) == expected
 
 
 def test_two_trainings_in_one_folder_are_refused(
@@ -223,21 +198,52 @@ def test_two_trainings_in_one_folder_are_refused(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"trainig": {}}, "trainig"),
+        ({"training": {"timesteps": 0}}, "training.timesteps = 0"),
+        ({"environment": {}}, "environment.id"),
+        ({"training": {"timesteps": 1000, "num_envs": True}}, "training.num_envs = True"),
+        ({"algorithm": {"name": "ppo", "network": {"hidden": [64.0]}}}, "hidden.0 = 64.0"),
         ({"algorithm": {"name": "ppo", "batch_size": 1}}, "algorithm.batch_size = 1"),
+        ({"algorithm": {"name": "dqn"}}, "action: discrete"),
         (
             {
-                "environment": {
-                    "id": "fusion_gym/TobitOscillator-v0",
-                    "options": {"access": "single"},
-                },
+                "environment": {"id": ENV, "options": {"access": "single"}},
                 "algorithm": {"name": "ppo", "initial_rate": 0.9},
             },
             "initial_rate = 0.9",
         ),
-        ({"training": {"timesteps": 64, "num_envs": 1}, "algorithm": {"name": "ppo", "n_steps": 1}},
-         "algorithm = 'ppo' is not allowed with these settings"),
+        (
+            {
+                "environment": {"id": ENV, "options": PRICED},
+                "training": SHORT | {"target_rate": 0.1},
+            },
+            "target_rate = 0.1 is not allowed",
+        ),
+        (
+            {
+                "training": {"timesteps": 64, "num_envs": 1},
+                "algorithm": {"name": "ppo", "n_steps": 1},
+            },
+            "algorithm = 'ppo' is not allowed with these settings",
+        ),
+        (
+            {
+                "environment": {"id": ENV, "options": {"action": "discrete"}},
+                "algorithm": {"name": "counterfactual_ppo", "alternatives": "flips"},
+            },
+            "an action is one number",
+        ),
+        (
+            {
+                "environment": {"id": ENV, "local": True},
+                "algorithm": {"name": "counterfactual_ppo", "alternatives": "all"},
+            },
+            "sensors decide by themselves",
+        ),
+        ({"training": SHORT | {"error": "mismatch", "error_filter": "none such"}}, "filter"),
+        ({"training": SHORT | {"error_filter": "adf"}}, "error_filter"),
     ],
-)  # fmt: skip
+)
 def test_a_refused_config_leaves_no_folder(
     tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from command_runs import Ended, call
+from command_runs import refusal, succeed
 from small_suite import SMALL, small_suite
 
 from fusion_gym.agents.experiments import verdict
@@ -29,13 +29,8 @@ CASES = [
     {"name": "loud", "title": "measurement noise ×2", "options": {"true_measurement_noise": 2.0}},
     {"name": "poor", "title": "half the tokens", "scaled": {"token_rate": 0.5}},
 ]
+pytestmark = pytest.mark.usefixtures("few_resamples")
 ODD = {"name": "odd", "title": "odd"}
-
-
-@pytest.fixture(autouse=True)
-def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Intervals are made in no time."""
-    monkeypatch.setattr(verdict, "RESAMPLES", 20)
 
 
 def suite_of(folder: Path, **changes: Any) -> Path:
@@ -44,10 +39,9 @@ def suite_of(folder: Path, **changes: Any) -> Path:
     return small_suite(folder, settings=[setting], cases=CASES[:1], robustness_episodes=8)
 
 
-def run(suite: Path, folder: Path, *more: str, parts: str = "robustness report") -> Ended:
+def words_of(suite: Path, folder: Path, *more: str, parts: str = "robustness report") -> list[str]:
     words = ["--config", str(suite), "--results", str(folder), "--work", str(folder / "work")]
-    words += ["--parts", *parts.split(), "--classes", "sensors", "--workers", "1"]
-    return call("benchmark", [*words, *more], seconds=300.0)
+    return [*words, "--parts", *parts.split(), "--classes", "sensors", "--workers", "1", *more]
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +49,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a suite, the committed rules and an agent."""
     folder = tmp_path_factory.mktemp("robust")
     path = suite_of(folder)
-    ended = run(path, folder / "results", parts="envelopes")
-    assert ended.status == 0, ended.err + ended.trace
+    succeed("benchmark", words_of(path, folder / "results", parts="envelopes"))
     suite = load_suite(path)
     of = next(item for item in classes_of(suite.settings[0]) if item.name == "sensors")
     train(experiment_of(suite, suite.settings[0], of, 0, folder / "models"), quiet=True)
@@ -72,8 +65,8 @@ def with_envelopes(source: Path, target: Path) -> Path:
 def test_all_of_it(folder: Path, tmp_path: Path) -> None:
     """Rules, an agent and one trained over draws in three cases; then a piece that was lost."""
     path, results = folder / "suite.yaml", with_envelopes(folder, tmp_path)
-    ended = run(path, results, "--trained", "--seeds", "1")
-    assert (ended.status, ended.trace) == (0, ""), ended.err
+    words = words_of(path, results, "--trained", "--seeds", "1")
+    succeed("benchmark", words)
     (content,) = verdict.read_cases(results, ["small"])
     assert list(content["cases"]) == ["as_assumed", "loud", "poor"]
     nominal, loud, poor = content["cases"].values()
@@ -88,14 +81,12 @@ def test_all_of_it(folder: Path, tmp_path: Path) -> None:
     assert [row[0] for row in rows] == ["as assumed", "measurement noise ×2", "half the tokens"]
     assert rows[0][1] == "+0.0% [+0.0%, +0.0%]"
 
-    again = run(path, results, "--trained", "--seeds", "1")
-    assert again.status == 1
-    assert "holds 1 finished pieces of work: go on with --resume" in again.err
+    held = "holds 1 finished pieces of work: go on with --resume"
+    assert held in refusal("benchmark", words)
     pieces = sorted((results / "work").rglob("output.pkl"))
     before = {path: path.stat().st_mtime_ns for path in pieces}
     pieces[0].unlink()
-    ended = run(path, results, "--trained", "--seeds", "1", "--resume")
-    assert (ended.status, ended.trace) == (0, ""), ended.err
+    succeed("benchmark", [*words, "--resume"])
     changed = [path for path, time in before.items() if path.stat().st_mtime_ns != time]
     assert changed == pieces[:1]
     assert verdict.read_cases(results, ["small"]) == [content]
@@ -153,9 +144,7 @@ def test_what_is_not_allowed_is_reported_before_anything_runs(
     folder: Path, tmp_path: Path, words: list[str], changes: dict[str, Any], text: str
 ) -> None:
     results = with_envelopes(folder, tmp_path)
-    ended = run(suite_of(tmp_path, **changes), results, *words)
-    assert (ended.status, ended.trace) == (1, "")
-    assert text in ended.err.splitlines()[-1]
+    assert text in refusal("benchmark", words_of(suite_of(tmp_path, **changes), results, *words))
     assert not (results / "work" / "pieces").exists()
 
 

@@ -176,25 +176,6 @@ def test_the_base_is_the_rest_of_the_text() -> None:
     assert run_episodes(task, free, 3, 0).rate.mean() > 0.1
 
 
-@pytest.mark.parametrize(
-    ("text", "options", "message"),
-    [
-        ("rollout", {}, "policy 'rollout' needs a parameter 'base': write base="),
-        ("rollout:base=always:samples=3", {}, "unknown parameter of policy 'always' 'samples'"),
-        ("rollout:steps=0,base=never", {}, "steps = 0"),
-        ("rollout:base=dynamic_event", {}, "base = 'dynamic_event' .* the present step alone"),
-        ("rollout:base=rollout:base=never", {}, "base = 'rollout:base=never' .* present step"),
-        ("rollout:base=value_of_information:own=true", {}, "base = .* a scheduler's policy"),
-        ("rollout:base=never", {"information": "centre"}, "information = 'centre'"),
-    ],
-)
-def test_what_cannot_be_is_refused(text: str, options: dict[str, Any], message: str) -> None:
-    task = fusion_gym.make_task(TOBIT, **options)
-    with pytest.raises(ConfigurationError, match=message) as caught:
-        make_policy(text, task)
-    assert "\n" not in str(caught.value)
-
-
 def test_an_input_that_is_the_same_in_every_episode_cannot_be_imagined() -> None:
     task = fusion_gym.make_task(INPUT, input_phase=(0.0, 1.0), horizon=5)
     with pytest.raises(ConfigurationError, match="UnknownInputSystem cannot be imagined here"):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_runs import call
+from command_runs import refusal, succeed
 from scipy import stats
 from scipy.optimize import brentq
 
@@ -233,18 +233,24 @@ def test_coordinates_make_noise_and_curvature_diagonal() -> None:
 
 
 @pytest.mark.parametrize(
-    ("env", "options", "named"),
+    ("env", "options", "change", "message"),
     [
-        ("TobitOscillator", {"filter": "paper"}, "filter"),
-        ("BiasedOscillator", {"bias_aware": False}, "bias_aware"),
-        ("UnknownInput", {}, "system"),
-        ("RemoteEstimation", {}, "system"),
+        ("TobitOscillator", {"filter": "paper"}, {}, "filter .*not allowed for the bound"),
+        ("BiasedOscillator", {"bias_aware": False}, {}, "bias_aware .*not allowed for the bound"),
+        ("UnknownInput", {}, {}, "system .*not allowed for the bound"),
+        ("RemoteEstimation", {}, {}, "system .*not allowed for the bound"),
+        ("TobitOscillator", OSCILLATOR, {"rates": (0.0,)}, "rates"),
+        ("TobitOscillator", OSCILLATOR, {"weights": (1.0, 0.0)}, "weights"),
+        ("TobitOscillator", OSCILLATOR, {"accuracy": 0.0}, "accuracy"),
+        ("TobitOscillator", OSCILLATOR, {"most_points": 10}, "most_points"),
     ],
 )
-def test_tasks_without_the_bound_are_refused(env: str, options: dict[str, Any], named: str) -> None:
+def test_tasks_without_the_bound_and_other_values_are_refused(
+    env: str, options: dict[str, Any], change: dict[str, Any], message: str
+) -> None:
     task = make_task(f"fusion_gym/{env}-v0", **options)
-    with pytest.raises(ConfigurationError, match=f"^{named} .*not allowed for the bound") as caught:
-        silence_bound(task, (0.1,))
+    with pytest.raises(ConfigurationError, match=f"^{message}") as caught:
+        silence_bound(task, **{"rates": (0.1,)} | change)
     assert "\n" not in str(caught.value)
 
 
@@ -273,21 +279,6 @@ def test_where_it_applies_silence_is_prediction(env: str, options: dict[str, Any
     assert system.fused(state)[0] == pytest.approx(matrix @ before, rel=1e-9, abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        ({"rates": (0.0,)}, "rates"),
-        ({"weights": (1.0, 0.0)}, "weights"),
-        ({"accuracy": 0.0}, "accuracy"),
-        ({"most_points": 10}, "most_points"),
-    ],
-)
-def test_values_that_are_refused(change: dict[str, Any], named: str) -> None:
-    task = make_task("fusion_gym/TobitOscillator-v0", **OSCILLATOR)
-    with pytest.raises(ConfigurationError, match=named):
-        silence_bound(task, **{"rates": (0.1,)} | change)
-
-
 # --- the command ----------------------------------------------------------------------------------
 
 
@@ -295,13 +286,10 @@ def test_the_command_writes_what_it_prints(tmp_path: Path) -> None:
     file = tmp_path / "bound.json"
     words = ["--env", "fusion_gym/TobitOscillator-v0", "--set", "filter=tobit", "horizon=5"]
     words += ["--episodes", "8", "--filters", "tobit", "adf", "--json", str(file)]
-    ended = call("bound", [*words, "--rates", "0.1", "--accuracy", "0.1"])
-    assert (ended.status, ended.trace) == (0, "")
+    ended = succeed("bound", [*words, "--rates", "0.1", "--accuracy", "0.1"])
     report = json.loads(file.read_text())
     assert report["everything_delivered"].keys() == {"tobit", "adf"}
     row = report["bounds"][0]
     assert report["floor"] < row["bound"]
     assert f"{row['bound']:.5g}" in ended.out
-    refused = call("bound", ["--env", "fusion_gym/UnknownInput-v0", "--rates", "0.1"])
-    assert refused.status == 1
-    assert refused.err.count("\n") == 1
+    refusal("bound", ["--env", "fusion_gym/UnknownInput-v0", "--rates", "0.1"])

@@ -37,13 +37,8 @@ def strictly(python: Path, file: Path, folder: Path) -> str:
     """What ``mypy --strict`` says of a user's file, outside of the repository."""
     (folder / "mypy.ini").write_text(STRICT)
     line = [sys.executable, "-m", "mypy", "--config-file", "mypy.ini"]
-    line += [
-        "--python-executable",
-        str(python),
-        "--cache-dir",
-        str(ROOT / ".mypy_cache" / "strict"),
-    ]
-    line += [str(file)]
+    line += ["--python-executable", str(python), str(file)]
+    line += ["--cache-dir", str(ROOT / ".mypy_cache" / "strict")]
     return subprocess.run(line, cwd=folder, capture_output=True, text=True).stdout
 
 

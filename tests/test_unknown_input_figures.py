@@ -41,8 +41,7 @@ def run(policy: str, episodes: int = 400, horizon: int = 100, **options: Any) ->
     task = build(horizon=horizon, **options)
     n = task.system.plant.size
     record = record_run(task, POLICIES.get(policy, policy), episodes, 9000)
-    every = np.concatenate((record.local, record.fused[:, None]), axis=1)
-    error = every - record.truth[:, None]
+    error = np.roll(record.errors, -1, axis=1)  # the fused estimate last
     square = (error**2).mean(0)
     return Run(record.granted.mean(0), square[:, :n].sum(1), square[:, n:].sum(1), error)
 
@@ -139,9 +138,9 @@ def test_exact_filter_is_unbiased_and_its_covariance_the_actual_one(signal: str)
 def test_held_measurements_cost_most_where_the_guarantee_is_void() -> None:
     """Why the default filter predicts: under random requests holding doubles the error."""
     weights = build().reward.state_weights
-    losses = {}
-    for kind in ("random_walk", "predict", "paper"):
-        error = run("random", 200, filter=kind).errors[:, 3]
-        losses[kind] = (weights * error**2).sum(1).mean()
+    losses = {
+        kind: (weights * run("random", 200, filter=kind).errors[:, 3] ** 2).sum(1).mean()
+        for kind in ("random_walk", "predict", "paper")
+    }
     assert losses["random_walk"] < 0.9 * losses["predict"]
     assert losses["predict"] < 0.5 * losses["paper"]

@@ -58,11 +58,9 @@ def test_the_verdict_is_the_arithmetic_that_it_says() -> None:
 
 
 @pytest.mark.parametrize("always", [1.0, 0.4])
-def test_the_middle_of_the_front_is_from_a_twentieth_to_half_of_always(
-    always: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("few_resamples")
+def test_the_middle_of_the_front_is_from_a_twentieth_to_half_of_always(always: float) -> None:
     """Rates just outside and just inside, each with a difference of its own."""
-    monkeypatch.setattr("fusion_gym.agents.experiments.verdict.RESAMPLES", 20)
     noise = np.random.default_rng(0).uniform(0.5, 1.5, 50)
     baselines = {"never": made_up(0.0, 2 * noise), "always": made_up(1.0, noise)}
 

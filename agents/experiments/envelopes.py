@@ -32,7 +32,7 @@ from ..output.folders import check_inputs
 from .classes import Class, classes_of
 from .config import Family, Setting, Suite, Tuning, front_prices
 from .tables import Row, group_by, read_rows, write_rows
-from .tuning import first_values, policy_text, tune_families
+from .tuning import WORST, first_values, policy_text, tune_families
 from .workers import Pool, missing, side_by_side
 
 # Beside the folder of the commands, in a clone as in an installed package.
@@ -110,13 +110,8 @@ class Test:
     @property
     def inputs(self) -> dict[str, Any]:
         """All that its result depends on."""
-        return {
-            "environment": self.setting.environment.model_dump(mode="json"),
-            "options": dict(self.options),
-            "policy": self.label or self.policy,
-            "episodes": self.episodes,
-            "seed": self.seed,
-        }
+        own = {"options": dict(self.options), "policy": self.label or self.policy}
+        return tested_inputs(self.setting, self.episodes, self.seed) | own
 
     def task(self) -> Task:
         """Return the task in which it runs."""
@@ -143,6 +138,12 @@ class Test:
         ]
 
 
+def tested_inputs(setting: Setting, episodes: int, seed: int) -> dict[str, Any]:
+    """Return what every result on the test episodes of a setting depends on."""
+    environment = setting.environment.model_dump(mode="json")
+    return {"environment": environment, "episodes": episodes, "seed": seed}
+
+
 def policy_with_options(policy: str, options: Iterable[tuple[str, Any]]) -> str:
     """A policy's text, with the options of its class where there are some."""
     added = " ".join(f"{key}={json.dumps(value).strip(chr(34))}" for key, value in options)
@@ -162,19 +163,15 @@ def run_search(search: Search) -> dict[str, Any]:
     )
     policies = [
         {
-            "policy": finalist.policy,
-            "knows": make_policy(finalist.policy, task).knowledge,
-            "found_by": finalist.found_by,
-            "rate": float(finalist.brief.rate.mean()),
-            "mse": mean_interval(_finite(finalist.brief.mse))._asdict(),
+            "policy": policy,
+            "knows": make_policy(policy, task).knowledge,
+            "found_by": found_by,
+            "rate": float(brief.rate.mean()),
+            "mse": mean_interval(np.nan_to_num(brief.mse, nan=WORST, posinf=WORST))._asdict(),
         }
-        for finalist in finalists
+        for policy, brief, found_by in finalists
     ]
     return {"trials": tried, "policies": policies}
-
-
-def _finite(mse: Any) -> Any:
-    return np.where(np.isfinite(mse), mse, 1e300)
 
 
 def run_test(test: Test) -> EpisodeResults:
@@ -278,10 +275,7 @@ def content_of(
         for seed in range(suite.tuning_of(setting).seeds)
     ]
     return {
-        "mode": of.mode,
-        "memory": of.memory,
-        "broadcast": of.broadcast,
-        "knows": of.knows,
+        **{key: getattr(of, key) for key in ("mode", "memory", "broadcast", "knows")},
         "options": dict(of.options),
         "contains": [c.name for c in classes_of(setting) if of.contains(c) and c != of],
         "families": sorted({candidate["family"] for candidate in candidates.values()}),
@@ -482,12 +476,6 @@ class EnvelopeStore(NamedTuple):
                 f"envelopes = {path!r} is not allowed: it has no class {name!r}: tune it first"
             )
         return dict(classes[name])
-
-    def vertices(self, setting: Setting, names: Sequence[str]) -> list[dict[str, Any]]:
-        """Return the rules of some classes, each once."""
-        classes = self.classes(setting)
-        result = {v["name"]: v for name in names for v in classes[name]["vertices"]}
-        return list(result.values())
 
     def missing(self, setting: Setting, names: Sequence[str]) -> list[Class]:
         """Return the missing ones of these classes, all of whose rules are made once.

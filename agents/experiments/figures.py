@@ -12,6 +12,7 @@ from ..output.files import write_text
 from ..output.markup import page_of
 from ..output.overview_figure import Dot, OverviewRow
 from ..output.pareto_figure import Differences, Limits, Panel, Series
+from .envelopes import at_least, rollout_of
 from .learning import read_learning
 from .report import (
     KNOWING,
@@ -70,16 +71,18 @@ def write_report(results: Path, titles: Mapping[str, str], pages: Mapping[Path, 
 
 def report_text(settings: Mapping[str, SettingResults]) -> str:
     """Return the report, which names the panels of every figure."""
-    small = {name: panels_of(results)[1] for name, results in settings.items()}
-    titles = {name: [" ".join(p.title.split()) for p in panels] for name, panels in small.items()}
-    return text_of(settings, titles)
+    panels = {
+        name: [" ".join(panel.title.split()) for panel in panels_of(results)[1]]
+        for name, results in settings.items()
+    }
+    return text_of(list(settings.values()), panels)
 
 
 def draw_setting(folder: Path, results: SettingResults) -> None:
     """Draw a setting's figure into its folder, as PNG and as SVG."""
     main, small = panels_of(results)
     paths = [folder / f"pareto.{suffix}" for suffix in ("png", "svg")]
-    limits = limits_of(results, [main, *small])
+    limits = limits_of(results.always, [main, *small])
     pareto_figure.draw_pareto(paths, results.verdict["title"], main, small, limits)
 
 
@@ -88,7 +91,8 @@ def panels_of(results: SettingResults) -> tuple[Panel, list[Panel]]:
     grouped: dict[tuple[str, str, str], list[str]] = {}
     for name, content in results.known_classes.items():
         grouped.setdefault(kind_of(content), []).append(name)
-    bound = [(rate, results.bound_at(rate)) for rate in _fine(results)] if results.bound else []
+    fine = fine_rates(results.always)
+    bound = [(rate, at_least(results.bound, rate)) for rate in fine] if results.bound else []
 
     def panel(title: str, names: list[str], known: Sequence[EnvelopePoint]) -> Panel:
         names = sorted(names, key=lambda name: results.known_classes[name]["memory"])
@@ -96,9 +100,10 @@ def panels_of(results: SettingResults) -> tuple[Panel, list[Panel]]:
         return Panel(title, series, single, bound, None, list(_differences(results, names)))
 
     main = panel("scheduler", grouped.pop(("sensors", "", "measurement"), []), results.ahead)
-    if results.rollout:
-        label = f"improved by simulation\n({results.rollout_episodes} episodes)"
-        points = [(point.rate, point.mse) for point in results.rollout]
+    rollout, episodes = rollout_of(results.folder)
+    if rollout:
+        label = f"improved by simulation\n({episodes} episodes)"
+        points = [(point.rate, point.mse) for point in rollout]
         style = palette.ROLLOUT._replace(label=label)
         main = main._replace(series=[*main.series, Series(style, [], points)])
     if results.genie and not bound:
@@ -119,9 +124,9 @@ def _title(mode: str, broadcast: str, packet: str) -> str:
     )
 
 
-def limits_of(results: SettingResults, panels: Sequence[Panel]) -> Limits:
+def limits_of(always: float, panels: Sequence[Panel]) -> Limits:
     """Return limits from 4 % of always transmitting and from the least error that is drawn."""
-    left, right = LEFT * results.always, 1.12 * results.always
+    left, right = LEFT * always, 1.12 * always
     every = [
         error
         for panel in panels
@@ -150,11 +155,11 @@ def _series(
     results: SettingResults, names: Sequence[str], reference: Sequence[EnvelopePoint]
 ) -> Iterator[Series]:
     """Yield rules and agents of classes that differ in memory, and what computes with the model."""
-    fine = _fine(results)
+    fine = fine_rates(results.always)
     for name in names:
         memory = results.known_classes[name]["memory"]
         style = palette.RULES_MEMORY if memory else palette.RULES
-        yield _curve(style, results.hull(name), fine)
+        yield envelope_series(style, results.hull(name), fine)
     if reference:
         hull = lower_hull(reference)
         style, label = palette.SCHEDULES, "best periodic schedules"
@@ -162,7 +167,7 @@ def _series(
             style = palette.REFERENCE
             label = "optimum" if results.optimal else "lookahead with the model"
         within = [rate for rate in fine if rate <= hull[-1].rate]
-        yield _curve(style._replace(label=label), hull, within)
+        yield envelope_series(style._replace(label=label), hull, within)
     for name in names:
         if name in results.classes:
             front = results.classes[name]
@@ -171,7 +176,9 @@ def _series(
             yield Series(style, marks, marks, list(_band(results, name, marks)))
 
 
-def _curve(style: palette.Style, hull: Sequence[EnvelopePoint], rates: Sequence[float]) -> Series:
+def envelope_series(
+    style: palette.Style, hull: Sequence[EnvelopePoint], rates: Sequence[float]
+) -> Series:
     """Return the line of an envelope, which bends on logarithmic axes, with its vertices."""
     heights = ((rate, height(hull, rate)) for rate in rates)
     line = [(rate, error) for rate, error in heights if error is not None]
@@ -225,8 +232,9 @@ def _single(results: SettingResults, names: Sequence[str]) -> list[list[tuple[fl
     return [points for points in curves.values() if len(points) > 1]
 
 
-def _fine(results: SettingResults) -> list[float]:
-    return np.geomspace(LEFT * results.always, results.always, FINE).tolist()
+def fine_rates(always: float) -> list[float]:
+    """Return rates for a curve, from 4 % of always transmitting."""
+    return np.geomspace(LEFT * always, always, FINE).tolist()
 
 
 def draw_overview(folder: Path, settings: Mapping[str, SettingResults]) -> None:

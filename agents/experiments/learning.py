@@ -46,7 +46,7 @@ from .envelopes import (
     run_test,
 )
 from .tables import Row, group_by, read_rows, write_rows
-from .verdict import MIDDLE, AgentFront, excess, interval
+from .verdict import MIDDLE, compare_classes, excess
 from .workers import Folders, Pool, check_training, missing, side_by_side, training_of
 
 Points = Sequence[Sequence[float]]  # (rate, MSE) at each price
@@ -458,10 +458,9 @@ def judge_fronts(setup: Mapping[str, Any]) -> dict[str, Any] | None:
     worst = max(points, key=lambda point: float(point["difference"]["mean"]))
     return {
         "compared": len(points),
-        "above": [{key: p[key] for key in ("seed", "price", "difference")} for p in above],
-        "worst": {key: worst[key] for key in ("seed", "price", "difference")},
+        "above": above,
+        "worst": worst,
         "rates": [choose(point["rate"] for point in points) for choose in (min, max)],
-        "mean": sum(p["difference"]["mean"] for p in points) / len(points),
         "closed": {name: gap_share(points, name) for name in ("rollout", "bound")},
     }
 
@@ -583,10 +582,7 @@ def beside_envelope(
     below = best_mse(references, rate)
     if below is None:
         return {}
-    front = AgentFront(
-        agent.mse[None, None], below[None, None], np.array([[rate]]), np.ones((1, 1, 1))
-    )
-    difference = interval(front, np.array([rate]))
+    difference = compare_classes(agent.mse[None, None], below[None, None], [rate])
     known = best_known(setup, rate, references)
     return {"envelope": float(below.mean()), "difference": difference} | known
 

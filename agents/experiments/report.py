@@ -61,6 +61,9 @@ TEMPLATES.filters |= {
 }  # fmt: skip
 
 
+TEMPLATES.globals["at_least"] = at_least
+
+
 @dataclass(frozen=True)
 class SettingResults:
     """A setting's tables as pages and figures need them; what is not there is empty.
@@ -69,11 +72,6 @@ class SettingResults:
     """
 
     folder: Path
-
-    @property
-    def name(self) -> str:
-        """The setting's name."""
-        return self.folder.name
 
     @cached_property
     def verdict(self) -> Row:
@@ -107,7 +105,7 @@ class SettingResults:
     @cached_property
     def envelopes(self) -> Row:
         """The committed envelopes."""
-        committed = path_of(self.folder.parent, self.name).exists()
+        committed = path_of(self.folder.parent, self.folder.name).exists()
         return read_envelopes(self.folder) if committed else {}
 
     @cached_property
@@ -149,11 +147,6 @@ class SettingResults:
     def rollout(self) -> list[EnvelopePoint]:
         """A rule that was improved by simulation."""
         return rollout_of(self.folder)[0]
-
-    @property
-    def rollout_episodes(self) -> int:
-        """The number of its episodes."""
-        return rollout_of(self.folder)[1]
 
     @cached_property
     def bound(self) -> Row | None:
@@ -206,11 +199,6 @@ class SettingResults:
         """Return the error of a class's rules at a rate."""
         hull = self.hull(name)
         return height(hull, rate) if hull else None
-
-    def bound_at(self, rate: float) -> float:
-        """Return the proven bound at a rate."""
-        assert self.bound is not None
-        return at_least(self.bound, rate)
 
     def worth(self, kind: str) -> Row:
         """Return the row that stands for a kind: with memory if there is, of the farthest apart."""
@@ -334,9 +322,8 @@ def hulls_of(envelopes: Row) -> dict[str, dict[bool, list[EnvelopePoint]]]:
     return result
 
 
-def text_of(results: Mapping[str, SettingResults], panels: Mapping[str, Sequence[str]]) -> str:
+def text_of(settings: Sequence[SettingResults], panels: Mapping[str, Sequence[str]]) -> str:
     """Return the report in Markdown; ``panels`` has the small panels of each setting's figure."""
-    settings = list(results.values())
     fronts = [front for item in settings for front in item.classes.values()]
     return _render(
         "report.md",

@@ -21,7 +21,7 @@ from fusion_gym.policies.registry import make_policy
 
 from ..output.folders import fingerprint
 from ..training.config import EnvironmentConfig, Experiment, TrainingConfig, ValidationConfig
-from .classes import Class, classes_of, trained_classes
+from .classes import Class, trained_classes
 from .config import Setting, Suite, front_prices
 from .envelopes import (
     EnvelopeStore,
@@ -31,6 +31,7 @@ from .envelopes import (
     read_tests,
     rule_tests,
     run_test,
+    tested_inputs,
 )
 from .tables import VERDICT, Row, write_rows
 from .verdict import ClassTests, at_rates, judge, worths
@@ -46,6 +47,7 @@ from .workers import (
 )
 
 VALIDATIONS = 2  # of a training
+_CLASS = ("mode", "memory", "broadcast", "packet", "knows")  # columns of a class
 _METRICS = ("mse", "return", "rate", "denied", "tokens", "nees")  # of each policy
 
 
@@ -98,11 +100,6 @@ class Agent(NamedTuple):
     work: Path
 
     @property
-    def name(self) -> str:
-        """Its name in the tables."""
-        return f"agent_{self.of.name}_{self.seed}"
-
-    @property
     def weight(self) -> float:
         """About how long it takes, in seconds on one core."""
         steps = self.suite.timesteps_of(self.setting, self.of.name, self.of.mode)
@@ -116,7 +113,7 @@ class Agent(NamedTuple):
     @property
     def inputs(self) -> dict[str, Any]:
         """All that its results depend on."""
-        return tested_inputs(self.suite, self.setting) | {
+        return tested_inputs(self.setting, self.suite.episodes, self.suite.seed) | {
             "training": training_of(self.experiment),
             "envelope": {"class": self.of.name, "sha256": self.sha256},
             "prices": self.suite.prices,
@@ -152,7 +149,9 @@ class HindsightSearch:
         assert self.setting.hindsight is not None
         hindsight = self.setting.hindsight.model_dump(mode="json")
         hindsight |= {"episodes": self.suite.hindsight_episodes}
-        return tested_inputs(self.suite, self.setting) | {"hindsight": hindsight}
+        return tested_inputs(self.setting, self.suite.episodes, self.suite.seed) | {
+            "hindsight": hindsight
+        }
 
 
 def search_in_hindsight(search: HindsightSearch) -> dict[str, EpisodeResults]:
@@ -166,15 +165,6 @@ def search_in_hindsight(search: HindsightSearch) -> dict[str, EpisodeResults]:
             task, price, hindsight.width, episodes, suite.seed
         )
         for price in hindsight.prices
-    }
-
-
-def tested_inputs(suite: Suite, setting: Setting) -> dict[str, Any]:
-    """Return what all results of a setting depend on."""
-    return {
-        "environment": setting.environment.model_dump(mode="json"),
-        "episodes": suite.episodes,
-        "seed": suite.seed,
     }
 
 
@@ -202,15 +192,16 @@ class SettingWork(NamedTuple):
         Raises:
             ConfigurationError: a class that an agent would be compared with is not there.
         """
-        trained = {of.name for of in trained_classes(self.suite, self.setting)}
-        names = [of.name for of in classes_of(self.setting) if of.name in trained]
+        names = [of.name for of in trained_classes(self.suite, self.setting)]
         return {name: self.store.envelope(self.setting, name)["sha256"] for name in names}
 
     @property
     def vertices(self) -> list[Row]:
-        """The rules of the envelopes that agents are compared with."""
-        names = [of.name for of in trained_classes(self.suite, self.setting)]
-        return self.store.vertices(self.setting, names)
+        """The rules of the envelopes that agents are compared with, each once."""
+        classes = self.store.classes(self.setting)
+        trained = trained_classes(self.suite, self.setting)
+        result = {v["name"]: v for of in trained for v in classes[of.name]["vertices"]}
+        return list(result.values())
 
     def tests(self) -> dict[str, list[Test]]:
         """Return the tests of rules and references by the run that reports them."""
@@ -229,7 +220,7 @@ class SettingWork(NamedTuple):
 
     def inputs(self, run: str) -> dict[str, Any]:
         """Return all that the results of a run of rules or references depend on."""
-        result = tested_inputs(self.suite, self.setting)
+        result = tested_inputs(self.setting, self.suite.episodes, self.suite.seed)
         if run != "baselines":
             return result | {run: list(getattr(self.setting, run) or ())}
         genie = self.setting.genie and self.setting.genie.model_dump(mode="json")
@@ -287,7 +278,8 @@ class SettingWork(NamedTuple):
                     "training_seed": agent.seed,
                 }
                 tested = dict(zip(names, content.pop("results"), strict=True))
-                result.append(BenchmarkRun(agent.name, agent.inputs, tested, own | content))
+                name = f"agent_{agent.of.name}_{agent.seed}"
+                result.append(BenchmarkRun(name, agent.inputs, tested, own | content))
         return result
 
 
@@ -325,11 +317,7 @@ def judge_setting(work: SettingWork) -> None:
             classes[of.name] = {
                 **judge(agents, prices, envelope, ahead, always, clairvoyant, own["searches"]),
                 "at": at_rates(tested[of.name], always),
-                "mode": of.mode,
-                "memory": of.memory,
-                "broadcast": of.broadcast,
-                "packet": of.packet,
-                "knows": of.knows,
+                **{key: getattr(of, key) for key in _CLASS},
                 "sha256": own["sha256"],
                 "envelope": [point._asdict() for point in points_of(envelope)],
             }

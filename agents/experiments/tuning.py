@@ -23,7 +23,7 @@ from .config import Choices, Family, Range, Tuning
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 _RUNS = 1024  # beside each other; fixed, so that results do not depend on the machine
 _MOST = 3  # parameters of a rule that multiply its trials
-_WORST = 1e300  # the error of a policy whose error is no number
+WORST = 1e300  # the error of a policy whose error is no number
 
 
 class TuningTrial(NamedTuple):
@@ -133,7 +133,7 @@ def search_family(
     def run(requested: Iterable[dict[str, Any]]) -> None:
         texts = {policy_text(family, values, task.sensors): values for values in requested}
         new = [text for text in texts if text not in tried]
-        briefs = briefs_of(task, new, tuning.episodes, episodes_seed(tuning, seed))
+        briefs = briefs_of(task, new, tuning.episodes, tuning.seed + seed * tuning.episodes)
         for text, brief in zip(new, briefs, strict=True):
             tried[text] = TuningTrial(text, texts[text], *_means(brief))
 
@@ -148,11 +148,6 @@ def search_family(
             for place, slope in enumerate(slopes)
         )
     return list(tried.values())
-
-
-def episodes_seed(tuning: Tuning, seed: int) -> int:
-    """Seed of the first episode of a search."""
-    return tuning.seed + seed * tuning.episodes
 
 
 def error_per_rate(task: Task, price: float) -> float:
@@ -196,7 +191,7 @@ def briefs_of(task: Task, policies: Sequence[str], episodes: int, seed: int) -> 
 
 def _means(brief: Brief) -> tuple[float, float]:
     mse = float(brief.mse.mean())
-    return float(brief.rate.mean()), mse if np.isfinite(mse) else _WORST
+    return float(brief.rate.mean()), mse if np.isfinite(mse) else WORST
 
 
 def near_hull(trials: Sequence[TuningTrial], near: float, finalists: int) -> list[str]:

@@ -157,11 +157,6 @@ def grid_of(front: AgentFront, always: float) -> Array:
     return np.asarray(np.clip(middles(always)[reached], low, high))
 
 
-def score(shares: Array, rates: Array, grid: Array) -> Array:
-    """Interquartile mean over seeds of the ``shares`` (seeds, P), at the rates of the ``grid``."""
-    return _between(trimmed(shares), rates.mean(0), grid)
-
-
 def trimmed(shares: Array) -> Array:
     """Mean over the first axis without its lowest and highest quarter, each rounded down."""
     cut = len(shares) // 4
@@ -198,7 +193,7 @@ def interval(front: AgentFront, grid: Array) -> dict[str, float]:
         for item in range(RESAMPLES)
     ]
     low, high = np.quantile(drawn, (0.025, 0.975))
-    mean = float(score(result, front.rates, grid).mean())
+    mean = float(_between(trimmed(result), front.rates.mean(0), grid).mean())
     return {"mean": mean, "low": float(low), "high": float(high)}
 
 

@@ -99,7 +99,11 @@ class Pool:
                     self._package().init(**self._cluster())
                     stack.callback(self._package().shutdown)
             except (OSError, ValueError) as error:
-                raise self._nobody(error) from None
+                reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+                raise ConfigurationError(
+                    f"address = {self.address!r} is not allowed with backend={self.backend!r}: "
+                    f"{reason}"
+                ) from None
             if self.backend != "ray":
                 jobs = self.workers if self.local else -1
                 stack.enter_context(joblib.parallel_config(self.backend, n_jobs=jobs))
@@ -123,12 +127,6 @@ class Pool:
                 f"backend = {self.backend!r} is not allowed: it needs {name}, which "
                 f"'fusion-gym[{self.backend}]' installs"
             ) from None
-
-    def _nobody(self, error: Exception) -> ConfigurationError:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        return ConfigurationError(
-            f"address = {self.address!r} is not allowed with backend={self.backend!r}: {reason}"
-        )
 
 
 class Folders(NamedTuple):

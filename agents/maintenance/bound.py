@@ -68,7 +68,8 @@ class Bound(Long):
             make_task(self.env, **options),
             everything_delivered_tasks(self.env, options, self.filters),
         )
-        weights = _reward_weights(task) if self.weights == "reward" else None
+        reward = task.reward.error_weight * task.reward.state_weights[:, 0]
+        weights = reward if self.weights == "reward" else None
         if self.rates:
             silence_model(task, weights)  # refuses what the bound does not hold for
         report: dict[str, Any] = {
@@ -121,10 +122,6 @@ def summary(bound: SilenceBound, rates: tuple[float, ...]) -> dict[str, Any]:
         rows.append({"rate": rate, "bound": value, "price": visible.price, "gap": visible.gap})
     costs = [asdict(cost) | {"gap": cost.gap} for cost in bound.costs]
     return {"floor": bound.floor, "bounds": rows, "costs": costs}
-
-
-def _reward_weights(task: Task) -> Any:
-    return task.reward.error_weight * task.reward.state_weights[:, 0]
 
 
 def _floors(report: dict[str, Any]) -> Table:

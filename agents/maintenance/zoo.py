@@ -73,17 +73,12 @@ def best_agents(results: Path) -> dict[tuple[str, str], dict[str, Any]]:
     result: dict[tuple[str, str], dict[str, Any]] = {}
     for path in sorted(results.glob("*/runs.csv")):
         policies = group_by(read_rows(path.parent, "policies"), "run")
-        for run in read_rows(path.parent, "runs"):
-            if "class" in run:
-                run |= {"setting": path.parent.name, "policies": policies.get(run["run"], [])}
-                earlier = result.setdefault((run["setting"], run["class"]), run)
-                if _validation(run) > _validation(earlier):
-                    result[run["setting"], run["class"]] = run
+        agents = [run for run in read_rows(path.parent, "runs") if "class" in run]
+        for name, seeds in group_by(agents, "class").items():
+            best = max(seeds, key=lambda run: float(run["best_validation"]["return"]))
+            best |= {"setting": path.parent.name, "class": name}
+            result[path.parent.name, name] = best | {"policies": policies.get(best["run"], [])}
     return result
-
-
-def _validation(run: Mapping[str, Any]) -> float:
-    return float(run["best_validation"]["return"])
 
 
 def select(

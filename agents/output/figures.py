@@ -79,9 +79,8 @@ def _draw(
 ) -> None:
     rate = np.array([r.rate.mean() for r in results])
     order = np.argsort(rate, kind="stable")
-    intervals = [mean_interval(results[i].mse) for i in order]
-    mean = np.array([i.mean for i in intervals])
-    spread = np.abs(np.array([[i.mean - i.low, i.high - i.mean] for i in intervals]).T)
+    mean, low, high = np.array([mean_interval(results[i].mse) for i in order]).T
+    spread = np.abs([mean - low, high - mean])
     axes.errorbar(
         rate[order], mean, yerr=spread, label=label, color=colour, marker=marker,
         ms=size, lw=1.1, elinewidth=0.8, capsize=1.5, zorder=3 if size > 5 else 2,

@@ -44,19 +44,6 @@ def alone_in(folder: Path, name: str) -> Iterator[None]:
         lock.release()
 
 
-def refuse_earlier(option: str, folder: Path, count: int, resume: bool) -> None:
-    """Refuse to begin where so many results are already, unless they are resumed.
-
-    Raises:
-        ConfigurationError: there are some, and no ``resume``.
-    """
-    if count and not resume:
-        raise ConfigurationError(
-            f"{option} = {str(folder)!r} holds {count} finished pieces of work: go on with "
-            "--resume, or give another --results and --work"
-        )
-
-
 def fingerprint(inputs: Mapping[str, Any]) -> str:
     """A hash of plain inputs, the same in every process."""
     plain = json.dumps(inputs, sort_keys=True, default=list)

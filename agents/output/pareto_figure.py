@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import matplotlib.ticker
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.lines import Line2D
@@ -135,17 +136,12 @@ def _strip(axes: Axes, panel: Panel, limits: Limits) -> None:
     """Agents relative to rules; zero is the envelope."""
     axes.axhline(0.0, color=BLUE, lw=1.6, zorder=2)
     for visible in panel.differences:
-        rates = [rate for rate, _, _, _ in visible.points]
-        means, low, high = ([point[place] for point in visible.points] for place in (1, 2, 3))
-        spread = [
-            [mean - end for mean, end in zip(means, low, strict=True)],
-            [end - mean for mean, end in zip(means, high, strict=True)],
-        ]
+        rates, means, low, high = np.reshape(visible.points, (-1, 4)).T
         style = visible.style
         mark = _mark(style._replace(size=0.75 * style.size))
         axes.errorbar(
-            rates, means, yerr=spread, ls=style.line, color=style.colour, lw=1.2, elinewidth=1.6,
-            zorder=4, **mark,
+            rates, means, yerr=[means - low, high - means], ls=style.line, color=style.colour,
+            lw=1.2, elinewidth=1.6, zorder=4, **mark,
         )  # fmt: skip
     axes.set_ylim(*limits.differences)
     axes.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator(3, steps=[1, 2, 5, 10]))

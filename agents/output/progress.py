@@ -106,21 +106,15 @@ def progress_bar(
 ) -> Iterator[Bar]:
     """A bar while this is entered, below others that are; ``initial`` was done before."""
     bar = Bar(description, total, unit, initial)
-    if quiet or is_quiet():
-        yield bar
-    elif _SCREEN.progress is not None or _watched():
-        with _SCREEN.showing(bar):
-            try:
-                yield bar
-            finally:
-                bar.end()
-    else:
-        bar.plain = True
+    silent = quiet or is_quiet()
+    drawn = not silent and (_SCREEN.progress is not None or _watched())
+    bar.plain = plain = not (silent or drawn)
+    with _SCREEN.showing(bar) if drawn else contextlib.nullcontext():
         try:
             yield bar
         finally:
             bar.end()
-            if bar.begun:
+            if plain and bar.begun:
                 remark(bar.line())
 
 

@@ -14,14 +14,13 @@ from scipy.stats import norm
 import fusion_gym
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import Signals
-from fusion_gym.evaluation.intervals import Interval
 from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
 
 from ..output import palette
 from .adaptive_innovation_runs import ELLIPSES, SENSORS, STEPS, Ask, ErrorRecord, Lane, steps, top
-from .drawing import legend, set_ticks
-from .numbers import Number, below, estimate, grid, verdict
+from .drawing import legend, set_ticks, stack
+from .numbers import Number, grid
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_of
 
 STATES = ("position", "velocity", "acceleration")
@@ -35,7 +34,6 @@ _A, _B, _C = (float(RULE.column(name, 1)[0, 0]) for name in ("threshold", "offse
 OURS, PRINTED_SIGN = "the trigger as we read it", "the sign in (10) as printed, -b + c |ε|"
 FIXED, TIMED = "c = 0", "a = 0"
 AT_BOUND, OTHERS, ALWAYS = "at the bounds", "requests of another episode", "always"
-_CLOSE = 0.1  # relative difference of two traces that still counts as close
 
 
 # --- thresholds and rates -------------------------------------------------------------------------
@@ -141,12 +139,9 @@ def _summarise_rates(data: Data) -> Data:
         Number.of(f"{name}, rate", 100.0 * sample, 100.0 * printed, unit="%")
         for name, sample, printed in zip(SENSORS, ours, PRINTED, strict=True)
     ]
-    agree = [number.verdict == "agrees" for number in numbers]
     far = np.abs(100.0 * (rates.mean(-1) - np.array(PRINTED))).max(1)
     size = np.linspace(0.0, 5.0, 51)
     falls = [bool((np.diff(level(size, size)) < 0.0).all()) for level in (_printed, _ours)]
-    unmoved = float(np.ptp(_ours(0.0 * size, size)))
-    after, silent = data["changes"]
     return {
         "tables": {
             "rates": numbers,
@@ -160,7 +155,6 @@ def _summarise_rates(data: Data) -> Data:
         "steps": STEPS, "counts": [round(STEPS * printed) for printed in PRINTED],
         "away": [(100.0 * p - n.mean) / n.spread for p, n in zip(PRINTED, numbers, strict=True)],
         "usual": float(norm.ppf(0.5 + 0.5 * 0.95 ** (1.0 / len(numbers)))),
-        "spread": 100.0 * ours.std(1, ddof=1),
         "nearest": sorted(zip(far.tolist(), readings, strict=True)),
         "percent": {
             name: 100.0 * by[reading]
@@ -168,13 +162,9 @@ def _summarise_rates(data: Data) -> Data:
                 ("ours", OURS), ("printed_sign", PRINTED_SIGN), ("fixed", FIXED), ("timed", TIMED),
             )
         },
-        "agree": agree, "falls": falls, "unmoved": unmoved, "after": after.mean(),
-        "silent": silent.mean(), "shares": data["requested"][WINDOW].mean(0),
-        "saves": verdict(estimate(sample).high < 1.0 for sample in ours),
-        "as_printed": verdict(agree), "decreases": verdict(falls[:1]),
-        "adapts": verdict([estimate(after).low > 0.0]),
-        "moves_in_silence": verdict([float(silent.max()) > 0.0]),
-        "limits": verdict([(by[TIMED] == 1.0).all(), unmoved == 0.0]),
+        "agree": [number.verdict == "agrees" for number in numbers], "falls": falls,
+        "unmoved": float(np.ptp(_ours(0.0 * size, size))),
+        "shares": data["requested"][WINDOW].mean(0),
     }  # fmt: skip
 
 
@@ -240,21 +230,13 @@ class _Lanes:
         """Return the data of both fusion rules, stacked."""
         return np.stack([self(fusion, name, lane) for fusion in FUSIONS])
 
-    def relative(self, lane: str) -> list[Interval]:
-        """Return MSE over actual trace, minus 1, of both fusion rules."""
-        actual = self.both("actual", lane).mean(-1, keepdims=True)
-        return [estimate(sample) for sample in self.both("mse", lane) / actual - 1.0]
-
-
-def _close(interval: Interval) -> bool:
-    return max(abs(interval.low), abs(interval.high)) <= _CLOSE
-
-
-def _hundredfold(intervals: Iterable[Interval]) -> list[Interval]:
-    return [Interval(*(100.0 * value for value in interval)) for interval in intervals]
+    def means(self, name: str, lanes: Iterable[str]) -> Array:
+        """Return means over episodes (fusion rules, lanes, …)."""
+        return np.stack([self.both(name, lane).mean(-1) for lane in lanes], axis=1)
 
 
 def _summarise_fusion(data: Data) -> Data:
+    """The page's tables, ``at`` the bounds the arrays of both rules, and shares by setting."""
     lanes, scaled = _Lanes(data), {f"scale {scale}": scale for scale in data["scales"]}
     names = {AT_BOUND: "trigger", OTHERS: "trigger's requests of another episode", ALWAYS: "always"}
     low_names = {lane: f"trigger, variances {scaled[lane]} of the bounds" for lane in scaled}
@@ -268,91 +250,52 @@ def _summarise_fusion(data: Data) -> Data:
         }
         return grid(tuple(quantities.values()), rows)
 
-    inside = {
+    rows = {
         f"{NAMES[f]}, variances {scale:g} of the bounds": 100.0 * lanes(f, "inside", lane)
         for f in FUSIONS
         for lane, scale in scaled.items()
     }
-    left = lanes.both("square", AT_BOUND).mean(-1).sum(-1)
+    every, first = [AT_BOUND, *scaled], next(iter(scaled))
+    inside = lanes.means("inside", scaled)
+    rule, lane, state = np.unravel_index(inside.argmin(), inside.shape)
+    per_step = ("mse_steps", "conservative_steps")
+    at_bound = ("mse", "conservative", "square", "level", "beats", *per_step)
     return {
         "tables": {
-            "traces": traces(names), "scales": traces(low_names), "inside": grid(STATES, inside),
+            "traces": traces(names), "scales": traces(low_names), "inside": grid(STATES, rows),
         },
         "quantities": list(quantities.values()), "states": STATES, "rules": list(NAMES.values()),
         "runs": data["sci_mse"].shape[-1], "ellipses": ELLIPSES,
-        "within": np.mean([_within(lanes, lane) for lane in scaled], axis=0),
-        "left": list(left / lanes.both("level", AT_BOUND).sum(1).mean(-1)),
-        "relative": _hundredfold(lanes.relative(AT_BOUND)),
-        "independent": _hundredfold(lanes.relative(OTHERS)),
-        **_summarise_figures(lanes, list(scaled)), **_summarise_bounds(lanes, list(scaled)),
-        **_summarise_comparisons(lanes, next(iter(scaled))),
+        "late": lanes.both("mse_steps", AT_BOUND)[:, _LATE],
+        "at": {name: lanes.both(name, AT_BOUND) for name in at_bound},
+        "within": np.mean([_within(lanes, lane) for lane in scaled], axis=0), "inside": inside,
+        "where": f"{NAMES[FUSIONS[rule]]}, {[*scaled][lane]}, {STATES[state]}",
+        "relative": _relative(lanes, "actual", AT_BOUND, AT_BOUND),
+        "independent": _relative(lanes, "actual", OTHERS, OTHERS),
+        "price": _relative(lanes, "mse", AT_BOUND, ALWAYS), "other": lanes.both("mse", OTHERS),
+        "ordered": lanes.means("ordered", scaled).min(-1),
+        "bounded": lanes.means("bounded", every),
+        "settings": [name.removeprefix("scale ") for name in every],
+        "worst": np.max([lanes.both("worst", lane).max(-1) for lane in every], axis=0),
+        "real": [top(lanes("sici", "whitened", lane)) for lane in (ALWAYS, AT_BOUND)],
+        "node": lanes("sci", "node_mse", AT_BOUND),
+        "node_share": min(float(lanes("sci", "node_bounded", lane).min()) for lane in every),
+        "gap": float(lanes("sci", "node_gap", AT_BOUND).max()),
+        "whole": lanes.both("encloses", first).mean(-1),
+        "plane": lanes.both("encloses_plane", first).mean(-1),
     }  # fmt: skip
+
+
+def _relative(lanes: _Lanes, name: str, lane: str, other: str) -> Array:
+    """MSE over the mean of another quantity, or of another setting, minus 1, in per cent."""
+    mean = lanes.both(name, other).mean(-1, keepdims=True)
+    return np.asarray(100.0 * (lanes.both("mse", lane) / mean - 1.0))
 
 
 def _within(lanes: _Lanes, lane: str) -> Array:
     """The shares of a run's errors within three actual deviations, by fusion rule."""
     error = np.abs(lanes.both("truth", lane) - lanes.both("mean", lane))
     return np.asarray((error <= 3.0 * lanes.both("actual_deviation", lane)).mean((1, 2)))
-
-
-def _summarise_figures(lanes: _Lanes, scaled: list[str]) -> Data:
-    square, level = (lanes.both(name, AT_BOUND).mean(-1) for name in ("square", "level"))
-    mse, trace = (lanes.both(f"{name}_steps", AT_BOUND) for name in ("mse", "conservative"))
-    lower = map(below, lanes.both("mse", AT_BOUND), lanes.both("conservative", AT_BOUND))
-    inside = np.stack([lanes.both("inside", lane).mean(-1) for lane in scaled], axis=1)
-    more, least = inside > 0.99, np.unravel_index(inside.argmin(), inside.shape)
-    rule, lane, state = map(int, least)
-    follows = 1.0 - square / level
-    return {
-        "explained": 100.0 * follows.min(), "tracks": verdict((follows > 0.99).ravel()),
-        "close_below": 100 * _CLOSE, "close": verdict(map(_close, lanes.relative(AT_BOUND))),
-        "under": 100.0 * (mse <= trace).mean(-1), "below_conservative": verdict(lower),
-        "more": more.ravel().tolist(), "inside": verdict(more.ravel()),
-        "least": 100.0 * inside.min(),
-        "where": f"{NAMES[FUSIONS[rule]]}, {scaled[lane]}, {STATES[state]}",
-        "whole": 100.0 * inside.mean((1, 2)),
-    }  # fmt: skip
-
-
-def _summarise_bounds(lanes: _Lanes, scaled: list[str]) -> Data:
-    every = [AT_BOUND, *scaled]
-    ordered = np.stack([lanes.both("ordered", lane).mean(-1).min(-1) for lane in scaled], axis=1)
-    bounded = np.stack([lanes.both("bounded", lane).mean(-1) for lane in every], axis=1)
-    nodes = min(float(lanes("sci", "node_bounded", lane).min()) for lane in every)
-    gap = float(lanes("sci", "node_gap", AT_BOUND).max())
-    places = [name.removeprefix("scale ") for name in every]
-    close = [_close(each) for lane in (AT_BOUND, OTHERS) for each in lanes.relative(lane)]
-    return {
-        "ordered_shares": ordered, "ordered": verdict((ordered == 1.0).ravel()),
-        "node_share": nodes, "node_bounds": verdict([nodes == 1.0]),
-        "gap": gap, "least_bound": verdict([gap < 1e-9]), "sci_share": bounded[0].min(),
-        "sci_bounds": verdict(bounded[0] == 1.0),
-        "sici_shares": dict(zip(places, bounded[1].tolist(), strict=True)),
-        "sici_bounds": verdict([bounded[1].min() == 1.0]), "bounded": bounded[:, 0].tolist(),
-        "worst": np.max([lanes.both("worst", lane).max(-1) for lane in every], axis=0),
-        "real": [estimate(top(lanes("sici", "whitened", lane))) for lane in (ALWAYS, AT_BOUND)],
-        "covariance": verdict(close),
-    }  # fmt: skip
-
-
-def _summarise_comparisons(lanes: _Lanes, scaled: str) -> Data:
-    mse, trace, beats = (lanes.both(name, AT_BOUND) for name in ("mse", "conservative", "beats"))
-    late = lanes.both("mse_steps", AT_BOUND)[:, _LATE]
-    bounded, beats = lanes.both("bounded", AT_BOUND).mean(-1), beats.mean(-1).min(-1)
-    node, other = lanes("sci", "node_mse", AT_BOUND), lanes.both("mse", OTHERS)
-    better = [below(own, each) for own in mse for each in node]
-    whole, plane = (lanes.both(name, scaled).mean(-1) for name in ("encloses", "encloses_plane"))
-    accurate, tight = below(mse[1], mse[0]), below(trace[1], trace[0])
-    price = mse / lanes.both("mse", ALWAYS).mean(-1, keepdims=True) - 1.0
-    return {
-        "mse": list(mse), "trace": trace, "node": node, "other": list(other),
-        "wins": float((mse[1] < mse[0]).mean()), "late": float((late[1] < late[0]).mean()),
-        "accurate": verdict([accurate, late[1].mean() < late[0].mean()]),
-        "remark_3": verdict([accurate, tight, bounded[1] >= bounded[0]]),
-        "beats": beats.tolist(), "higher": verdict([*(beats > 0.99), *better]), "plane": plane,
-        "whole_ellipses": whole, "encloses": verdict((np.stack((whole, plane)) > 0.99).ravel()),
-        "price": _hundredfold(map(estimate, price)), "effective": verdict(map(below, mse, other)),
-    }  # fmt: skip
 
 
 # --- figures --------------------------------------------------------------------------------------
@@ -367,7 +310,7 @@ _SUM = "sum over states (SI units)"
 
 def _draw_thresholds(figure: Any, data: Data) -> None:
     time, requested = _TIME[WINDOW], data["requested"].astype(bool)[WINDOW]
-    axes = figure.subplots(len(SENSORS), 1, sharex=True, sharey=True)
+    axes = stack(figure, len(SENSORS), "step k", sharey=True)
     for i, (axis, name) in enumerate(zip(axes, SENSORS, strict=True)):
         colour, requests = palette.SENSORS[i], requested[:, i]
         axis.step(time, data["levels"][WINDOW, i], where="mid", color=colour, lw=1.6)
@@ -375,13 +318,12 @@ def _draw_thresholds(figure: Any, data: Data) -> None:
         axis.set_title(f"({'abc'[i]}) {name}", loc="left", color=colour)
         axis.set_ylim(0.0, 1.02 * data["ceiling"] or 1.0)
         axis.set_ylabel("θ (m²)" if i == 0 else "θ (m²/s²)" if i == 1 else "θ (m²/s⁴)")
-    axes[-1].set_xlabel("step k")
     axes[-1].set_xlim(time[0], time[-1])
 
 
 def _draw_tracking(figure: Any, data: Data) -> None:
     lanes = _Lanes(data)
-    axes = figure.subplots(3, 1, sharex=True)
+    axes = stack(figure, 3, "step k")
     for state, axis in enumerate(axes):
         truth = lanes("sci", "truth", AT_BOUND)[:, state]
         axis.plot(_TIME, truth, color=palette.TRUTH, lw=3.0, label="true value")
@@ -392,14 +334,13 @@ def _draw_tracking(figure: Any, data: Data) -> None:
             )  # fmt: skip
         axis.set_title(f"({'abc'[state]}) {STATES[state]}", loc="left")
         axis.set_ylabel(f"$x_{state + 1}$ ({UNITS[state]})")
-    axes[-1].set_xlabel("step k")
     axes[-1].set_xlim(0, STEPS)
     legend(figure, axes[0], 3)
 
 
 def _draw_traces(figure: Any, data: Data) -> None:
     lanes = _Lanes(data)
-    axes = figure.subplots(2, 1, sharex=True, sharey=True)
+    axes = stack(figure, 2, "step k", sharey=True)
     for place, (fusion, axis) in enumerate(zip(FUSIONS, axes, strict=True)):
         for name, colour, label in (
             ("conservative", palette.BLACK, "trace of conservative variance"),
@@ -414,16 +355,14 @@ def _draw_traces(figure: Any, data: Data) -> None:
         axis.legend(loc="upper right", ncols=3, fontsize=9, columnspacing=1.0)
         axis.set_ylim(0.2, 4.0)
         set_ticks(axis, [0.2, 0.3, 0.5, 1.0, 2.0, 4.0])
-    axes[-1].set_xlabel("step k")
     axes[-1].set_xlim(0, STEPS)
 
 
 def _draw_comparison(figure: Any, data: Data) -> None:
-    axis = figure.subplots()
+    (axis,) = stack(figure, 1, "step k")
     for fusion in FUSIONS:
         mse = _Lanes(data)(fusion, "mse_steps", AT_BOUND)[_LATE]
         axis.plot(_TIME[_LATE], mse, color=_COLOURS[fusion], lw=1.8, label=NAMES[fusion])
-    axis.set_xlabel("step k")
     axis.set_ylabel(f"MSE, {_SUM}")
     axis.set_xlim(_TIME[_LATE][0], STEPS)
     axis.set_ylim(bottom=0.0)

@@ -216,11 +216,8 @@ def _largest(actual: Array, claimed: Array) -> Array:
     """The largest λ (…, N) with det(P̄ - λ P) = 0: P bounds P̄ where it is at most 1."""
     factor = np.linalg.inv(np.linalg.cholesky(_first(claimed)))
     whitened = factor @ _first(actual) @ factor.swapaxes(-1, -2)
-    return np.asarray(np.linalg.eigvalsh(_even(whitened))[..., -1], dtype=float)
-
-
-def _even(matrix: NDArray[Any]) -> NDArray[Any]:
-    return 0.5 * (matrix + matrix.swapaxes(-1, -2))
+    even = 0.5 * (whitened + whitened.swapaxes(-1, -2))
+    return np.asarray(np.linalg.eigvalsh(even)[..., -1], dtype=float)
 
 
 def _whitened(error: Array, claimed: Array) -> Array:

@@ -1,9 +1,16 @@
-"""What the figures of several papers share: legends over all axes, and ticks at given values."""
+"""What the figures of several papers share: panels, legends over all axes, and given ticks."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+
+
+def stack(figure: Any, count: int, label: str, **style: Any) -> Any:
+    """Return axes (count,) one over another, with one label of their common horizontal axis."""
+    axes = np.ravel(figure.subplots(count, 1, sharex=True, **style))
+    axes[-1].set_xlabel(label)
+    return axes
 
 
 def legend(

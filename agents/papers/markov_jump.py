@@ -6,8 +6,6 @@ systems with correlated noises and fading measurements), Section 6.
 
 from __future__ import annotations
 
-import operator
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,16 +17,15 @@ from fusion_gym.core.task import Task
 from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingOptions
 
 from ..output.palette import BLACK, BLUE, GREEN, ORANGE, PURPLE, SENSORS, SKY, TRUTH, VERMILLION
-from .drawing import legend_of
+from .drawing import legend_of, stack
 from .markov_jump_covariances import covariances
-from .numbers import Number, below, grid, verdict
+from .numbers import Number, below, grid
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_list
 from .walk import walk
 
 STATES = ("position", "velocity")
 UNITS = ("m", "m/s")
 _PAPERS_RUNS = 100
-_TRACKED = 0.9  # of the squared error of an estimate that receives nothing
 _LONG, _SHOWN, _INSTANTS = 200, 100, 60  # steps
 _LAST = 60  # steps that stand for the settled ones
 _SETTLED = 1e-9  # relative change over a period below which a trace repeats itself
@@ -37,7 +34,6 @@ _PRINTED = {  # of Section 6, with half of their last digit
     "mean of β": ((0.65, 0.39, 0.45), 0.005), "variance of β": ((0.09, 0.0499, 0.0585), 0.00005),
 }  # fmt: skip
 _CLEAR = 4.0  # standard errors: not reached by chance in some dozens of comparisons
-_SAME = 1e-9  # relative difference of two recursions that are the same
 _PERIOD = 6  # steps, after which all sensors' sampling repeats
 _SEARCHED = 4  # packets in a period, up to which all schedules are compared
 
@@ -129,13 +125,13 @@ def simulate_schedule(episodes: int, seed: int, settings: Settings) -> Data:
     }  # fmt: skip
 
 
-def period_of(values: Array) -> int | None:
-    """Return the period of values (H,) at their end; None if they do not repeat themselves."""
+def period_of(values: Array) -> int:
+    """Return the period of values (H,) at their end; 0 if they do not repeat themselves."""
     last = values[-_LAST:]
     for period in range(1, _LAST // 3):
         if np.abs(last[period:] - last[:-period]).max() <= _SETTLED * np.abs(last).max():
             return period
-    return None
+    return 0
 
 
 def _summarise_schedule(data: Data) -> Data:
@@ -144,7 +140,6 @@ def _summarise_schedule(data: Data) -> Data:
     packets, settled = shares.sum(-1), trace[:, -_LAST:].mean(-1)
     columns = ("node 1", "node 2", "node 3", "packets a step", "mean trace", "settled trace")
     values = np.column_stack((shares, packets, trace[:, :_SHOWN].mean(-1), settled))
-    larger = [float((after >= before * (1.0 - 1e-12)).mean()) for before, after in pairwise(trace)]
     fused, own = ([period_of(item) for item in curves] for curves in (trace, data["local"]))
     return {
         "columns": columns,
@@ -161,17 +156,10 @@ def _summarise_schedule(data: Data) -> Data:
             ],
         },
         "shown": _SHOWN, "instants": _INSTANTS, "settled_from": _LONG - _LAST + 1,
-        "tolerance": _SETTLED, "shares": shares, "packets": packets,
-        "falls": verdict(now > later for now, later in pairwise(packets)),
+        "tolerance": _SETTLED, "shares": shares, "packets": packets, "literal": literal,
         "quiet": int((~literal.all(-1)).nonzero()[0].max(initial=-1)) + 1,
-        "everything": verdict([literal.all(), literal[_SHOWN // 2 :].all()]),
-        "matter": verdict([data["at_ends"][0] == 1.0, data["at_ends"][1] == 0.0]), "larger": larger,
-        "grows": verdict(share == 1.0 for share in larger), "settled": settled,
-        "fused_periods": [period or "none" for period in fused],
-        "periodic": verdict(period is not None for period in fused),
-        "own_periods": [period or "none" for period in own],
-        "as_sampled": verdict(map(operator.eq, own, data["periods"])),
-        "stable": verdict((max(data["radii"]) < 1.0, data["square_radius"] < 1.0)),
+        "larger": (trace[1:] >= trace[:-1] * (1.0 - 1e-12)).mean(-1), "settled": settled,
+        "fused_periods": np.array(fused), "own_periods": np.array(own),
     }  # fmt: skip
 
 
@@ -197,23 +185,13 @@ def simulate_tracking(episodes: int, seed: int, settings: Settings) -> Data:
 
 
 def _summarise_tracking(data: Data) -> Data:
-    squares, silent = data["squares"], data["silent"]
-    square = squares.mean(-1).T
     columns = [f"mean squared error of the {state}" for state in STATES]
-    rows = dict(zip(data["labels"], squares, strict=True)) | {"nothing sent": silent}
-    states = range(len(STATES))
-    raised = [below(now[s], later[s]) for now, later in pairwise(squares) for s in states]
-    every, few = data["every"], data["few"]
-    top = (every[-1] >= every.max(0)).mean(0)
-    first = [below(squares[0, s], later[s]) for later in squares[1:] for s in states]
+    squares, every, few = data["squares"], data["every"], data["few"]
+    rows = dict(zip(data["labels"], squares, strict=True)) | {"nothing sent": data["silent"]}
     return {
         "columns": columns, "tables": {"errors": grid(columns, rows)}, "papers_runs": _PAPERS_RUNS,
-        "gain": {name: 1.0 - square[s] / silent[s].mean() for s, name in enumerate(STATES)},
-        "tracks": verdict(below(own[s], _TRACKED * silent[s]) for own in squares for s in states),
-        "roots": {name: np.sqrt(square[s]) for s, name in enumerate(STATES)},
-        "raised": raised, "worse": verdict(raised), "top": top,
-        "few_top": (few[-1] >= few.max(0)).mean(0),
-        "on_top": verdict(share > 0.5 for share in top), "first_best": verdict([all(first)]),
+        "states": STATES, "raised": below(squares[:-1], squares[1:]),
+        "top": (every[-1] >= every.max(0)).mean(0), "few_top": (few[-1] >= few.max(0)).mean(0),
     }  # fmt: skip
 
 
@@ -274,14 +252,12 @@ def _summarise_theorems(data: Data) -> Data:
     ratios |= {f"fused, m = {m:g}": pair for m, pair in zip(data["m"], fused, strict=True)}
     ratios |= {"the state itself": moment}
     rows = {name: [sample / claim] for name, (sample, claim) in ratios.items()}
-    full = data["fused"][0]
     return {
         "tables": {"covariances": grid(("ratio",), rows)},
-        "local_pairs": local, "fused_pairs": fused, "moment_right": verdict([_agrees(*moment)]),
-        "local_right": verdict(_agrees(*item) for item in local),
-        "fused_right": verdict(_agrees(*item) for item in fused),
-        "crossed": verdict((data["difference"][0] < _SAME, *(np.array(data["least"]) > -_SAME))),
-        "optimal": verdict(below(full, other) for other in (*data["local"], data["ci"])),
+        "least": np.array(data["least"]), "local_pairs": local, "fused_pairs": fused,
+        "moment_right": _agrees(*moment),
+        "local_right": [_agrees(*item) for item in local],
+        "fused_right": [_agrees(*item) for item in fused],
     }  # fmt: skip
 
 
@@ -314,7 +290,7 @@ def simulate_others(episodes: int, seed: int, settings: Settings) -> Data:
 
 
 def _summarise_others(data: Data) -> Data:
-    m, paper, chance = data["m"], data["paper"], data["chance"]
+    m, paper = data["m"], data["paper"]
     columns = ("the paper's trigger", "random, same rates")
     searched = [i for i, count in enumerate(data["packets"]) if count <= _SEARCHED]
     schedules = [
@@ -329,22 +305,15 @@ def _summarise_others(data: Data) -> Data:
         f"best schedule of {item['packets']} packets in {_PERIOD} steps": [item["best"]]
         for item in schedules
     }
-    shares = [sum(rates) / len(rates) for rates in data["rates"]]
-    saves = all(share < 1.0 for share in shares)
-    near = all(not below(item["best"] * 1.1, item["paper"]) for item in schedules)
+    rows = zip(m, zip(paper, data["chance"], strict=True), strict=True)
     return {
         "columns": columns,
         "tables": {
-            "rates": grid(
-                columns, {f"m = {level:g}": (paper[i], chance[i]) for i, level in enumerate(m)}
-            ),
+            "rates": grid(columns, {f"m = {level:g}": pair for level, pair in rows}),
             "beside": grid(("squared error",), beside),
         },
-        "shares": shares, "period": _PERIOD, "schedules": schedules,
-        "price": paper[0].mean() / data["sent"].mean() - 1.0,
-        "redundant": verdict((saves, all(map(below, paper, chance)))),
-        "accurate": verdict((saves, near)),
-        "linear_best": verdict([below(data["centralised"], data["sent"])]),
+        "shares": np.mean(data["rates"], axis=1), "period": _PERIOD, "schedules": schedules,
+        "far": below(1.1 * data["best"], paper[searched]),
     }  # fmt: skip
 
 
@@ -368,7 +337,7 @@ def _draw_instants(figure: Any, data: Data) -> None:
     """A panel a threshold, without m = 0 unless it stands alone."""
     lanes = list(zip(data["labels"], data["sent"].astype(bool)[:, :_INSTANTS], strict=True))
     lanes = [lane for lane in lanes if lane[0] != "m = 0"] or lanes
-    axes = figure.subplots(len(lanes), 1, sharex=True, squeeze=False)[:, 0]
+    axes = stack(figure, len(lanes), _TIME)
     for place, (axis, (label, sent)) in enumerate(zip(axes, lanes, strict=True)):
         time, count = np.arange(1, len(sent) + 1), sent.shape[-1]
         for sensor in range(count):
@@ -387,39 +356,35 @@ def _draw_instants(figure: Any, data: Data) -> None:
         axis.set_ylim(-0.5, _LANE * count - 0.2)
         axis.set_title(f"({chr(ord('a') + place)}) {label}", loc="left")
     axes[len(lanes) // 2].set_ylabel("received (1) or not (0)")
-    axes[-1].set_xlabel(_TIME)
 
 
 def _draw_tracking(figure: Any, data: Data) -> None:
-    axes = figure.subplots(len(STATES), 1, sharex=True)
+    axes = stack(figure, len(STATES), _TIME)
     truth = data["truth"]
     time = np.arange(1, len(truth) + 1)
     for state, axis in enumerate(axes):
         handles = axis.plot(time, truth[:, state], color=TRUTH, lw=1.8, label="state")
         handles += _curves(axis, data, data["means"][..., state])
         _title(axis, state, STATES[state])
-    axes[-1].set_xlabel(_TIME)
     legend_of(figure, handles, len(handles), 1.8)
 
 
 def _draw_errors(figure: Any, data: Data) -> None:
     """RMSE over as many runs as in the paper, and over all."""
-    axes = figure.subplots(len(STATES), 1, sharex=True)
+    axes = stack(figure, len(STATES), _TIME)
     for state, axis in enumerate(axes):
         _curves(axis, data, data["few"][..., state], width=0.7, alpha=0.55)
         handles = _curves(axis, data, data["every"][..., state], width=2.0)
         axis.set_ylim(bottom=0.0)
         _title(axis, state, f"RMSE of {STATES[state]}")
-    axes[-1].set_xlabel(_TIME)
     legend_of(figure, handles, len(handles), 1.8)
 
 
 def _draw_traces(figure: Any, data: Data) -> None:
-    axis = figure.subplots()
+    (axis,) = stack(figure, 1, _TIME)
     handles = _curves(axis, data, data["trace"][:, :_SHOWN], width=1.8)
     axis.set_ylabel("trace of $P_0$ (m² and m²/s²)")
     axis.set_ylim(bottom=0.0)
-    axis.set_xlabel(_TIME)
     legend_of(figure, handles, len(handles), 1.8)
 
 

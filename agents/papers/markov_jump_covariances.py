@@ -16,12 +16,15 @@ from fusion_gym.arrays import Array
 def covariances(system: Any, sent: NDArray[np.bool_], swapped: bool) -> Array:
     """Return Σ(k) (H + 1, l n, l n) at k = 0..H; ``sent`` (H, l) is what was sent at k = 1..H.
 
+    Its entries are the sums (45) and (51) over the modes.
     ``swapped`` takes the third term of (46) as it is printed, with the indices i and j of the
     first; otherwise it is the transposed second term of the pair (j, i), as its derivation wants.
     """
-    return np.array(
-        [_collapsed(joint, system.plant.size) for joint in _joint(system, sent, swapped)]
-    )
+    joint, states = np.array(_joint(system, sent, swapped)), system.plant.size
+    times, count, _, size, _ = joint.shape
+    modes = size // states
+    blocks = joint.reshape(times, count, count, modes, states, modes, states).sum((3, 5))
+    return blocks.transpose(0, 1, 3, 2, 4).reshape(times, count * states, count * states)
 
 
 def _joint(system: Any, sent: NDArray[np.bool_], swapped: bool) -> list[Array]:
@@ -34,11 +37,9 @@ def _joint(system: Any, sent: NDArray[np.bool_], swapped: bool) -> list[Array]:
     steps = [step for _, step in zip(range(len(sent) + 1), model.steps(), strict=False)]
     start = steps[0].moment - np.outer(steps[0].mean, steps[0].mean)
     everyone = np.vstack((np.ones((1, count), bool), sent))
-    filtered = np.broadcast_to(start, (count, count, size, size)).copy()
+    filtered = np.tile(start, (count, count, 1, 1))
     crossed = np.zeros((count, count, size, len(model.plant.noise_covariance)))  # P_ςi wj
-    noises = np.broadcast_to(
-        model.plant.noise_covariance, (count, count, *model.plant.noise_covariance.shape)
-    ).copy()
+    noises = np.tile(model.plant.noise_covariance, (count, count, 1, 1))
     result = [filtered]
     for time, (before, _) in enumerate(pairwise(steps), start=1):
         entry = before.input
@@ -91,11 +92,3 @@ def _prior(system: Any, place: int, node: int) -> Array:
         filters.gain[node, :, place], system.model.faded[node]
     )
     return np.asarray(np.linalg.solve(keep, filters.covariance[node, node, ..., place]))
-
-
-def _collapsed(joint: Array, states: int) -> Array:
-    """From (l, l, a, a) to Σ (l n, l n): the sums (45) and (51) over the modes."""
-    count, _, size, _ = joint.shape
-    modes = size // states
-    blocks = joint.reshape(count, count, modes, states, modes, states).sum((2, 4))
-    return blocks.transpose(0, 2, 1, 3).reshape(count * states, count * states)

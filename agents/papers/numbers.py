@@ -68,21 +68,30 @@ def grid(columns: Sequence[str], rows: Mapping[str, Iterable[Any]]) -> list[Numb
     ]
 
 
-def verdict(parts: Iterable[Any]) -> Verdict:
-    """Return the verdict on a claim with several parts: all of them hold, some, or none."""
-    result = [bool(part) for part in parts]
-    if all(result):
+def verdict(parts: Any) -> Verdict:
+    """Return the verdict on a claim: all of its parts hold, some, or none.
+
+    Args:
+        parts: A condition, an array of conditions, or a list of both.
+    """
+    entries = parts if isinstance(parts, list | tuple) else [parts]
+    result = np.concatenate([np.ravel(np.asarray(entry, dtype=float)) for entry in entries])
+    if result.all():
         return "holds"
-    return "holds partly" if any(result) else "does not hold"
+    return "holds partly" if result.any() else "does not hold"
 
 
 def estimate(sample: Any) -> Interval:
-    """Return the mean of a sample (episodes,) with its 95 % interval."""
-    return mean_interval(np.asarray(sample, dtype=float))
+    """Return the mean of a sample (…, episodes) with its 95 % interval, each (…,)."""
+    values = np.asarray(sample, dtype=float)
+    return Interval(*np.moveaxis(np.apply_along_axis(mean_interval, -1, values), -1, 0))
 
 
-def below(first: Any, second: Any) -> bool:
-    """Return whether paired samples show the first mean below the second: the whole interval."""
+def below(first: Any, second: Any) -> Any:
+    """Return whether paired samples (…, episodes) show the first mean below the second.
+
+    The whole interval of the difference must lie below zero.
+    """
     return estimate(np.asarray(first) - np.asarray(second)).high < 0.0
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from ..output import palette
 from ..output.files import read_json, replacing, write, write_text
-from .numbers import cite, number_text, percent
+from .numbers import below, cite, estimate, number_text, percent, verdict
 from .paper import NAMES, Data, Paper, PaperFigure
 
 OVERVIEW = "README.md"
@@ -29,10 +29,11 @@ def render_page(
     }
     claims: list[dict[str, str]] = []
 
-    def claim(text: str, source: str, verdict: str, caller: Callable[[], str]) -> str:
-        row = {"text": text, "source": source, "verdict": verdict, "evidence": caller()}
+    def claim(text: str, source: str, parts: Any, caller: Callable[[], str]) -> str:
+        result = parts if isinstance(parts, str) else verdict(parts)
+        row = {"text": text, "source": source, "verdict": result, "evidence": caller()}
         claims.append({name: _line(value) for name, value in row.items()})
-        cells = claims[-1] | {"verdict": f"**{verdict}**"}
+        cells = claims[-1] | {"verdict": f"**{result}**"}
         return f"| {' | '.join(map(_cell, cells.values()))} |\n"
 
     template = _template(f"{paper.name}.md")
@@ -87,6 +88,7 @@ def _template(name: str) -> jinja2.Template:
     environment.filters |= {
         "cell": _cell, "cite": cite, "line": _line, "number": number_text, "percent": percent,
     }  # fmt: skip
+    environment.globals |= {"below": below, "estimate": estimate}
     return environment.get_template(name)
 
 

@@ -21,8 +21,8 @@ from fusion_gym.policies.registry import make_policy
 from ..output import palette
 from . import round_robin_tobit_runs as runs
 from . import round_robin_tobit_theorems as theorems
-from .drawing import legend
-from .numbers import Number, verdict
+from .drawing import legend, stack
+from .numbers import Number
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_of
 from .walk import SomeSensors
 
@@ -37,8 +37,6 @@ TABLE_III = {
     0.1: (0.0948, 0.3707, 0.2082),
     0.06: (0.0742, 0.2924, 0.1601),
 }
-_PRECISE = 0.9  # share of the open-loop variance that an estimate which tracks precisely explains
-_SATISFACTORY = 1.5  # times the least that any filter can have
 _BOTH: dict[str, dict[str, Any]] = {"aware": {}, "unaware": {"bias_aware": False}}
 _FILTERS = {"paper": "the paper's filter", "adf": "assumed-density filter"}
 _LOCAL = ("single", "node")
@@ -101,47 +99,19 @@ def _bias_deviation(task: Task) -> float:
     return float(np.sqrt(np.asarray(task.settings["bias_noise_covariance"])[0, 0]))
 
 
-def _summarise_curves(data: Data, states: Sequence[str], units: Sequence[str]) -> Data:
-    aware, unaware = (data[f"{name}_armse"]["mean"] for name in _BOTH)
+def _summarise_curves(
+    data: Data, name: str, states: Sequence[str], units: Sequence[str] = ("", "", "")
+) -> Data:
     filters = {"aware": "FTKF-DB", "unaware": "FTKF (bias ignored)"}
-    ratio = aware[2] / data["floor"][2]
-    lower = runs.always_below(data["difference"][..., :2])
+    numbers = [
+        runs.armse_number(f"ARMSE of {state}, {label}", data[f"{key}_armse"], i, None, units[i])
+        for key, label in filters.items()
+        for i, state in enumerate(states)
+        if key == "aware" or i < 2
+    ]
     return {
-        "curves": [
-            runs.armse_number(f"ARMSE of {state}, {label}", data[f"{key}_armse"], i, None, units[i])
-            for key, label in filters.items()
-            for i, state in enumerate(states)
-            if key == "aware" or i < 2
-        ],
-        "factors": [other / own for own, other in zip(aware, unaware, strict=True)],
-        "bias_mean": aware[2], "lower": lower, "ratio": ratio, "far": aware[2] / data["silent"][2],
-        "satisfactory_below": _SATISFACTORY, "satisfactory": verdict([ratio < _SATISFACTORY]),
-    }  # fmt: skip
-
-
-def _summarise_oscillator(data: Data) -> Data:
-    result = _summarise_curves(data, ("x1", "x2", "b"), ("", "", ""))
-    held, truth = np.abs(data["held_clipped"]), data["truth"]
-    means = (data[f"{name}_armse"]["mean"] for name in _BOTH)
-    tracks, misses = (runs.explained(mean, data["silent"]) for mean in means)
-    return result | {
-        "tables": {"oscillator": result["curves"]},
-        "clipped": float(np.mean(held >= data["interval"])),
-        "worst": [np.abs(data[f"{n}_mean"] - truth)[:, :2].max() for n in ("aware", "unaware")],
-        "precise": _PRECISE,
-        "explained": [[max(share, 0.0) for share in shares] for shares in (tracks, misses)],
-        "tracks": verdict(share >= _PRECISE for share in tracks),
-        "misses": verdict([max(misses[:2]) < _PRECISE, misses[2] < 0.05]),
-    }
-
-
-def _summarise_target(data: Data) -> Data:
-    states, units = ("position", "velocity", "acceleration"), ("m", "m/s", "m/s²")
-    result = _summarise_curves(data, states, units)
-    close = np.array(data["aware_armse"]["mean"]) / np.array(data["floor"])
-    return result | {
-        "tables": {"target": result["curves"]}, "close": close,
-        "optimum": verdict(abs(item - 1.0) < 0.03 for item in close),
+        "tables": {name: numbers}, "lower": runs.always_below(data["difference"][..., :2]),
+        **{key: np.array(data[f"{key}_armse"]["mean"]) for key in filters},
     }  # fmt: skip
 
 
@@ -178,15 +148,15 @@ def _summarise_nodes(data: Data) -> Data:
     }  # fmt: skip
     columns = [f"ARMSE{state + 1}" for state in range(3)]
     claims = {}
-    for what, states in (("states", range(2)), ("bias", range(2, 3))):
+    for what, states in (("states", slice(2)), ("bias", slice(2, 3))):
         for name in _LOCAL:
             rises, often = [], []
             for sensor in range(2):
-                rise = data[f"{name}_{sensor}_increase"]
-                rises.append([Interval(*(rise[end][state] for end in _ENDS)) for state in states])
+                ends = (data[f"{name}_{sensor}_increase"][end][states] for end in _ENDS)
+                rises.append(list(map(Interval, *ends)))
                 often.append(runs.always_below(data[f"{name}_{sensor}_difference"][..., states]))
-            parts = [interval.low > 0.0 for rise in rises for interval in rise]
-            claims[f"{what}_{name}"] = {"verdict": verdict(parts), "rises": rises, "often": often}
+            higher = [interval.low > 0.0 for rise in rises for interval in rise]
+            claims[f"{what}_{name}"] = {"higher": higher, "rises": rises, "often": often}
     return {
         "columns": columns,
         "tables": {
@@ -328,9 +298,8 @@ def _moves(rows: list[Data], end: str, sign: float) -> Data:
         for name in _FILTERS
     }
     return {
-        "moved": {name: int(result[:3].sum()) for name, result in moved.items()},
-        "median": bool(moved["paper"][3]), "chain": [row["paper"]["mean"] for row in rows],
-        "medians": [row["paper"]["median"][0] for row in rows], "verdict": verdict(moved["paper"]),
+        "moved": moved, "chain": [row["paper"]["mean"] for row in rows],
+        "medians": [row["paper"]["median"][0] for row in rows],
     }  # fmt: skip
 
 
@@ -403,7 +372,7 @@ def _draw_curves(
     step: str = _STEP,
 ) -> None:
     """Panels one over another over a common time, each with the name of its axis and a state."""
-    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    axes = stack(figure, len(panels), step)
     for axis, (label, state) in zip(axes, panels, strict=True):
         for name in names:
             line, colour, style, width = _STYLES[name]
@@ -416,13 +385,12 @@ def _draw_curves(
         axis.margins(x=0.01)
         if kind == "rmse":
             axis.set_ylim(bottom=0.0)
-    axes[-1].set_xlabel(step)
     legend(figure, axes, 4, "lower")
 
 
 def _draw_measurements(figure: Any, data: Data) -> None:
     whole, clipped, limit = data["held_whole"], data["held_clipped"], data["interval"]
-    axes = figure.subplots(whole.shape[1], 1, sharex=True)
+    axes = stack(figure, whole.shape[1], _STEP)
     steps = np.arange(1, len(whole) + 1)
     for number, axis in enumerate(axes):
         for values, colour, width, label in (
@@ -436,7 +404,6 @@ def _draw_measurements(figure: Any, data: Data) -> None:
             axis.axhline(side, color=palette.INK, linewidth=0.8, linestyle="--")
         axis.set_ylabel(f"measurement\nof x{number + 1} (sensor {number + 1})")
         axis.margins(x=0.01)
-    axes[-1].set_xlabel(_STEP)
     legend(figure, axes, 4, "lower")
 
 
@@ -492,6 +459,11 @@ def _table(name: str) -> PaperFigure:
     return PaperFigure("tables", draw, (7.2, 3.8), {"tables": [name]})
 
 
+_summarise_oscillator = partial(_summarise_curves, name="oscillator", states=("x1", "x2", "b"))
+_summarise_target = partial(
+    _summarise_curves, name="target", states=("position", "velocity", "acceleration"),
+    units=("m", "m/s", "m/s²"),
+)  # fmt: skip
 _RMSES = (("RMSE1 (of x1)", 0), ("RMSE2 (of x2)", 1), ("RMSE3 (of b)", 2))
 PAPER = Paper(
     "round_robin_tobit",

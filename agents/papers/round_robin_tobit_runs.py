@@ -1,6 +1,6 @@
 """Runs of the biased oscillator and the biased target, and the measures of their errors."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -173,11 +173,6 @@ def always_below(difference: Array) -> Comparison:
     else:
         result = "holds partly" if lower.sum() > higher.sum() else "does not hold"
     return Comparison(result, lower.sum(), higher.sum(), (mean < 0).sum(), mean.size)
-
-
-def explained(armse: Sequence[float], silent: Sequence[float]) -> list[float]:
-    """Return shares of the open-loop variance that an estimate explains, a state each."""
-    return [1.0 - (first / none) ** 2 for first, none in zip(armse, silent, strict=True)]
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from fusion_gym.systems.unknown_input.system import UnknownInputSystem
 from ..output import palette
 from . import unknown_input_recursion as recursion
 from .drawing import legend, set_ticks
-from .numbers import Number, below, estimate, grid, verdict
+from .numbers import below, estimate, grid
 from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
 from .unknown_input_recursion import EXACT_CUTOFF
 from .walk import walk
@@ -42,9 +42,6 @@ LANES: dict[str, tuple[str, dict[str, Any]]] = {
 }
 KINDS = ("states", "inputs")
 _HOLD = {PRINTED: {"hold_variance": 0.05}}  # as the example's page does
-_TRACKED = 0.1  # of a quantity's mean square: an error below it is called accurate
-_FEW = 0.5  # a rate below it is called a significant reduction
-_GROWN = 1.1  # second half over first half of an episode: more is growth
 _SMALL = 0.2  # ρ̄ over the noise's variance, where (1 + 1/ε) ρ̄ - V is negative
 _FACTOR = {PRINTED: 1.0, CARTS: 0.2}  # ε = ξ, as in the library's examples
 
@@ -185,72 +182,38 @@ def _under_the_trigger(system: UnknownInputSystem, rule: AdaptiveThreshold, reco
         "each": halves((errors**2).mean(0), n, 1), "filled": np.array(filled),
         "power": halves((record.truth**2).mean(0), n, 0), "steady": np.array(steady),
         "within": float((record.square <= high)[silent].mean()),
-        "rho_range": [
-            float(np.diff(rho, axis=0).min()),
-            float((rho / low).min()),
-            float((rho / high).max()),
-        ],
+        "rho_range": [np.diff(rho, axis=0).min(), (rho / low).min(), (rho / high).max()],
         "settled": (rho < 0.99 * limit).sum(0).max(0).astype(float), "radius": nodes.tables.radius,
     }  # fmt: skip
 
 
 def _summarise_filters(data: Data) -> Data:
-    """The page's numbers by example, in :data:`EXAMPLES`, and the verdicts."""
-    examples = [_summarise_example(data, example) for example in EXAMPLES]
+    """The page's numbers by example, in :data:`EXAMPLES`."""
     columns = ("rate in %", "MSE of the states", "MSE of the inputs")
     rows = {
         f"{NAMES[e]}, {lane}": (100.0 * data[f"{e}_rates"][i].mean(0), *data[f"{e}_mse"][i])
         for e in EXAMPLES
         for i, lane in enumerate(data["lanes"])
     }
-    better = [
-        below(item["each"][0, block], node)
-        for item in examples
-        for block in range(len(KINDS))
-        for node in item["each"][1:, block]
-    ]
-    return {
-        "examples": examples, "columns": columns, "tables": {"settings": grid(columns, rows)},
-        "level": float(np.sqrt(data[f"{PRINTED}_bound"][-1, 0, 2:].sum())),
-        "tracked_below": _TRACKED,
-        "tracked": [verdict([estimate(r).high < _TRACKED]) for r in examples[0]["relative"]],
-        "below_trace": verdict(item["under"] == 1.0 for item in examples),
-        "node_bound": verdict(item["nodes"] <= 1.0 for item in examples),
-        "consistent": verdict(item["fused_fill"] <= 1.0 for item in examples),
-        "mean_square": verdict(
-            [estimate(item["growth"]).low <= _GROWN for item in examples]
-            + [item["radius"] < 1.0 for item in examples]
-        ),
-        "monotone": verdict(
-            least >= 0.0 and low >= 1.0 and high <= 1.0
-            for least, low, high in (item["rho_range"] for item in examples)
-        ),
-        "within_limit": verdict(item["within"] == 1.0 for item in examples), "better": better,
-        "improves": verdict(better),
-        "reduces": verdict(estimate(rate).high < _FEW for rate in examples[0]["rates"]),
-    }  # fmt: skip
+    examples = [_summarise_example(data, example) for example in EXAMPLES]
+    return {"examples": examples, "columns": columns, "tables": {"settings": grid(columns, rows)}}
 
 
 def _summarise_example(data: Data, example: str) -> Data:
     start = f"{example}_"
     part = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
     ours, fixed, walk = (data["lanes"].index(name) for name in (OURS, FIXED, WALK))
-    power, mse = part["power"].mean(-1), part["mse"]
-    tops = [[estimate(sample).high for sample in place] for place in part["filled"]]
+    power, each, steady = part["power"].mean(-1), part["each"], part["steady"]
     states = [entry for entry, _ in _STATES[example]]
-    slack = (part["bound"][:, 0] / part["square"][:, 0]).mean(0)
     return part | {
-        "name": NAMES[example], "power": power, "relative": mse[ours] / power[:, None],
-        "walk": mse[walk] / power[:, None],
-        "under": float((part["square"] <= part["bound"]).mean()),
-        "nodes": max(max(place) for place in tops[1:]), "fused_fill": max(tops[0]),
-        "radius": float(part["radius"].max()),
-        "growth": part["steady"][1] / part["steady"][0].mean(),
-        "best": [nodes[nodes.mean(-1).argmin()] for nodes in part["each"][1:].swapaxes(0, 1)],
-        "rates": part["rates"][ours], "average": 100.0 * part["rates"][ours].mean(0),
-        "fixed": 100.0 * part["rates"][fixed].mean(0),
-        "root": np.sqrt(part["each"][0].mean(-1)) / np.sqrt(power),  # fused over the quantity's own
-        "slack": slack[states],
+        "name": NAMES[example], "power": power, "relative": part["mse"][ours] / power[:, None],
+        "walk": part["mse"][walk] / power[:, None],
+        "filled": np.max(estimate(part["filled"]).high, axis=-1),
+        "growth": steady[1] / steady[0].mean(),
+        "best": [nodes[nodes.mean(-1).argmin()] for nodes in each[1:].swapaxes(0, 1)],
+        "better": below(each[0], each[1:]), "rates": part["rates"][ours],
+        "fixed": part["rates"][fixed], "root": np.sqrt(each[0].mean(-1) / power),
+        "slack": (part["bound"][:, 0] / part["square"][:, 0]).mean(0)[states],
     }  # fmt: skip
 
 
@@ -316,38 +279,24 @@ def _recursion(
 
 def _summarise_printed(data: Data) -> Data:
     node, readings = data["node"], data["readings"]
-    exact = readings.index(recursion.EXACT)
-    state, trace = node[exact, :, 0], data["trace"][exact]
+    exact, inverted, partly, small = (
+        readings.index(name)
+        for name in (
+            recursion.EXACT, recursion.INVERTED, recursion.PARTLY, recursion.DEVIATIONS,
+        )
+    )  # fmt: skip
     power = data["power"].mean(-1)
     share = node.mean(-1) / power[:, None].T
-    inverted, partly, small = recursion.INVERTED, recursion.PARTLY, recursion.DEVIATIONS
-    selected = {"inverted": inverted, "partly": partly, "small": small}
     least = share[:, :, 1].min(1)
     columns = [f"node {i + 1}, {kind}" for kind in KINDS for i in range(node.shape[1])]
+    samples = node.swapaxes(1, 2).reshape(len(readings), len(columns), -1)
     return {
-        "tables": {
-            "readings": [
-                Number.of(f"{reading}: node {i + 1}, {kind}", node[place, i, block])
-                for place, reading in enumerate(readings)
-                for block, kind in enumerate(KINDS)
-                for i in range(node.shape[1])
-            ]
-        },
-        "columns": columns, "power": power, "residual": max(data["hidden"][exact]),
-        "below_trace": list(zip(state.mean(-1), trace.mean(-1), strict=True)),
-        "tighter": 100.0 * (data["silent"].mean(-1) / data["sent"].mean(-1) - 1.0),
-        "excess": 100.0 * data["excess"].mean(-1), "floor": np.sqrt(np.array(data["floor"])),
-        "share": {name: share[readings.index(selected[name]), :, 0] for name in selected},
-        "partly": data["hidden"][readings.index(partly)][0], "best": least.min(),
-        "where": readings[least.argmin()],
-        "decouples": "holds" if data["rank"] == data["columns"] else "does not hold",
-        "hides": verdict([max(data["hidden"][exact]) < 1e-6]),
-        "bounds": verdict(
-            [*(below(own, claim) for own, claim in zip(state, trace, strict=True)),
-             data["negative"] == 0.0]
-        ),
-        "minimises": verdict(abs(each) < 1e-6 for each in data["excess"].mean(-1)),
-        "input_columns": data["columns"],
+        "tables": {"readings": grid(columns, dict(zip(readings, samples, strict=True)))},
+        "columns": columns, "power": power, "state": node[exact, :, 0],
+        "trace": data["trace"][exact], "residual": max(data["hidden"][exact]),
+        "floor": np.sqrt(np.array(data["floor"])),
+        "share": share[..., 0], "inverted": inverted, "partly": partly, "small_noise": small,
+        "best": least.min(), "where": readings[least.argmin()], "input_columns": data["columns"],
     }  # fmt: skip
 
 

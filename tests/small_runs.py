@@ -1,0 +1,67 @@
+"""Short runs of the commands that write folders, and what their results say."""
+
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import optuna
+import torch
+import yaml
+from small_suite import ENV, small_suite
+from training_configs import small_config
+
+
+def arguments(
+    command: str, folder: Path, seed: int = 0, steps: int = 256, repetitions: int = 1
+) -> list[str]:
+    """Return the words of a short run into the folder; the seed makes another run."""
+    if command == "evaluate":
+        options = ["--env", ENV, "--set", "horizon=5", "--policies", "always", "never"]
+        return [*options, "--episodes", "3", "--seed", str(seed), "--json", f"{folder}/result.json"]
+    if command == "benchmark":
+        changes = {"training_seeds": repetitions, "timesteps": steps, "seed": seed}
+        config = small_suite(folder, classes=["sensors"], **changes)
+        places = ["--results", str(folder / "results"), "--work", str(folder / "work")]
+        return ["--config", str(config), *places, "--workers", "1", "--parts", "agents"]
+    training = {"timesteps": steps, "num_envs": 8, "seed": seed}
+    every = {"every": min(1024, steps // 2), "episodes": 2}
+    words = ["--config", str(small_config(folder, training=training, validation=every))]
+    if command == "tune":
+        words += ["--trials", str(repetitions), "--output", str(folder / "study")]
+    return words
+
+
+def meaning(folder: Path) -> dict[str, Any]:
+    """Return what the results of a run say, without what says where and how fast it was."""
+    contents = {
+        str(path.relative_to(folder)): _content(path, str(folder))
+        for path in sorted(folder.rglob("*"))
+        if path.name not in ("metadata.json", "runs.csv")  # with seconds
+    }
+    return {name: content for name, content in contents.items() if content is not None}
+
+
+def _content(path: Path, folder: str) -> Any:
+    match path.name, path.suffix:
+        case "best_model.zip" | "final_model.zip", _:
+            with zipfile.ZipFile(path) as archive:
+                weights = torch.load(io.BytesIO(archive.read("policy.pth")))
+            return {name: weight.tolist() for name, weight in weights.items()}
+        case "study.db", _:
+            study = optuna.load_study(study_name="tune", storage=f"sqlite:///{path}")
+            ended = [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
+            return [(t.state.name, t.params, t.value, t.intermediate_values) for t in ended]
+        case "best.yaml", _:
+            return yaml.safe_load(path.read_text())["algorithm"]
+        case _, ".csv":
+            return path.read_text()
+        case _, ".json" | ".jsonl":
+            lines = path.read_text().splitlines() if path.suffix == ".jsonl" else [path.read_text()]
+            records = [json.loads(line) for line in lines]
+            for record in records:
+                for key in ("seconds", "steps_per_second"):
+                    record.pop(key, None)
+            return json.dumps(records).replace(folder, "")
+    return None
