@@ -22,11 +22,12 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf, dpotri
 
 FloatArray = NDArray[np.float64]
 _MANY = 8  # rows from which on it is worth to look whether a matrix is diagonal
 _LARGE = 16  # rows from which on BLAS and LAPACK are faster than element-wise operations
-_CHUNK = 64  # lanes that are transposed at a time and so stay in the cache
+_CHUNK = 32  # lanes that are transposed at a time and so stay in the cache
 
 
 def identity(size: int) -> FloatArray:
@@ -114,15 +115,15 @@ def _by_lane(function: Callable[..., FloatArray], *matrices: FloatArray) -> Floa
 
 
 def _inverse_of_stack(stack: FloatArray) -> FloatArray:
-    """L^-T L^-1 of a stack ``(..., n, n)`` with the Cholesky factor L; NaN where there is none."""
-    try:
-        root = np.linalg.cholesky(stack)
-    except np.linalg.LinAlgError:
-        if stack.ndim == 2:
-            return np.full_like(stack, np.nan)
-        return np.array([_inverse_of_stack(part) for part in stack])
-    inverse_root = np.linalg.inv(root)
-    return np.matmul(inverse_root.swapaxes(-1, -2), inverse_root)
+    """Inverses of a stack ``(..., n, n)`` by LAPACK; NaN where a matrix has no Cholesky factor."""
+    size = stack.shape[-1]
+    lower = np.empty((stack.size // size**2, size, size))
+    for matrix, result in zip(stack.reshape(lower.shape), lower, strict=True):
+        factor, failed = dpotrf(matrix.T)  # the upper triangle of a matrix that is kept by columns
+        result[:] = np.nan if failed else dpotri(factor)[0].T
+    whole: FloatArray = lower + lower.swapaxes(-1, -2)
+    whole[:, range(size), range(size)] *= 0.5
+    return whole.reshape(stack.shape)
 
 
 def matvec(a: FloatArray, v: FloatArray) -> FloatArray:
@@ -133,6 +134,8 @@ def matvec(a: FloatArray, v: FloatArray) -> FloatArray:
     """
     length = a.shape[-2]
     _require_equal_lengths("matvec", length, v.shape[-2])
+    if min(a.shape[-3], length) >= _LARGE:
+        return _by_lane(np.matmul, a, v[..., None, :])[..., 0, :]
     result: FloatArray = a[..., 0, :] * v[..., 0:1, :]
     for k in range(1, length):
         result += a[..., k, :] * v[..., k : k + 1, :]
@@ -378,8 +381,7 @@ def inverse(a: FloatArray) -> FloatArray:
         return result
     work, scale = _equilibrate(a)
     if size >= _LARGE:
-        result = symmetrise(_by_lane(_inverse_of_stack, work))
-        return result * outer(scale, scale)
+        return _by_lane(_inverse_of_stack, work) * outer(scale, scale)
     # Rows n and up turn from the scales into diag(scale) L^-T, which is upper triangular.
     stack = np.zeros((*a.shape[:-3], 2 * size, size, a.shape[-1]))
     stack[..., :size, :, :] = work
