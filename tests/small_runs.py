@@ -14,7 +14,12 @@ from training_configs import small_config
 
 
 def arguments(
-    command: str, folder: Path, seed: int = 0, steps: int = 256, repetitions: int = 1
+    command: str,
+    folder: Path,
+    seed: int = 0,
+    steps: int = 256,
+    repetitions: int = 1,
+    classes: list[str] | None = None,
 ) -> list[str]:
     """Return the words of a short run into the folder; the seed makes another run."""
     if command == "evaluate":
@@ -22,7 +27,7 @@ def arguments(
         return [*options, "--episodes", "3", "--seed", str(seed), "--json", f"{folder}/result.json"]
     if command == "benchmark":
         changes = {"training_seeds": repetitions, "timesteps": steps, "seed": seed}
-        config = small_suite(folder, classes=["sensors"], **changes)
+        config = small_suite(folder, classes=classes, **changes)
         places = ["--results", str(folder / "results"), "--work", str(folder / "work")]
         return ["--config", str(config), *places, "--workers", "1", "--parts", "agents"]
     training = {"timesteps": steps, "num_envs": 8, "seed": seed}

@@ -49,7 +49,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, int], Path]
     def find(command: str, seed: int) -> Path:
         if (command, seed) not in jobs:
             jobs[command, seed] = folder = tmp_path_factory.mktemp(command)
-            succeed(command, arguments(command, folder, seed))
+            succeed(command, arguments(command, folder, seed, classes=["sensors"]))
         return jobs[command, seed]
 
     return find
@@ -74,7 +74,7 @@ def test_a_damaged_file_is_reported_or_mended(
     folder = tmp_path / "run"
     shutil.copytree(runs(command, 0), folder)
     other = runs(command, 1) / file if kind == "another run's" else folder / file
-    words = arguments(command, folder)
+    words = arguments(command, folder, classes=["sensors"])
     damaged = folder / file
     if damaged.is_dir():  # all pieces in it
         for piece in damaged.rglob("output.pkl"):

@@ -255,7 +255,7 @@ def test_innovations_have_the_variance_that_is_claimed(name: str, options: dict[
     assert every.mean() == pytest.approx(1.0, abs=0.015)
 
 
-# --- what is believed -----------------------------------------------------------------------------
+# --- beliefs --------------------------------------------------------------------------------------
 
 
 def joined(item: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
