@@ -22,11 +22,12 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.linalg.lapack import dpotrf, dpotri, dpstrf
 
 FloatArray = NDArray[np.float64]
 _MANY = 8  # rows from which on it is worth to look whether a matrix is diagonal
 _LARGE = 16  # rows from which on BLAS and LAPACK are faster than element-wise operations
+_ROUNDING = 2e-15  # relative, of a variance that is a difference, for each row
 _CHUNK = 32  # lanes that are transposed at a time and so stay in the cache
 
 
@@ -266,23 +267,55 @@ def cholesky(a: FloatArray) -> FloatArray:
     return factor
 
 
-def factor(a: FloatArray) -> FloatArray:
-    """Some F with ``F F^T = a``: ``(..., n, n, N)`` to the same shape.
+@np.errstate(all="ignore")
+def root(a: FloatArray) -> FloatArray:
+    """Some F with ``F F^T = a``, ``(..., n, n, N)``, of any symmetric positive semi-definite `a`.
 
-    Args:
-        a: symmetric positive semi-definite with a positive diagonal; negative eigenvalues, which
-            rounding leaves of zeros, count as zero.
+    A Cholesky factorisation of the correlations with complete pivoting. A direction whose variance
+    is the rounding of the others' gets none, and with D diagonal the root of ``D a D`` is ``D F``.
     """
-    correlation, scale = _equilibrate(a)
-    values, vectors = np.linalg.eigh(np.moveaxis(correlation, -1, -3))
-    root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
-    result: FloatArray = np.moveaxis(root, -3, -1) / scale[..., :, None, :]
+    size = a.shape[-2]
+    scale = np.sqrt(np.maximum(diagonal(a), 0.0))
+    if size == 1:
+        return scale[..., None, :]
+    unit = np.where(scale == 0.0, 0.0, 1.0 / scale)
+    rest = unit[..., :, None, :] * a * unit[..., None, :, :]
+    if size >= _LARGE:
+        return scale[..., :, None, :] * _by_lane(_root_of_stack, rest)
+    result = np.zeros_like(rest)
+    if size == 2:
+        correlation = np.clip(rest[..., 1, 0, :], -1.0, 1.0)
+        left = (1.0 - correlation) * (1.0 + correlation)
+        result[..., 0, 0, :] = scale[..., 0, :]
+        result[..., 1, 0, :] = scale[..., 1, :] * correlation
+        left = np.where(left <= size * _ROUNDING, 0.0, left)
+        result[..., 1, 1, :] = scale[..., 1, :] * np.sqrt(left)
+        return result
+    for k in range(size):
+        left = diagonal(rest)
+        first = left.argmax(-2)[..., None, :]
+        pivot = np.take_along_axis(left, first, -2)
+        column = np.take_along_axis(rest, first[..., None, :, :], -3)[..., 0, :, :]
+        column = np.where(pivot <= size * _ROUNDING, 0.0, column / np.sqrt(pivot))
+        result[..., k, :] = scale * column
+        rest -= outer(column, column)
     return result
+
+
+def _root_of_stack(stack: FloatArray) -> FloatArray:
+    """Roots of a stack ``(..., n, n)`` by LAPACK's pivoted Cholesky factorisation."""
+    size = stack.shape[-1]
+    result = np.zeros((stack.size // size**2, size, size))
+    for matrix, lower in zip(stack.reshape(result.shape), result, strict=True):
+        factor, order, rank, _ = dpstrf(matrix, tol=size * _ROUNDING, lower=1)
+        lower[order - 1, :rank] = np.tril(factor)[:, :rank]
+        lower[np.isnan(matrix).any(-1)] = np.nan
+    return result.reshape(stack.shape)
 
 
 def draw_normal(mean: FloatArray, covariance: FloatArray, normals: FloatArray) -> FloatArray:
     """From N(mean, covariance): ``(..., n, N)`` of ``(..., n, n, N)`` and standard normals."""
-    return mean + matvec(factor(covariance), normals)
+    return mean + matvec(root(covariance), normals)
 
 
 @np.errstate(all="ignore")

@@ -223,7 +223,7 @@ def claimed(error: Array, bound: Array) -> tuple[Array, Array]:
 
     At most 1 if the bound holds on average. ``error`` (H, n, E), ``bound`` (H, n, n, E).
     """
-    root = np.moveaxis(linalg.factor(bound), -1, 1)
+    root = np.moveaxis(linalg.root(bound), -1, 1)
     turned = np.moveaxis(error, 1, -1)[..., None]
     whitened = np.linalg.solve(root, turned)[..., 0]
     second = np.einsum("tei,tej->tij", whitened, whitened) / error.shape[-1]

@@ -270,7 +270,7 @@ class NonlinearSystem(System[FilteredState]):
         mean = state.prior_mean
         nothing = np.zeros((self.sensor_count * self.channels, mean.shape[-1]))
         variance = (self._measured(mean, nothing + 1.0) - self._measured(mean, nothing)) ** 2
-        root = linalg.factor(state.prior_covariance)
+        root = linalg.root(state.prior_covariance)
         for column in range(root.shape[1]):
             ahead = self._measured(mean + root[:, column], nothing)
             behind = self._measured(mean - root[:, column], nothing)

@@ -270,7 +270,7 @@ class BoundTobitFilter:
         k1, k2, _, k4, _, _, _, _ = self.constants.kappa
         grow, shift = self.constants.second_moment
         matrix = self.sensors.measurement_matrix
-        observed = linalg.matmul(matrix, linalg.factor(covariance))
+        observed = linalg.matmul(matrix, linalg.root(covariance))
         offsets = np.stack((np.sqrt(k4 * shift) * latent, np.sqrt(k2) * bias), axis=-2)
         noise = [
             linalg.matmul(gain, np.sqrt(k4 * grow) * observed),

@@ -159,7 +159,7 @@ def joseph_form(
     guidance", 1968.
     """
     keep = linalg.identity(covariance.shape[-2]) - linalg.matmul(gain, matrix)
-    retention = linalg.matmul(keep, linalg.factor(covariance))
+    retention = linalg.matmul(keep, linalg.root(covariance))
     return sensors.gram(np.concatenate([retention, *noise], axis=-2))
 
 
