@@ -10,7 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fusion_gym import ConfigurationError, make_task
+from fusion_gym.core.system import Signals
 from fusion_gym.core.token_bucket import SHARING_RULES, TokenBucket
+from fusion_gym.policies.rules.periodic import RoundRobin
 
 PAPER = {"rate": 5.0, "capacity": 30.0, "initial": 10.0, "cost": 3.0, "sensors": 3}
 
@@ -27,7 +29,7 @@ def scalar_step(
 ) -> tuple[list[bool], float, float]:
     """(16)-(18), and the rules that serve one sensor after another, in plain Python.
 
-    ``queue`` holds the sensors in the order of their turns, and is moved.
+    ``queue`` holds the sensors in its order, and is moved.
     """
     sensors = len(costs)
     granted = [False] * sensors
@@ -44,9 +46,9 @@ def scalar_step(
             if requests[m] and costs[m] <= left:
                 granted[m] = True
                 left -= costs[m]
-                queue.append(queue.pop(queue.index(m)))
             elif requests[m] and sharing == "turns":
                 break
+    queue.sort(key=granted.__getitem__)
     spent = math.fsum(cost for cost, grant in zip(costs, granted, strict=True) if grant)
     return granted, spent, min(tokens + rate - spent, capacity)
 
@@ -99,8 +101,7 @@ def test_random_buckets_agree_with_the_scalar_loop(bucket: TokenBucket, seed: in
                 queues[run],
             )
             assert answer.granted[:, run].tolist() == granted
-            if bucket.sharing == "turns":
-                assert answer.queue[:, run].tolist() == np.argsort(queues[run]).tolist()
+            assert answer.queue[:, run].tolist() == np.argsort(queues[run]).tolist()
             assert (answer.spent[run], answer.tokens[run]) == (spent, left)
         tokens, queue = answer.tokens, answer.queue
 
@@ -118,6 +119,42 @@ def test_turns_favour_nobody_who_requests_alike(bucket: TokenBucket, seed: int, 
         grants.append(answer.granted[:2, 0])
     ahead = np.cumsum([0, *(int(a) - int(b) for a, b in grants)])
     assert ahead.max() - ahead.min() <= 1
+
+
+@given(bucket=buckets(), period=st.integers(1, 4))
+@settings(max_examples=300, deadline=None)
+def test_the_round_robin_rule_passes_its_turn_when_granted(
+    bucket: TokenBucket, period: int
+) -> None:
+    """Whatever costs, rate and sharing: grants go round in order, so that no window favours one."""
+    rule = RoundRobin(period)
+    tokens, queue, served = bucket.start(1), bucket.start_queue(1), []
+    for step in np.arange(60)[:, None]:
+        request = rule(Signals({"queue": queue, "step": step}))
+        assert request.sum() == (step[0] % period == 0)
+        granted, _, tokens, queue = bucket.grant(tokens, request, step, queue)
+        served += np.flatnonzero(granted).tolist()
+    assert served == [number % len(bucket.cost) for number in range(len(served))]
+
+
+@given(
+    sensors=st.integers(1, 20), seed=st.integers(0, 2**31), sharing=st.sampled_from(SHARING_RULES)
+)
+@settings(max_examples=200, deadline=None)
+def test_a_run_is_answered_alone_as_in_a_batch(sensors: int, seed: int, sharing: str) -> None:
+    """Bitwise, whatever the costs, and the queue stays an order of all sensors."""
+    generator = np.random.default_rng(seed)
+    cost = generator.random(sensors) + 0.1
+    bucket = TokenBucket.create(0.3, 25.0, 9.0, cost, sensors, sharing)
+    tokens, queue = bucket.start(5), bucket.start_queue(5)
+    for step, request in enumerate(random_requests(bucket, 5, 8, seed)):
+        number = np.full(5, step)
+        answer = bucket.grant(tokens, request, number, queue)
+        alone = bucket.grant(tokens[3:4], request[:, 3:4], number[3:4], queue[:, 3:4])
+        for one, every in zip(alone, answer, strict=True):
+            np.testing.assert_array_equal(one[..., 0], every[..., 3])
+        assert (np.sort(answer.queue, axis=0) == np.arange(sensors)[:, None]).all()
+        tokens, queue = answer.tokens, answer.queue
 
 
 @given(sensors=st.integers(2, 6), cost=st.integers(1, 12), rate=st.integers(1, 12))
@@ -216,7 +253,7 @@ def test_the_least_capacity_is_accepted() -> None:
     assert fixed.capacity == 3.0
 
 
-@pytest.mark.parametrize("sharing", ["equal", "fixed", "rotating"])
+@pytest.mark.parametrize("sharing", SHARING_RULES)
 def test_tokens_that_add_up_pay_for_a_transmission(sharing: str) -> None:
     """Ten times 0.1 is a little less than 1 in floating point, and still enough."""
     bucket = TokenBucket.create(

@@ -183,13 +183,13 @@ RULES: list[tuple[str, Rule]] = [
     ("periodic", lambda g: [(g["step"] - phase) % 4 == 0 for phase in (0, 1, 2)]),
     ("periodic:period=6", lambda g: [(g["step"] - phase) % 6 == 0 for phase in (0, 2, 4)]),
     ("periodic:period=5,staggered=false", lambda g: [g["step"] % 5 == 0] * SENSORS),
-    ("round_robin", lambda g: [g["step"] % 3 == s for s in range(SENSORS)]),
-    ("round_robin:period=2", lambda g: [g["step"] % 6 == 2 * s for s in range(SENSORS)]),
+    ("round_robin", lambda g: [place == 0 for place in g["queue"]]),
+    ("round_robin:period=2", lambda g: [place == g["step"] % 2 * 9 for place in g["queue"]]),
 ]  # fmt: skip
 
 
 LOOKED_AT = ("measurement", "held", "expected_measurement", "innovation_deviation")
-LOOKED_AT += ("age", "variance_reduction", "silent_variance", "step")
+LOOKED_AT += ("age", "variance_reduction", "silent_variance", "step", "queue")
 
 
 @pytest.mark.parametrize(("spec", "rule"), RULES, ids=[spec for spec, _ in RULES])

@@ -34,10 +34,5 @@ def access_mask(
 
 def first_request(requests: NDArray[np.bool_], place: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return at most one of the requests (sensors, N), from the sensor with the lowest place."""
-    first = np.argmin(np.where(requests, place, len(requests)), axis=0)
-    return requests & (np.arange(len(requests))[:, None] == first)
-
-
-def rotation(requests: NDArray[np.bool_], step: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return places (sensors, N) in an order whose first is one sensor later in each step (N,)."""
-    return (np.arange(len(requests))[:, None] - step) % len(requests)
+    waiting = np.where(requests, place, len(requests))
+    return requests & (waiting == waiting.min(0))

@@ -68,7 +68,7 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
     )
     queue = Block(
         "queue",
-        "the sensor's place in the bucket's queue over the number of sensors",
+        "the sensor's place in the queue over the number of sensors, 0 for the head",
         lambda net: net.queue / task.sensors,
         (numbered(task.sensors),),
         node="own",
@@ -90,10 +90,11 @@ def network_blocks(task: Task) -> tuple[Block, ...]:
         constants={} if price.span is None else {"range": price.span},
     )
     decides = task.access in ("round_robin", "random")
+    queues = task.bucket.sharing == "turns" and not task.bucket.unlimited
     return (
         tokens,
         *((admitted,) if decides else ()),
-        *((queue,) if task.bucket.sharing == "turns" else ()),
+        *((queue,) if queues else ()),
         *((left,) if task.clock else ()),
         *((block,) if price.span is not None else ()),
     )

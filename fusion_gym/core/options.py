@@ -54,7 +54,7 @@ class CommonOptions:
     """Tokens ξ₀ at the start of an episode."""
     token_cost: ArrayLike = 3.0
     """Tokens c that a transmission costs: one number, or one per sensor."""
-    sharing: SharingRule = "rotating"
+    sharing: SharingRule = "turns"
     """How simultaneous requests share the tokens. ``"equal"`` gives each sensor the same share: ξ/l
     ≥ c (tobit_token_bucket, equations (16) and (18)). ``"fixed"`` grants in the order of the
     sensors while tokens last. ``"rotating"`` starts that order one sensor later in each step.

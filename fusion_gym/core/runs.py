@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, take_runs
-from fusion_gym.core.access import access_mask, first_request, rotation
+from fusion_gym.core.access import access_mask, first_request
 from fusion_gym.core.beliefs import Beliefs, Estimate
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import NetworkState, ObservationLayout
@@ -114,8 +114,7 @@ class Runs:
         """The network's answer to requests (sensors, R), each of one of the R ``runs``."""
         steps, queue = self.steps[runs], self.queue[:, runs]
         if self.task.access == "single":
-            turns = self.task.bucket.sharing == "turns"
-            requests = first_request(requests, queue if turns else rotation(requests, steps))
+            requests = first_request(requests, queue)
         elif self.task.access in ("round_robin", "random"):
             requests = requests & self.admitted()[:, runs]
         return self.task.bucket.grant(self.tokens[runs], requests, steps, queue)
@@ -181,24 +180,17 @@ class Runs:
 
     def grantable(self) -> NDArray[np.bool_]:
         """The sensors (sensors, N) whose request alone the network would grant now."""
-        admitted, bucket = self.admitted(), self.task.bucket
-        result = np.zeros_like(admitted)
-        for sensor in range(self.task.sensors):
-            single = np.zeros_like(admitted)
-            single[sensor] = admitted[sensor]
-            granted = bucket.grant(self.tokens, single, self.steps, self.queue).granted
-            result[sensor] = granted[sensor]
-        return result
+        return np.asarray(self.admitted() & self.task.bucket.affordable(self.tokens))
 
     def signals(self) -> Signals:
         """The signals of all runs, without what the information mode withholds.
 
         To the system's own it adds ``tokens`` (N,), ``token_cost`` (sensors, 1), ``price`` (N,) of
         a token, ``step`` (N,), the steps taken in the episode, ``queue`` (sensors, N), each
-        sensor's place in the bucket's queue, ``start`` (N,) bool, ``admitted`` and
-        ``grantable`` (sensors, N) bool, ``observation`` (N, entries), and ``model``, the system's
-        state without what no policy may know, for policies that plan with the system's own moves;
-        and the beliefs (:mod:`fusion_gym.core.signals`).
+        sensor's place in the queue, 0 for who was granted least recently, ``start`` (N,) bool,
+        ``admitted`` and ``grantable`` (sensors, N) bool, ``observation`` (N, entries), and
+        ``model``, the system's state without what no policy may know, for policies that plan with
+        the system's own moves; and the beliefs (:mod:`fusion_gym.core.signals`).
         """
         system, state = self.task.system, self.state
         values = dict(system.read(state))

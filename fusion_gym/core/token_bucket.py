@@ -18,13 +18,14 @@ from fusion_gym.validation import ConfigurationError
 SHARING_RULES: tuple[str, ...] = get_args(SharingRule)
 Queue = NDArray[np.int64]
 _ROUNDING = 1e-9  # tokens: ten times 0.1 pays for a transmission that costs 1
+_FEW = 16  # sensors up to which comparing all pairs is faster than sorting
 
 
 class Grants(NamedTuple):
     """What the network answered.
 
     ``granted`` (sensors, N) bool, ``spent`` and ``tokens`` (N,), and ``queue`` (sensors, N), each
-    sensor's place among those to be served next, 0 first.
+    sensor's place in the queue, 0 for who was granted least recently.
     """
 
     granted: NDArray[np.bool_]
@@ -44,10 +45,11 @@ class TokenBucket:
       nothing. It looks at the tokens before this step's spending.
     - ``"fixed"``: requests are granted in the order of the sensors while tokens last.
     - ``"rotating"``: the same, the first in the order moving on by one sensor each step.
-    - ``"turns"``: the same in the order of a queue. Who is granted goes to its end in the order of
-      service, and a head that the tokens do not pay for blocks those behind it. Of two sensors
-      that request alike neither gets more than one grant more than the other, in any window.
+    - ``"turns"``: the same in the order of a queue, whose head blocks those behind it if the tokens
+      do not pay for it. Of two sensors that request alike neither gets more than one grant more
+      than the other, in any window.
 
+    The queue moves under every rule: who is granted goes to its end, several in their order.
     ``unlimited`` grants everything; tokens spent are still counted, the level stays full.
 
     Shapes: ``cost`` (sensors, 1), in tokens; ``rate``, ``capacity`` and ``initial`` in tokens.
@@ -129,6 +131,11 @@ class TokenBucket:
         """The queue at the start of an episode, sensor 0 first, shape (sensors, num_envs)."""
         return np.repeat(np.arange(len(self.cost))[:, None], num_envs, axis=1)
 
+    def affordable(self, tokens: Array) -> NDArray[np.bool_]:
+        """Return whether tokens (N,) pay for a request of each sensor alone, (sensors, N)."""
+        share = len(self.cost) if self.sharing == "equal" else 1
+        return np.asarray((self.cost * share <= tokens + _ROUNDING) | self.unlimited)
+
     def grant(
         self,
         tokens: Array,
@@ -139,45 +146,48 @@ class TokenBucket:
         """Answer the requests (sensors, N) with the tokens (N,).
 
         ``step`` (N,) turns the order of ``"rotating"``, ``queue`` (sensors, N) is the order of
-        ``"turns"``; by default sensor 0 is first.
+        ``"turns"``; by default sensor 0 is first. Grants move the queue under every rule.
 
         Source: tobit_token_bucket, equations (16)-(18).
         """
         queue = self.start_queue(len(tokens)) if queue is None else queue
-        if self.unlimited:
-            return Grants(requests.copy(), (requests * self.cost).sum(0), tokens, queue)
-        if self.sharing == "equal":
-            granted = requests & (self.cost * len(self.cost) <= tokens + _ROUNDING)
-            spent = (granted * self.cost).sum(0)
+        if self.unlimited or self.sharing == "equal":
+            granted = requests & self.affordable(tokens)
+        elif self.sharing == "turns":
+            granted = self._grant_by_queue(tokens, requests, queue)
         else:
-            granted, spent, queue = self._grant_in_order(tokens, requests, step, queue)
-        left = np.maximum(tokens + self.rate - spent, 0.0)
-        return Grants(granted, spent, np.minimum(left, self.capacity), queue)
+            granted = self._grant_in_order(tokens, requests, step)
+        spent = np.cumsum(granted * self.cost, axis=0)[-1]  # one order of summation for every N
+        left = np.minimum(np.maximum(tokens + self.rate - spent, 0.0), self.capacity)
+        queue = move_to_end(queue, granted)
+        return Grants(granted, spent, tokens if self.unlimited else left, queue)
+
+    def _grant_by_queue(
+        self, tokens: Array, requests: NDArray[np.bool_], queue: Queue
+    ) -> NDArray[np.bool_]:
+        """Grant what the tokens pay for together with all requests ahead of it in the queue."""
+        runs, total = np.arange(len(tokens)), np.empty(requests.shape)
+        total[queue, runs] = requests * self.cost
+        paid = np.cumsum(total, axis=0) <= tokens + _ROUNDING
+        return requests & paid[queue, runs]
 
     def _grant_in_order(
-        self, tokens: Array, requests: NDArray[np.bool_], step: NDArray[np.int64], queue: Queue
-    ) -> tuple[NDArray[np.bool_], Array, Queue]:
-        runs, turns = np.arange(len(tokens)), self.sharing == "turns"
-        granted = np.zeros_like(requests)
-        spent, blocked = np.zeros(len(runs)), np.zeros(len(runs), dtype=np.bool_)
-        for sensor in self._order(step, queue):
-            cost = self.cost[sensor, 0]
-            paid = spent + cost <= tokens + _ROUNDING
-            answer = requests[sensor, runs] & paid & ~blocked
-            if turns:
-                blocked |= requests[sensor, runs] & ~paid
-            granted[sensor, runs] = answer
-            spent += answer * cost
-        return granted, spent, move_to_end(queue, granted) if turns else queue
-
-    def _order(self, step: NDArray[np.int64], queue: Queue) -> NDArray[np.int64]:
-        """The sensors (places, N) in the order in which they are served."""
-        if self.sharing == "turns":
-            return np.argsort(queue, axis=0)
+        self, tokens: Array, requests: NDArray[np.bool_], step: NDArray[np.int64]
+    ) -> NDArray[np.bool_]:
+        """Grant in the order of the sensors, from the first of this step on, what is paid for."""
+        runs, granted, left = np.arange(len(tokens)), np.zeros_like(requests), tokens + _ROUNDING
         first = step if self.sharing == "rotating" else np.zeros_like(step)
-        return (np.arange(len(queue))[:, None] + first) % len(queue)
+        for place in range(len(requests)):
+            sensor = (place + first) % len(requests)
+            cost = self.cost[sensor, 0]
+            granted[sensor, runs] = answer = requests[sensor, runs] & (cost <= left)
+            left = left - answer * cost
+        return granted
 
 
 def move_to_end(queue: Queue, granted: NDArray[np.bool_]) -> Queue:
-    """Return the queue after these grants: who was served is last, in the order of service."""
-    return np.argsort(np.argsort(queue + len(queue) * granted, axis=0), axis=0)
+    """Return the queue after these grants: who was granted is last, several in their order."""
+    key = queue + len(queue) * granted
+    if len(queue) > _FEW:
+        return np.argsort(np.argsort(key, axis=0), axis=0)
+    return (key[:, None] > key).sum(1) if len(queue) > 1 else queue

@@ -43,7 +43,7 @@ _PAGE = Path(__file__).with_name("page.md")  # with the names of what page() fil
 # Blocks of the network that not every task has, and when they are there.
 _NETWORK = {
     "admitted": 'only with `access="round_robin"` or `"random"`',
-    "queue": 'only with `sharing="turns"`',
+    "queue": 'only with `sharing="turns"` and limited tokens',
     "time_left": "only with `clock=True`",
     "price": "only with a `price_range`",
 }
@@ -117,7 +117,7 @@ def observation_table(task: Task, *others: tuple[str, Task]) -> str:
             rows[block.name] = _row(task, block, "" if visible else condition)
     always = [block.name for block in network_blocks(task)]
     price = replace(task.reward, price=Price(None, (0.01, 1.0)))
-    turns = replace(task.bucket, sharing="turns")
+    turns = replace(task.bucket, sharing="turns", unlimited=False)
     network = replace(task, access="round_robin", bucket=turns, clock=True, reward=price)
     for block in network_blocks(network):
         rows[block.name] = _row(task, block, "" if block.name in always else _NETWORK[block.name])

@@ -1,5 +1,7 @@
 """Laws of the network: who is served, what it costs, what the reward pays."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from cases import IDS, SCARCE, Case, each_case, each_id, read, requests, short
@@ -7,9 +9,14 @@ from cases import IDS, SCARCE, Case, each_case, each_id, read, requests, short
 import fusion_gym
 from fusion_gym.core.access import ACCESS_RULES
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 STEPS = 6
+THREE = {
+    "LinearFusion": {"measurement_matrices": [[1, 0], [0, 1], [1, 1]]},
+    "RemoteEstimation": {"sensors": 3},
+}
 NOT_ADOPTING = ("MarkovJumpTracking", "UnknownInput", "RemoteEstimation", "RandomWalk")
 
 
@@ -65,6 +72,23 @@ def test_only_who_is_admitted_is_granted(env_id: str, access: str) -> None:
     if access == "random":
         mean = turns.sum() / task.sensors
         assert (np.abs(turns - mean) < 4.0 * np.sqrt(mean) * (task.sensors > 1) + 1e-9).all()
+
+
+@pytest.mark.parametrize("rate", [0.5, 1.0, 2.0, 4.5])
+@each_id
+def test_sensors_that_request_alike_are_granted_alike(env_id: str, rate: float) -> None:
+    """In every window their grants differ by at most one, by default and with one grant a step."""
+    batch = Case(env_id, THREE.get(short(env_id), {})).batch(**SCARCE | {"token_rate": rate})
+    for access in ("any", "single"):
+        task = dataclasses.replace(batch.task, access=access)
+        for name in ("always", "round_robin"):
+            policy, batch = make_policy(name, task), EpisodeBatch.seeded(task, 1, 0)
+            grants = np.array([batch.step(policy(batch.signals())).granted for _ in range(60)])
+            ahead = np.cumsum(grants[:, :, None] * 1 - grants[:, None], axis=0)
+            assert (np.ptp(np.concatenate((0 * ahead[:1], ahead)), axis=0) <= 1).all()
+            assert (
+                grants.sum() >= min(20.0 * rate, 60 * task.sensors if access == "any" else 60) - 1
+            )
 
 
 @each_case

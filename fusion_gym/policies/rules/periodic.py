@@ -48,20 +48,21 @@ class Periodic(Rule):
 
 @dataclass
 class RoundRobin(Rule):
-    r"""Request one sensor after another, the next one every ``period`` steps.
+    r"""Request one sensor after another every ``period`` steps, the next one after a grant.
 
     Args:
         period: steps between two requests, >= 1.
 
     Equation:
         $$
-        \delta_i(t)=1\iff t\equiv 0\ (\mathrm{mod}\ p)\ \ \text{and}\ \ \lfloor t/p\rfloor\equiv
-        i\ (\mathrm{mod}\ l)
+        \delta_i(t)=1\iff t\equiv 0\ (\mathrm{mod}\ p)\ \ \text{and}\ \ k(t)\equiv i\ (\mathrm{mod}\
+        l)
         $$
 
-        p is ``period``, l the number of sensors, i counts from 0.
+        p is ``period``, k(t) the number of grants before step t, l the number of sensors, i counts
+        from 0.
 
-    Assumes: nothing; it looks at the clock alone.
+    Assumes: nothing; it looks at the clock and at the network's answers to its own requests.
 
     Source: round_robin_tobit, equation (4), for the protocol in which one sensor a step may
     transmit.
@@ -75,7 +76,4 @@ class RoundRobin(Rule):
 
     def __call__(self, signals: Signals) -> Requests:
         """Requests (sensors, N)."""
-        sensors, _ = shape_of(signals)
-        step = signals["step"]
-        turn = (step // self.period) % sensors
-        return (np.arange(sensors)[:, None] == turn) & (step % self.period == 0)
+        return (signals["queue"] == 0) & (signals["step"] % self.period == 0)
