@@ -151,25 +151,27 @@ class TokenBucket:
         Source: tobit_token_bucket, equations (16)-(18).
         """
         queue = self.start_queue(len(tokens)) if queue is None else queue
-        if self.unlimited or self.sharing == "equal":
+        if self.unlimited:
+            granted = requests.copy()
+        elif self.sharing == "equal":
             granted = requests & self.affordable(tokens)
         elif self.sharing == "turns":
             granted = self._grant_by_queue(tokens, requests, queue)
         else:
             granted = self._grant_in_order(tokens, requests, step)
-        spent = np.cumsum(granted * self.cost, axis=0)[-1]  # one order of summation for every N
-        left = np.minimum(np.maximum(tokens + self.rate - spent, 0.0), self.capacity)
-        queue = move_to_end(queue, granted)
-        return Grants(granted, spent, tokens if self.unlimited else left, queue)
+        paid = granted * self.cost  # np.sum adds 8 terms and more in another order if N is 1
+        spent = paid.sum(0) if len(paid) < 8 else np.cumsum(paid, axis=0)[-1]
+        if not self.unlimited:
+            tokens = np.minimum(np.maximum(tokens + self.rate - spent, 0.0), self.capacity)
+        return Grants(granted, spent, tokens, move_to_end(queue, granted))
 
     def _grant_by_queue(
         self, tokens: Array, requests: NDArray[np.bool_], queue: Queue
     ) -> NDArray[np.bool_]:
         """Grant what the tokens pay for together with all requests ahead of it in the queue."""
-        runs, total = np.arange(len(tokens)), np.empty(requests.shape)
-        total[queue, runs] = requests * self.cost
-        paid = np.cumsum(total, axis=0) <= tokens + _ROUNDING
-        return requests & paid[queue, runs]
+        place, total = queue * len(tokens) + np.arange(len(tokens)), np.empty(requests.shape)
+        total.reshape(-1)[place] = requests * self.cost
+        return requests & (np.cumsum(total, axis=0) <= tokens + _ROUNDING).take(place)
 
     def _grant_in_order(
         self, tokens: Array, requests: NDArray[np.bool_], step: NDArray[np.int64]
@@ -187,7 +189,9 @@ class TokenBucket:
 
 def move_to_end(queue: Queue, granted: NDArray[np.bool_]) -> Queue:
     """Return the queue after these grants: who was granted is last, several in their order."""
+    if len(queue) == 1:
+        return queue
     key = queue + len(queue) * granted
     if len(queue) > _FEW:
         return np.argsort(np.argsort(key, axis=0), axis=0)
-    return (key[:, None] > key).sum(1) if len(queue) > 1 else queue
+    return (key[:, None] > key).sum(1)

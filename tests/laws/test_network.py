@@ -86,9 +86,7 @@ def test_sensors_that_request_alike_are_granted_alike(env_id: str, rate: float) 
             grants = np.array([batch.step(policy(batch.signals())).granted for _ in range(60)])
             ahead = np.cumsum(grants[:, :, None] * 1 - grants[:, None], axis=0)
             assert (np.ptp(np.concatenate((0 * ahead[:1], ahead)), axis=0) <= 1).all()
-            assert (
-                grants.sum() >= min(20.0 * rate, 60 * task.sensors if access == "any" else 60) - 1
-            )
+            assert grants.any(0).all()
 
 
 @each_case
