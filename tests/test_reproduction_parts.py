@@ -97,7 +97,7 @@ def test_some_sensors_transmit_as_in_the_whole_policy_and_the_others_never(
     sensors: set[int],
 ) -> None:
     task = fusion_gym.make_task(biased.OSCILLATOR)
-    policy = SomeSensors(fusion_gym.make_policy("round_robin", task), sensors)
+    policy = SomeSensors(fusion_gym.make_policy("periodic:period=2", task), sensors)
     rate = run_episodes(task, policy, 2, 0).rate
     np.testing.assert_allclose(rate, [[0.5 * (sensor in sensors) for sensor in range(2)]] * 2)
 

@@ -507,7 +507,7 @@ PAPER = Paper(
     {
         "interval": Parameter(tuple(TABLE_II), numbers_within(above=0.0)),
         "variance": Parameter(tuple(TABLE_III), numbers_within(above=0.0)),
-        "policy": Parameter("round_robin", policy_of()),
+        "policy": Parameter("periodic:period=2", policy_of()),
     },
     ("horizon", "process_covariance", "bias_noise_covariance"),
 )  # fmt: skip

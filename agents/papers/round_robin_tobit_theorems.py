@@ -291,7 +291,7 @@ def simulate_bounds(episodes: int, seed: int, settings: Settings) -> Data:
         task = fusion_gym.make_task(env, **options)
         for sensor in range(2):
             single = _of(task, sensor, 1.0)
-            policy = SomeSensors(fusion_gym.make_policy("round_robin", task), {sensor})
+            policy = SomeSensors(fusion_gym.make_policy("periodic:period=2", task), {sensor})
             local, _ = failures(task, policy, episodes, seed, list(single.values()))
             for name, sample in zip(single, local, strict=True):
                 data[f"{example}:4/{name}/{sensor}"] = sample

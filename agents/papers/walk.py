@@ -44,7 +44,10 @@ def walk_in_parts(
 
 @dataclass
 class SomeSensors:
-    """Another policy's requests of some sensors; the others never transmit."""
+    """Another policy's requests of some sensors; the others never transmit.
+
+    ``round_robin`` would wait for them for ever: the turns of ``periodic`` come by the clock.
+    """
 
     policy: Policy
     sensors: Collection[int]
