@@ -25,8 +25,10 @@ from fusion_gym.policies.base import Policy, owner_of
 
 Values = dict[str, Any]
 RUNS, STEPS = 6, 7
-CLOCK = ("step", "start", "token_cost")  # all runs know the costs, which never change
-TOLD = (*CLOCK, "tokens", "price")
+TIME = ("step", "start", "token_cost")  # all runs know the costs, which never change
+CLOCK = (*TIME, "queue")
+OWN_ROW = ("admitted", "grantable", "queue")
+TOLD = (*TIME, "tokens", "price")
 
 
 class Believed:
@@ -179,7 +181,7 @@ def of_sensor(sensor: int, true: Values, other: Values, batch: EpisodeBatch) -> 
 
     result = {name: true[name] if name in TOLD else other[name] for name in true}
     for name, value in true.items():
-        if name in ("admitted", "grantable") or declared.get(name, "").startswith("(sensors"):
+        if name in OWN_ROW or declared.get(name, "").startswith("(sensors"):
             result[name] = with_own(result[name], value)
         elif name == "own_beliefs":
             result[name] = other[name].with_each(with_own, value)

@@ -40,7 +40,7 @@ class CommonOptions:
     structure: ClassVar[Structure | None] = None
 
     access: AccessRule = "any"
-    """Rule of medium access. ``"any"`` admits all requests, ``"single"`` grants one request a step.
+    """Rule of medium access. ``"any"`` admits all requests, ``"single"`` the first in the queue.
     ``"round_robin"`` admits one sensor a step in turn, ``"random"`` one at random. With
     ``"single"`` the action is ``Discrete(sensors + 1)``: 0 for nobody, m for sensor m - 1."""
     tokens: Tokens = "limited"
@@ -58,8 +58,8 @@ class CommonOptions:
     """How simultaneous requests share the tokens. ``"equal"`` gives each sensor the same share: ξ/l
     ≥ c (tobit_token_bucket, equations (16) and (18)). ``"fixed"`` grants in the order of the
     sensors while tokens last. ``"rotating"`` starts that order one sensor later in each step.
-    ``"turns"`` keeps a queue: a sensor that is granted goes to its end, and a head that the tokens
-    do not pay for blocks those behind it."""
+    ``"turns"`` grants in the order of a queue: a sensor that is granted goes to its end, and a head
+    that the tokens do not pay for blocks those behind it."""
     packet: Literal["measurement", "estimate"] = "measurement"
     """Content of a packet: the sensor's measurement as in the paper, or the centralised scheduler's
     estimate with its covariance. ``"estimate"`` needs ``memory=True``."""

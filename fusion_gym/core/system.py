@@ -25,7 +25,7 @@ Knowledge = Literal[
 ]  # fmt: skip
 KNOWLEDGE: tuple[Knowledge, ...] = get_args(Knowledge)
 MEANING: dict[Knowledge, str] = {
-    "clock": "nothing but the time in the episode",
+    "clock": "nothing but the time in the episode and the order of the last grants",
     "centre": "what the fusion centre knows before anything is sent",
     "own": "a sensor's new measurement and what the centre tells all sensors",
     "scheduler": "all sensors' new measurements and what the centre knows",

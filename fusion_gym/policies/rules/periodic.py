@@ -1,4 +1,4 @@
-"""Time-triggered policies: they look at the clock alone."""
+"""Time-triggered policies: they look at the clock and at the order of the last grants."""
 
 from dataclasses import dataclass
 from typing import ClassVar
