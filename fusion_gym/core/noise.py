@@ -38,7 +38,7 @@ class PhiloxNoise:
 
     def __init__(self) -> None:
         self._generator = np.random.Generator(np.random.Philox(key=0))
-        self._fresh = self._generator.bit_generator.state | {"buffer": [0, 0, 0, 0]}
+        self._fresh = {**self._generator.bit_generator.state, "buffer": [0, 0, 0, 0]}
 
     def start(self, seed: int, episode: int, channels: int) -> Array:
         """Return the normals (channels,) of the episode's start."""
