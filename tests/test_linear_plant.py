@@ -42,6 +42,33 @@ def test_factor_has_the_rank_and_the_square(matrix: Any, rank: int) -> None:
     np.testing.assert_allclose(factor @ factor.T, matrix, rtol=1e-12, atol=1e-14 * matrix.max())
 
 
+def test_factor_has_the_rank_that_rounding_hides() -> None:
+    draw = np.random.default_rng(0)
+    for dt in 10.0 ** draw.uniform(-4, 2, 500):
+        for size in (2, 3):
+            gain = np.array([dt**3 / 6, dt**2 / 2, dt][-size:])
+            noise = draw.uniform(0.01, 10) * np.array([[a * b for a in gain] for b in gain])
+            moved = np.diag(10.0 ** draw.uniform(-3, 3, size))
+            assert covariance_factor(moved @ noise @ moved).shape == (size, 1), (dt, size)
+    acceleration = [covariance_factor(np.array([[dt**4 / 4, dt**3 / 2], [dt**3 / 2, dt**2]]))
+                    for dt in 10.0 ** draw.uniform(-4, 2, 500)]  # fmt: skip
+    assert {factor.shape for factor in acceleration} == {(2, 1)}
+
+
+def test_factor_follows_the_unit_of_each_state() -> None:
+    """Bitwise for powers of two; a genuine direction stays however small its unit makes it."""
+    draw = np.random.default_rng(1)
+    for size in (1, 2, 3, 5, 20):
+        for rank in {1, size // 2 + 1, size}:
+            gain = draw.normal(size=(size, rank))
+            matrix = gain @ gain.T
+            factor = covariance_factor((matrix + matrix.T) / 2)
+            by = 2.0 ** draw.integers(-30, 30, size)
+            other = covariance_factor((matrix + matrix.T) / 2 * np.outer(by, by))
+            assert factor.shape == (size, rank)
+            np.testing.assert_array_equal(factor * by[:, None], other)
+
+
 def monte_carlo_room(covariance: Any, draws: int) -> Any:
     """Five standard errors of each entry of an empirical covariance of normal draws."""
     variance = np.diagonal(covariance)

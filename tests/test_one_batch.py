@@ -32,7 +32,7 @@ def play(envs: Any, steps: int) -> list[Any]:
         for info in (infos[run] for run in np.flatnonzero(done)):
             episode = info["episode"]
             result += [info["terminal_observation"].tolist(), info["TimeLimit.truncated"]]
-            result += [round(episode["r"], 5), episode["l"]]
+            result += [round(episode["r"], 6), episode["l"]]
     return result
 
 

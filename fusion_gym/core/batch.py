@@ -7,26 +7,30 @@ from typing import Any
 
 import numpy as np
 from gymnasium.error import ResetNeeded
-from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
+from fusion_gym import validation
 from fusion_gym.arrays import Array, merge_runs
 from fusion_gym.core.beliefs import Owner, arrived
 from fusion_gym.core.memory import Memory
+from fusion_gym.core.noise import NoiseSource, PhiloxNoise
 from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.runs import Outcome, Runs
 from fusion_gym.core.system import System
 from fusion_gym.core.task import Task
 
-_LONGEST_BLOCK = 256  # steps of noise that are drawn and kept at a time
+# Normals that are drawn and kept at a time, at least one step's: of a run, and of all (64 MB).
+_BLOCK_OF_RUN, _BLOCK = 2**11, 2**23
+_TOGETHER = 256  # runs whose normals are transposed at a time and so stay in the cache
 
 
 class EpisodeBatch(Runs):
     """N runs of a :class:`~fusion_gym.core.task.Task`, advanced together.
 
-    Each run draws all its noise from its own generator, in blocks and whatever the actions: a
-    seed fixes an episode's noise (common random numbers), and a run does not depend on what
-    stands beside it (batch invariance).
+    All noise is a function of a run's seed, the episode's number and the step, whatever the
+    actions: a seed fixes an episode's noise (common random numbers), and a run does not depend
+    on what stands beside it (batch invariance). ``noise`` is its source, by default
+    :class:`~fusion_gym.core.noise.PhiloxNoise`.
 
     ``remember`` says whose memory is kept, the scheduler's or every sensor's own; ``None`` is
     the scheduler's in a task with memory, and nothing in one without.
@@ -44,12 +48,14 @@ class EpisodeBatch(Runs):
         num_envs: int,
         remember: Owner | None = None,
         reference: System[Any] | None = None,
+        noise: NoiseSource | None = None,
     ) -> None:
         memory = Memory(task, "scheduler" if remember is None else remember)
         super().__init__(task, memory, ObservationLayout(task, memory.owner))
         self.num_envs = num_envs
-        self.generators: list[np.random.Generator | None] = [None] * num_envs
-        self._episode_starts: list[Any] = [None] * num_envs
+        self.source: NoiseSource = PhiloxNoise() if noise is None else noise
+        self.seeds = np.random.SeedSequence().generate_state(num_envs, np.uint64).tolist()
+        self.episodes = np.full(num_envs, -1)
         self.state = None
         self.reference = reference
         # Where the scheduler's own memory is that of the reference, it is not kept twice.
@@ -63,12 +69,9 @@ class EpisodeBatch(Runs):
         self.steps = np.zeros(num_envs, dtype=np.int64)
         self.finished = np.ones(num_envs, dtype=np.bool_)
         self._limit = np.full(num_envs, task.horizon, dtype=np.int64)
-        # Row (cursor mod block) of the ring holds the noise of the next sensing; a run's block
-        # starts wherever the cursor stood at its reset, so that a row is one contiguous read.
-        self._block = min(task.horizon + 1, _LONGEST_BLOCK)
-        self._ring = np.zeros((self._block, self.channels, num_envs))
-        self._cursor = 0
-        self._block_start = np.zeros(num_envs, dtype=np.int64)
+        most = min(_BLOCK_OF_RUN, _BLOCK // num_envs) // max(1, self.channels)
+        self._block = np.zeros((min(task.horizon + 1, max(1, most)), self.channels, num_envs))
+        self._row = 0  # of the block: the noise of the last sensing
 
     @classmethod
     def seeded(
@@ -81,16 +84,15 @@ class EpisodeBatch(Runs):
         return batch
 
     def seed(self, runs: NDArray[np.int64], seeds: Sequence[int | None]) -> None:
-        """Give these runs new generators; ``None`` keeps a run's generator if it has one."""
-        for run, seed in zip(runs.tolist(), seeds, strict=True):
-            if seed is not None or self.generators[run] is None:
-                self.use_generator(run, seeding.np_random(seed)[0])
+        """Set the seeds of these runs' next episodes; ``None`` keeps a run's (at first random).
 
-    def use_generator(self, run: int, generator: np.random.Generator) -> None:
-        """Draw this run's noise from ``generator``, from its present state on (if it is new)."""
-        if generator is not self.generators[run]:
-            self.generators[run] = generator
-            self._episode_starts[run] = None
+        Raises:
+            ConfigurationError: a seed that is not a whole number >= 0.
+        """
+        for run, seed in zip(runs.tolist(), seeds, strict=True):
+            if seed is not None:
+                self.seeds[run] = validation.integer("seed", seed, at_least=0)
+                self.episodes[run] = -1
 
     def reset(
         self,
@@ -105,15 +107,26 @@ class EpisodeBatch(Runs):
         later ones do not all end in the same step: each run has its own, or each of ``groups``, for
         a step in which some episode begins costs almost as much as if all did.
         """
-        everyone = runs is None
         runs = np.arange(self.num_envs) if runs is None else runs
-        system = self.task.system
+        everyone = np.array_equal(runs, np.arange(self.num_envs))
+        system, source, horizon = self.task.system, self.source, self.task.horizon
+        self.episodes[runs] += 1
+        self.steps[runs] = 0
+        self.finished[runs] = False
+        self._limit[runs] = horizon
+        if stagger:
+            parts = len(runs) if groups is None else min(groups, len(runs))
+            part = (np.arange(len(runs)) * parts) // len(runs)
+            self._limit[runs] = horizon - (part * horizon) // parts
+        keys = self._keys(runs)
         noise = np.empty((len(runs), system.start_channels))
-        for place, run in enumerate(runs.tolist()):
-            self._next_episode(run).standard_normal(out=noise[place])
+        for place, key in enumerate(keys):
+            noise[place] = source.start(*key, noise.shape[1])
         if self.task.reward.price.fixed is None:
-            drawn = np.array([self._far_uniform(run) for run in runs.tolist()])
+            drawn = np.array([source.uniform(*key) for key in keys])
             self.price = merge_runs(self.price, self.task.reward.price.draw(drawn), runs)
+        if everyone:
+            self._row = 0
         self._draw(runs)
         first = np.ascontiguousarray(noise.T)
         fresh = system.start(first)
@@ -126,14 +139,6 @@ class EpisodeBatch(Runs):
         self.state = fresh if everyone else merge_runs(self.state, fresh, runs)
         self.tokens = merge_runs(self.tokens, self.task.bucket.start(len(runs)), runs)
         self.queue = merge_runs(self.queue, self.task.bucket.start_queue(len(runs)), runs)
-        self.steps[runs] = 0
-        self.finished[runs] = False
-        horizon = self.task.horizon
-        self._limit[runs] = horizon
-        if stagger:
-            parts = len(runs) if groups is None else min(groups, len(runs))
-            part = (np.arange(len(runs)) * parts) // len(runs)
-            self._limit[runs] = horizon - (part * horizon) // parts
 
     def step(self, requests: NDArray[np.bool_]) -> Outcome:
         """Answer the requests (sensors, N), update, fuse, reward; then move and sense.
@@ -148,10 +153,10 @@ class EpisodeBatch(Runs):
         outcome = self.deliver(requests)
         if self.reference is not None:
             self._refer(self.reference)
-        self._cursor += 1
-        used_up = ~self.finished & (self._cursor - self._block_start >= self._block)
-        if used_up.any():
-            self._draw(np.flatnonzero(used_up))
+        self._row += 1
+        if self._row == len(self._block):
+            self._row = 0
+            self._draw(np.arange(self.num_envs))
         self.sense(self.normals())
         if self.reference is not None and not self._shared:
             self._beside = self.reference.sense(self._beside, self.noise())
@@ -160,7 +165,7 @@ class EpisodeBatch(Runs):
 
     def normals(self) -> Array:
         """The normals (channels, N) of the last sensing, a view that later steps overwrite."""
-        return self._ring[self._cursor % self._block]
+        return self._block[self._row]
 
     def noise(self) -> Array:
         """Those of them that the system takes."""
@@ -168,7 +173,7 @@ class EpisodeBatch(Runs):
 
     def snapshot(self) -> dict[str, Any]:
         """Where all runs are, without the task, for :meth:`restore`; valid until the next step."""
-        fixed = ("task", "layout", "memory", "reference")
+        fixed = ("task", "layout", "memory", "reference", "source")
         moving = {key: value for key, value in vars(self).items() if key not in fixed}
         return moving | {"memory_states": self.memory.states}
 
@@ -191,42 +196,22 @@ class EpisodeBatch(Runs):
     def _lottery(self) -> Array | None:
         return self.normals()[-1] if self.task.access == "random" else None
 
-    def _next_episode(self, run: int) -> np.random.Generator:
-        """The run's generator at the start of its next episode.
-
-        Episodes begin 2⁶⁴ draws apart, so that the noise of one does not depend on how long the
-        one before it was.
-        """
-        if self.generators[run] is None:
-            self.use_generator(run, seeding.np_random(None)[0])
-        generator = self._generator(run)
-        bits = generator.bit_generator
-        if self._episode_starts[run] is not None:
-            bits.state = self._episode_starts[run]
-            bits.advance(2**64)  # type: ignore[attr-defined]
-        self._episode_starts[run] = bits.state
-        return generator
-
-    def _far_uniform(self, run: int) -> float:
-        """A uniform number of the episode from beyond all its noise, which it does not shift."""
-        generator = self._generator(run)
-        bits = generator.bit_generator
-        here = bits.state
-        bits.advance(2**63)  # type: ignore[attr-defined]
-        drawn = generator.random()
-        bits.state = here
-        return drawn
-
-    def _generator(self, run: int) -> np.random.Generator:
-        generator = self.generators[run]
-        assert generator is not None, "reset gives every run a generator"
-        return generator
+    def _keys(self, runs: NDArray[np.int64]) -> list[tuple[int, int]]:
+        """Seed and number of the episodes of these runs."""
+        seeds = [self.seeds[run] for run in runs.tolist()]
+        return list(zip(seeds, self.episodes[runs].tolist(), strict=True))
 
     def _draw(self, runs: NDArray[np.int64]) -> None:
-        """Draw the next block of noise for these runs, to begin at the cursor."""
-        noise = np.empty((len(runs), self._block, self.channels))
-        for place, run in enumerate(runs.tolist()):
-            self._generator(run).standard_normal(out=noise[place])
-        rows = (self._cursor + np.arange(self._block)) % self._block
-        self._ring[rows[:, None], :, runs[None, :]] = noise.transpose(1, 0, 2)
-        self._block_start[runs] = self._cursor
+        """Draw the noise of these runs from this row to the block's end, or the episode's."""
+        rows, channels = len(self._block) - self._row, self.channels
+        lanes = self._block[self._row :].reshape(-1, self.num_envs)
+        counts = np.clip(self._limit[runs] + 1 - self.steps[runs], 0, rows)
+        parts = zip(self._keys(runs), self.steps[runs].tolist(), counts.tolist(), strict=True)
+        for begin in range(0, len(runs), _TOGETHER):
+            some = runs[begin : begin + _TOGETHER]
+            drawn = np.zeros((len(some), rows, channels))
+            for into, (key, first, count) in zip(drawn, parts, strict=False):
+                into[:count] = self.source.steps(*key, first, count, channels)
+            beside = some[-1] - some[0] == len(some) - 1
+            chosen = slice(some[0], some[-1] + 1) if beside else some
+            lanes[:, chosen] = drawn.reshape(len(some), -1).T

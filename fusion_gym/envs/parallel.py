@@ -8,7 +8,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
-from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
@@ -65,8 +64,7 @@ class FusionParallelEnv(ParallelEnv[str, NDArray[np.float32], int]):
         The infos are those of a step in which nothing was sent.
         There are no options, and PettingZoo's interface test demands that any be taken.
         """
-        if seed is not None:
-            self.batch.use_generator(0, seeding.np_random(seed)[0])
+        self.batch.seed(np.zeros(1, dtype=np.int64), [seed])
         self.batch.reset()
         self.agents = list(self.possible_agents)
         infos = {agent: {"granted": False, "cost": 0.0} for agent in self.agents}

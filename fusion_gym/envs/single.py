@@ -46,6 +46,7 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
         visible = self.render_mode == "human"
         self._window = Window(type(self).__name__, FRAMES_PER_SECOND) if visible else None
         self.batch = EpisodeBatch(task, 1)
+        self._seeded: np.random.Generator | None = None  # whose seed the batch has
         self.view = SchedulerView(task)
         self.observation_names = self.view.names
         self.observation_space = self.view.space
@@ -63,7 +64,11 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
         """
         validation.reset_options(options, [])
         super().reset(seed=seed)
-        self.batch.use_generator(0, self.np_random)
+        if self.np_random is not self._seeded:
+            self._seeded = self.np_random
+            known = self.np_random_seed >= 0
+            entropy = self.np_random_seed if known else self.np_random.integers(2**63)
+            self.batch.seed(np.zeros(1, dtype=np.int64), [int(entropy)])
         self.batch.reset()
         if self._film is not None:
             self._film.begin()

@@ -13,13 +13,9 @@ from fusion_gym.core.nature import true_motion
 
 
 def covariance_factor(matrix: Array) -> Array:
-    """A factor F of shape (n, rank) with F Fᵀ = matrix, for any positive semi-definite matrix.
-
-    A Cholesky factor does not exist for a matrix of deficient rank; the eigenvectors do.
-    """
-    values, vectors = np.linalg.eigh(matrix)
-    keep = values > 1e-14 * max(float(values[-1]), 1e-300)
-    return np.ascontiguousarray(vectors[:, keep] * np.sqrt(values[keep]))
+    """A factor F of shape (n, rank) with F Fᵀ = matrix, for any positive semi-definite matrix."""
+    factor = linalg.root(matrix[..., None])[..., 0]
+    return np.ascontiguousarray(factor[:, factor.any(0)])
 
 
 @dataclass(frozen=True)
