@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 
+Active = NDArray[np.bool_] | None  # (l, N), the estimates that take part; all by default
+
 # Relative. Above the rounding of Σ, so that weights stay below 1e6 and their covariance honest to
 # 1e-4 in the worst case (1e-9 in the usual one); below any difference of estimates that matters.
 _RIDGE = 1e-12
@@ -50,12 +52,7 @@ class FusionRule(ABC):
 
     @abstractmethod
     def fuse(
-        self,
-        means: Array,
-        covariance: Array,
-        active: NDArray[np.bool_] | None = None,
-        *,
-        basis: Array | None = None,
+        self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
     ) -> Fused:
         """The active estimates joined.
 
@@ -130,12 +127,7 @@ class InformationFusion(FusionRule):
     """
 
     def fuse(
-        self,
-        means: Array,
-        covariance: Array,
-        active: NDArray[np.bool_] | None = None,
-        *,
-        basis: Array | None = None,
+        self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
     ) -> Fused:
         """See :class:`FusionRule`; a lane with a covariance that is not definite is NaN."""
         information = linalg.inverse(own_covariances(covariance))
@@ -238,12 +230,7 @@ class MatrixWeightedFusion(FusionRule):
         return weights
 
     def fuse(
-        self,
-        means: Array,
-        covariance: Array,
-        active: NDArray[np.bool_] | None = None,
-        *,
-        basis: Array | None = None,
+        self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
     ) -> Fused:
         """See :class:`FusionRule`.
 

@@ -13,11 +13,18 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.fusion.intersection import best_of_pair
-from fusion_gym.fusion.rules import Fused, FusionRule, own_covariances
+from fusion_gym.fusion.intersection import (
+    REGULAR,
+    SequentialIntersection,
+    best_of_pair,
+    information_fusion,
+    whiten,
+)
+from fusion_gym.fusion.rules import Active, Fused, FusionRule, own_covariances
 
 _GAP = 1e-6  # relative optimality gap at which the search ends
 _STEPS = 100  # cap of its steps; most lanes need four, ill-conditioned ones up to about thirty
+_NOTHING = 1e-22  # part of the least variance of each state below which a direction is known
 _RIDGE = 1e-10  # keeps the curvature invertible where estimates are alike
 
 
@@ -47,12 +54,7 @@ class CovarianceIntersection(FusionRule):
     """
 
     def fuse(
-        self,
-        means: Array,
-        covariance: Array,
-        active: NDArray[np.bool_] | None = None,
-        *,
-        basis: Array | None = None,
+        self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
     ) -> Fused:
         """See :class:`~fusion_gym.fusion.rules.FusionRule`."""
         own = own_covariances(covariance)
@@ -80,10 +82,7 @@ class CovarianceIntersection(FusionRule):
 
 @np.errstate(all="ignore")
 def covariance_intersection_many(
-    means: Array,
-    covariances: Array,
-    active: NDArray[np.bool_] | None = None,
-    basis: Array | None = None,
+    means: Array, covariances: Array, active: Active = None, basis: Array | None = None
 ) -> Fused:
     """Covariance intersection of l estimates at once, of the smallest trace.
 
@@ -93,7 +92,8 @@ def covariance_intersection_many(
 
     Args:
         means: (l, n, N).
-        covariances: (l, n, n, N), symmetric positive definite where active.
+        covariances: (l, n, n, N), symmetric positive semi-definite where active. What one estimate
+            knows exactly the result knows too, as in the limit of weights above zero.
         active: (l, N), the estimates that take part; all by default. Others are not read and get
             the weight 0.
         basis: as in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
@@ -102,8 +102,7 @@ def covariance_intersection_many(
         The fused estimate with its weights w (l, N). The search ends at a gap of a relative 1e-6,
         or after 100 steps of a lane (each lowers the trace or shortens the one before). Where two
         estimates take part the trace is within a relative 1e-6 of the optimum. In a lane without
-        active estimates, and in one with a covariance that is not positive definite, mean and
-        covariance are NaN.
+        active estimates, and in one with a NaN, mean and covariance are NaN.
 
     The multiplicative update w_i <- w_i sqrt(tr(P Y_i P)) has the same optimum, but where
     estimates are alike thousands of its steps do not reach it. Newton's need four to thirty.
@@ -119,6 +118,8 @@ def covariance_intersection_many(
     metric = np.zeros_like(covariances[0])
     metric += linalg.identity(len(metric)) if basis is None else basis
     weights, fused, open_lanes = _best_alone(covariances, information, metric, selected)
+    singular = selected.any(0) & (~is_regular(covariances, information) & selected).any(0)
+    open_lanes &= ~singular
     pairs = open_lanes & (selected.sum(0) == 2)
     lanes = np.flatnonzero(pairs)
     if lanes.size:
@@ -137,12 +138,60 @@ def covariance_intersection_many(
     vector = np.zeros_like(means[0])
     for weight, item, mean, takes_part in zip(weights, information, means, selected, strict=True):
         vector += weight * linalg.matvec(item, np.where(takes_part, mean, 0.0))
-    return Fused(
-        linalg.matvec(fused, vector),
-        fused,
-        lambda: linalg.matmul(fused, weights[:, None, None] * information),
-        weights,
-    )
+    joined = linalg.matvec(fused, vector)
+    lanes = np.flatnonzero(singular)
+    if lanes.size:
+        own, taking_part = _of(covariances, lanes), _of(selected, lanes)
+        part, weights[:, lanes], fused[..., lanes] = _constrained(
+            own, taking_part, _of(metric, lanes)
+        )
+        known = np.where(taking_part[:, None], _of(means, lanes), 0.0)
+        joined[:, lanes] = sum_rows(linalg.matvec(part, known))
+
+    def gains() -> Array:
+        every = linalg.matmul(fused, weights[:, None, None] * information)
+        if lanes.size:
+            every[..., lanes] = part
+        return every
+
+    return Fused(joined, fused, gains, weights)
+
+
+def is_regular(covariance: Array, information: Array) -> NDArray[np.bool_]:
+    """Whether an inverse (..., n, n, N) is accurate to some 12 digits, (..., N)."""
+    inflation = linalg.diagonal(covariance) * linalg.diagonal(information)
+    return np.asarray((REGULAR * inflation < 1.0).all(-2))
+
+
+def _constrained(
+    covariances: Array, selected: NDArray[np.bool_], basis: Array
+) -> tuple[Array, Array, Array]:
+    """Gains (l, n, n, N), weights (l, N) and covariance where a covariance is nearly singular.
+
+    What one estimate knows exactly the result knows too, as in the limit of weights above zero.
+    The rest is x = x_0 + R u: x_0 joins the estimates as if they were independent, with the
+    covariance R Rᵀ, so that all Rᵀ P_i⁻ R are at most the identity.
+    """
+    size = len(basis)
+    own = np.where(selected[:, None, None], covariances, linalg.identity(size))
+    first = SequentialIntersection(information_fusion).fuse(own[:, 0], own, selected)
+    least = np.where(selected[:, None], linalg.diagonal(own), np.inf).min(0)[:, None]
+    root = linalg.root(first.covariance)
+    root *= (root * root > _NOTHING * least).any(0) & (least > 0.0)
+    half = np.stack([whiten(linalg.root(item)[None])[:, size : 2 * size] for item in own])
+    legs = linalg.matmul(half, root)
+    information = linalg.matmul(linalg.transpose(legs), legs)
+    information = linalg.add_diagonal(
+        information, np.where(root.any(0), 0.0, 1.0)
+    )  # of a u without meaning
+    information *= selected[:, None, None]
+    start = selected / selected.sum(0)
+    weights, inside = _search(information, linalg.matmul(basis, root), start)
+    part = linalg.matmul(linalg.matmul(root, inside), linalg.transpose(legs))
+    part = linalg.matmul(weights[:, None, None] * part, half)
+    rest = linalg.identity(size) - sum_rows(part)
+    gains = part + linalg.matmul(rest, first.gains)
+    return gains, weights, linalg.congruence(root, inside)
 
 
 def _informations(covariances: Array, selected: NDArray[np.bool_]) -> Array:
@@ -271,8 +320,8 @@ def _newton(
 ) -> Array:
     """The weights (l, N) at which the trace's quadratic model is smallest, none of them negative.
 
-    With S = P Gᵀ the gradient is -``gain`` and the curvature H_ij = 2 tr(Sᵀ Y_i P Y_j S). The trace is
-    homogeneous of degree -1, so H w = 2 ``gain`` and the model is tᵀ H t / 2 - 3 ``gain``ᵀ t.
+    With S = P Gᵀ the gradient is -``gain`` and the curvature H_ij = 2 tr(Sᵀ Y_i P Y_j S). The trace
+    is homogeneous of degree -1, so H w = 2 ``gain`` and the model is tᵀ H t / 2 - 3 ``gain``ᵀ t.
     Free are the estimates of positive weight and those of a gain above the trace. While the
     minimum has a negative weight, the weights go towards it as far as they can, and the estimate
     whose weight is then zero is free no longer. Where rounding leaves no descent, weight goes from
