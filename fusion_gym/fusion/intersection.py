@@ -161,8 +161,11 @@ def best_weight(numerator: Array, start: Array, end: Array) -> Array:
         divisor = change * weight
         divisor += start
         divisor *= divisor
-        np.reciprocal(divisor, out=divisor)
-        weight += np.copysign(step, linalg.dot(factor, divisor))
+        np.divide(factor, divisor, out=divisor)
+        slope = divisor[0]
+        for row in divisor[1:]:
+            slope += row
+        weight += np.copysign(step, slope)
         step *= 0.5
     weight[descent_start <= 0.0] = 0.0
     weight[descent_end >= 0.0] = 1.0

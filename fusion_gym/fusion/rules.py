@@ -218,6 +218,7 @@ class MatrixWeightedFusion(FusionRule):
         spread = joint[1:, 1:] - joint[0, 1:] - toward[:, None]
         own = linalg.diagonal(own_covariances(joint))
         ridge = _RIDGE * (own[0] + own[1:])
+        ridge[ridge < np.finfo(np.float64).tiny] = 1.0  # of what all know exactly
         for i in range(count - 1):
             for state in range(n):
                 spread[i, i, state, state] += ridge[i, state]
@@ -236,8 +237,7 @@ class MatrixWeightedFusion(FusionRule):
 
         Args:
             means: (l, n, N).
-            covariance: (l, l, n, n, N), that of all errors, positive semi-definite with a
-                positive diagonal.
+            covariance: (l, l, n, n, N), that of all errors, positive semi-definite.
             active: (l, N); all by default.
         """
         if active is not None:

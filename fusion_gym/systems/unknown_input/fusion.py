@@ -101,6 +101,7 @@ def _smallest_variance(mean: Array, covariance: Array) -> Fused:
     return Fused(joined, smallest, lambda: weights[:, None, None], weights)
 
 
+@np.errstate(all="ignore")
 def tracked_intersection(mean: Array, covariance: Array, weights: Array) -> Fused:
     """Covariance intersection with weights that follow the smallest trace over time.
 
