@@ -24,9 +24,9 @@ class EpisodeResults:
     ``mse`` (E,) squared error of the fused estimate, summed over states · ``bound_trace`` (E,)
     trace of the claimed covariance · ``nees`` (E,) normalised squared error divided by the number
     of directions with a variance, 1 for a consistent filter · ``rate`` and ``requests``
-    (E, sensors) · ``tokens`` (E,) spent and ``denied`` (E,) requests refused, per step · ``returns`` (E,) sum of the
-    rewards · ``diverged`` (E,) share of diverged steps · ``squared_error`` (H, n), the mean over
-    episodes at each time and state.
+    (E, sensors) · ``tokens`` (E,) spent and ``denied`` (E,) requests refused, per step ·
+    ``returns`` (E,) sum of the rewards · ``diverged`` (E,) share of diverged steps ·
+    ``squared_error`` (H, n), the mean over episodes at each time and state.
     """
 
     mse: Array

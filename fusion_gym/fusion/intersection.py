@@ -31,7 +31,8 @@ class DiagonalPair(NamedTuple):
 
     ``basis`` Vᵀ (n, n, N), rows of zeros where both know a direction exactly · ``inverse`` V⁺
     (n, n, N) · ``first`` a and ``second`` b (n, N) · ``power`` c (n, N), the squared norms of the
-    columns of V, so that a covariance V diag(p) Vᵀ has the trace Σ c_j p_j.
+    columns of V, so that a covariance V diag(p) Vᵀ has the trace Σ c_j p_j ·
+    ``uncertain`` (n, N), the states of which neither variance is zero.
     """
 
     basis: Array
@@ -39,6 +40,7 @@ class DiagonalPair(NamedTuple):
     first: Array
     second: Array
     power: Array
+    uncertain: NDArray[np.bool_]
 
 
 @np.errstate(all="ignore")
@@ -103,7 +105,9 @@ def diagonalise(
         other, own, inverse[..., lanes], basis[..., lanes] = np.split(rows, 4, 1)
         variances[..., lanes] = linalg.dot(own, own), linalg.dot(other, other)
     weighed = basis if metric is None else linalg.matmul(basis, linalg.transpose(metric))
-    return DiagonalPair(basis, inverse, variances[0], variances[1], linalg.dot(weighed, weighed))
+    power = linalg.dot(weighed, weighed)
+    uncertain = np.asarray((linalg.diagonal(pair) > 0.0).all(0))
+    return DiagonalPair(basis, inverse, variances[0], variances[1], power, uncertain)
 
 
 def _orthogonalise(rows: Array) -> None:
@@ -178,7 +182,7 @@ def _join(
     mean_a: Array, mean_b: Array, pair: DiagonalPair, fused: Array, share: Array, weight: Array
 ) -> Fused:
     """Back from the diagonal coordinates: P = V diag(fused) Vᵀ and L = V diag(share) V⁻¹."""
-    scaled = pair.basis * np.sqrt(fused)[:, None]
+    scaled = pair.basis * np.sqrt(fused)[:, None] * pair.uncertain
     second = linalg.matmul(linalg.transpose(pair.basis), pair.inverse * share[:, None])
     return Fused(
         mean_a + linalg.matvec(second, mean_b - mean_a),
