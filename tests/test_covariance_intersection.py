@@ -92,7 +92,7 @@ def test_a_worse_estimate_is_dropped_whichever_side_it_is_on(rule: str) -> None:
 def test_a_covariance_that_is_none_spoils_only_its_own_lane(rule: str) -> None:
     mean, covariance = estimates("alike", 2, 3, 3)
     clean = RULES[rule](mean[0], covariance[0], mean[1], covariance[1])
-    covariance[1, 0, 0, 1] = -1.0
+    covariance[1, 0, 0, 1] = np.nan
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         spoiled = RULES[rule](mean[0], covariance[0], mean[1], covariance[1])

@@ -123,7 +123,7 @@ def test_lanes_of_every_number_of_active_estimates_stand_side_by_side() -> None:
     generator = np.random.default_rng(8)
     mean, covariance = estimates("crossed", 4, 3, 120)
     active = generator.random((4, 120)) < 0.6
-    covariance[1, 2, 2, ::10] = -1.0
+    covariance[1, 2, 2, ::10] = np.nan
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         batch = many(mean, covariance, active)

@@ -211,9 +211,10 @@ def sensed(prediction: PredictionT | None) -> PredictionT:
 def log_deviation(covariance: Array, reference: Array) -> Array:
     """Return ln √(variance/reference) (..., n, N) of covariances (..., n, n, N).
 
-    ``reference`` (n,) are variances.
+    ``reference`` (n,) are variances. It is -inf where the variance is zero.
     """
-    return 0.5 * np.log(linalg.diagonal(covariance) / reference[:, None])
+    with np.errstate(divide="ignore"):
+        return 0.5 * np.log(linalg.diagonal(covariance) / reference[:, None])
 
 
 def numbered(count: int) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
+from fusion_gym.fusion.intersection import whiten
 from fusion_gym.policies.base import Policy, owner_of, refused_signals
 
 BATCH = 1024  # episodes side by side; fixed, so that results do not depend on the machine
@@ -22,10 +23,10 @@ class EpisodeResults:
 
     ``mse`` (E,) squared error of the fused estimate, summed over states · ``bound_trace`` (E,)
     trace of the claimed covariance · ``nees`` (E,) normalised squared error divided by the number
-    of states, 1 for a consistent filter · ``rate`` and ``requests`` (E, sensors) · ``tokens``
-    (E,) spent and ``denied`` (E,) requests refused, per step · ``returns`` (E,) sum of the
-    rewards · ``diverged`` (E,) share of diverged steps · ``squared_error`` (H, n), the mean over
-    episodes at each time and state.
+    of directions with a variance, 1 for a consistent filter · ``rate`` and ``requests``
+    (E, sensors) · ``tokens`` (E,) spent and ``denied`` (E,) requests refused, per step ·
+    ``returns`` (E,) sum of the rewards · ``diverged`` (E,) share of diverged steps ·
+    ``squared_error`` (H, n), the mean over episodes at each time and state.
     """
 
     mse: Array
@@ -76,6 +77,18 @@ def run_episodes(
     return EpisodeResults(**joined, squared_error=np.asarray(error))
 
 
+def _normalised_error(error: Array, covariance: Array) -> Array:
+    """Return eᵀ P⁺ e over the rank of P (N,): directions without a variance do not count."""
+    result = linalg.dot(error, linalg.solve_vector(covariance, error)) / len(error)
+    lanes = np.flatnonzero(np.isnan(result) & np.isfinite(covariance).all((0, 1)))
+    if lanes.size:
+        root = linalg.root(covariance.take(lanes, axis=-1))
+        inverse = whiten(root[None])[:, len(error) : 2 * len(error)]
+        unit = linalg.matvec(inverse, error.take(lanes, axis=-1))
+        result[lanes] = linalg.dot(unit, unit) / np.maximum(inverse.any(1).sum(0), 1)
+    return result
+
+
 def _run_batch(
     task: Task, policy: Policy, episodes: int, seed: int, progress: Callable[[int], Any] | None
 ) -> EpisodeResults:
@@ -95,7 +108,7 @@ def _run_batch(
         squared_error[step] = outcome.squared_error.mean(-1)
         mse += outcome.squared_error.sum(0)
         trace += linalg.trace(covariance)
-        nees += linalg.dot(error, linalg.solve_vector(covariance, error)) / states
+        nees += _normalised_error(error, covariance)
         rate += outcome.granted
         requests += outcome.requested
         tokens += outcome.cost

@@ -15,64 +15,118 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.fusion.rules import Fused, FusionRule, own_covariances
+from fusion_gym.fusion.rules import Active, Fused, FusionRule, own_covariances
 from fusion_gym.validation import refusal
 
 _ORTHOGONAL = 1e-13  # cosine below which two rows count as orthogonal
 _SWEEPS = 30  # cap of the rotations; sizes up to 6 need fewer than 10 sweeps
 _HALVINGS = 24  # of the interval of weights; the trace is then within 2^-25 of its optimum
+REGULAR = 1e-4  # part of a state's variance that the other states must leave unexplained
+_DEPENDENT = 1e-24  # part of a row's squared norm below which other rows explain it
 _FLAT = 1e-12  # relative slope below which the weight makes no difference
 
 
 class DiagonalPair(NamedTuple):
-    """Two covariances P_A = V Vᵀ and P_B = V diag(d) Vᵀ in the coordinates V⁻¹ x.
+    """Two covariances P_A = V diag(a) Vᵀ and P_B = V diag(b) Vᵀ with a + b = 1.
 
-    ``basis`` Vᵀ (n, n, N) · ``inverse`` V⁻¹ (n, n, N) · ``ratio`` d (n, N), variances of b over
-    those of a · ``power`` c (n, N), the squared norms of the columns of V, so that a covariance
-    V diag(p) Vᵀ has the trace Σ c_j p_j.
+    ``basis`` Vᵀ (n, n, N), rows of zeros where both know a direction exactly · ``inverse`` V⁺
+    (n, n, N) · ``first`` a and ``second`` b (n, N) · ``power`` c (n, N), the squared norms of the
+    columns of V, so that a covariance V diag(p) Vᵀ has the trace Σ c_j p_j ·
+    ``uncertain`` (n, N), the states of which neither variance is zero.
     """
 
     basis: Array
     inverse: Array
-    ratio: Array
+    first: Array
+    second: Array
     power: Array
+    uncertain: NDArray[np.bool_]
 
 
-def diagonalise(covariance_a: Array, covariance_b: Array) -> DiagonalPair:
-    """Both covariances (n, n, N) in the coordinates in which they are diagonal.
+@np.errstate(all="ignore")
+def whiten(roots: Array) -> Array:
+    """Coordinates in which Σ F_i F_iᵀ is the identity, from the roots F_i (l, n, n, N).
 
-    With P_A = C Cᵀ and the eigenvectors U of C⁻¹ P_B C⁻ᵀ, V is C U. Plane rotations make the rows
-    of G = C⁻¹ chol(P_B) orthogonal (one-sided Jacobi method): their squared norms are d, each to
-    its own relative accuracy. The same rotations turn Cᵀ into Vᵀ and C⁻¹ into V⁻¹. A lane whose
-    rows are orthogonal is left untouched, so that its result does not depend on the others.
+    Rows (n, (l + 2) n, N) of (W_1, …, W_l, T, Vᵀ) with F_i = V W_i and T V = I, zeros from the rank
+    on: the Gram-Schmidt method, which takes the row of which the largest part is left.
     """
-    size = covariance_a.shape[0]
-    factor = linalg.cholesky(np.ascontiguousarray(covariance_a))
-    runs = max(covariance_a.shape[-1], covariance_b.shape[-1])
-    rows = np.zeros((size, 3 * size, runs))  # [G, C⁻¹, Cᵀ], rotated together
-    rows[:, :size] = linalg.cholesky(np.ascontiguousarray(covariance_b))
+    count, size, _, runs = roots.shape
+    width, lanes = count * size, np.arange(runs)
+    rows = np.empty((size, width + size, runs))
+    rows[:, :width] = roots.swapaxes(0, 1).reshape(size, width, runs)
+    rows[:, width:] = linalg.identity(size)
+    result = np.empty((size, width + 2 * size, runs))
+    whole = linalg.dot(rows[:, :width], rows[:, :width])
+    for k in range(size):
+        square = linalg.dot(rows[:, :width], rows[:, :width])
+        left = np.where(whole == 0.0, 0.0, square / whole)
+        row = left.argmax(0)
+        length = np.sqrt(square[row, lanes])
+        taken = np.take_along_axis(rows, row[None, None], 0)[0] / length
+        taken = np.where(left[row, lanes] <= _DEPENDENT, 0.0, taken)
+        column = linalg.dot(rows[:, :width], taken[:width])
+        rows -= column[:, None] * taken
+        result[k] = np.concatenate((taken, column))
+    return result
+
+
+@np.errstate(all="ignore")
+def diagonalise(
+    covariance_a: Array, covariance_b: Array, metric: Array | None = None
+) -> DiagonalPair:
+    """Both covariances (n, n, N), positive semi-definite, in common diagonal coordinates.
+
+    With P_A = C Cᵀ, the rows of G = C⁻¹ chol(P_B) are made orthogonal: their squared norms are
+    b / a, each to its own relative accuracy. The rotations turn Cᵀ into Vᵀ and C⁻¹ into V⁻¹. Where
+    P_A or P_B is nearly singular, the rows of :func:`whiten` take the place of those of G: those of
+    P_A are made orthogonal, then those of P_B, which the first ones do not tell where b is small.
+    """
+    pair = np.stack(np.broadcast_arrays(covariance_a, covariance_b))
+    size, factor = len(covariance_a), linalg.cholesky(pair)
+    rows = np.zeros((size, 3 * size, pair.shape[-1]))  # [G, C⁻¹, Cᵀ], rotated together
+    rows[:, :size] = factor[1]
     rows[:, size : 2 * size] = linalg.identity(size)
     for k in range(size):
-        rows[k, : 2 * size] /= factor[k, k]
-        rows[k + 1 :, : 2 * size] -= factor[k + 1 :, k, None] * rows[k, : 2 * size]
-    rows[:, 2 * size :] = linalg.transpose(factor)
+        rows[k, : 2 * size] /= factor[0, k, k]
+        rows[k + 1 :, : 2 * size] -= factor[0, k + 1 :, k, None] * rows[k, : 2 * size]
+    rows[:, 2 * size :] = linalg.transpose(factor[0])
+    _orthogonalise(rows)
+    ratio = linalg.dot(rows[:, :size], rows[:, :size])
+    unit = np.sqrt(1.0 + ratio)[:, None]
+    inverse, basis = rows[:, size : 2 * size] / unit, rows[:, 2 * size :] * unit
+    variances = np.stack((np.ones_like(ratio), ratio)) / (1.0 + ratio)
+    regular = np.square(linalg.diagonal(factor)) > REGULAR * linalg.diagonal(pair)
+    lanes = np.flatnonzero(~regular.all((0, 1)))
+    if lanes.size:
+        rows = whiten(linalg.root(pair.take(lanes, axis=-1)))
+        _orthogonalise(rows)
+        rows[:, : 2 * size] = np.roll(rows[:, : 2 * size], size, 1)
+        _orthogonalise(rows)
+        other, own, inverse[..., lanes], basis[..., lanes] = np.split(rows, 4, 1)
+        variances[..., lanes] = linalg.dot(own, own), linalg.dot(other, other)
+    weighed = basis if metric is None else linalg.matmul(basis, linalg.transpose(metric))
+    power = linalg.dot(weighed, weighed)
+    uncertain = np.asarray((linalg.diagonal(pair) > 0.0).all(0))
+    return DiagonalPair(basis, inverse, variances[0], variances[1], power, uncertain)
+
+
+def _orthogonalise(rows: Array) -> None:
+    """Rotate rows (n, m, N) until their first n entries are orthogonal (one-sided Jacobi method).
+
+    A lane whose rows are orthogonal is left untouched, so that its result does not depend on the
+    others.
+    """
+    size = len(rows)
     for _ in range(_SWEEPS):
         rotated = False
         for first, second in combinations(range(size), 2):
             rotated |= _rotate(rows[first], rows[second], size)
         if not rotated:
             break
-    whitened, basis = rows[:, :size], rows[:, 2 * size :]
-    return DiagonalPair(
-        basis,
-        rows[:, size : 2 * size],
-        linalg.dot(whitened, whitened),
-        linalg.dot(basis, basis),
-    )
 
 
 def _rotate(first: Array, second: Array, size: int) -> bool:
-    """Make the leading parts of two rows (3 n, N) orthogonal; False where they all were."""
+    """Make the first n entries of two rows (m, N) orthogonal; False where they all were."""
     product = linalg.dot(first[:size], second[:size])
     norm_first = linalg.dot(first[:size], first[:size])
     norm_second = linalg.dot(second[:size], second[:size])
@@ -94,6 +148,7 @@ def _rotate(first: Array, second: Array, size: int) -> bool:
     return True
 
 
+@np.errstate(all="ignore")
 def best_weight(numerator: Array, start: Array, end: Array) -> Array:
     """The ω in [0, 1] (N,) at which Σ_j g_j / ((1 - ω) s_j + ω e_j) is smallest.
 
@@ -110,8 +165,11 @@ def best_weight(numerator: Array, start: Array, end: Array) -> Array:
         divisor = change * weight
         divisor += start
         divisor *= divisor
-        np.reciprocal(divisor, out=divisor)
-        weight += np.copysign(step, linalg.dot(factor, divisor))
+        np.divide(factor, divisor, out=divisor)
+        slope = divisor[0]
+        for row in divisor[1:]:
+            slope += row
+        weight += np.copysign(step, slope)
         step *= 0.5
     weight[descent_start <= 0.0] = 0.0
     weight[descent_end >= 0.0] = 1.0
@@ -124,7 +182,7 @@ def _join(
     mean_a: Array, mean_b: Array, pair: DiagonalPair, fused: Array, share: Array, weight: Array
 ) -> Fused:
     """Back from the diagonal coordinates: P = V diag(fused) Vᵀ and L = V diag(share) V⁻¹."""
-    scaled = pair.basis * np.sqrt(fused)[:, None]
+    scaled = pair.basis * np.sqrt(fused)[:, None] * pair.uncertain
     second = linalg.matmul(linalg.transpose(pair.basis), pair.inverse * share[:, None])
     return Fused(
         mean_a + linalg.matvec(second, mean_b - mean_a),
@@ -135,7 +193,11 @@ def _join(
 
 
 def covariance_intersection(
-    mean_a: Array, covariance_a: Array, mean_b: Array, covariance_b: Array
+    mean_a: Array,
+    covariance_a: Array,
+    mean_b: Array,
+    covariance_b: Array,
+    basis: Array | None = None,
 ) -> Fused:
     """Covariance intersection of two estimates, of the smallest trace.
 
@@ -145,13 +207,13 @@ def covariance_intersection(
 
     Args:
         mean_a, mean_b: (n, N).
-        covariance_a, covariance_b: (n, n, N), symmetric positive definite; only the lower
-            triangles are read. A batch axis of length 1 broadcasts.
+        covariance_a, covariance_b: (n, n, N), symmetric positive semi-definite. What one of them
+            knows exactly the result knows too. A batch axis of length 1 broadcasts.
+        basis: as in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
 
     Returns:
         The fused estimate with the gains K, L and the weights ω, 1 - ω. Its trace is within a
-        relative 1e-6 of the optimum. A lane with a covariance that is not positive definite is
-        NaN, except for the weights.
+        relative 1e-6 of the optimum. A lane with a NaN is NaN, except for the weights.
 
     Assumes: P_A and P_B bound their own error covariances; nothing of the correlation of the
     two.
@@ -159,19 +221,29 @@ def covariance_intersection(
     Source: adaptive_innovation, equations (37), (38) and (42); S. J. Julier and J. K. Uhlmann, "A
     non-divergent estimation algorithm in the presence of unknown correlations", 1997.
     """
-    pair, weight, total = _intersect(covariance_a, covariance_b)
-    return _join(mean_a, mean_b, pair, pair.ratio / total, (1.0 - weight) / total, weight)
+    pair, weight, fused, share = _intersect(covariance_a, covariance_b, basis)
+    return _join(mean_a, mean_b, pair, fused, share, weight)
 
 
-def _intersect(covariance_a: Array, covariance_b: Array) -> tuple[DiagonalPair, Array, Array]:
-    """The pair, the weight ω of the smallest trace, and ω d + 1 - ω."""
-    pair = diagonalise(covariance_a, covariance_b)
-    d = pair.ratio
-    weight = best_weight(pair.power * d, np.ones_like(d), d)
-    return pair, weight, weight * d + (1.0 - weight)
+def _intersect(
+    covariance_a: Array, covariance_b: Array, basis: Array | None
+) -> tuple[DiagonalPair, Array, Array, Array]:
+    """The pair, the weight ω of the smallest trace, the variances p and b's shares in the mean.
+
+    p = a b / (ω b + (1 - ω) a), and zero where one of them is, for every ω.
+    """
+    pair = diagonalise(covariance_a, covariance_b, basis)
+    both = pair.first * pair.second
+    start, end = np.where(both > 0.0, pair[2:4], 1.0)
+    weight = best_weight(pair.power * both, start, end)
+    total = weight * end + (1.0 - weight) * start
+    share = np.where(both > 0.0, (1.0 - weight) * start / total, pair.first)
+    return pair, weight, both / total, share
 
 
-def best_of_pair(covariances: Array, selected: NDArray[np.bool_]) -> tuple[Array, Array]:
+def best_of_pair(
+    covariances: Array, selected: NDArray[np.bool_], basis: Array | None
+) -> tuple[Array, Array]:
     """Covariance intersection where two of l estimates are ``selected`` (l, N).
 
     Weights (l, N) and covariance (n, n, N) of the smallest trace, from ``covariances``
@@ -182,22 +254,39 @@ def best_of_pair(covariances: Array, selected: NDArray[np.bool_]) -> tuple[Array
     a, b = (
         np.take_along_axis(covariances, which[None, None, None], 0)[0] for which in (first, second)
     )
-    pair, share, total = _intersect(a, b)
-    scaled = pair.basis * np.sqrt(pair.ratio / total)[:, None]
+    pair, weight, fused, _ = _intersect(a, b, basis)
+    scaled = pair.basis * np.sqrt(fused)[:, None]
     weights = np.zeros(selected.shape)
     inside = np.arange(selected.shape[-1])
-    weights[first, inside], weights[second, inside] = share, 1.0 - share
+    weights[first, inside], weights[second, inside] = weight, 1.0 - weight
     return weights, linalg.matmul(linalg.transpose(scaled), scaled)
 
 
+def information_fusion(
+    mean_a: Array,
+    covariance_a: Array,
+    mean_b: Array,
+    covariance_b: Array,
+    basis: Array | None = None,
+) -> Fused:
+    """Fuse two estimates of independent errors: P = (P_A⁻¹ + P_B⁻¹)⁻¹."""
+    pair = diagonalise(covariance_a, covariance_b)
+    weight = np.full(pair.first.shape[-1:], 0.5)
+    return _join(mean_a, mean_b, pair, pair.first * pair.second, pair.first, weight)
+
+
 def inverse_covariance_intersection(
-    mean_a: Array, covariance_a: Array, mean_b: Array, covariance_b: Array
+    mean_a: Array,
+    covariance_a: Array,
+    mean_b: Array,
+    covariance_b: Array,
+    basis: Array | None = None,
 ) -> Fused:
     """Inverse covariance intersection of two estimates, of the smallest trace.
 
     With X = (ω P_A + (1 - ω) P_B)⁻¹: P = (P_A⁻¹ + P_B⁻¹ - X)⁻¹, K = P (P_A⁻¹ - ω X) and
-    L = P (P_B⁻¹ - (1 - ω) X). In the diagonal coordinates
-    p = d (ω + (1 - ω) d) / (ω + (1 - ω) d²) and L = ω / (ω + (1 - ω) d²). Never above the trace
+    L = P (P_B⁻¹ - (1 - ω) X). In the diagonal coordinates, with t = ω a² + (1 - ω) b²,
+    p = a b + (a b)² / t and L = ω a² / t. Never above the trace
     of covariance intersection.
 
     **P is not a bound for every correlation.** It is one where both estimates contain the same
@@ -211,13 +300,13 @@ def inverse_covariance_intersection(
 
     Args:
         mean_a, mean_b: (n, N).
-        covariance_a, covariance_b: (n, n, N), symmetric positive definite; only the lower
-            triangles are read. A batch axis of length 1 broadcasts.
+        covariance_a, covariance_b: (n, n, N), symmetric positive semi-definite. What one of them
+            knows exactly the result knows too. A batch axis of length 1 broadcasts.
+        basis: as in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
 
     Returns:
         The fused estimate with the gains K, L and the weights ω, 1 - ω. Its trace is within a
-        relative 1e-6 of the optimum. A lane with a covariance that is not positive definite is
-        NaN, except for the weights.
+        relative 1e-6 of the optimum. A lane with a NaN is NaN, except for the weights.
 
     Assumes: common information of the structure above; nothing else that both estimates share.
 
@@ -225,13 +314,13 @@ def inverse_covariance_intersection(
     of (49) and (50); B. Noack, J. Sijs, M. Reinhardt and U. D. Hanebeck, "Decentralized data
     fusion with inverse covariance intersection", Automatica 79, 2017.
     """
-    pair = diagonalise(covariance_a, covariance_b)
-    d = pair.ratio
-    square = d * d
-    weight = best_weight(pair.power * square / (1.0 + d), square, np.ones_like(d))
-    total = weight + (1.0 - weight) * square
-    fused = d * (weight + (1.0 - weight) * d) / total
-    return _join(mean_a, mean_b, pair, fused, weight / total, weight)
+    pair = diagonalise(covariance_a, covariance_b, basis)
+    both = pair.first * pair.second
+    end, start = np.where(both > 0.0, np.square(pair[2:4]), 1.0)
+    weight = best_weight(pair.power * both * both, start, end)
+    total = weight * end + (1.0 - weight) * start
+    share = np.where(both > 0.0, weight * end / total, pair.first)
+    return _join(mean_a, mean_b, pair, both + both * both / total, share, weight)
 
 
 @dataclass(frozen=True)
@@ -278,14 +367,14 @@ class SequentialIntersection(FusionRule):
     fusion with inverse covariance intersection", Automatica 79, 2017.
     """
 
-    join: Callable[[Array, Array, Array, Array], Fused] = covariance_intersection
+    join: Callable[[Array, Array, Array, Array, Array | None], Fused] = covariance_intersection
     order: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         self._check_order()
 
     def fuse(
-        self, means: Array, covariance: Array, active: NDArray[np.bool_] | None = None
+        self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
     ) -> Fused:
         """See :class:`~fusion_gym.fusion.rules.FusionRule`."""
         own = own_covariances(covariance)
@@ -310,6 +399,7 @@ class SequentialIntersection(FusionRule):
                     _lanes(fused, lanes),
                     _lanes(means[estimate], lanes),
                     _lanes(own[estimate], lanes),
+                    None if basis is None else _lanes(basis, lanes),
                 )
                 mean[:, lanes], fused[..., lanes] = pair.mean, pair.covariance
             steps.append(_Step(estimate, first, lanes, pair))

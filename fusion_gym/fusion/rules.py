@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 
+Active = NDArray[np.bool_] | None  # (l, N), the estimates that take part; all by default
+
 # Relative. Above the rounding of Σ, so that weights stay below 1e6 and their covariance honest to
 # 1e-4 in the worst case (1e-9 in the usual one); below any difference of estimates that matters.
 _RIDGE = 1e-12
@@ -50,7 +52,7 @@ class FusionRule(ABC):
 
     @abstractmethod
     def fuse(
-        self, means: Array, covariance: Array, active: NDArray[np.bool_] | None = None
+        self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
     ) -> Fused:
         """The active estimates joined.
 
@@ -59,9 +61,13 @@ class FusionRule(ABC):
             covariance: the estimates' own, (l, n, n, N), or the joint one of their errors,
                 (l, l, n, n, N), of which most rules read the diagonal blocks alone.
             active: (l, N), the estimates that take part; all by default. Others are not read.
+            basis: G (n, n, N) where the estimates, and the result, are of z with x = G z; weights
+                then minimise the trace of G P Gᵀ. The identity by default.
         """
 
-    def fuse_single(self, silent: Array, delivered: Array) -> tuple[Array, Array]:
+    def fuse_single(
+        self, silent: Array, delivered: Array, basis: Array | None = None
+    ) -> tuple[Array, Array]:
         """Fused covariances if nobody delivers (n, n, N), and (l, n, n, N) if each alone does.
 
         From the nodes' own covariances without and with a delivery, both (l, n, n, N).
@@ -71,8 +77,8 @@ class FusionRule(ABC):
         for node in range(len(silent)):
             covariances = silent.copy()
             covariances[node] = delivered[node]
-            single[node] = self.fuse(nowhere, covariances).covariance
-        return self.fuse(nowhere, silent).covariance, single
+            single[node] = self.fuse(nowhere, covariances, basis=basis).covariance
+        return self.fuse(nowhere, silent, basis=basis).covariance, single
 
 
 def own_covariances(covariance: Array) -> Array:
@@ -121,7 +127,7 @@ class InformationFusion(FusionRule):
     """
 
     def fuse(
-        self, means: Array, covariance: Array, active: NDArray[np.bool_] | None = None
+        self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
     ) -> Fused:
         """See :class:`FusionRule`; a lane with a covariance that is not definite is NaN."""
         information = linalg.inverse(own_covariances(covariance))
@@ -149,7 +155,9 @@ class InformationFusion(FusionRule):
         vector = _replaced_in_turn(linalg.matvec(information, means), linalg.matvec(gained, others))
         return linalg.matvec(fused, vector), fused
 
-    def fuse_single(self, silent: Array, delivered: Array) -> tuple[Array, Array]:
+    def fuse_single(
+        self, silent: Array, delivered: Array, basis: Array | None = None
+    ) -> tuple[Array, Array]:
         """See :class:`FusionRule`: informations are sums."""
         information = inverses(silent)
         total = information.sum(0)
@@ -210,6 +218,7 @@ class MatrixWeightedFusion(FusionRule):
         spread = joint[1:, 1:] - joint[0, 1:] - toward[:, None]
         own = linalg.diagonal(own_covariances(joint))
         ridge = _RIDGE * (own[0] + own[1:])
+        ridge[ridge < np.finfo(np.float64).tiny] = 1.0  # of what all know exactly
         for i in range(count - 1):
             for state in range(n):
                 spread[i, i, state, state] += ridge[i, state]
@@ -222,14 +231,13 @@ class MatrixWeightedFusion(FusionRule):
         return weights
 
     def fuse(
-        self, means: Array, covariance: Array, active: NDArray[np.bool_] | None = None
+        self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
     ) -> Fused:
         """See :class:`FusionRule`.
 
         Args:
             means: (l, n, N).
-            covariance: (l, l, n, n, N), that of all errors, positive semi-definite with a
-                positive diagonal.
+            covariance: (l, l, n, n, N), that of all errors, positive semi-definite.
             active: (l, N); all by default.
         """
         if active is not None:

@@ -10,7 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Block, SignalArray, System, age_block, common_signals, numbered
+from fusion_gym.core.system import (
+    Block,
+    SignalArray,
+    System,
+    age_block,
+    common_signals,
+    log_deviation,
+    numbered,
+)
 from fusion_gym.systems.linear_plant import covariance_factor
 
 _RUNS = 1000  # that tell what happens without transmissions
@@ -140,7 +148,7 @@ class NonlinearSystem(System[FilteredState]):
             Block(
                 "log_variance",
                 "logarithm of the predicted variance over its open-loop mean",
-                lambda s: np.log(linalg.diagonal(s.prior_covariance) / self._typical[1][:, None]),
+                lambda s: 2.0 * log_deviation(s.prior_covariance, self._typical[1]),
                 (self.state_names,),
                 node="broadcast",
                 limit=_RANGE,

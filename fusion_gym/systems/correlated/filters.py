@@ -88,8 +88,17 @@ class RobustKalmanFilter:
             gain = cross / innovation
         else:
             gain = linalg.transpose(linalg.solve(innovation, linalg.transpose(cross)))
-        reduction = linalg.matmul(gain, linalg.transpose(cross))
-        return RobustOutcomes(gain, innovation, linalg.symmetrise(covariance - reduction))
+        rest = linalg.identity(covariance.shape[-2]) - linalg.matmul(
+            gain, sensors.measurement_matrix
+        )
+        shared = linalg.matmul(
+            linalg.matmul(rest, sensors.cross_covariance), linalg.transpose(gain)
+        )
+        own = np.arange(sensors.count)
+        delivered = linalg.congruence(rest, covariance)
+        delivered += linalg.congruence(gain, sensors.covariance[own, own])
+        delivered -= shared + linalg.transpose(shared)
+        return RobustOutcomes(gain, innovation, delivered)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature
-from fusion_gym.core.system import Block, SignalArray, age_block, common_signals, numbered, sensed
+from fusion_gym.core.system import (
+    Block,
+    SignalArray,
+    age_block,
+    common_signals,
+    log_deviation,
+    numbered,
+    sensed,
+)
 from fusion_gym.systems.markov_jump.centralised_linear import (
     Belief,
     CentralisedLinearFilter,
@@ -276,8 +284,8 @@ class MarkovJumpCentralSystem(MarkovJumpFamily[MarkovJumpCentralState]):
         return self._innovation(state, prediction) / self._deviation(prediction)
 
     def _log_deviation(self, state: MarkovJumpCentralState) -> Array:
-        variance = linalg.diagonal(sensed(state.prediction).covariance)[: self.plant.size]
-        return 0.5 * np.log(variance / self.reference[:, None])
+        n = self.plant.size
+        return log_deviation(sensed(state.prediction).covariance[:n, :n], self.reference)
 
     def _innovation(self, state: MarkovJumpCentralState, prediction: ModePrediction) -> Array:
         surprise = state.measurement - prediction.mean[self.plant.size :]

@@ -17,10 +17,13 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel, Times
+from fusion_gym.systems.markov_jump.linear_minimum_variance import (
+    AugmentedModel,
+    Times,
+    settled,
+)
 
 _LONGEST = 2000  # steps after which tables that have not settled end anyway
-_SETTLED = 1e-13  # relative change in a step below which they have
 
 
 class Belief(NamedTuple):
@@ -167,11 +170,13 @@ class CentralisedLinearFilter:
         maps[:n, :size] = np.tile(np.eye(n), model.plant.modes)
         maps[n:, :size], maps[n:, size:] = model.faded, sensors.noise_coupling[..., 0]
         rows: list[tuple[Array, Array, Array]] = []
+        now: tuple[Array, ...] = ()
         for time, step in enumerate(model.steps()):
             observed = ((model.unfaded @ step.moment) * model.unfaded).sum(1)
             own = sensors.fading_variance * observed + sensors.variance[:, 0]
             rows.append((np.hstack((model.transition, step.input)), step.additional, own))
-            if time > 0 and all(_same(*pair) for pair in zip(rows[-1], rows[-2], strict=True)):
+            before, now = now, step.moments(model.plant)
+            if time > 0 and settled(now, before):
                 break
             if time >= max(horizon + 2, _LONGEST):
                 break
@@ -222,7 +227,3 @@ class CentralisedLinearFilter:
 
     def _at(self, time: Times) -> Times:
         return np.minimum(time, self.variance.shape[-1] - 1)
-
-
-def _same(now: Array, before: Array) -> bool:
-    return bool(np.abs(now - before).max() <= _SETTLED * np.abs(now).max())

@@ -24,7 +24,7 @@ from fusion_gym.systems.markov_jump.sensors import FadingSensors
 Times = NDArray[np.int64]
 
 _LONGEST = 2000  # steps after which tables that have not become periodic end anyway
-_SETTLED = 1e-13  # relative change over a period below which they have
+_SETTLED = 1e-13  # change over a period, in deviations of each state, below which they have
 
 
 class AugmentedStep(NamedTuple):
@@ -40,6 +40,10 @@ class AugmentedStep(NamedTuple):
     mean: Array
     input: Array
     additional: Array
+
+    def moments(self, plant: MarkovJumpPlant) -> tuple[Array, Array]:
+        """Return P(k) and B̄ Q B̄ᵀ (a, a), from which all else of the step follows."""
+        return self.moment, self.input @ plant.noise_covariance @ self.input.T
 
 
 @dataclass(frozen=True)
@@ -219,8 +223,8 @@ class LocalFilters:
         for time, step in enumerate(model.steps()):
             row, following = _advance(model, step, joint, shared, noise, time)
             rows.append(row)
-            observed.append((joint, step.moment, step.input))
-            if time > period and _same(observed[time], observed[time - period]):
+            observed.append((*step.moments(plant), joint.swapaxes(1, 2)))
+            if time > period and settled(observed[time], observed[time - period]):
                 break
             if time >= max(horizon + 2, _LONGEST):
                 break
@@ -281,10 +285,15 @@ class _Row(NamedTuple):
     predicted_cross: Array
 
 
-def _same(now: tuple[Array, ...], before: tuple[Array, ...]) -> bool:
-    """Whether arrays agree to a relative 1e-13 of the largest entry of each."""
-    pairs = zip(now, before, strict=True)
-    return all(np.abs(a - b).max() <= _SETTLED * np.abs(a).max() for a, b in pairs)
+def settled(now: tuple[Array, ...], before: tuple[Array, ...]) -> bool:
+    """Whether second moments (a, a) or (l, a, l, a) agree to 1e-13 of their own deviations."""
+    for a, b in zip(now, before, strict=True):
+        rows = math.isqrt(a.size)
+        deviation = np.sqrt(np.abs(np.diagonal(a.reshape(rows, rows))))
+        change = np.abs(a - b).reshape(rows, rows)
+        if (change > _SETTLED * np.outer(deviation, deviation)).any():
+            return False
+    return True
 
 
 def _advance(

@@ -262,7 +262,7 @@ class MarkovJumpSystem(MarkovJumpFamily[MarkovJumpState]):
 
     def _local_log_deviation(self, state: MarkovJumpState) -> Array:
         trace = self.recursion.local_trace.take(self.filters.at(state.time), -1)
-        return 0.5 * np.log(trace / self.reference.sum())
+        return log_deviation(trace[:, None, None], self.reference.sum(keepdims=True))[:, 0]
 
     def _copy_log_deviation(self, state: MarkovJumpState) -> Array:
         prediction, nodes = sensed(state.prediction), np.arange(self.sensor_count)

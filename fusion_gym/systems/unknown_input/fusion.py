@@ -15,8 +15,13 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.fusion.rules import Fused, FusionRule, own_covariances
-from fusion_gym.fusion.several import CovarianceIntersection, sum_rows
+from fusion_gym.fusion.rules import Active, Fused, FusionRule, own_covariances
+from fusion_gym.fusion.several import (
+    CovarianceIntersection,
+    covariance_intersection_many,
+    is_regular,
+    sum_rows,
+)
 
 _GAP = 0.01  # relative gap at which the tracked weights rest
 _STEPS = 4  # evaluations of the tracked weights at a time, at most
@@ -51,7 +56,7 @@ class NodeFusion(FusionRule):
         return self if weights is None else replace(self, weights=weights)
 
     def fuse(
-        self, means: Array, covariance: Array, active: NDArray[np.bool_] | None = None
+        self, means: Array, covariance: Array, active: Active = None, *, basis: Array | None = None
     ) -> Fused:
         """See :class:`~fusion_gym.fusion.rules.FusionRule`, for means (l, s, N), s = n + q.
 
@@ -96,17 +101,19 @@ def _smallest_variance(mean: Array, covariance: Array) -> Fused:
     return Fused(joined, smallest, lambda: weights[:, None, None], weights)
 
 
+@np.errstate(all="ignore")
 def tracked_intersection(mean: Array, covariance: Array, weights: Array) -> Fused:
     """Covariance intersection with weights that follow the smallest trace over time.
 
     From the given weights (l, N) on, w_i ← w_i √tr(P Y_i P), normalised, with Y_i = P_i⁻¹ and
     P = (Σ w_i Y_i)⁻¹, until the trace of P is within 1 % of its minimum: the gap is at most
     max_i tr(P Y_i P) - tr P. At most four evaluations are made at a time; the search goes on at
-    the next. Every P on the way is a bound, since any weights give one.
+    the next. Every P on the way is a bound, since any weights give one. Where an estimate is nearly
+    singular the search is :func:`covariance_intersection_many`.
 
     Args:
         mean: (l, n, N).
-        covariance: (l, n, n, N), symmetric positive definite.
+        covariance: (l, n, n, N), symmetric positive semi-definite.
         weights: (l, N), not negative, of sum 1.
     """
     information = linalg.inverse(covariance)
@@ -132,6 +139,19 @@ def tracked_intersection(mean: Array, covariance: Array, weights: Array) -> Fuse
         moved = np.maximum(some[:, still] * np.sqrt(gain[:, still]), _FLOOR**2)
         weights[:, lanes] = moved / sum_rows(moved)
     joined = linalg.matvec(fused, sum_rows(weights[:, None] * vectors))
-    return Fused(
-        joined, fused, lambda: linalg.matmul(fused, weights[:, None, None] * information), weights
-    )
+    lanes = np.flatnonzero(~is_regular(covariance, information).all(0))
+    if lanes.size:
+        best = covariance_intersection_many(mean[..., lanes], covariance[..., lanes])
+        joined[:, lanes], fused[..., lanes], weights[:, lanes] = (
+            best.mean,
+            best.covariance,
+            best.weights,
+        )
+
+    def gains() -> Array:
+        every = linalg.matmul(fused, weights[:, None, None] * information)
+        if lanes.size:
+            every[..., lanes] = best.gains
+        return every
+
+    return Fused(joined, fused, gains, weights)
