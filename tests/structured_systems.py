@@ -140,11 +140,9 @@ def _tobit(random: np.random.Generator, horizon: int) -> Drawn:
         "filter": _pick(random, "paper", "paper", "tobit", "tobit", "kalman", "adf", "stochastic"),
         "horizon": plant.horizon,
     }
-    if options["filter"] == "paper":  # a held measurement must have independent rows
-        ranks = np.linalg.matrix_rank(options["measurement_matrices"])
-        options["silent"] = (
-            _pick(random, None, "predict") if (ranks == channels).all() else "predict"
-        )
+    ranks = np.linalg.matrix_rank(options["measurement_matrices"])
+    if (ranks < channels).any():  # a held measurement must have independent rows
+        options["silent"] = "predict"
     return Drawn("TobitOscillator", _fusion(random, options, None, sensors), plant.known)
 
 
@@ -275,7 +273,7 @@ def _remote(random: np.random.Generator, horizon: int) -> Drawn:
 
 
 def draw_linear(random: np.random.Generator, horizon: int, exact: bool = False) -> Drawn:
-    """Of LinearFusion; ``exact`` draws uncensored sensors and filters that are the Kalman filter."""
+    """Of LinearFusion; ``exact`` draws uncensored sensors with the Kalman filter in its forms."""
     plant = draw_plant(random, horizon)
     sensors = int(random.integers(1, 4))
     sizes = random.integers(1, 4, sensors)
