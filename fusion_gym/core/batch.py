@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array, merge_runs
+from fusion_gym.core.admission import require_finite
 from fusion_gym.core.beliefs import Owner, arrived
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.observation import ObservationLayout
@@ -142,10 +144,13 @@ class EpisodeBatch(Runs):
 
         Raises:
             ResetNeeded: before the first reset.
+            DivergenceError: an error or a reward that is not finite, of a run that goes on.
         """
         if self.state is None:
             raise ResetNeeded("call reset before the first step")
         outcome = self.deliver(requests)
+        if not math.isfinite(np.add.reduce(outcome.error, None) + np.add.reduce(outcome.reward)):
+            self._require_finite(outcome)
         if self.reference is not None:
             self._refer(self.reference)
         self._cursor += 1
@@ -157,6 +162,19 @@ class EpisodeBatch(Runs):
             self._beside = self.reference.sense(self._beside, self.noise())
         self.finished = outcome.ended.copy()
         return outcome
+
+    def observe(self) -> NDArray[np.float32]:
+        """Observations (N, entries) of all runs, a fresh array.
+
+        Raises:
+            DivergenceError: an entry that is not a number, of a run that goes on.
+        """
+        observation = super().observe()
+        if not math.isfinite(np.add.reduce(observation, None)):
+            entry = np.isnan(observation).argmax(1)  # the first one of each run
+            values = {f"observation {self.layout.names[k]!r}": observation.T[k] for k in set(entry)}
+            require_finite(values, self.finished, self.steps)
+        return observation
 
     def normals(self) -> Array:
         """The normals (channels, N) of the last sensing, a view that later steps overwrite."""
@@ -177,6 +195,19 @@ class EpisodeBatch(Runs):
         moving = dict(snapshot)
         self.memory = self.memory.with_states(moving.pop("memory_states"))
         vars(self).update(moving)
+
+    def _require_finite(self, outcome: Outcome) -> None:
+        """Name what is not finite in a run that has not ended before this step."""
+        system = self.task.system
+        mean, covariance = system.fused(self.delivered)
+        values = {
+            "truth (the plant has diverged)": system.truth(self.delivered),
+            "covariance": covariance,
+            "mean": mean,
+            "error": outcome.error,
+            "reward": outcome.reward,
+        }
+        require_finite(values, self.finished, self.steps)
 
     def _refer(self, system: System[Any]) -> None:
         """Let the reference take in every measurement of this step."""

@@ -211,9 +211,12 @@ def sensed(prediction: PredictionT | None) -> PredictionT:
 def log_deviation(covariance: Array, reference: Array) -> Array:
     """Return ln √(variance/reference) (..., n, N) of covariances (..., n, n, N).
 
-    ``reference`` (n,) are variances.
+    ``reference`` (n,) are variances, zero of a state that is always known. Minus infinity for a
+    variance of zero.
     """
-    return 0.5 * np.log(linalg.diagonal(covariance) / reference[:, None])
+    possible = np.where(reference > 0.0, reference, np.inf)
+    with np.errstate(divide="ignore"):
+        return 0.5 * np.log(linalg.diagonal(covariance) / possible[:, None])
 
 
 def numbered(count: int) -> tuple[str, ...]:
@@ -382,6 +385,13 @@ class System(ABC, Generic[StateT]):
     @abstractmethod
     def open_loop(self, horizon: int) -> Array:
         """Return the mean error variance (n,) over t = 1..horizon without any delivery."""
+
+    def signal_to_noise(self, horizon: int) -> float:
+        """Return the largest mean square over noise variance of a measurement at t = 0..horizon.
+
+        0 where it is not known.
+        """
+        return 0.0
 
     def truth(self, state: StateT) -> Array:
         """Return the plant's state (n, N): for the reward and for metrics, never for a policy."""

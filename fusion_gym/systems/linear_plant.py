@@ -130,15 +130,25 @@ class LinearPlant(Plant):
             total += np.diagonal(current)
         return total / horizon
 
+    def second_moments(self, horizon: int, random_start: bool = False) -> Array:
+        """Mean square (horizon + 1, n) of each state at t = 0..horizon."""
+        transition, process = self.transition[..., 0], self.process_covariance[..., 0]
+        mean, size = self.initial_mean[:, 0], self.size
+        moment = np.eye(size) * (mean @ mean) / size if random_start else np.outer(mean, mean)
+        moment = moment + self.initial_covariance[..., 0]
+        result = [np.diagonal(moment)]
+        for _ in range(horizon):
+            moment = transition @ moment @ transition.T + process
+            result.append(np.diagonal(moment))
+        return np.array(result)
+
 
 def typical_magnitude(plant: LinearPlant, horizon: int, random_start: bool) -> Array:
     """Root of the mean second moment of each state over t = 0..horizon, shape (n,)."""
-    transition, process = plant.transition[..., 0], plant.process_covariance[..., 0]
-    mean, size = plant.initial_mean[:, 0], plant.size
-    moment = np.eye(size) * (mean @ mean) / size if random_start else np.outer(mean, mean)
-    moment = moment + plant.initial_covariance[..., 0]
-    total = np.diagonal(moment).copy()
-    for _ in range(horizon):
-        moment = transition @ moment @ transition.T + process
-        total += np.diagonal(moment)
-    return np.sqrt(total / (horizon + 1))
+    return np.sqrt(plant.second_moments(horizon, random_start).mean(0))
+
+
+def largest_ratio(moments: Array, rows: Array) -> float:
+    """Bound of the mean square of any of the ``rows`` (..., n) of states of ``moments`` (T, n)."""
+    finest = np.abs(rows).reshape(-1, rows.shape[-1]).max(0)
+    return float((np.sqrt(moments) @ finest).max() ** 2)

@@ -265,11 +265,19 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
 
     def open_loop(self, horizon: int) -> Array:
         """Mean error variance (n,) over t = 1..horizon of a centre that never receives."""
-        variance, total = self.initial_deviation**2, np.zeros(self.sensor_count)
+        return self._variances(horizon).mean(0)
+
+    def signal_to_noise(self, horizon: int) -> float:
+        """See :class:`System`; the noise is the source's own, for its value is seen exactly."""
+        return float((self._variances(horizon) / self.deviation**2).max())
+
+    def _variances(self, horizon: int) -> Array:
+        """The sources' variances (horizon, n) at t = 1..horizon."""
+        variance, result = self.initial_deviation**2, []
         for _ in range(horizon):
             variance = self.coefficient**2 * variance + self.deviation**2
-            total = total + variance
-        return total / horizon
+            result.append(variance)
+        return np.array(result)
 
     def _coming(
         self, channel: NDArray[np.int64], noise: Array

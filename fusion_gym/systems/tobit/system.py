@@ -22,10 +22,11 @@ from fusion_gym.core.system import (
     System,
     age_block,
     common_signals,
+    log_deviation,
     numbered,
     sensed,
 )
-from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio
 from fusion_gym.systems.tobit.centre import Centre, CentrePrediction
 
 _RANGE = 5.0  # whitened quantities and logarithms of variance ratios are clipped here
@@ -286,7 +287,7 @@ class CensoredSystem(System[CensoredState]):
         }
 
     def _log_variance(self, state: CensoredState) -> Array:
-        return np.log(linalg.diagonal(state.prior_covariance) / self.reference[:, None])
+        return 2.0 * log_deviation(state.prior_covariance, self.reference)
 
     def visible(self, state: CensoredState) -> CensoredState:
         """The state without the truth and its departure; nothing else is hidden."""
@@ -321,6 +322,12 @@ class CensoredSystem(System[CensoredState]):
     def open_loop(self, horizon: int) -> Array:
         """Mean error variance (n,) over t = 1..horizon of a centre that only predicts."""
         return self.plant.open_loop(horizon)
+
+    def signal_to_noise(self, horizon: int) -> float:
+        """See :class:`System`."""
+        matrix, deviation = self.centre.sensors.measurement_matrix, self.centre.sensors.deviation
+        moments = self.plant.second_moments(horizon, self.random_start)
+        return largest_ratio(moments, matrix[..., 0] / deviation)
 
 
 def _whitened(state: CensoredState) -> Array:
