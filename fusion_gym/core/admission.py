@@ -11,7 +11,7 @@ from fusion_gym.core.system import System
 from fusion_gym.errors import ConfigurationError, DivergenceError
 
 _LARGEST_ERROR = 1e32  # of squares on average: rewards are also handed on as float32
-_LARGEST_SIGNAL = 1e14  # over the noise: a rounding of 1e-16 is then 1e-9 deviations of the noise
+_LARGEST_SIGNAL = 1e12  # over the noise: a rounding is then 1e-10 of the noise's deviation
 
 
 def admit(system: System[Any], horizon: int) -> Array:
