@@ -22,7 +22,6 @@ from fusion_gym.core.system import (
     System,
     age_block,
     common_signals,
-    log_deviation,
     numbered,
     sensed,
 )
@@ -287,7 +286,7 @@ class CensoredSystem(System[CensoredState]):
         }
 
     def _log_variance(self, state: CensoredState) -> Array:
-        return 2.0 * log_deviation(state.prior_covariance, self.reference)
+        return np.log(linalg.diagonal(state.prior_covariance) / self.reference[:, None])
 
     def visible(self, state: CensoredState) -> CensoredState:
         """The state without the truth and its departure; nothing else is hidden."""
