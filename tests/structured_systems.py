@@ -22,7 +22,7 @@ Options = dict[str, Any]
 PATTERNS = ("never", "rarely", "always", "random", "bursts")
 _DECAYS = (0.0, 0.05, 0.5, 0.9, 1.0)
 _GROWTHS = (1.02, 1.05, 1.1, 1.3)
-_LARGEST = 1e4  # by which most growing directions grow in an episode
+_LARGEST = 300.0  # by which most growing directions grow in an episode
 
 
 @dataclass(frozen=True)

@@ -7,28 +7,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import System
+from fusion_gym.core.system import Rounding, System
 from fusion_gym.errors import ConfigurationError, DivergenceError
 
+# By comparison with 50 digits: within them, means are right to 1e-9 of a deviation, variances too.
 _LARGEST_ERROR = 1e32  # of squares on average: rewards are also handed on as float32
-_LARGEST_SIGNAL = 1e12  # over the noise: a rounding is then 1e-10 of the noise's deviation
+_LARGEST_SIGNAL, _LARGEST_LOSS = 1e12, 1e7
 
 
 def admit(system: System[Any], horizon: int) -> Array:
     """Return the error variances (n,) of a centre that never receives, of a system that fits.
 
     Raises:
-        ConfigurationError: over the horizon they grow beyond all bounds, or the state so far beyond
-            its noise that the noise has no digits left; names the longest horizon that is allowed.
+        ConfigurationError: over the horizon they grow beyond all bounds, or states so far beyond
+            their noise that nothing is left of its digits; names the longest horizon that fits.
     """
     open_loop = system.open_loop(horizon)
-    error, signal = float(open_loop.max()), system.signal_to_noise(horizon)
-    if error <= _LARGEST_ERROR and signal <= _LARGEST_SIGNAL:
+    error, rounding = float(open_loop.max()), system.rounding(horizon)
+    if _fits(error, rounding):
         return open_loop
     why = (
-        f"without transmissions the mean squared error reaches {error:.3g} (at most "
-        f"{_LARGEST_ERROR:g}), and the mean square of a measured state {signal:.3g} times the "
-        f"noise's variance (at most {_LARGEST_SIGNAL:g})"
+        f"float64 holds a mean squared error without transmissions up to {_LARGEST_ERROR:g} (here "
+        f"{error:.3g}), measurements with a mean square up to {_LARGEST_SIGNAL:g} times their "
+        f"noise's variance (here {rounding.signal:.3g}), and variances of which a packet leaves "
+        f"one part in {_LARGEST_LOSS:g} (here in {rounding.variance:.3g})"
     )
     longest = _longest(system, horizon)
     if not longest:
@@ -37,6 +39,27 @@ def admit(system: System[Any], horizon: int) -> Array:
         f"horizon = {horizon} is not allowed with this plant and these sensors: it must be at most "
         f"{longest}, for {why}"
     )
+
+
+def _fits(error: float, rounding: Rounding) -> bool:
+    signal, variance = rounding
+    return error <= _LARGEST_ERROR and signal <= _LARGEST_SIGNAL and variance <= _LARGEST_LOSS
+
+
+def _longest(system: System[Any], refused: int) -> int:
+    """The longest horizon below a refused one that fits, 0 for none; what is lost rises with it."""
+
+    def fits(horizon: int) -> bool:
+        return _fits(float(system.open_loop(horizon).max()), system.rounding(horizon))
+
+    low, high = 0, 1
+    while high < refused and fits(high):
+        low, high = high, 2 * high
+    high = min(high, refused)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low
 
 
 def require_finite(
@@ -52,20 +75,3 @@ def require_finite(
         if lost.any():
             run = int(lost.argmax())
             raise DivergenceError(f"run {run}, step {steps[run]}: the {name} is not finite")
-
-
-def _longest(system: System[Any], refused: int) -> int:
-    """The longest horizon below a refused one that fits, 0 for none; the ratios rise with it."""
-
-    def fits(horizon: int) -> bool:
-        error, signal = system.open_loop(horizon), system.signal_to_noise(horizon)
-        return bool(np.all(error <= _LARGEST_ERROR)) and signal <= _LARGEST_SIGNAL
-
-    low, high = 0, 1
-    while high < refused and fits(high):
-        low, high = high, 2 * high
-    high = min(high, refused)
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if fits(middle) else (low, middle)
-    return low

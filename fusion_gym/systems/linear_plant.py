@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,25 +123,26 @@ class LinearPlant(Plant):
 
     def open_loop(self, horizon: int) -> Array:
         """Mean over t = 1..horizon of the error variance without measurements, shape (n,)."""
-        matrix, process = self.transition[..., 0], self.process_covariance[..., 0]
-        current = self.initial_covariance[..., 0]
-        total = np.zeros(self.size)
-        for _ in range(horizon):
-            current = matrix @ current @ matrix.T + process
-            total += np.diagonal(current)
-        return total / horizon
+        return np.array([np.diagonal(p) for p in self.covariances(horizon)][1:]).mean(0)
+
+    def covariances(self, horizon: int) -> Iterator[Array]:
+        """Error covariances (n, n) without measurements at t = 0..horizon."""
+        return self._moments(self.initial_covariance[..., 0], horizon)
 
     def second_moments(self, horizon: int, random_start: bool = False) -> Array:
         """Mean square (horizon + 1, n) of each state at t = 0..horizon."""
-        transition, process = self.transition[..., 0], self.process_covariance[..., 0]
         mean, size = self.initial_mean[:, 0], self.size
-        moment = np.eye(size) * (mean @ mean) / size if random_start else np.outer(mean, mean)
-        moment = moment + self.initial_covariance[..., 0]
-        result = [np.diagonal(moment)]
+        start = np.eye(size) * (mean @ mean) / size if random_start else np.outer(mean, mean)
+        moments = self._moments(start + self.initial_covariance[..., 0], horizon)
+        return np.array([np.diagonal(moment) for moment in moments])
+
+    def _moments(self, start: Array, horizon: int) -> Iterator[Array]:
+        """The matrix ``start`` (n, n) at t = 0 and what A X Aᵀ + W makes of it until the horizon."""
+        transition, process = self.transition[..., 0], self.process_covariance[..., 0]
+        yield start
         for _ in range(horizon):
-            moment = transition @ moment @ transition.T + process
-            result.append(np.diagonal(moment))
-        return np.array(result)
+            start = transition @ start @ transition.T + process
+            yield start
 
 
 def typical_magnitude(plant: LinearPlant, horizon: int, random_start: bool) -> Array:
@@ -152,3 +154,25 @@ def largest_ratio(moments: Array, rows: Array) -> float:
     """Bound of the mean square of any of the ``rows`` (..., n) of states of ``moments`` (T, n)."""
     finest = np.abs(rows).reshape(-1, rows.shape[-1]).max(0)
     return float((np.sqrt(moments) @ finest).max() ** 2)
+
+
+def variance_loss(plant: LinearPlant, horizon: int, rows: Array, noise: Array) -> float:
+    """Largest ratio by which the rounding of predicted variances counts in what a packet leaves.
+
+    After silence until one of sixteen times, of packets with ``rows`` C (..., m, n) and ``noise``
+    R (..., m, m). With G = I - K C and P the prediction, state i has (Σ |G_ij| √P_jj)² over the
+    variance that is left.
+    """
+    times = np.geomspace(1, horizon, 16).round()
+    largest = 0.0
+    for time, prior in enumerate(plant.covariances(horizon)):
+        if time not in times:
+            continue
+        cross = rows @ prior
+        gain = np.linalg.solve(cross @ rows.swapaxes(-1, -2) + noise, cross).swapaxes(-1, -2)
+        keep = np.eye(plant.size) - gain @ rows
+        left = ((keep @ prior) * keep).sum(-1) + ((gain @ noise) * gain).sum(-1)
+        rounded = (np.abs(keep) @ np.sqrt(np.diagonal(prior))) ** 2
+        ratio = np.where(rounded > 0.0, rounded / np.maximum(left, 0.0), 0.0)
+        largest = float(np.maximum(largest, ratio.max()))
+    return largest

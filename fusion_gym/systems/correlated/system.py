@@ -19,6 +19,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.system import (
     Block,
+    Rounding,
     SignalArray,
     System,
     age_block,
@@ -325,10 +326,12 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
         """Mean error variance (n,) over t = 1..horizon of a centre that only predicts (bound)."""
         return self.plant.open_loop(horizon)
 
-    def signal_to_noise(self, horizon: int) -> float:
+    def rounding(self, horizon: int) -> Rounding:
         """See :class:`System`."""
         matrix, deviation = self.filter.sensors.measurement_matrix, self.filter.sensors.deviation
-        return largest_ratio(self.plant.second_moments(horizon), matrix[..., 0] / deviation)
+        return Rounding(
+            largest_ratio(self.plant.second_moments(horizon), matrix[..., 0] / deviation)
+        )
 
     def _scale(self, noise: Array) -> Array:
         """Noise scales (N,) from standard normals (N,)."""

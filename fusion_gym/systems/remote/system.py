@@ -15,6 +15,7 @@ from fusion_gym.core.channel import STATES, Channel
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_motion, true_noise
 from fusion_gym.core.system import (
     Block,
+    Rounding,
     Signal,
     SignalArray,
     System,
@@ -267,9 +268,9 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
         """Mean error variance (n,) over t = 1..horizon of a centre that never receives."""
         return self._variances(horizon).mean(0)
 
-    def signal_to_noise(self, horizon: int) -> float:
+    def rounding(self, horizon: int) -> Rounding:
         """See :class:`System`; the noise is the source's own, for its value is seen exactly."""
-        return float((self._variances(horizon) / self.deviation**2).max())
+        return Rounding(float((self._variances(horizon) / self.deviation**2).max()))
 
     def _variances(self, horizon: int) -> Array:
         """The sources' variances (horizon, n) at t = 1..horizon."""

@@ -17,6 +17,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.system import (
     Block,
+    Rounding,
     Signal,
     SignalArray,
     System,
@@ -25,9 +26,10 @@ from fusion_gym.core.system import (
     numbered,
     sensed,
 )
-from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio
+from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio, variance_loss
 from fusion_gym.systems.tobit.centre import Centre, CentrePrediction
 
+_LARGEST_SIGNAL = 1e14  # over the noise, beyond which predictions of measurements are singular
 _RANGE = 5.0  # whitened quantities and logarithms of variance ratios are clipped here
 
 
@@ -322,11 +324,18 @@ class CensoredSystem(System[CensoredState]):
         """Mean error variance (n,) over t = 1..horizon of a centre that only predicts."""
         return self.plant.open_loop(horizon)
 
-    def signal_to_noise(self, horizon: int) -> float:
+    def rounding(self, horizon: int) -> Rounding:
         """See :class:`System`."""
-        matrix, deviation = self.centre.sensors.measurement_matrix, self.centre.sensors.deviation
+        sensors, size = self.centre.sensors, self.plant.size
+        matrix, noise = sensors.measurement_matrix[..., 0], sensors.noise_covariance[..., 0]
         moments = self.plant.second_moments(horizon, self.random_start)
-        return largest_ratio(moments, matrix[..., 0] / deviation)
+        signal = largest_ratio(moments, matrix / sensors.deviation)
+        if not signal <= _LARGEST_SIGNAL:
+            return Rounding(signal, np.inf)
+        own = sensors.variance * np.eye(sensors.size)  # of single packets, then of all together
+        groups = ((matrix, own), (matrix.reshape(-1, size), noise))
+        loss = max(variance_loss(self.plant, horizon, *group) for group in groups)
+        return Rounding(signal, loss)
 
 
 def _whitened(state: CensoredState) -> Array:

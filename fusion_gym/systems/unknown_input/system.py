@@ -18,6 +18,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.system import (
     Block,
+    Rounding,
     SignalArray,
     System,
     age_block,
@@ -303,12 +304,12 @@ class UnknownInputSystem(System[UnknownInputState]):
         """Mean squared error (n + q,) over k = 1..horizon of a centre that takes d for zero."""
         return self.plant.open_loop(self.signal, horizon)
 
-    def signal_to_noise(self, horizon: int) -> float:
+    def rounding(self, horizon: int) -> Rounding:
         """See :class:`System`."""
         plant, sensors = self.plant, self.nodes.sensors
         moments = plant.second_moments(self.signal, horizon, plant.initial_mean[:, 0])
         deviation = np.sqrt(linalg.diagonal(sensors.covariance))
-        return largest_ratio(moments[:, : plant.size], sensors.matrix[..., 0] / deviation)
+        return Rounding(largest_ratio(moments[:, : plant.size], sensors.matrix[..., 0] / deviation))
 
     def _deviation(self, state: UnknownInputState) -> Array:
         """The innovation's deviation (l, m, N or 1)."""
