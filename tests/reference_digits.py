@@ -11,6 +11,11 @@ from typing import Any
 import numpy as np
 from mpmath import mp, mpf
 from numpy.typing import NDArray
+from structured_systems import request
+
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.task import Task
+from fusion_gym.systems.tobit.system import CensoredSystem
 
 DIGITS = 50
 Exact = NDArray[np.object_]
@@ -61,6 +66,10 @@ class ExactFilter:
         a = self.transition
         self.mean = a @ self.mean
         self.covariance = a @ self.covariance @ a.T + self.process
+        self.take(measurement, granted)
+
+    def take(self, measurement: Any, granted: Any) -> None:
+        """Take the granted (sensors,) of the measurements (sensors, m)."""
         sensors, channels, _ = self.rows.shape
         taken = np.flatnonzero(np.repeat(granted, channels))
         if not taken.size:
@@ -106,3 +115,44 @@ def tobit(latent: Any, variance: Any, low: float, high: float) -> tuple[Any, Any
         share * mpf(limit) for share, limit in ((below, low), (above, high)) if abs(limit) < 1e300
     )
     return q, value, ratio
+
+
+def largest_errors(task: Task, steps: int, runs: int, *, censored: bool) -> tuple[float, float]:
+    """Of variances, over each state's own, and of means, in deviations, on the same deliveries.
+
+    ``censored`` says whether the task's filter is the Tobit Kalman filter. Variances that float64
+    does not hold in full, below 1e-290, are left out.
+    """
+    random, batch = np.random.default_rng(0), EpisodeBatch.seeded(task, runs, seed=0)
+    system = task.system
+    assert isinstance(system, CensoredSystem)
+    plant, sensors = system.plant, system.centre.sensors
+    filters = [
+        ExactFilter(
+            *(value[..., 0] for value in (plant.transition, plant.process_covariance)),
+            plant.initial_mean[:, 0],
+            plant.initial_covariance[..., 0],
+            sensors.measurement_matrix[..., 0],
+            sensors.noise_covariance[..., 0],
+            (sensors.threshold, sensors.upper) if censored else None,
+        )
+        for _ in range(runs)
+    ]
+    if "joint_measurement_covariance" in task.settings:  # of LinearFusion: its start is known
+        for run, one in enumerate(filters):
+            one.take(batch.state.held[..., run], np.ones(task.sensors, dtype=np.bool_))
+    variance_error = mean_error = mpf(0)
+    for step in range(min(steps, task.horizon)):
+        measurement = batch.state.measurement
+        outcome = batch.step(request(random, step, task.sensors, runs))
+        mean, covariance = (exact(value) for value in system.fused(batch.delivered))
+        for run, one in enumerate(filters):
+            one.step(measurement[..., run], outcome.granted[:, run])
+            variance = np.diagonal(one.covariance)
+            held = variance > mpf(10) ** -290
+            difference = np.abs(np.diagonal(covariance[..., run]) - variance)
+            variance_error = max([variance_error, *(difference / variance)[held]])
+            deviation = np.array([mp.sqrt(value) for value in variance], dtype=object)
+            difference = np.abs(mean[:, run] - one.mean)
+            mean_error = max([mean_error, *(difference[held] / deviation[held])])
+    return float(variance_error), float(mean_error)

@@ -137,7 +137,7 @@ class LinearPlant(Plant):
         return np.array([np.diagonal(moment) for moment in moments])
 
     def _moments(self, start: Array, horizon: int) -> Iterator[Array]:
-        """The matrix ``start`` (n, n) at t = 0 and what A X Aᵀ + W makes of it until the horizon."""
+        """X = ``start`` (n, n) at t = 0, then A X Aᵀ + W again and again until the horizon."""
         transition, process = self.transition[..., 0], self.process_covariance[..., 0]
         yield start
         for _ in range(horizon):
