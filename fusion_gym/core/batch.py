@@ -149,7 +149,7 @@ class EpisodeBatch(Runs):
         if self.state is None:
             raise ResetNeeded("call reset before the first step")
         outcome = self.deliver(requests)
-        if not math.isfinite(np.vdot(outcome.error, outcome.error) + outcome.reward.sum()):
+        if not math.isfinite(np.vdot(outcome.error, outcome.error) - outcome.reward.sum()):
             self._require_finite(outcome)
         if self.reference is not None:
             self._refer(self.reference)

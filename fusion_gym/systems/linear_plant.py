@@ -169,7 +169,10 @@ def variance_loss(plant: LinearPlant, horizon: int, rows: Array, noise: Array) -
         if time not in times:
             continue
         cross = rows @ prior
-        gain = np.linalg.solve(cross @ rows.swapaxes(-1, -2) + noise, cross).swapaxes(-1, -2)
+        try:
+            gain = np.linalg.solve(cross @ rows.swapaxes(-1, -2) + noise, cross).swapaxes(-1, -2)
+        except np.linalg.LinAlgError:  # the noise drowns
+            return np.inf
         keep = np.eye(plant.size) - gain @ rows
         left = ((keep @ prior) * keep).sum(-1) + ((gain @ noise) * gain).sum(-1)
         rounded = (np.abs(keep) @ np.sqrt(np.diagonal(prior))) ** 2

@@ -29,7 +29,6 @@ from fusion_gym.core.system import (
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio, variance_loss
 from fusion_gym.systems.tobit.centre import Centre, CentrePrediction
 
-_LARGEST_SIGNAL = 1e14  # over the noise, beyond which predictions of measurements are singular
 _RANGE = 5.0  # whitened quantities and logarithms of variance ratios are clipped here
 
 
@@ -330,8 +329,6 @@ class CensoredSystem(System[CensoredState]):
         matrix, noise = sensors.measurement_matrix[..., 0], sensors.noise_covariance[..., 0]
         moments = self.plant.second_moments(horizon, self.random_start)
         signal = largest_ratio(moments, matrix / sensors.deviation)
-        if not signal <= _LARGEST_SIGNAL:
-            return Rounding(signal, np.inf)
         own = sensors.variance * np.eye(sensors.size)  # of single packets, then of all together
         groups = ((matrix, own), (matrix.reshape(-1, size), noise))
         loss = max(variance_loss(self.plant, horizon, *group) for group in groups)
