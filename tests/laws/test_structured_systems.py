@@ -100,7 +100,7 @@ def test_a_step_names_run_step_and_quantity(family: str) -> None:
     nobody = np.zeros((task.sensors, 3), dtype=np.bool_)
     batch.step(nobody)
     batch.state.truth = batch.state.truth.copy()
-    batch.state.truth[0, 1] = np.inf
+    batch.state.truth[0, 1] = np.nan
     with pytest.raises(DivergenceError, match="run 1, step 2: the truth"):
         batch.step(nobody)
     batch.finished[1] = True
