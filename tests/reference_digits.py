@@ -150,9 +150,9 @@ def largest_errors(task: Task, steps: int, runs: int, *, censored: bool) -> tupl
             one.step(measurement[..., run], outcome.granted[:, run])
             variance = np.diagonal(one.covariance)
             held = variance > mpf(10) ** -290
-            difference = np.abs(np.diagonal(covariance[..., run]) - variance)
-            variance_error = max([variance_error, *(difference / variance)[held]])
+            variance = variance[held]
+            difference = np.abs(np.diagonal(covariance[..., run])[held] - variance)
+            variance_error = max([variance_error, *(difference / variance)])
             deviation = np.array([mp.sqrt(value) for value in variance], dtype=object)
-            difference = np.abs(mean[:, run] - one.mean)
-            mean_error = max([mean_error, *(difference[held] / deviation[held])])
+            mean_error = max([mean_error, *(np.abs(mean[:, run] - one.mean)[held] / deviation)])
     return float(variance_error), float(mean_error)
