@@ -144,12 +144,12 @@ class EpisodeBatch(Runs):
 
         Raises:
             ResetNeeded: before the first reset.
-            DivergenceError: an error or a reward that is not finite, of a run that goes on.
+            DivergenceError: an error that is not finite, of a run that goes on.
         """
         if self.state is None:
             raise ResetNeeded("call reset before the first step")
         outcome = self.deliver(requests)
-        if not math.isfinite(np.vdot(outcome.error, outcome.error) - outcome.reward.sum()):
+        if not math.isfinite(np.vdot(outcome.error, outcome.error)):
             self._require_finite(outcome)
         if self.reference is not None:
             self._refer(self.reference)
@@ -170,7 +170,7 @@ class EpisodeBatch(Runs):
             DivergenceError: an entry that is not a number, of a run that goes on.
         """
         observation = super().observe()
-        if not math.isfinite(np.add.reduce(observation, None)):
+        if not math.isfinite(np.vdot(observation, observation)):
             entry = np.isnan(observation).argmax(1)  # the first one of each run
             values = {f"observation {self.layout.names[k]!r}": observation.T[k] for k in set(entry)}
             require_finite(values, self.finished, self.steps)
@@ -205,7 +205,6 @@ class EpisodeBatch(Runs):
             "covariance": covariance,
             "mean": mean,
             "error": outcome.error,
-            "reward": outcome.reward,
         }
         require_finite(values, self.finished, self.steps)
 
