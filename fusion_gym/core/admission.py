@@ -1,5 +1,6 @@
 """Whether float64 can hold a system over an episode: by its moments before, its numbers in it."""
 
+from bisect import bisect_left
 from collections.abc import Mapping
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_gym.arrays import Array
-from fusion_gym.core.system import Rounding, System
+from fusion_gym.core.system import System
 from fusion_gym.errors import ConfigurationError, DivergenceError
 
 # By comparison with 50 digits: within them, means are right to 1e-9 of a deviation, variances too.
@@ -23,16 +24,17 @@ def admit(system: System[Any], horizon: int) -> Array:
             their noise that nothing is left of its digits; names the longest horizon that fits.
     """
     open_loop = system.open_loop(horizon)
-    error, rounding = float(open_loop.max()), system.rounding(horizon)
-    if _fits(error, rounding):
+    if _fits(system, horizon):
         return open_loop
+    signal, variance = system.rounding(horizon)
     why = (
         f"float64 holds a mean squared error without transmissions up to {_LARGEST_ERROR:g} (here "
-        f"{error:.3g}), measurements with a mean square up to {_LARGEST_SIGNAL:g} times their "
-        f"noise's variance (here {rounding.signal:.3g}), and variances of which a packet leaves "
-        f"one part in {_LARGEST_LOSS:g} (here in {rounding.variance:.3g})"
+        f"{open_loop.max():.3g}), measurements with a mean square up to {_LARGEST_SIGNAL:g} times "
+        f"their noise's variance (here {signal:.3g}), and variances of which a packet leaves one "
+        f"part in {_LARGEST_LOSS:g} (here in {variance:.3g})"
     )
-    longest = _longest(system, horizon)
+    # What is lost rises with the horizon.
+    longest = bisect_left(range(1, horizon), True, key=lambda steps: not _fits(system, steps))
     if not longest:
         raise ConfigurationError(f"these numbers together are not allowed: {why}")
     raise ConfigurationError(
@@ -41,25 +43,9 @@ def admit(system: System[Any], horizon: int) -> Array:
     )
 
 
-def _fits(error: float, rounding: Rounding) -> bool:
-    signal, variance = rounding
-    return error <= _LARGEST_ERROR and signal <= _LARGEST_SIGNAL and variance <= _LARGEST_LOSS
-
-
-def _longest(system: System[Any], refused: int) -> int:
-    """The longest horizon below a refused one that fits, 0 for none; what is lost rises with it."""
-
-    def fits(horizon: int) -> bool:
-        return _fits(float(system.open_loop(horizon).max()), system.rounding(horizon))
-
-    low, high = 0, 1
-    while high < refused and fits(high):
-        low, high = high, 2 * high
-    high = min(high, refused)
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if fits(middle) else (low, middle)
-    return low
+def _fits(system: System[Any], horizon: int) -> bool:
+    lost = np.array((system.open_loop(horizon).max(), *system.rounding(horizon)))
+    return bool((lost <= (_LARGEST_ERROR, _LARGEST_SIGNAL, _LARGEST_LOSS)).all())
 
 
 def require_finite(

@@ -150,7 +150,10 @@ class EpisodeBatch(Runs):
             raise ResetNeeded("call reset before the first step")
         outcome = self.deliver(requests)
         if not math.isfinite(np.vdot(outcome.error, outcome.error)):
-            self._require_finite(outcome)
+            mean, covariance = self.task.system.fused(self.delivered)
+            truth = self.task.system.truth(self.delivered)
+            values = {"truth (the plant has diverged)": truth, "covariance": covariance}
+            require_finite(values | {"mean": mean}, self.finished, self.steps)
         if self.reference is not None:
             self._refer(self.reference)
         self._cursor += 1
@@ -195,18 +198,6 @@ class EpisodeBatch(Runs):
         moving = dict(snapshot)
         self.memory = self.memory.with_states(moving.pop("memory_states"))
         vars(self).update(moving)
-
-    def _require_finite(self, outcome: Outcome) -> None:
-        """Name what is not finite in a run that has not ended before this step."""
-        system = self.task.system
-        mean, covariance = system.fused(self.delivered)
-        values = {
-            "truth (the plant has diverged)": system.truth(self.delivered),
-            "covariance": covariance,
-            "mean": mean,
-            "error": outcome.error,
-        }
-        require_finite(values, self.finished, self.steps)
 
     def _refer(self, system: System[Any]) -> None:
         """Let the reference take in every measurement of this step."""

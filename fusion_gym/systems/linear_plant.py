@@ -123,26 +123,25 @@ class LinearPlant(Plant):
 
     def open_loop(self, horizon: int) -> Array:
         """Mean over t = 1..horizon of the error variance without measurements, shape (n,)."""
-        return np.array([np.diagonal(p) for p in self.covariances(horizon)][1:]).mean(0)
-
-    def covariances(self, horizon: int) -> Iterator[Array]:
-        """Error covariances (n, n) without measurements at t = 0..horizon."""
-        return self._moments(self.initial_covariance[..., 0], horizon)
+        return np.array([np.diagonal(moment) for moment in self.moments(horizon)][1:]).mean(0)
 
     def second_moments(self, horizon: int, random_start: bool = False) -> Array:
         """Mean square (horizon + 1, n) of each state at t = 0..horizon."""
         mean, size = self.initial_mean[:, 0], self.size
         start = np.eye(size) * (mean @ mean) / size if random_start else np.outer(mean, mean)
-        moments = self._moments(start + self.initial_covariance[..., 0], horizon)
-        return np.array([np.diagonal(moment) for moment in moments])
+        return np.array([np.diagonal(moment) for moment in self.moments(horizon, start)])
 
-    def _moments(self, start: Array, horizon: int) -> Iterator[Array]:
-        """X = ``start`` (n, n) at t = 0, then A X Aᵀ + W again and again until the horizon."""
+    def moments(self, horizon: int, square: float | Array = 0.0) -> Iterator[Array]:
+        """Second moments (n, n) at t = 0..horizon, of the error without measurements.
+
+        With a ``square`` (n, n) of the initial mean, those of the state.
+        """
         transition, process = self.transition[..., 0], self.process_covariance[..., 0]
-        yield start
+        moment = self.initial_covariance[..., 0] + square
+        yield moment
         for _ in range(horizon):
-            start = transition @ start @ transition.T + process
-            yield start
+            moment = transition @ moment @ transition.T + process
+            yield moment
 
 
 def typical_magnitude(plant: LinearPlant, horizon: int, random_start: bool) -> Array:
@@ -165,7 +164,7 @@ def variance_loss(plant: LinearPlant, horizon: int, rows: Array, noise: Array) -
     """
     times = np.geomspace(1, horizon, 16).round()
     largest = 0.0
-    for time, prior in enumerate(plant.covariances(horizon)):
+    for time, prior in enumerate(plant.moments(horizon)):
         if time not in times:
             continue
         cross = rows @ prior

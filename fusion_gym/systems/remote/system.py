@@ -269,8 +269,8 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
         return self._variances(horizon).mean(0)
 
     def rounding(self, horizon: int) -> Rounding:
-        """See :class:`System`; the noise is the source's own, for its value is seen exactly."""
-        return Rounding(float((self._variances(horizon) / self.deviation**2).max()))
+        """See :class:`System`; the noise is a source's own, of which 1e-7 deviations may be lost."""
+        return Rounding(1e-6 * float((self._variances(horizon) / self.deviation**2).max()))
 
     def _variances(self, horizon: int) -> Array:
         """The sources' variances (horizon, n) at t = 1..horizon."""
