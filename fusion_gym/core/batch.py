@@ -151,9 +151,8 @@ class EpisodeBatch(Runs):
         outcome = self.deliver(requests)
         if not math.isfinite(np.vdot(outcome.error, outcome.error)):
             mean, covariance = self.task.system.fused(self.delivered)
-            truth = self.task.system.truth(self.delivered)
-            values = {"truth (the plant has diverged)": truth, "covariance": covariance}
-            require_finite(values | {"mean": mean}, self.finished, self.steps)
+            values = {"covariance": covariance, "mean": mean, "truth": outcome.error}
+            require_finite(values, self.finished, self.steps)
         if self.reference is not None:
             self._refer(self.reference)
         self._cursor += 1

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import FunctionType
-from typing import Any, ClassVar, Generic, Literal, NamedTuple, Self, TypeVar, cast, get_args
+from typing import Any, ClassVar, Generic, Literal, Self, TypeVar, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -224,17 +224,6 @@ def numbered(count: int) -> tuple[str, ...]:
     return tuple(str(place) for place in range(count))
 
 
-class Rounding(NamedTuple):
-    """What float64 may lose over a horizon, in units of its own precision.
-
-    ``signal`` is the largest mean square of a measurement over its noise's variance, ``variance``
-    the largest ratio of what a packet after silence takes off a state's variance to what it leaves.
-    """
-
-    signal: float = 0.0
-    variance: float = 0.0
-
-
 class SignalError(KeyError):
     """A signal that there is not, or that is withheld; a ``KeyError`` that shows plain text."""
 
@@ -397,9 +386,13 @@ class System(ABC, Generic[StateT]):
     def open_loop(self, horizon: int) -> Array:
         """Return the mean error variance (n,) over t = 1..horizon without any delivery."""
 
-    def rounding(self, horizon: int) -> Rounding:
-        """Return what float64 may lose at t = 0..horizon; nothing where that is not known."""
-        return Rounding()
+    def rounding(self, horizon: int) -> tuple[float, float]:
+        """Return what float64 may lose at t = 0..horizon, in units of its precision; 0 if unknown.
+
+        The largest mean square of a measurement over its noise's variance, and the largest ratio of
+        a predicted variance to what a packet after silence leaves of it.
+        """
+        return 0.0, 0.0
 
     def truth(self, state: StateT) -> Array:
         """Return the plant's state (n, N): for the reward and for metrics, never for a policy."""

@@ -132,9 +132,9 @@ class LinearPlant(Plant):
         return np.array([np.diagonal(moment) for moment in self.moments(horizon, start)])
 
     def moments(self, horizon: int, square: float | Array = 0.0) -> Iterator[Array]:
-        """Second moments (n, n) at t = 0..horizon, of the error without measurements.
+        """Covariances (n, n) of the error without measurements at t = 0..horizon.
 
-        With a ``square`` (n, n) of the initial mean, those of the state.
+        With the ``square`` (n, n) of the initial mean, the state's second moments.
         """
         transition, process = self.transition[..., 0], self.process_covariance[..., 0]
         moment = self.initial_covariance[..., 0] + square
@@ -156,7 +156,7 @@ def largest_ratio(moments: Array, rows: Array) -> float:
 
 
 def variance_loss(plant: LinearPlant, horizon: int, rows: Array, noise: Array) -> float:
-    """Largest ratio by which the rounding of predicted variances counts in what a packet leaves.
+    """Largest ratio of predicted variances, and their rounding, to those that a packet leaves.
 
     After silence until one of sixteen times, of packets with ``rows`` C (..., m, n) and ``noise``
     R (..., m, m). With G = I - K C and P the prediction, state i has (Σ |G_ij| √P_jj)² over the

@@ -19,7 +19,6 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.system import (
     Block,
-    Rounding,
     SignalArray,
     System,
     age_block,
@@ -326,12 +325,11 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
         """Mean error variance (n,) over t = 1..horizon of a centre that only predicts (bound)."""
         return self.plant.open_loop(horizon)
 
-    def rounding(self, horizon: int) -> Rounding:
+    def rounding(self, horizon: int) -> tuple[float, float]:
         """See :class:`System`."""
         matrix, deviation = self.filter.sensors.measurement_matrix, self.filter.sensors.deviation
-        return Rounding(
-            largest_ratio(self.plant.second_moments(horizon), matrix[..., 0] / deviation)
-        )
+        moments = self.plant.second_moments(horizon)
+        return largest_ratio(moments, matrix[..., 0] / deviation), 0.0
 
     def _scale(self, noise: Array) -> Array:
         """Noise scales (N,) from standard normals (N,)."""

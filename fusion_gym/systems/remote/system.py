@@ -15,7 +15,6 @@ from fusion_gym.core.channel import STATES, Channel
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_motion, true_noise
 from fusion_gym.core.system import (
     Block,
-    Rounding,
     Signal,
     SignalArray,
     System,
@@ -266,19 +265,16 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
 
     def open_loop(self, horizon: int) -> Array:
         """Mean error variance (n,) over t = 1..horizon of a centre that never receives."""
-        return self._variances(horizon).mean(0)
-
-    def rounding(self, horizon: int) -> Rounding:
-        """See :class:`System`; the noise is a source's own, of which 1e-7 deviations may be lost."""
-        return Rounding(1e-6 * float((self._variances(horizon) / self.deviation**2).max()))
-
-    def _variances(self, horizon: int) -> Array:
-        """The sources' variances (horizon, n) at t = 1..horizon."""
-        variance, result = self.initial_deviation**2, []
+        variance, total = self.initial_deviation**2, np.zeros(self.sensor_count)
         for _ in range(horizon):
             variance = self.coefficient**2 * variance + self.deviation**2
-            result.append(variance)
-        return np.array(result)
+            total = total + variance
+        return total / horizon
+
+    def rounding(self, horizon: int) -> tuple[float, float]:
+        """See :class:`System`; of a source's own noise 1e-6 deviations may be lost."""
+        largest = horizon * self.open_loop(horizon) / self.deviation**2
+        return 1e-8 * float(largest.max()), 0.0
 
     def _coming(
         self, channel: NDArray[np.int64], noise: Array

@@ -17,7 +17,6 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.system import (
     Block,
-    Rounding,
     Signal,
     SignalArray,
     System,
@@ -323,7 +322,7 @@ class CensoredSystem(System[CensoredState]):
         """Mean error variance (n,) over t = 1..horizon of a centre that only predicts."""
         return self.plant.open_loop(horizon)
 
-    def rounding(self, horizon: int) -> Rounding:
+    def rounding(self, horizon: int) -> tuple[float, float]:
         """See :class:`System`."""
         sensors, size = self.centre.sensors, self.plant.size
         matrix, noise = sensors.measurement_matrix[..., 0], sensors.noise_covariance[..., 0]
@@ -332,7 +331,7 @@ class CensoredSystem(System[CensoredState]):
         own = sensors.variance * np.eye(sensors.size)  # of single packets, then of all together
         groups = ((matrix, own), (matrix.reshape(-1, size), noise))
         loss = max(variance_loss(self.plant, horizon, *group) for group in groups)
-        return Rounding(signal, loss)
+        return signal, loss
 
 
 def _whitened(state: CensoredState) -> Array:

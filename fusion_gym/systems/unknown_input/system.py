@@ -18,7 +18,6 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature, true_noise
 from fusion_gym.core.system import (
     Block,
-    Rounding,
     SignalArray,
     System,
     age_block,
@@ -304,12 +303,12 @@ class UnknownInputSystem(System[UnknownInputState]):
         """Mean squared error (n + q,) over k = 1..horizon of a centre that takes d for zero."""
         return self.plant.open_loop(self.signal, horizon)
 
-    def rounding(self, horizon: int) -> Rounding:
+    def rounding(self, horizon: int) -> tuple[float, float]:
         """See :class:`System`."""
         plant, sensors = self.plant, self.nodes.sensors
         moments = plant.second_moments(self.signal, horizon, plant.initial_mean[:, 0])
         deviation = np.sqrt(linalg.diagonal(sensors.covariance))
-        return Rounding(largest_ratio(moments[:, : plant.size], sensors.matrix[..., 0] / deviation))
+        return largest_ratio(moments[:, : plant.size], sensors.matrix[..., 0] / deviation), 0.0
 
     def _deviation(self, state: UnknownInputState) -> Array:
         """The innovation's deviation (l, m, N or 1)."""
