@@ -35,6 +35,10 @@ class UnexpectedArgumentError(ConfigurationError, TypeError):
         return cls(f"{owner} got an unexpected keyword argument {name!r}: {reason}")
 
 
+class DivergenceError(FloatingPointError):
+    """A number of a run that is not finite; the message names run, step and quantity."""
+
+
 def refusal(field: str, value: Any, allowed: str, where: str = "") -> ConfigurationError:
     """The error of a field whose value is not what is allowed; ``where``, if not everywhere."""
     refused = f"{field} = {display(value)} is not allowed {where}".rstrip()

@@ -63,7 +63,7 @@ BAD_OPTIONS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
     ({"measurement_variance": 1e308}, ("1e+308", "at most 1e+15")),
     ({"initial_covariance": np.diag([1e-32, 1e-32])}, ("1e-32", "positive definite")),
     ({"horizon": 10**9}, ("1000000000", "<= 50000")),
-    ({"transition": ((1, 2), (3, 4))}, ("((1, 2), (3, 4))", "horizon = 100", "below 1e+32")),
+    ({"transition": ((1, 2), (3, 4))}, ("((1, 2), (3, 4))", "horizon = 100", "up to 1e+32")),
     (
         {"error_weight": 1e15, "state_weights": (1e15, 1e15), "process_variance": 1e5},
         ("1e+15", "state_weights = ", "1e+32"),

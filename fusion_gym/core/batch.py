@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array, merge_runs
+from fusion_gym.core.admission import require_finite
 from fusion_gym.core.beliefs import Owner, arrived
 from fusion_gym.core.memory import Memory
 from fusion_gym.core.noise import NoiseSource, PhiloxNoise
@@ -147,10 +149,15 @@ class EpisodeBatch(Runs):
 
         Raises:
             ResetNeeded: before the first reset.
+            DivergenceError: an error that is not finite, of a run that goes on.
         """
         if self.state is None:
             raise ResetNeeded("call reset before the first step")
         outcome = self.deliver(requests)
+        if not math.isfinite(np.vdot(outcome.error, outcome.error)):
+            mean, covariance = self.task.system.fused(self.delivered)
+            values = {"covariance": covariance, "mean": mean, "truth": outcome.error}
+            require_finite(values, self.finished, self.steps)
         if self.reference is not None:
             self._refer(self.reference)
         self._row += 1
@@ -162,6 +169,19 @@ class EpisodeBatch(Runs):
             self._beside = self.reference.sense(self._beside, self.noise())
         self.finished = outcome.ended.copy()
         return outcome
+
+    def observe(self) -> NDArray[np.float32]:
+        """Observations (N, entries) of all runs, a fresh array.
+
+        Raises:
+            DivergenceError: an entry that is not a number, of a run that goes on.
+        """
+        observation = super().observe()
+        if not math.isfinite(np.vdot(observation, observation)):
+            entry = np.isnan(observation).argmax(1)  # the first one of each run
+            values = {f"observation {self.layout.names[k]!r}": observation.T[k] for k in set(entry)}
+            require_finite(values, self.finished, self.steps)
+        return observation
 
     def normals(self) -> Array:
         """The normals (channels, N) of the last sensing, a view that later steps overwrite."""

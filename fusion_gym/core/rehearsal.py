@@ -4,7 +4,7 @@ import numpy as np
 
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
-from fusion_gym.validation import ConfigurationError
+from fusion_gym.errors import ConfigurationError, DivergenceError
 
 _STEPS = 8
 
@@ -15,18 +15,16 @@ def rehearse(task: Task) -> None:
     Raises:
         ConfigurationError: an observation, estimate or reward that is not finite.
     """
-    batch = EpisodeBatch.seeded(task, 3, seed=0)
     sensors = np.arange(task.sensors)
-    finite = bool(np.isfinite(batch.observe()).all())
-    step = 0
-    while finite and step < min(_STEPS, task.horizon):
-        requests = np.stack([sensors < 0, sensors >= 0, (sensors + step) % 2 == 0], axis=-1)
-        outcome = batch.step(requests)
-        observation = (outcome.reward, outcome.squared_error, batch.observe())
-        finite = all(bool(np.isfinite(entry).all()) for entry in observation)
-        step += 1
-    if not finite:
+    try:
+        batch = EpisodeBatch.seeded(task, 3, seed=0)
+        for step in range(min(_STEPS, task.horizon)):
+            batch.observe()
+            requests = np.stack([sensors < 0, sensors >= 0, (sensors + step) % 2 == 0], axis=-1)
+            batch.step(requests)
+        batch.observe()
+    except DivergenceError as error:
         raise ConfigurationError(
-            f"these numbers together are not allowed: after {step} steps what is observed or "
-            "rewarded is not finite, for they lie too far apart or make a covariance singular"
-        )
+            f"these numbers together are not allowed: {error}, for they lie too far apart or make "
+            "a covariance singular"
+        ) from None

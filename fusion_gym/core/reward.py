@@ -22,28 +22,13 @@ TRAINING_ERRORS = ("squared", "excess", "mismatch")
 _LARGEST = 1e32  # of squares on average: rewards are also handed on as float32
 
 
-def bounded_open_loop(open_loop: Array, horizon: int) -> Array:
-    """The error variances (n,) of a centre that never receives, if they can be worked with.
-
-    Raises:
-        ConfigurationError: they are not finite or beyond all bounds over the horizon.
-    """
-    if not np.all(open_loop <= _LARGEST):
-        raise ConfigurationError(
-            f"horizon = {horizon} is not allowed with this plant: without transmissions the "
-            f"squared error must stay below {_LARGEST:g} on average, and is "
-            f"{float(open_loop.max()):.3g}"
-        )
-    return open_loop
-
-
 def equal_weights(open_loop: Array) -> Array:
     """Weights (n,) by which every state counts alike and open loop (n,) costs one.
 
     Raises:
         ConfigurationError: a state that is known without any transmission.
     """
-    if not np.all(open_loop > 0.0):
+    if np.any(open_loop <= 0.0):
         raise _at_rest(open_loop)
     return 1.0 / (len(open_loop) * open_loop)
 

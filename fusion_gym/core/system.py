@@ -211,10 +211,12 @@ def sensed(prediction: PredictionT | None) -> PredictionT:
 def log_deviation(covariance: Array, reference: Array) -> Array:
     """Return ln √(variance/reference) (..., n, N) of covariances (..., n, n, N).
 
-    ``reference`` (n,) are variances. It is -inf where the variance is zero.
+    ``reference`` (n,) are variances, zero of a state that is always known. Minus infinity for a
+    variance of zero.
     """
+    possible = np.where(reference > 0.0, reference, np.inf)
     with np.errstate(divide="ignore"):
-        return 0.5 * np.log(linalg.diagonal(covariance) / reference[:, None])
+        return 0.5 * np.log(linalg.diagonal(covariance) / possible[:, None])
 
 
 def numbered(count: int) -> tuple[str, ...]:
@@ -383,6 +385,14 @@ class System(ABC, Generic[StateT]):
     @abstractmethod
     def open_loop(self, horizon: int) -> Array:
         """Return the mean error variance (n,) over t = 1..horizon without any delivery."""
+
+    def rounding(self, horizon: int) -> tuple[float, float]:
+        """Return what float64 may lose at t = 0..horizon, in units of its precision; 0 if unknown.
+
+        The largest mean square of a measurement over its noise's variance, and the largest ratio of
+        a predicted variance to what a packet after silence leaves of it.
+        """
+        return 0.0, 0.0
 
     def truth(self, state: StateT) -> Array:
         """Return the plant's state (n, N): for the reward and for metrics, never for a policy."""

@@ -12,10 +12,11 @@ import numpy as np
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.access import ACCESS_RULES
+from fusion_gym.core.admission import admit
 from fusion_gym.core.communication import communication
 from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import Action, CommonOptions, Scenario, plain_options
-from fusion_gym.core.reward import Price, Reward, bounded_open_loop
+from fusion_gym.core.reward import Price, Reward
 from fusion_gym.core.system import Knowledge, System, covers, least_covering
 from fusion_gym.core.token_bucket import TokenBucket
 
@@ -115,7 +116,7 @@ class Task:
             options.error_weight,
             Price.create(options.cost_weight, options.price_range),
             scenario.state_weights if options.state_weights is None else options.state_weights,
-            bounded_open_loop(system.open_loop(horizon), horizon),
+            admit(system, horizon),
         )
         how = communication(scenario)
         return cls(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -118,23 +119,58 @@ class LinearPlant(Plant):
 
     def open_loop(self, horizon: int) -> Array:
         """Mean over t = 1..horizon of the error variance without measurements, shape (n,)."""
-        matrix, process = self.transition[..., 0], self.process_covariance[..., 0]
-        current = self.initial_covariance[..., 0]
-        total = np.zeros(self.size)
+        return np.array([np.diagonal(moment) for moment in self.moments(horizon)][1:]).mean(0)
+
+    def second_moments(self, horizon: int, random_start: bool = False) -> Array:
+        """Mean square (horizon + 1, n) of each state at t = 0..horizon."""
+        mean, size = self.initial_mean[:, 0], self.size
+        start = np.eye(size) * (mean @ mean) / size if random_start else np.outer(mean, mean)
+        return np.array([np.diagonal(moment) for moment in self.moments(horizon, start)])
+
+    def moments(self, horizon: int, square: float | Array = 0.0) -> Iterator[Array]:
+        """Covariances (n, n) of the error without measurements at t = 0..horizon.
+
+        With the ``square`` (n, n) of the initial mean, the state's second moments.
+        """
+        transition, process = self.transition[..., 0], self.process_covariance[..., 0]
+        moment = self.initial_covariance[..., 0] + square
+        yield moment
         for _ in range(horizon):
-            current = matrix @ current @ matrix.T + process
-            total += np.diagonal(current)
-        return total / horizon
+            moment = transition @ moment @ transition.T + process
+            yield moment
 
 
 def typical_magnitude(plant: LinearPlant, horizon: int, random_start: bool) -> Array:
     """Root of the mean second moment of each state over t = 0..horizon, shape (n,)."""
-    transition, process = plant.transition[..., 0], plant.process_covariance[..., 0]
-    mean, size = plant.initial_mean[:, 0], plant.size
-    moment = np.eye(size) * (mean @ mean) / size if random_start else np.outer(mean, mean)
-    moment = moment + plant.initial_covariance[..., 0]
-    total = np.diagonal(moment).copy()
-    for _ in range(horizon):
-        moment = transition @ moment @ transition.T + process
-        total += np.diagonal(moment)
-    return np.sqrt(total / (horizon + 1))
+    return np.sqrt(plant.second_moments(horizon, random_start).mean(0))
+
+
+def largest_ratio(moments: Array, rows: Array) -> float:
+    """Bound of the mean square of any of the ``rows`` (..., n) of states of ``moments`` (T, n)."""
+    finest = np.abs(rows).reshape(-1, rows.shape[-1]).max(0)
+    return float((np.sqrt(moments) @ finest).max() ** 2)
+
+
+def variance_loss(plant: LinearPlant, horizon: int, rows: Array, noise: Array) -> float:
+    """Largest ratio of predicted variances, and their rounding, to those that a packet leaves.
+
+    After silence until one of sixteen times, of packets with ``rows`` C (..., m, n) and ``noise``
+    R (..., m, m). With G = I - K C and P the prediction, state i has (Σ |G_ij| √P_jj)² over the
+    variance that is left.
+    """
+    times = np.geomspace(1, horizon, 16).round()
+    largest = 0.0
+    for time, prior in enumerate(plant.moments(horizon)):
+        if time not in times:
+            continue
+        cross = rows @ prior
+        try:
+            gain = np.linalg.solve(cross @ rows.swapaxes(-1, -2) + noise, cross).swapaxes(-1, -2)
+        except np.linalg.LinAlgError:  # the noise drowns
+            return np.inf
+        keep = np.eye(plant.size) - gain @ rows
+        left = ((keep @ prior) * keep).sum(-1) + ((gain @ noise) * gain).sum(-1)
+        rounded = (np.abs(keep) @ np.sqrt(np.diagonal(prior))) ** 2
+        ratio = np.where(rounded > 0.0, rounded / np.maximum(left, 0.0), 0.0)
+        largest = float(np.maximum(largest, ratio.max()))
+    return largest

@@ -33,7 +33,7 @@ from fusion_gym.systems.correlated.filters import (
     RobustKalmanFilter,
     RobustOutcomes,
 )
-from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio
 from fusion_gym.validation import refusal
 
 _RANGE = 5.0  # whitened quantities and logarithms of deviation ratios are clipped here
@@ -324,6 +324,12 @@ class CorrelatedTrackingSystem(System[CorrelatedTrackingState]):
     def open_loop(self, horizon: int) -> Array:
         """Mean error variance (n,) over t = 1..horizon of a centre that only predicts (bound)."""
         return self.plant.open_loop(horizon)
+
+    def rounding(self, horizon: int) -> tuple[float, float]:
+        """See :class:`System`."""
+        matrix, deviation = self.filter.sensors.measurement_matrix, self.filter.sensors.deviation
+        moments = self.plant.second_moments(horizon)
+        return largest_ratio(moments, matrix[..., 0] / deviation), 0.0
 
     def _scale(self, noise: Array) -> Array:
         """Noise scales (N,) from standard normals (N,)."""

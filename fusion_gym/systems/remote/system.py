@@ -271,6 +271,11 @@ class RemoteEstimationSystem(System[RemoteEstimationState]):
             total = total + variance
         return total / horizon
 
+    def rounding(self, horizon: int) -> tuple[float, float]:
+        """See :class:`System`; of a source's own noise 1e-6 deviations may be lost."""
+        largest = horizon * self.open_loop(horizon) / self.deviation**2
+        return 1e-8 * float(largest.max()), 0.0
+
     def _coming(
         self, channel: NDArray[np.int64], noise: Array
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

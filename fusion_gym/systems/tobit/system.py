@@ -25,7 +25,7 @@ from fusion_gym.core.system import (
     numbered,
     sensed,
 )
-from fusion_gym.systems.linear_plant import LinearPlant
+from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio, variance_loss
 from fusion_gym.systems.tobit.centre import Centre, CentrePrediction
 
 _RANGE = 5.0  # whitened quantities and logarithms of variance ratios are clipped here
@@ -321,6 +321,17 @@ class CensoredSystem(System[CensoredState]):
     def open_loop(self, horizon: int) -> Array:
         """Mean error variance (n,) over t = 1..horizon of a centre that only predicts."""
         return self.plant.open_loop(horizon)
+
+    def rounding(self, horizon: int) -> tuple[float, float]:
+        """See :class:`System`."""
+        sensors, size = self.centre.sensors, self.plant.size
+        matrix, noise = sensors.measurement_matrix[..., 0], sensors.noise_covariance[..., 0]
+        moments = self.plant.second_moments(horizon, self.random_start)
+        signal = largest_ratio(moments, matrix / sensors.deviation)
+        own = sensors.variance * np.eye(sensors.size)  # of single packets, then of all together
+        groups = ((matrix, own), (matrix.reshape(-1, size), noise))
+        loss = max(variance_loss(self.plant, horizon, *group) for group in groups)
+        return signal, loss
 
 
 def _whitened(state: CensoredState) -> Array:

@@ -118,14 +118,16 @@ class UnknownInputPlant(Plant):
         It predicts the state from the initial mean; the last q entries are the input's own mean
         square. Closed form from the signal's first two moments.
         """
-        return self._second_moments(signal, horizon, np.zeros(self.size))
+        return self.second_moments(signal, horizon, np.zeros(self.size)).mean(0)
 
     def magnitude(self, signal: InputSignal, horizon: int) -> Array:
         """Root mean square (n + q,) of state and input over k = 1..horizon."""
-        return np.sqrt(self._second_moments(signal, horizon, self.initial_mean[:, 0]))
+        return np.sqrt(self.second_moments(signal, horizon, self.initial_mean[:, 0]).mean(0))
 
-    def _second_moments(self, signal: InputSignal, horizon: int, offset: Array) -> Array:
-        """E x xᵀ and E d dᵀ, diagonals averaged; the state's mean starts at ``offset`` (n,).
+    def second_moments(self, signal: InputSignal, horizon: int, offset: Array) -> Array:
+        """Mean squares (horizon, n + q) of state and input at k = 1..horizon.
+
+        The state's mean starts at ``offset`` (n,).
 
         The error's random part has the covariance C' = 𝒜 C 𝒜ᵀ + 𝒜 X ℬᵀ + (𝒜 X ℬᵀ)ᵀ +
         ℬ R(0) ℬᵀ + 𝒲 with X the covariance of the error and the coming input; in it
@@ -138,7 +140,7 @@ class UnknownInputPlant(Plant):
         else:
             spread = np.diag(self.initial_half_width[:, 0] ** 2 / 3.0)
         mean, cross, reach = offset, np.zeros((self.size, self.inputs)), b
-        total, inputs = np.zeros(self.size), np.zeros(self.inputs)
+        result = []
         for k in range(horizon):
             crossed = a @ cross @ b.T
             spread = a @ spread @ a.T + crossed + crossed.T + b @ lags[0] @ b.T
@@ -146,6 +148,6 @@ class UnknownInputPlant(Plant):
             mean = a @ mean + b @ means[k]
             cross = cross + reach @ lags[k + 1]
             reach = a @ reach
-            total += np.diagonal(spread) + mean**2
-            inputs += np.diagonal(lags[0]) + means[k] ** 2
-        return np.concatenate((total, inputs)) / horizon
+            inputs = np.diagonal(lags[0]) + means[k] ** 2
+            result.append(np.concatenate((np.diagonal(spread) + mean**2, inputs)))
+        return np.array(result)

@@ -26,6 +26,7 @@ from fusion_gym.core.system import (
     numbered,
     sensed,
 )
+from fusion_gym.systems.linear_plant import largest_ratio
 from fusion_gym.systems.unknown_input.nodes import Estimates, NodePrediction, Nodes, RunNodes
 from fusion_gym.systems.unknown_input.plant import UnknownInputPlant
 from fusion_gym.systems.unknown_input.signals import InputSignal
@@ -301,6 +302,13 @@ class UnknownInputSystem(System[UnknownInputState]):
     def open_loop(self, horizon: int) -> Array:
         """Mean squared error (n + q,) over k = 1..horizon of a centre that takes d for zero."""
         return self.plant.open_loop(self.signal, horizon)
+
+    def rounding(self, horizon: int) -> tuple[float, float]:
+        """See :class:`System`."""
+        plant, sensors = self.plant, self.nodes.sensors
+        moments = plant.second_moments(self.signal, horizon, plant.initial_mean[:, 0])
+        deviation = np.sqrt(linalg.diagonal(sensors.covariance))
+        return largest_ratio(moments[:, : plant.size], sensors.matrix[..., 0] / deviation), 0.0
 
     def _deviation(self, state: UnknownInputState) -> Array:
         """The innovation's deviation (l, m, N or 1)."""
