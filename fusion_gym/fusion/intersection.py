@@ -38,7 +38,9 @@ class DiagonalPair(NamedTuple):
     power: Array
 
 
-def diagonalise(covariance_a: Array, covariance_b: Array) -> DiagonalPair:
+def diagonalise(
+    covariance_a: Array, covariance_b: Array, metric: Array | None = None
+) -> DiagonalPair:
     """Both covariances (n, n, N) in the coordinates in which they are diagonal.
 
     With P_A = C Cᵀ and the eigenvectors U of C⁻¹ P_B C⁻ᵀ, V is C U. Plane rotations make the rows
@@ -63,11 +65,12 @@ def diagonalise(covariance_a: Array, covariance_b: Array) -> DiagonalPair:
         if not rotated:
             break
     whitened, basis = rows[:, :size], rows[:, 2 * size :]
+    weighed = basis if metric is None else linalg.matmul(basis, linalg.transpose(metric))
     return DiagonalPair(
         basis,
         rows[:, size : 2 * size],
         linalg.dot(whitened, whitened),
-        linalg.dot(basis, basis),
+        linalg.dot(weighed, weighed),
     )
 
 
@@ -135,7 +138,11 @@ def _join(
 
 
 def covariance_intersection(
-    mean_a: Array, covariance_a: Array, mean_b: Array, covariance_b: Array
+    mean_a: Array,
+    covariance_a: Array,
+    mean_b: Array,
+    covariance_b: Array,
+    basis: Array | None = None,
 ) -> Fused:
     """Covariance intersection of two estimates, of the smallest trace.
 
@@ -147,6 +154,7 @@ def covariance_intersection(
         mean_a, mean_b: (n, N).
         covariance_a, covariance_b: (n, n, N), symmetric positive definite; only the lower
             triangles are read. A batch axis of length 1 broadcasts.
+        basis: as in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
 
     Returns:
         The fused estimate with the gains K, L and the weights ω, 1 - ω. Its trace is within a
@@ -159,19 +167,23 @@ def covariance_intersection(
     Source: adaptive_innovation, equations (37), (38) and (42); S. J. Julier and J. K. Uhlmann, "A
     non-divergent estimation algorithm in the presence of unknown correlations", 1997.
     """
-    pair, weight, total = _intersect(covariance_a, covariance_b)
+    pair, weight, total = _intersect(covariance_a, covariance_b, basis)
     return _join(mean_a, mean_b, pair, pair.ratio / total, (1.0 - weight) / total, weight)
 
 
-def _intersect(covariance_a: Array, covariance_b: Array) -> tuple[DiagonalPair, Array, Array]:
+def _intersect(
+    covariance_a: Array, covariance_b: Array, basis: Array | None
+) -> tuple[DiagonalPair, Array, Array]:
     """The pair, the weight ω of the smallest trace, and ω d + 1 - ω."""
-    pair = diagonalise(covariance_a, covariance_b)
+    pair = diagonalise(covariance_a, covariance_b, basis)
     d = pair.ratio
     weight = best_weight(pair.power * d, np.ones_like(d), d)
     return pair, weight, weight * d + (1.0 - weight)
 
 
-def best_of_pair(covariances: Array, selected: NDArray[np.bool_]) -> tuple[Array, Array]:
+def best_of_pair(
+    covariances: Array, selected: NDArray[np.bool_], basis: Array | None
+) -> tuple[Array, Array]:
     """Covariance intersection where two of l estimates are ``selected`` (l, N).
 
     Weights (l, N) and covariance (n, n, N) of the smallest trace, from ``covariances``
@@ -182,7 +194,7 @@ def best_of_pair(covariances: Array, selected: NDArray[np.bool_]) -> tuple[Array
     a, b = (
         np.take_along_axis(covariances, which[None, None, None], 0)[0] for which in (first, second)
     )
-    pair, share, total = _intersect(a, b)
+    pair, share, total = _intersect(a, b, basis)
     scaled = pair.basis * np.sqrt(pair.ratio / total)[:, None]
     weights = np.zeros(selected.shape)
     inside = np.arange(selected.shape[-1])
@@ -191,7 +203,11 @@ def best_of_pair(covariances: Array, selected: NDArray[np.bool_]) -> tuple[Array
 
 
 def inverse_covariance_intersection(
-    mean_a: Array, covariance_a: Array, mean_b: Array, covariance_b: Array
+    mean_a: Array,
+    covariance_a: Array,
+    mean_b: Array,
+    covariance_b: Array,
+    basis: Array | None = None,
 ) -> Fused:
     """Inverse covariance intersection of two estimates, of the smallest trace.
 
@@ -213,6 +229,7 @@ def inverse_covariance_intersection(
         mean_a, mean_b: (n, N).
         covariance_a, covariance_b: (n, n, N), symmetric positive definite; only the lower
             triangles are read. A batch axis of length 1 broadcasts.
+        basis: as in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
 
     Returns:
         The fused estimate with the gains K, L and the weights ω, 1 - ω. Its trace is within a
@@ -225,7 +242,7 @@ def inverse_covariance_intersection(
     of (49) and (50); B. Noack, J. Sijs, M. Reinhardt and U. D. Hanebeck, "Decentralized data
     fusion with inverse covariance intersection", Automatica 79, 2017.
     """
-    pair = diagonalise(covariance_a, covariance_b)
+    pair = diagonalise(covariance_a, covariance_b, basis)
     d = pair.ratio
     square = d * d
     weight = best_weight(pair.power * square / (1.0 + d), square, np.ones_like(d))
@@ -278,14 +295,19 @@ class SequentialIntersection(FusionRule):
     fusion with inverse covariance intersection", Automatica 79, 2017.
     """
 
-    join: Callable[[Array, Array, Array, Array], Fused] = covariance_intersection
+    join: Callable[[Array, Array, Array, Array, Array | None], Fused] = covariance_intersection
     order: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         self._check_order()
 
     def fuse(
-        self, means: Array, covariance: Array, active: NDArray[np.bool_] | None = None
+        self,
+        means: Array,
+        covariance: Array,
+        active: NDArray[np.bool_] | None = None,
+        *,
+        basis: Array | None = None,
     ) -> Fused:
         """See :class:`~fusion_gym.fusion.rules.FusionRule`."""
         own = own_covariances(covariance)
@@ -310,6 +332,7 @@ class SequentialIntersection(FusionRule):
                     _lanes(fused, lanes),
                     _lanes(means[estimate], lanes),
                     _lanes(own[estimate], lanes),
+                    None if basis is None else _lanes(basis, lanes),
                 )
                 mean[:, lanes], fused[..., lanes] = pair.mean, pair.covariance
             steps.append(_Step(estimate, first, lanes, pair))

@@ -50,7 +50,12 @@ class FusionRule(ABC):
 
     @abstractmethod
     def fuse(
-        self, means: Array, covariance: Array, active: NDArray[np.bool_] | None = None
+        self,
+        means: Array,
+        covariance: Array,
+        active: NDArray[np.bool_] | None = None,
+        *,
+        basis: Array | None = None,
     ) -> Fused:
         """The active estimates joined.
 
@@ -59,9 +64,13 @@ class FusionRule(ABC):
             covariance: the estimates' own, (l, n, n, N), or the joint one of their errors,
                 (l, l, n, n, N), of which most rules read the diagonal blocks alone.
             active: (l, N), the estimates that take part; all by default. Others are not read.
+            basis: G (n, n, N) where the estimates, and the result, are of z with x = G z; weights
+                then minimise the trace of G P Gᵀ. The identity by default.
         """
 
-    def fuse_single(self, silent: Array, delivered: Array) -> tuple[Array, Array]:
+    def fuse_single(
+        self, silent: Array, delivered: Array, basis: Array | None = None
+    ) -> tuple[Array, Array]:
         """Fused covariances if nobody delivers (n, n, N), and (l, n, n, N) if each alone does.
 
         From the nodes' own covariances without and with a delivery, both (l, n, n, N).
@@ -71,8 +80,8 @@ class FusionRule(ABC):
         for node in range(len(silent)):
             covariances = silent.copy()
             covariances[node] = delivered[node]
-            single[node] = self.fuse(nowhere, covariances).covariance
-        return self.fuse(nowhere, silent).covariance, single
+            single[node] = self.fuse(nowhere, covariances, basis=basis).covariance
+        return self.fuse(nowhere, silent, basis=basis).covariance, single
 
 
 def own_covariances(covariance: Array) -> Array:
@@ -121,7 +130,12 @@ class InformationFusion(FusionRule):
     """
 
     def fuse(
-        self, means: Array, covariance: Array, active: NDArray[np.bool_] | None = None
+        self,
+        means: Array,
+        covariance: Array,
+        active: NDArray[np.bool_] | None = None,
+        *,
+        basis: Array | None = None,
     ) -> Fused:
         """See :class:`FusionRule`; a lane with a covariance that is not definite is NaN."""
         information = linalg.inverse(own_covariances(covariance))
@@ -149,7 +163,9 @@ class InformationFusion(FusionRule):
         vector = _replaced_in_turn(linalg.matvec(information, means), linalg.matvec(gained, others))
         return linalg.matvec(fused, vector), fused
 
-    def fuse_single(self, silent: Array, delivered: Array) -> tuple[Array, Array]:
+    def fuse_single(
+        self, silent: Array, delivered: Array, basis: Array | None = None
+    ) -> tuple[Array, Array]:
         """See :class:`FusionRule`: informations are sums."""
         information = inverses(silent)
         total = information.sum(0)
@@ -222,7 +238,12 @@ class MatrixWeightedFusion(FusionRule):
         return weights
 
     def fuse(
-        self, means: Array, covariance: Array, active: NDArray[np.bool_] | None = None
+        self,
+        means: Array,
+        covariance: Array,
+        active: NDArray[np.bool_] | None = None,
+        *,
+        basis: Array | None = None,
     ) -> Fused:
         """See :class:`FusionRule`.
 

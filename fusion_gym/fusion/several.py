@@ -47,18 +47,26 @@ class CovarianceIntersection(FusionRule):
     """
 
     def fuse(
-        self, means: Array, covariance: Array, active: NDArray[np.bool_] | None = None
+        self,
+        means: Array,
+        covariance: Array,
+        active: NDArray[np.bool_] | None = None,
+        *,
+        basis: Array | None = None,
     ) -> Fused:
         """See :class:`~fusion_gym.fusion.rules.FusionRule`."""
         own = own_covariances(covariance)
         if active is None:
-            return covariance_intersection_many(means, own)
+            return covariance_intersection_many(means, own, basis=basis)
         first = active.argmax(0)
         mean = np.take_along_axis(means, first[None, None], 0)[0]
         fused = np.take_along_axis(own, first[None, None, None], 0)[0]
         weights = (np.arange(len(means))[:, None] == first) * 1.0
         lanes = np.flatnonzero(active.sum(0) != 1)
-        part = covariance_intersection_many(_of(means, lanes), _of(own, lanes), _of(active, lanes))
+        metric = None if basis is None else _of(basis, lanes)
+        part = covariance_intersection_many(
+            _of(means, lanes), _of(own, lanes), _of(active, lanes), metric
+        )
         mean[:, lanes], fused[..., lanes] = part.mean, part.covariance
         weights[:, lanes] = part.weights
 
@@ -72,7 +80,10 @@ class CovarianceIntersection(FusionRule):
 
 @np.errstate(all="ignore")
 def covariance_intersection_many(
-    means: Array, covariances: Array, active: NDArray[np.bool_] | None = None
+    means: Array,
+    covariances: Array,
+    active: NDArray[np.bool_] | None = None,
+    basis: Array | None = None,
 ) -> Fused:
     """Covariance intersection of l estimates at once, of the smallest trace.
 
@@ -85,6 +96,7 @@ def covariance_intersection_many(
         covariances: (l, n, n, N), symmetric positive definite where active.
         active: (l, N), the estimates that take part; all by default. Others are not read and get
             the weight 0.
+        basis: as in :meth:`~fusion_gym.fusion.rules.FusionRule.fuse`.
 
     Returns:
         The fused estimate with its weights w (l, N). The search ends at a gap of a relative 1e-6,
@@ -104,12 +116,14 @@ def covariance_intersection_many(
     selected = np.ones(means.shape[::2], dtype=np.bool_) if active is None else active
     means, covariances = np.ascontiguousarray(means), np.ascontiguousarray(covariances)
     information = _informations(covariances, selected)
-    weights, fused, open_lanes = _best_alone(covariances, information, selected)
+    metric = np.zeros_like(covariances[0])
+    metric += linalg.identity(len(metric)) if basis is None else basis
+    weights, fused, open_lanes = _best_alone(covariances, information, metric, selected)
     pairs = open_lanes & (selected.sum(0) == 2)
     lanes = np.flatnonzero(pairs)
     if lanes.size:
         weights[:, lanes], fused[..., lanes] = best_of_pair(
-            _of(covariances, lanes), _of(selected, lanes)
+            _of(covariances, lanes), _of(selected, lanes), _of(metric, lanes)
         )
     lanes = np.flatnonzero(open_lanes & ~pairs)
     if lanes.size:
@@ -117,7 +131,9 @@ def covariance_intersection_many(
         start = taking_part / np.abs(_of(linalg.trace(covariances), lanes))
         np.copyto(start, 0.0, where=~taking_part)
         start /= sum_rows(start)
-        weights[:, lanes], fused[..., lanes] = _search(_of(information, lanes), start)
+        weights[:, lanes], fused[..., lanes] = _search(
+            _of(information, lanes), _of(metric, lanes), start
+        )
     vector = np.zeros_like(means[0])
     for weight, item, mean, takes_part in zip(weights, information, means, selected, strict=True):
         vector += weight * linalg.matvec(item, np.where(takes_part, mean, 0.0))
@@ -162,7 +178,7 @@ def _total(terms: Array) -> Array:
 
 
 def _best_alone(
-    covariances: Array, information: Array, selected: NDArray[np.bool_]
+    covariances: Array, information: Array, basis: Array, selected: NDArray[np.bool_]
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """All weight on the active estimate of the smallest trace; where it is not the optimum.
 
@@ -170,25 +186,27 @@ def _best_alone(
         Weights (l, N), covariance (n, n, N), and the lanes (N,) that have a gap or a NaN. Where
         nobody is active the weights are zero, the covariance is NaN, and there is no search.
     """
-    traces = np.where(selected, linalg.trace(covariances), np.inf)
+    spread = linalg.matmul(covariances, linalg.transpose(basis))
+    traces = np.where(selected, linalg.trace(linalg.matmul(basis, spread)), np.inf)
     first = traces.argmin(0)
     weights = ((np.arange(len(traces))[:, None] == first) & selected) * 1.0
     fused = np.take_along_axis(covariances, first[None, None, None], 0)[0]
     nobody = ~selected.any(0)
     fused[..., nobody] = np.nan
-    gain, total = _gain(information, fused), linalg.trace(fused)
+    gain = _gain(information, linalg.matmul(fused, linalg.transpose(basis)))
+    total = np.where(nobody, np.nan, traces.min(0))
     closed = gain.max(0) - total <= _GAP * total
     return weights, fused, ~(closed | nobody)
 
 
-def _gain(information: Array, fused: Array) -> Array:
-    """tr(P Y_i P) (l, N), by which the trace of P falls with each weight."""
-    square = linalg.matmul(fused, fused)
+def _gain(information: Array, spread: Array) -> Array:
+    """tr(Y_i S Sᵀ) (l, N) of S = P Gᵀ, by which the trace of G P Gᵀ falls with each weight."""
+    square = linalg.matmul(spread, linalg.transpose(spread))
     product = information * square
     return _total(product.reshape(len(information), len(square) ** 2, -1))
 
 
-def _search(information: Array, start: Array) -> tuple[Array, Array]:
+def _search(information: Array, basis: Array, start: Array) -> tuple[Array, Array]:
     """Weights (l, N) and covariance (n, n, N) of the smallest trace, from ``start`` (l, N).
 
     A step that does not lower the trace is halved until it does.
@@ -199,8 +217,9 @@ def _search(information: Array, start: Array) -> tuple[Array, Array]:
     for _ in range(_STEPS):
         root = _inverse_root(_weighted(new, information))
         covariance = linalg.matmul(root, linalg.transpose(root))
-        total = linalg.trace(covariance)
-        gain = _gain(information, covariance)
+        spread = linalg.matmul(covariance, linalg.transpose(basis))
+        total = linalg.trace(linalg.matmul(basis, spread))
+        gain = _gain(information, spread)
         worse = ~(total <= lowest) & (lowest < np.inf)
         open_lanes = worse | (gain.max(0) - total > _GAP * total)
         if not open_lanes.all():
@@ -210,10 +229,11 @@ def _search(information: Array, start: Array) -> tuple[Array, Array]:
             if not still.size:
                 return weights, fused
             lanes, information, worse = lanes[still], _of(information, still), worse[still]
-            root, covariance, gain = _of(root, still), _of(covariance, still), _of(gain, still)
+            root, spread, gain = _of(root, still), _of(spread, still), _of(gain, still)
+            basis = _of(basis, still)
             old, new = _of(old, still), _of(new, still)
             total, lowest = total[still], lowest[still]
-        target = _newton(information, new, root, covariance, gain)
+        target = _newton(information, new, root, spread, gain, total)
         target = np.where(worse, 0.5 * (old + new), target)
         old, lowest = np.where(worse, old, new), np.where(worse, lowest, total)
         new = target
@@ -246,25 +266,27 @@ def _inverse_root(matrix: Array) -> Array:
     return stack[size:]
 
 
-def _newton(information: Array, weights: Array, root: Array, fused: Array, gain: Array) -> Array:
+def _newton(
+    information: Array, weights: Array, root: Array, spread: Array, gain: Array, total: Array
+) -> Array:
     """The weights (l, N) at which the trace's quadratic model is smallest, none of them negative.
 
-    The gradient is -``gain`` and the curvature H_ij = 2 tr(P Y_i P Y_j P). The trace is
+    With S = P Gᵀ the gradient is -``gain`` and the curvature H_ij = 2 tr(Sᵀ Y_i P Y_j S). The trace is
     homogeneous of degree -1, so H w = 2 ``gain`` and the model is tᵀ H t / 2 - 3 ``gain``ᵀ t.
     Free are the estimates of positive weight and those of a gain above the trace. While the
     minimum has a negative weight, the weights go towards it as far as they can, and the estimate
     whose weight is then zero is free no longer. Where rounding leaves no descent, weight goes from
     the estimate of the smallest gain to that of the largest.
     """
-    free = (weights > 0.0) | (gain > linalg.trace(fused))
+    free = (weights > 0.0) | (gain > total)
     somewhere = free.any(1)
     if not somewhere.all():  # estimates without a part in any lane cost no time
         target = np.zeros_like(weights)
         target[somewhere] = _newton(
-            information[somewhere], weights[somewhere], root, fused, gain[somewhere]
+            information[somewhere], weights[somewhere], root, spread, gain[somewhere], total
         )
         return target
-    curvature = _curvature(information, root, fused)
+    curvature = _curvature(information, root, spread)
     target = _model_minimum(curvature, gain, free)
     reached = weights.copy()
     lanes = np.flatnonzero((target < 0.0).any(0))
@@ -296,13 +318,13 @@ def _as_far(weights: Array, target: Array) -> tuple[Array, NDArray[np.bool_]]:
     return np.maximum(reached, 0.0), blocking
 
 
-def _curvature(information: Array, root: Array, fused: Array) -> Array:
-    """2 tr(P Y_i P Y_j P), (l, l, N), for i <= j; zero below.
+def _curvature(information: Array, root: Array, spread: Array) -> Array:
+    """2 tr(Sᵀ Y_i P Y_j S), (l, l, N), for i <= j; zero below.
 
-    With P = U Uᵀ it is twice the inner product of the Uᵀ Y_i P.
+    With P = U Uᵀ it is twice the inner product of the Uᵀ Y_i S.
     """
     count, size, _, runs = information.shape
-    legs = linalg.matmul(information, fused)
+    legs = linalg.matmul(information, spread)
     for row in range(size - 1, -1, -1):
         legs[:, row] *= root[row, row]
         for other in range(row):

@@ -51,7 +51,12 @@ class NodeFusion(FusionRule):
         return self if weights is None else replace(self, weights=weights)
 
     def fuse(
-        self, means: Array, covariance: Array, active: NDArray[np.bool_] | None = None
+        self,
+        means: Array,
+        covariance: Array,
+        active: NDArray[np.bool_] | None = None,
+        *,
+        basis: Array | None = None,
     ) -> Fused:
         """See :class:`~fusion_gym.fusion.rules.FusionRule`, for means (l, s, N), s = n + q.
 
