@@ -7,14 +7,13 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.systems.tobit.centre import CentrePrediction, Posterior
-from fusion_gym.systems.tobit.filters import (
-    Expectation,
-    KalmanFilter,
-    Outcomes,
-    in_lanes,
-    joseph_form,
+from fusion_gym.systems.tobit.centre import (
+    CentrePrediction,
+    FederatedCentre,
+    Feedback,
+    Posterior,
 )
+from fusion_gym.systems.tobit.filters import KalmanFilter, in_lanes, joseph_form
 from fusion_gym.systems.tobit.options import FeedbackOptions, refuse_fusion
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.validation import ConfigurationError
@@ -23,7 +22,7 @@ _MOST_CHANNELS = 100  # whose joint covariance is solved in every step
 
 
 @dataclass(frozen=True)
-class JointCentre:
+class JointCentre(FederatedCentre):
     r"""Kalman filter at the centre, of all measurements that arrive in a step; there are no nodes.
 
     With C and y the rows of what has arrived and R the covariance of their noises, correlations
@@ -48,25 +47,6 @@ class JointCentre:
 
     Source: B. D. O. Anderson and J. B. Moore, "Optimal Filtering", 1979, chapter 3.
     """
-
-    sensors: CensoredSensors
-
-    @property
-    def predictable(self) -> bool:
-        """See :class:`Centre`."""
-        return self.sensors.unlimited
-
-    @property
-    def separable(self) -> bool:
-        """See :class:`Centre`."""
-        return True
-
-    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
-        """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
-        expectation = KalmanFilter(self.sensors).expect(mean)
-        matrix, variance = self.sensors.measurement_matrix, self.sensors.variance
-        spread = (matrix * linalg.matmul(matrix, covariance)).sum(-2)
-        return CentrePrediction(expectation, np.sqrt(spread + (1.0 + 1e-3) * variance), None)
 
     def update(
         self,
@@ -94,36 +74,10 @@ class JointCentre:
         if lanes.size:
             gain = linalg.transpose(in_lanes(correction, lanes))
             noise = [linalg.matmul(gain, sensors.noise_factor)]
-            prior, rows = covariance[..., lanes], in_lanes(matrix, lanes)
-            posterior[..., lanes] = joseph_form(sensors, prior, rows, gain, noise)
+            prior = linalg.root(covariance[..., lanes])
+            posterior[..., lanes] = joseph_form(prior, in_lanes(matrix, lanes), gain, noise)
         local = np.broadcast_to(mean, (sensors.count, *mean.shape))
         return Posterior(mean, posterior, local)
-
-    def single(
-        self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
-    ) -> tuple[Array, Array]:
-        """See :class:`Centre`: by the sensor's own channels, up to rounding."""
-        outcomes = self._each(mean, covariance, prediction)
-        innovation = measurement - prediction.expectation.value
-        correction = linalg.matvec(linalg.transpose(outcomes.correction), innovation)
-        return mean + correction, outcomes.delivered_covariance
-
-    def variances(
-        self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
-    ) -> tuple[Array, Array]:
-        """See :class:`Centre`."""
-        silent = linalg.weighted_trace(covariance, weights)
-        single = self._each(mean, covariance, prediction)
-        return silent, silent - linalg.weighted_trace(single.delivered_covariance, weights)
-
-    def _each(self, mean: Array, covariance: Array, prediction: CentrePrediction) -> Outcomes:
-        """What each sensor alone makes of the centre's own prediction."""
-        priors = np.broadcast_to(covariance, (self.sensors.count, *covariance.shape))
-        means = np.broadcast_to(mean, (self.sensors.count, *mean.shape))
-        expectation: Expectation = prediction.expectation
-        return KalmanFilter(self.sensors).outcomes(
-            means, priors, expectation, expectation.value, mean[0]
-        )
 
 
 def joint_centre(options: FeedbackOptions, sensors: CensoredSensors) -> JointCentre:
@@ -141,4 +95,4 @@ def joint_centre(options: FeedbackOptions, sensors: CensoredSensors) -> JointCen
             f"channels: together they may have at most {_MOST_CHANNELS}, for a step costs their "
             "cube; where noises of different sensors are independent, 'kalman' is the same filter"
         )
-    return JointCentre(sensors)
+    return JointCentre(KalmanFilter(sensors), Feedback.in_full(sensors.count))

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import gaussian, linalg
 from fusion_gym.arrays import Array
-from fusion_gym.systems.tobit.filters import Expectation, Outcomes, joseph_form, linear_update
+from fusion_gym.systems.tobit.filters import Expectation, KalmanFilter, scalar_update
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 _FAR = 50.0  # a threshold this many deviations away never censors
@@ -76,7 +76,7 @@ def _two_sided_moments(sensors: CensoredSensors, latent: Array, deviation: Array
 
 
 @dataclass(frozen=True)
-class TobitKalmanFilter:
+class TobitKalmanFilter(KalmanFilter):
     r"""Tobit Kalman filter; when nothing arrives the prior is the posterior.
 
     S = q C P Cᵀ q + R v, K = P Cᵀ q S⁻¹ with q, v of :func:`expect_censored`.
@@ -109,22 +109,9 @@ class TobitKalmanFilter:
     tobit_token_bucket, equations (21)-(23) with κ₁ = 1 and S = diag(R v).
     """
 
-    sensors: CensoredSensors
-
     def expect(self, mean: Array) -> Expectation:
         """See :class:`NodeFilter`."""
         return expect_censored(self.sensors, mean)
-
-    def outcomes(
-        self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
-    ) -> Outcomes:
-        """See :class:`NodeFilter`; ``held`` and ``time`` do not matter here."""
-        weighted = expectation.uncensored_probability[:, :, None] * self.sensors.measurement_matrix
-        innovation = linalg.congruence(weighted, covariance)
-        noise = self.sensors.variance * expectation.truncated_variance
-        innovation = linalg.add_diagonal(innovation, noise)
-        correction, posterior = linear_update(self.sensors, covariance, weighted, innovation, noise)
-        return Outcomes(correction, posterior, mean, covariance)
 
 
 @dataclass(frozen=True)
@@ -207,9 +194,7 @@ class AssumedDensityFilter:
                 distance = sign * (latent[:, component] - limit) / np.sqrt(variance)
                 distance = np.where(np.isfinite(limit), distance, _FAR)
                 share -= gaussian.upper_tail(distance) * gaussian.truncated_variance(distance)
-            result = self._explained(
-                result, row, cross, variance, noise[:, component], share, lanes
-            )
+            result = scalar_update(result, row, cross, variance, noise[:, component], share, lanes)
         return result
 
     def _take(
@@ -239,40 +224,8 @@ class AssumedDensityFilter:
         step = np.where(granted, step, 0.0)
         loss = np.where(granted, loss, 0.0)
         noise = self.sensors.variance[sensor, component]
-        covariance = self._explained(covariance, row, cross, variance, noise, loss, lanes)
+        covariance = scalar_update(covariance, row, cross, variance, noise, loss, lanes)
         return mean + cross * step, covariance
-
-    def _explained(
-        self,
-        covariance: Array,
-        row: Array,
-        cross: Array,
-        variance: Array,
-        noise: Array,
-        share: Array,
-        lanes: NDArray[np.intp],
-    ) -> Array:
-        """P - P Cᵀ C P s/S, where a scalar measurement explains the share s of its variance S.
-
-        P (…, n, n, N), ``row`` C (…, n, 1), ``cross`` P Cᵀ (…, n, N), ``noise`` R (…, 1), S and s
-        (…, N). The same as :func:`joseph_form` with K = P Cᵀ s/S and the noise that makes s
-        optimal, s (1 - s)/S + R s²/S² in units of P Cᵀ; that is taken in the ``lanes`` where P is
-        large.
-        """
-        loss = share / variance
-        result = covariance - linalg.outer(cross, cross) * loss[..., None, None, :]
-        if lanes.size:
-            gain, loss = cross[..., lanes] * loss[..., None, lanes], loss[..., lanes]
-            left = loss * (1.0 - share[..., lanes]) + noise * loss * loss
-            part = cross[..., lanes] * np.sqrt(np.maximum(left, 0.0))[..., None, :]
-            result[..., lanes] = joseph_form(
-                self.sensors,
-                covariance[..., lanes],
-                row[..., None, :, :],
-                gain[..., None, :],
-                [part[..., None, :]],
-            )
-        return result
 
 
 def _loss(distance: Array) -> Array:
