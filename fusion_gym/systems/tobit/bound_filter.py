@@ -185,7 +185,7 @@ class BoundTobitFilter:
         κ₁ P - κ₁ P C̃ᵀ Φ⁻¹ C̃ P κ₁, with Φ = κ₁ C̃ P C̃ᵀ + S and C̃ = q C; here P = I.
         """
         latent = expectation.latent
-        spread = linalg.matmul(matrix, linalg.transpose(matrix))
+        spread = linalg.gram(matrix)
         grow, shift = self.constants.second_moment
         moment = grow * spread + shift * linalg.outer(latent, latent)
         correction, delivered = self._delivered(matrix, linalg.diagonal(moment), expectation, time)

@@ -16,7 +16,7 @@ from fusion_gym.systems.tobit.filters import (
     KalmanFilter,
     NodeFilter,
     Outcomes,
-    scalar_update,
+    Scalar,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
@@ -172,7 +172,7 @@ class FeedbackCentre(Centre):
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`."""
         expectation = self.filter.expect(mean)
-        root = linalg.root(self.sensors.limited(covariance))
+        root = linalg.root(self.sensors.regular(covariance))
         observed = linalg.matmul(self.sensors.measurement_matrix, root)
         deviation = _deviation(self.sensors, expectation, (observed * observed).sum(-2))
         inflated = observed / np.sqrt(self.feedback.share)[:, None, None]
@@ -197,10 +197,9 @@ class FeedbackCentre(Centre):
         share = self.feedback.share[:, None]
         local = local / np.sqrt(share)
         fused = self.fusion.fuse(local, own / share[:, None], basis=root)
-        factor = linalg.matmul(root, linalg.root(fused.covariance))
         return Posterior(
             mean + linalg.matvec(root, fused.mean),
-            linalg.matmul(factor, linalg.transpose(factor)),
+            linalg.gram(linalg.matmul(root, linalg.root(fused.covariance))),
             mean + linalg.matvec(root, local),
         )
 
@@ -265,83 +264,73 @@ class FederatedCentre(Centre):
     ) -> Posterior:
         """See :class:`Centre`."""
         local = mean + self._correction(covariance, prediction, measurement, granted)
-        shift, posterior = np.zeros_like(mean), self._silent(covariance)
+        shift, root = np.zeros_like(mean), self._silent_root(covariance)
         for sensor in np.flatnonzero(granted.any(-1)):
-            shift, posterior = self._deliver(
-                sensor, shift, posterior, prediction.expectation, measurement, granted[sensor]
+            shift, root = self._deliver(
+                sensor, shift, root, prediction.expectation, measurement, granted[sensor]
             )
-        return Posterior(mean + shift, posterior, local)
+        known = granted.any(0) | (self.filter.silence is not None)
+        return Posterior(mean + shift, np.where(known, linalg.gram(root), covariance), local)
 
     def single(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
     ) -> tuple[Array, Array]:
         """See :class:`Centre`."""
-        shift, posterior = self._deliver(
-            slice(None),
-            np.zeros_like(mean),
-            self._silent(covariance)[None],
-            prediction.expectation,
-            measurement,
-            np.array([True]),
+        root, everyone = self._silent_root(covariance)[None], np.array([True])
+        shift, root = self._deliver(
+            slice(None), np.zeros_like(mean), root, prediction.expectation, measurement, everyone
         )
-        return mean + shift, posterior
+        return mean + shift, linalg.gram(root)
 
     def variances(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
         """See :class:`Centre`."""
-        silent = linalg.weighted_trace(self._silent(covariance), weights)
+        silent = linalg.weighted_trace(linalg.gram(self._silent_root(covariance)), weights)
         single = self.single(mean, covariance, prediction, prediction.expectation.value)[1]
         return silent, silent - linalg.weighted_trace(single, weights)
 
-    def _silent(self, covariance: Array) -> Array:
-        """The centre's covariance if nobody transmits."""
+    def _silent_root(self, covariance: Array) -> Array:
+        """Root of the centre's covariance if nobody transmits."""
         weight, sensors = self.filter.silence, self.sensors
+        root = linalg.root(covariance)
         if weight is None:
-            return covariance
-        lanes = sensors.starved(covariance)
-        noises = 1.0 + weight[:, None] * sensors.variance
+            return root
         rows = np.sqrt(weight)[:, None, None] * sensors.measurement_matrix
-        for row, noise in zip(
-            rows.reshape(-1, *rows.shape[2:]), noises.reshape(-1, 1), strict=True
-        ):
-            cross = linalg.matvec(covariance, row)
-            variance = linalg.dot(row, cross) + noise
-            share = np.ones_like(variance)
-            covariance = scalar_update(covariance, row, cross, variance, noise, share, lanes)
-        return covariance
+        noises = 1.0 + weight[:, None] * sensors.variance
+        for sensor, component in np.ndindex(sensors.count, sensors.size):
+            place = (sensor, component)
+            root = Scalar.of(root, rows[place], noises[place]).posterior(1.0)
+        return root
 
     def _deliver(
         self,
         place: Any,
         shift: Array,
-        covariance: Array,
+        root: Array,
         expectation: Expectation,
         measurement: Array,
         granted: NDArray[np.bool_],
     ) -> tuple[Array, Array]:
-        """Shift (…, n, N) and covariance after what the sensors at ``place`` deliver.
+        """Shift (…, n, N) and root of the covariance after what the sensors at ``place`` deliver.
 
         One sensor, or each of some alone.
         """
         sensors, weight = self.sensors, self.filter.silence
-        lanes = sensors.starved(covariance)
         matrix, q = sensors.measurement_matrix[place], expectation.uncensored_probability[place]
         noises = sensors.variance[place] * expectation.truncated_variance[place]
         innovation = measurement[place] - expectation.value[place]
         if weight is not None:
             larger = 1.0 + weight[place][..., None, :] * noises
             noises, innovation = noises * larger, innovation * larger
+        share = np.where(granted, 1.0, 0.0)
         for component in range(sensors.size):
             row = q[..., component, None, :] * matrix[..., component, :, :]
-            noise = noises[..., component, :]
-            cross = linalg.matvec(covariance, row)
-            variance = linalg.dot(row, cross) + noise
+            scalar = Scalar.of(root, row, noises[..., component, :])
             residual = innovation[..., component, :] - linalg.dot(row, shift)
-            shift = shift + cross * np.where(granted, residual / variance, 0.0)[..., None, :]
-            share = np.where(granted, np.ones_like(variance), 0.0)
-            covariance = scalar_update(covariance, row, cross, variance, noise, share, lanes)
-        return shift, covariance
+            shift = shift + scalar.cross * (share * residual / scalar.variance)[..., None, :]
+            root = scalar.posterior(share)
+        return shift, root
 
     def _correction(
         self,

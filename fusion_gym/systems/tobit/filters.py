@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
@@ -86,10 +86,10 @@ def linear_update(matrix: Array, noise: Array, bias: Array | None = None) -> tup
 
     The minimum-variance update of z ~ N(0, I) for ``matrix`` B (…, m, n, N) and innovation
     covariance S = B Bᵀ + N, with N = diag(``noise``) + ``bias`` ``bias``ᵀ, both (…, m, N). Where
-    the difference would lose its digits it is the Joseph form, with a ridge in proportion to its
-    diagonal that keeps it definite.
+    the difference would lose its digits it is the Joseph form (I - K B) (I - K B)ᵀ + K N Kᵀ, with a
+    ridge in proportion to its diagonal that keeps it definite.
     """
-    spread = linalg.matmul(matrix, linalg.transpose(matrix))
+    spread = linalg.gram(matrix)
     total = linalg.add_diagonal(spread, noise)
     if bias is not None:
         total += linalg.outer(bias, bias)
@@ -102,64 +102,47 @@ def linear_update(matrix: Array, noise: Array, bias: Array | None = None) -> tup
     lanes = np.flatnonzero(large)
     if lanes.size:
         gain = linalg.transpose(correction[..., lanes])
-        parts = [gain * np.sqrt(in_lanes(noise, lanes))[..., None, :, :]]
+        noise = np.broadcast_to(noise, matrix.shape[:-2] + matrix.shape[-1:])
+        parts = [identity - linalg.matmul(gain, matrix[..., lanes])]
+        parts.append(gain * np.sqrt(noise[..., lanes])[..., None, :, :])
         if bias is not None:
             parts.append(linalg.matvec(gain, bias[..., lanes])[..., None, :])
-        exact = joseph_form(identity, matrix[..., lanes], gain, parts)
+        exact = linalg.gram(np.concatenate(parts, axis=-2))
         ridge = size * _RIDGE * linalg.diagonal(exact)
         posterior[..., lanes] = linalg.add_diagonal(exact, ridge)
     return correction, posterior
 
 
-def joseph_form(root: Array, matrix: Array, gain: Array, noise: list[Array]) -> Array:
-    """(I - K C) F Fᵀ (I - K C)ᵀ + Σ V Vᵀ (…, n, n, N) for any gain K (…, n, m, N).
+class Scalar(NamedTuple):
+    """A scalar measurement c x + v of a prior covariance G Gᵀ.
 
-    A sum of squares, which keeps its small eigenvalues beside large ones. ``root`` is F
-    (…, n, n, N), and ``noise`` are the V (…, n, k, N), what the gain makes of the measurement's
-    noise.
-    Source: R. S. Bucy and P. D. Joseph, "Filtering for stochastic processes with applications to
-    guidance", 1968.
+    ``root`` G (…, n, n, N) · ``projection`` g = Gᵀ cᵀ and ``cross`` G g, both (…, n, N) · ``noise``
+    R (…, 1) or (…, N), the variance of v · ``variance`` S = gᵀ g + R (…, N).
     """
-    keep = linalg.identity(root.shape[-2]) - linalg.matmul(gain, matrix)
-    factor = np.concatenate([linalg.matmul(keep, root), *noise], axis=-2)
-    return linalg.matmul(factor, linalg.transpose(factor))
 
+    root: Array
+    projection: Array
+    cross: Array
+    noise: Array
+    variance: Array
 
-def scalar_update(
-    covariance: Array,
-    row: Array,
-    cross: Array,
-    variance: Array,
-    noise: Array,
-    share: Array,
-    lanes: NDArray[np.intp],
-) -> Array:
-    """P - P Cᵀ C P s/S, where a scalar measurement explains the share s of its variance S.
+    @classmethod
+    def of(cls, root: Array, row: Array, noise: Array) -> Scalar:
+        """Return the measurement of ``row`` c (…, n, 1) or (…, n, N)."""
+        projection = linalg.matvec(linalg.transpose(root), row)
+        variance = linalg.dot(projection, projection) + noise
+        return cls(root, projection, linalg.matvec(root, projection), noise, variance)
 
-    P (…, n, n, N), ``row`` C (…, n, 1) or (…, n, N), ``cross`` P Cᵀ (…, n, N), ``noise`` R
-    (…, 1) or (…, N), S and s (…, N). The same as :func:`joseph_form` with K = P Cᵀ s/S and the
-    noise that makes s optimal, s (1 - s)/S + R s²/S² in units of P Cᵀ; that is taken in the
-    ``lanes`` where P is large.
-    """
-    loss = share / variance
-    scaled = cross * np.sqrt(loss)[..., None, :]
-    result = covariance - linalg.outer(scaled, scaled)
-    if lanes.size:
-        cross, loss, share = (in_lanes(values, lanes) for values in (cross, loss, share))
-        left = loss * (1.0 - share) + in_lanes(noise, lanes) * loss * loss
-        part = cross * np.sqrt(np.maximum(left, 0.0))[..., None, :]
-        result[..., lanes] = joseph_form(
-            linalg.root(covariance[..., lanes]),
-            in_lanes(row, lanes)[..., None, :, :],
-            (cross * loss[..., None, :])[..., None, :],
-            [part[..., None, :]],
-        )
-    return result
+    def posterior(self, share: Array | float) -> Array:
+        """Root of P - P cᵀ c P s/S, where the measurement explains the share s of its variance.
 
-
-def in_lanes(values: Array, lanes: NDArray[np.intp]) -> Array:
-    """The runs with these numbers, of values with one column a run or one for all."""
-    return values if values.shape[-1] == 1 else values[..., lanes]
+        It is G (I - w g gᵀ) with (1 - w gᵀ g)² = 1 - s gᵀ g/S, which loses no digits whatever P is.
+        Source: J. E. Potter's form; P. S. Maybeck, "Stochastic models, estimation, and control",
+        volume 1, 1979, section 7.3.
+        """
+        left = (share * self.noise + (1.0 - share) * self.variance) / self.variance
+        weight = share / (self.variance * (1.0 + np.sqrt(left)))
+        return self.root - linalg.outer(self.cross * weight[..., None, :], self.projection)
 
 
 @dataclass(frozen=True)

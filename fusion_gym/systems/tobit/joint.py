@@ -13,7 +13,7 @@ from fusion_gym.systems.tobit.centre import (
     Feedback,
     Posterior,
 )
-from fusion_gym.systems.tobit.filters import KalmanFilter, in_lanes, joseph_form
+from fusion_gym.systems.tobit.filters import KalmanFilter, Scalar
 from fusion_gym.systems.tobit.options import FeedbackOptions, refuse_fusion
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.validation import ConfigurationError
@@ -58,26 +58,31 @@ class JointCentre(FederatedCentre):
     ) -> Posterior:
         """See :class:`Centre`."""
         sensors, runs = self.sensors, granted.shape[-1]
-        taken = np.repeat(granted, sensors.size, axis=0).astype(np.float64)  # (channels, N)
-        innovation = (measurement - prediction.expectation.value).reshape(-1, runs)
-        matrix = taken[:, None] * sensors.stacked_matrix
-        cross = linalg.matmul(matrix, covariance)
-        spread = linalg.matmul(cross, linalg.transpose(matrix))
+        (channels,) = np.nonzero(np.repeat(granted.any(-1), sensors.size))
+        taken = np.repeat(granted, sensors.size, axis=0)[channels].astype(np.float64)
+        innovation = (measurement - prediction.expectation.value).reshape(-1, runs)[channels]
         # A channel that has not arrived stands for nothing, with a variance of 1.
-        spread = spread + taken[:, None] * taken * sensors.noise_covariance
-        spread = linalg.add_diagonal(linalg.symmetrise(spread), 1.0 - taken)
-        correction = linalg.solve(spread, cross)
-        mean = mean + linalg.matvec(linalg.transpose(correction), innovation)
-        posterior = covariance - linalg.matmul(linalg.transpose(cross), correction)
-        posterior = linalg.symmetrise(posterior)
-        lanes = sensors.starved(covariance)
-        if lanes.size:
-            gain = linalg.transpose(in_lanes(correction, lanes))
-            noise = [linalg.matmul(gain, sensors.noise_factor)]
-            prior = linalg.root(covariance[..., lanes])
-            posterior[..., lanes] = joseph_form(prior, in_lanes(matrix, lanes), gain, noise)
-        local = np.broadcast_to(mean, (sensors.count, *mean.shape))
-        return Posterior(mean, posterior, local)
+        noise = taken[:, None] * taken * sensors.noise_covariance[np.ix_(channels, channels)]
+        factor = linalg.cholesky(linalg.add_diagonal(noise, 1.0 - taken))
+        white = np.concatenate(
+            [
+                sensors.stacked_matrix[channels] * taken[:, None],
+                innovation[:, None] * taken[:, None],
+            ],
+            axis=1,
+        )
+        shift, root, unit = np.zeros_like(mean), linalg.root(covariance), np.ones(1)
+        for k in range(len(channels)):
+            if k:
+                white[k] -= linalg.matvec(linalg.transpose(white[:k]), factor[k, :k])
+            white[k] /= factor[k, k]
+            scalar = Scalar.of(root, white[k, :-1], unit)
+            residual = white[k, -1] - linalg.dot(white[k, :-1], shift)
+            shift = shift + scalar.cross * (residual / scalar.variance)
+            root = scalar.posterior(1.0)
+        posterior = np.where(granted.any(0), linalg.gram(root), covariance)
+        local = np.broadcast_to(mean + shift, (sensors.count, *mean.shape))
+        return Posterior(mean + shift, posterior, local)
 
 
 def joint_centre(options: FeedbackOptions, sensors: CensoredSensors) -> JointCentre:

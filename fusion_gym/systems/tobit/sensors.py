@@ -13,9 +13,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_limits
 from fusion_gym.validation import ConfigurationError
 
-# In units of the resolution: beyond it, differences of covariances have too few digits left.
-_STARVED = 1e6
-_NONE = np.empty(0, dtype=np.intp)
+_RIDGE = 4e-15  # relative, for each state: twice what linalg.root takes for rounding
 _LARGEST = 1e26  # what a delivery leaves of a larger variance would drown in its rounding
 
 
@@ -162,27 +160,20 @@ class CensoredSensors:
         values = 1.0 / np.where(observed, information, np.inf)
         return np.where(observed, values, values.max() if observed.any() else np.inf)
 
-    @functools.cached_property
-    def _finest(self) -> float:
-        return float(self.resolution.min())
+    def regular(self, covariance: Array) -> Array:
+        """A regular covariance (n, n, N) that is a bound of this one, larger by its rounding.
 
-    def starved(self, covariance: Array) -> NDArray[np.intp]:
-        """Numbers of the runs of a covariance (…, n, n, N) with a variance > 10⁶ resolutions."""
-        if not covariance.max() > _STARVED * self._finest:  # the usual case, told apart in no time
-            return _NONE
-        large = linalg.diagonal(covariance) > _STARVED * self.resolution
-        return np.flatnonzero(large.reshape(-1, large.shape[-1]).any(0))
-
-    def limited(self, covariance: Array) -> Array:
-        """The covariance (n, n, N) with no variance above 10²⁶ resolutions, correlations kept.
-
-        That much larger than any noise, an update depends on the shape of a covariance alone.
+        No variance is above 10²⁶ resolutions: that much larger than any noise, an update depends
+        on the shape alone.
         """
+        result = linalg.add_diagonal(
+            covariance, len(covariance) * _RIDGE * linalg.diagonal(covariance)
+        )
         limit = _LARGEST * self.resolution
-        if not covariance.max() > limit.min():
-            return covariance
-        scale = np.sqrt(limit / np.maximum(linalg.diagonal(covariance), limit))
-        return covariance * linalg.outer(scale, scale)
+        if not result.max() > limit.min():
+            return result
+        scale = np.sqrt(limit / np.maximum(linalg.diagonal(result), limit))
+        return result * linalg.outer(scale, scale)
 
     def censored(self, measurement: Array) -> NDArray[np.bool_]:
         """Which components (sensors, m, N) lie at a threshold."""

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import gaussian, linalg
 from fusion_gym.arrays import Array
-from fusion_gym.systems.tobit.filters import Expectation, KalmanFilter, scalar_update
+from fusion_gym.systems.tobit.filters import Expectation, KalmanFilter, Scalar
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 _FAR = 50.0  # a threshold this many deviations away never censors
@@ -163,16 +163,12 @@ class AssumedDensityFilter:
         self, mean: Array, covariance: Array, measurement: Array, granted: NDArray[np.bool_]
     ) -> tuple[Array, Array]:
         """Posterior (n, N), (n, n, N) after the granted (sensors, N) measurements."""
-        lanes = self.sensors.starved(covariance)
-        for sensor in range(self.sensors.count):
-            if not granted[sensor].any():
-                continue
+        root = linalg.root(covariance)
+        for sensor in np.flatnonzero(granted.any(-1)).tolist():
             for component in range(self.sensors.size):
-                mean, covariance = self._take(
-                    mean, covariance, sensor, component, measurement[sensor, component],
-                    granted[sensor], lanes,
-                )  # fmt: skip
-        return mean, covariance
+                value, taken = measurement[sensor, component], granted[sensor]
+                mean, root = self._take(mean, root, sensor, component, value, taken)
+        return mean, np.where(granted.any(0), linalg.gram(root), covariance)
 
     def expected_covariance(self, mean: Array, covariance: Array) -> Array:
         """Expected posterior covariance (sensors, n, n, N) if one sensor alone delivers.
@@ -182,36 +178,32 @@ class AssumedDensityFilter:
         """
         matrix, noise = self.sensors.measurement_matrix, self.sensors.variance
         latent = linalg.matvec(matrix, mean)
-        result = np.broadcast_to(covariance, (self.sensors.count, *covariance.shape))
-        lanes = self.sensors.starved(covariance)
+        root = linalg.root(covariance)[None]
         for component in range(self.sensors.size):
             row = matrix[:, component]
-            cross = linalg.matvec(result, row)
-            variance = linalg.dot(row, cross) + noise[:, component]
-            share = np.ones_like(variance)
+            scalar = Scalar.of(root, row, noise[:, component])
+            share, deviation = np.ones_like(scalar.variance), np.sqrt(scalar.variance)
             for sign, threshold in ((1.0, self.sensors.threshold), (-1.0, self.sensors.upper)):
                 limit = threshold[:, component]
-                distance = sign * (latent[:, component] - limit) / np.sqrt(variance)
+                distance = sign * (latent[:, component] - limit) / deviation
                 distance = np.where(np.isfinite(limit), distance, _FAR)
                 share -= gaussian.upper_tail(distance) * gaussian.truncated_variance(distance)
-            result = scalar_update(result, row, cross, variance, noise[:, component], share, lanes)
-        return result
+            root = scalar.posterior(share)
+        return linalg.gram(root)
 
     def _take(
         self,
         mean: Array,
-        covariance: Array,
+        root: Array,
         sensor: int,
         component: int,
         value: Array,
         granted: NDArray[np.bool_],
-        lanes: NDArray[np.intp],
     ) -> tuple[Array, Array]:
         row = self.sensors.measurement_matrix[sensor, component]
-        cross = linalg.matvec(covariance, row)
-        variance = linalg.dot(row, cross) + self.sensors.variance[sensor, component]
-        latent, deviation = linalg.dot(row, mean), np.sqrt(variance)
-        step = (value - latent) / variance
+        scalar = Scalar.of(root, row, self.sensors.variance[sensor, component])
+        latent, deviation = linalg.dot(row, mean), np.sqrt(scalar.variance)
+        step = (value - latent) / scalar.variance
         loss = np.ones_like(step)
         for sign, threshold in ((1.0, self.sensors.threshold), (-1.0, self.sensors.upper)):
             limit = threshold[sensor, component]
@@ -223,9 +215,7 @@ class AssumedDensityFilter:
             loss = np.where(censored, _loss(distance), loss)
         step = np.where(granted, step, 0.0)
         loss = np.where(granted, loss, 0.0)
-        noise = self.sensors.variance[sensor, component]
-        covariance = scalar_update(covariance, row, cross, variance, noise, loss, lanes)
-        return mean + cross * step, covariance
+        return mean + scalar.cross * step, scalar.posterior(loss)
 
 
 def _loss(distance: Array) -> Array:
