@@ -16,7 +16,7 @@ from fusion_gym.systems.tobit.filters import (
     KalmanFilter,
     NodeFilter,
     Outcomes,
-    Scalar,
+    joint_update,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
@@ -26,15 +26,15 @@ from fusion_gym.validation import ConfigurationError
 class CentrePrediction(NamedTuple):
     """What centre and nodes expect before anything is sent.
 
-    ``expectation`` of the measurements and ``deviation`` (sensors, m, N) of the innovation. Where
-    nodes have covariances of their own, ``root`` G (n, n, N) of the prediction x = x̂ + G z, and
-    the nodes' ``outcomes`` z.
+    ``expectation`` of the measurements, ``deviation`` (sensors, m, N) of the innovation, ``root`` G
+    (n, n, N) of the covariance if nobody transmits, and where nodes have covariances of their own,
+    their ``outcomes`` z of x = x̂ + G z.
     """
 
     expectation: Expectation
     deviation: Array
+    root: Array
     outcomes: Outcomes | None = None
-    root: Array | None = None
 
 
 class Posterior(NamedTuple):
@@ -177,7 +177,7 @@ class FeedbackCentre(Centre):
         deviation = _deviation(self.sensors, expectation, (observed * observed).sum(-2))
         inflated = observed / np.sqrt(self.feedback.share)[:, None, None]
         outcomes = self.filter.outcomes(inflated, expectation, held, time)
-        return CentrePrediction(expectation, deviation, outcomes, root)
+        return CentrePrediction(expectation, deviation, root, outcomes)
 
     def update(
         self,
@@ -188,7 +188,7 @@ class FeedbackCentre(Centre):
         granted: NDArray[np.bool_],
     ) -> Posterior:
         """Each node takes the planned outcome of the network's answer; the centre fuses."""
-        outcomes, root = _planned(prediction)
+        outcomes, root = _outcomes(prediction), prediction.root
         innovation = measurement - prediction.expectation.value
         delivered = linalg.matvec(linalg.transpose(outcomes.correction), innovation)
         local = np.where(granted[:, None], delivered, outcomes.silent_mean)
@@ -207,7 +207,7 @@ class FeedbackCentre(Centre):
         self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
         """See :class:`Centre`; by the bound where the filter minimises one."""
-        outcomes, root = _planned(prediction)
+        outcomes, root = _outcomes(prediction), prediction.root
         share = self.feedback.share[:, None, None]
         covariances = outcomes.silent_covariance / share, outcomes.delivered_covariance / share
         silent, single = (
@@ -250,9 +250,17 @@ class FederatedCentre(Centre):
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
-        expectation, matrix = self.filter.expect(mean), self.sensors.measurement_matrix
-        spread = (matrix * linalg.matmul(matrix, covariance)).sum(-2)
-        return CentrePrediction(expectation, _deviation(self.sensors, expectation, spread))
+        sensors, weight = self.sensors, self.filter.silence
+        expectation, root = self.filter.expect(mean), linalg.root(covariance)
+        observed = linalg.matmul(sensors.measurement_matrix, root)
+        deviation = _deviation(sensors, expectation, (observed * observed).sum(-2))
+        if weight is not None:
+            # Both sides times √Z, so that weight 0 is no exception.
+            scale = np.sqrt(weight / (1.0 + weight * sensors.variance[..., 0]))[..., None, None]
+            nothing = np.zeros_like(expectation.value)
+            _, silent = joint_update(_stack(scale * observed), _stack(nothing))
+            root = linalg.matmul(root, linalg.root(silent))
+        return CentrePrediction(expectation, deviation, root)
 
     def update(
         self,
@@ -263,91 +271,65 @@ class FederatedCentre(Centre):
         granted: NDArray[np.bool_],
     ) -> Posterior:
         """See :class:`Centre`."""
-        local = mean + self._correction(covariance, prediction, measurement, granted)
-        shift, root = np.zeros_like(mean), self._silent_root(covariance)
-        for sensor in np.flatnonzero(granted.any(-1)):
-            shift, root = self._deliver(
-                sensor, shift, root, prediction.expectation, measurement, granted[sensor]
-            )
-        known = granted.any(0) | (self.filter.silence is not None)
-        return Posterior(mean + shift, np.where(known, linalg.gram(root), covariance), local)
+        places = np.flatnonzero(granted.any(-1))
+        local = np.broadcast_to(mean, (len(granted), *mean.shape)).copy()
+        silent = covariance if self.filter.silence is None else linalg.gram(prediction.root)
+        if places.size:
+            taken = granted[places, None]
+            local[places] += self._correction(covariance, prediction, measurement, places, taken)
+            matrix, value = self._whitened(prediction, measurement, places)
+            matrix = np.where(taken[:, None], matrix, 0.0)
+            mean, posterior = _shifted(mean, prediction, _stack(matrix), _stack(value))
+            silent = np.where(granted.any(0), posterior, silent)
+        return Posterior(mean, silent, local)
 
     def single(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
     ) -> tuple[Array, Array]:
         """See :class:`Centre`."""
-        root, everyone = self._silent_root(covariance)[None], np.array([True])
-        shift, root = self._deliver(
-            slice(None), np.zeros_like(mean), root, prediction.expectation, measurement, everyone
-        )
-        return mean + shift, linalg.gram(root)
+        return _shifted(mean, prediction, *self._whitened(prediction, measurement, slice(None)))
 
     def variances(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
         """See :class:`Centre`."""
-        silent = linalg.weighted_trace(linalg.gram(self._silent_root(covariance)), weights)
+        silent = linalg.weighted_trace(linalg.gram(prediction.root), weights)
         single = self.single(mean, covariance, prediction, prediction.expectation.value)[1]
         return silent, silent - linalg.weighted_trace(single, weights)
 
-    def _silent_root(self, covariance: Array) -> Array:
-        """Root of the centre's covariance if nobody transmits."""
-        weight, sensors = self.filter.silence, self.sensors
-        root = linalg.root(covariance)
-        if weight is None:
-            return root
-        rows = np.sqrt(weight)[:, None, None] * sensors.measurement_matrix
-        noises = 1.0 + weight[:, None] * sensors.variance
-        for sensor, component in np.ndindex(sensors.count, sensors.size):
-            place = (sensor, component)
-            root = Scalar.of(root, rows[place], noises[place]).posterior(1.0)
-        return root
-
-    def _deliver(
-        self,
-        place: Any,
-        shift: Array,
-        root: Array,
-        expectation: Expectation,
-        measurement: Array,
-        granted: NDArray[np.bool_],
+    def _whitened(
+        self, prediction: CentrePrediction, measurement: Array, places: Any
     ) -> tuple[Array, Array]:
-        """Shift (…, n, N) and root of the covariance after what the sensors at ``place`` deliver.
-
-        One sensor, or each of some alone.
-        """
-        sensors, weight = self.sensors, self.filter.silence
-        matrix, q = sensors.measurement_matrix[place], expectation.uncensored_probability[place]
-        noises = sensors.variance[place] * expectation.truncated_variance[place]
-        innovation = measurement[place] - expectation.value[place]
+        """What sensors would deliver, of unit noise: N^-½ q C G (…, m, n, N) and N^-½ (y - ŷ)."""
+        sensors, expectation, weight = self.sensors, prediction.expectation, self.filter.silence
+        noise = sensors.variance[places] * expectation.truncated_variance[places]
+        innovation = measurement[places] - expectation.value[places]
         if weight is not None:
-            larger = 1.0 + weight[place][..., None, :] * noises
-            noises, innovation = noises * larger, innovation * larger
-        share = np.where(granted, 1.0, 0.0)
-        for component in range(sensors.size):
-            row = q[..., component, None, :] * matrix[..., component, :, :]
-            scalar = Scalar.of(root, row, noises[..., component, :])
-            residual = innovation[..., component, :] - linalg.dot(row, shift)
-            shift = shift + scalar.cross * (share * residual / scalar.variance)[..., None, :]
-            root = scalar.posterior(share)
-        return shift, root
+            larger = 1.0 + weight[places, None] * noise
+            noise, innovation = noise * larger, innovation * larger
+        scale = 1.0 / np.sqrt(noise)
+        matrix = linalg.matmul(sensors.measurement_matrix[places], prediction.root)
+        scaled = scale * expectation.uncensored_probability[places]
+        return scaled[..., None, :] * matrix, scale * innovation
 
     def _correction(
         self,
         covariance: Array,
         prediction: CentrePrediction,
         measurement: Array,
-        granted: NDArray[np.bool_],
+        places: NDArray[np.intp],
+        taken: NDArray[np.bool_],
     ) -> Array:
-        """What each node adds to its own mean (sensors, n, N)."""
-        expectation = prediction.expectation
-        weighted = expectation.uncensored_probability[:, :, None] * self.sensors.measurement_matrix
+        """What nodes add to their own means (…, n, N)."""
+        sensors, expectation = self.sensors, prediction.expectation
+        q = expectation.uncensored_probability[places, :, None]
+        weighted = q * sensors.measurement_matrix[places]
         cross = linalg.matmul(weighted, covariance)
-        noise = self.sensors.variance * expectation.truncated_variance
         total = linalg.matmul(cross, linalg.transpose(weighted))
-        total = linalg.add_diagonal(total, self.feedback.share[:, None] * noise)
-        solved = linalg.solve_vector(total, measurement - expectation.value)
-        return np.where(granted[:, None], linalg.matvec(linalg.transpose(cross), solved), 0.0)
+        noise = sensors.variance[places] * expectation.truncated_variance[places]
+        total = linalg.add_diagonal(total, self.feedback.share[places, None] * noise)
+        innovation = np.where(taken, measurement[places] - expectation.value[places], 0.0)
+        return linalg.matvec(linalg.transpose(cross), linalg.solve_vector(total, innovation))
 
 
 @dataclass(frozen=True)
@@ -363,9 +345,10 @@ class SequentialCentre(Centre):
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
-        expectation = self.filter.expect(mean, covariance)
+        root = linalg.root(covariance)
+        expectation = self.filter.expect(mean, root)
         floor = 1e-3 * self.sensors.variance
-        return CentrePrediction(expectation, np.sqrt(expectation.noise_variance + floor))
+        return CentrePrediction(expectation, np.sqrt(expectation.noise_variance + floor), root)
 
     def update(
         self,
@@ -376,7 +359,8 @@ class SequentialCentre(Centre):
         granted: NDArray[np.bool_],
     ) -> Posterior:
         """See :class:`Centre`."""
-        mean, covariance = self.filter.update(mean, covariance, measurement, granted)
+        mean, root = self.filter.update(mean, prediction.root, measurement, granted)
+        covariance = np.where(granted.any(0), linalg.gram(root), covariance)
         local = np.broadcast_to(mean, (self.sensors.count, *mean.shape))
         return Posterior(mean, covariance, local)
 
@@ -385,7 +369,7 @@ class SequentialCentre(Centre):
     ) -> tuple[Array, Array]:
         """See :class:`Centre`; the reduction is the expected one."""
         silent = linalg.weighted_trace(covariance, weights)
-        expected = self.filter.expected_covariance(mean, covariance)
+        expected = self.filter.expected_covariance(mean, prediction.root)
         return silent, silent - linalg.weighted_trace(expected, weights)
 
 
@@ -395,8 +379,21 @@ def _deviation(sensors: CensoredSensors, expectation: Expectation, spread: Array
     return np.sqrt(q * q * spread + expectation.noise_variance + 1e-3 * sensors.variance)
 
 
-def _planned(prediction: CentrePrediction) -> tuple[Outcomes, Array]:
-    """The nodes' outcomes, and the root of the prediction's covariance."""
-    if prediction.outcomes is None or prediction.root is None:
+def _stack(values: Array) -> Array:
+    """The channels of all sensors one after another, (sensors · m, …), of (sensors, m, …)."""
+    return values.reshape(-1, *values.shape[2:])
+
+
+def _shifted(
+    mean: Array, prediction: CentrePrediction, matrix: Array, value: Array
+) -> tuple[Array, Array]:
+    """Mean and covariance of x = x̂ + G z after :func:`joint_update` of z."""
+    shift, covariance = joint_update(matrix, value)
+    root = prediction.root
+    return mean + linalg.matvec(root, shift), linalg.congruence(root, covariance)
+
+
+def _outcomes(prediction: CentrePrediction) -> Outcomes:
+    if prediction.outcomes is None:
         raise RuntimeError("the prediction has no outcomes: it was made by another centre")
-    return prediction.outcomes, prediction.root
+    return prediction.outcomes

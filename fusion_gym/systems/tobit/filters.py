@@ -41,6 +41,7 @@ class Expectation(NamedTuple):
 
 
 _STARVED = 1e6  # P - P Cᵀ S⁻¹ C P loses its digits where C P Cᵀ is so many times the noise
+_LARGE = 16  # states from which on a product by BLAS is faster than a sum of outer products
 _RIDGE = 1e-14  # relative, for each row: above the rounding of a Gram matrix
 
 
@@ -143,6 +144,35 @@ class Scalar(NamedTuple):
         left = (share * self.noise + (1.0 - share) * self.variance) / self.variance
         weight = share / (self.variance * (1.0 + np.sqrt(left)))
         return self.root - linalg.outer(self.cross * weight[..., None, :], self.projection)
+
+
+def joint_update(matrix: Array, value: Array) -> tuple[Array, Array]:
+    """Mean (…, n, N) and covariance (…, n, n, N) of z ~ N(0, I) after ``value`` = B z + v.
+
+    ``matrix`` B (…, c, n, N) and ``value`` (…, c, N) of any number of channels, v ~ N(0, I). It is
+    (I + Bᵀ B)⁻¹, or one channel after another where that sum would lose its digits.
+    """
+    size = matrix.shape[-2]
+    both = np.concatenate([matrix, value[..., None, :]], axis=-2)
+    if size < _LARGE:
+        total = (matrix[..., :, None, :] * both[..., None, :, :]).sum(-4)
+    else:
+        total = linalg.matmul(linalg.transpose(matrix), both)
+    covariance = linalg.inverse(linalg.identity(size) + total[..., :size, :])
+    mean = linalg.matvec(covariance, total[..., size, :])
+    large = (matrix * matrix).sum(-2) > _STARVED
+    lanes = np.flatnonzero(large.reshape(-1, large.shape[-1]).any(0))
+    if lanes.size:
+        root, shift = linalg.identity(size), np.zeros_like(mean[..., lanes])
+        for channel in range(matrix.shape[-3]):
+            row = matrix[..., channel, :, lanes]
+            row = np.moveaxis(row, 0, -1)
+            scalar = Scalar.of(root, row, np.ones(1))
+            residual = value[..., channel, lanes] - linalg.dot(row, shift)
+            shift = shift + scalar.cross * (residual / scalar.variance)[..., None, :]
+            root = scalar.posterior(1.0)
+        mean[..., lanes], covariance[..., lanes] = shift, linalg.gram(root)
+    return mean, covariance
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from fusion_gym.systems.tobit.centre import (
     Feedback,
     Posterior,
 )
-from fusion_gym.systems.tobit.filters import KalmanFilter, Scalar
+from fusion_gym.systems.tobit.filters import KalmanFilter, joint_update
 from fusion_gym.systems.tobit.options import FeedbackOptions, refuse_fusion
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.validation import ConfigurationError
@@ -64,25 +64,18 @@ class JointCentre(FederatedCentre):
         # A channel that has not arrived stands for nothing, with a variance of 1.
         noise = taken[:, None] * taken * sensors.noise_covariance[np.ix_(channels, channels)]
         factor = linalg.cholesky(linalg.add_diagonal(noise, 1.0 - taken))
-        white = np.concatenate(
-            [
-                sensors.stacked_matrix[channels] * taken[:, None],
-                innovation[:, None] * taken[:, None],
-            ],
-            axis=1,
-        )
-        shift, root, unit = np.zeros_like(mean), linalg.root(covariance), np.ones(1)
+        matrix = linalg.matmul(sensors.stacked_matrix[channels], prediction.root)
+        both = taken[:, None] * np.concatenate([matrix, innovation[:, None]], axis=1)
         for k in range(len(channels)):
             if k:
-                white[k] -= linalg.matvec(linalg.transpose(white[:k]), factor[k, :k])
-            white[k] /= factor[k, k]
-            scalar = Scalar.of(root, white[k, :-1], unit)
-            residual = white[k, -1] - linalg.dot(white[k, :-1], shift)
-            shift = shift + scalar.cross * (residual / scalar.variance)
-            root = scalar.posterior(1.0)
-        posterior = np.where(granted.any(0), linalg.gram(root), covariance)
-        local = np.broadcast_to(mean + shift, (sensors.count, *mean.shape))
-        return Posterior(mean + shift, posterior, local)
+                both[k] -= linalg.matvec(linalg.transpose(both[:k]), factor[k, :k])
+            both[k] /= factor[k, k]
+        shift, posterior = joint_update(both[:, :-1], both[:, -1])
+        posterior = linalg.congruence(prediction.root, posterior)
+        mean = mean + linalg.matvec(prediction.root, shift)
+        posterior = np.where(granted.any(0), posterior, covariance)
+        local = np.broadcast_to(mean, (sensors.count, *mean.shape))
+        return Posterior(mean, posterior, local)
 
 
 def joint_centre(options: FeedbackOptions, sensors: CensoredSensors) -> JointCentre:

@@ -152,25 +152,27 @@ class AssumedDensityFilter:
 
     sensors: CensoredSensors
 
-    def expect(self, mean: Array, covariance: Array) -> Expectation:
-        """Moments of the measurements (sensors, m, N) under the prior (n, N), (n, n, N)."""
+    def expect(self, mean: Array, root: Array) -> Expectation:
+        """Moments of the measurements (sensors, m, N) under the prior N(mean, G Gᵀ).
+
+        ``mean`` (n, N) and ``root`` G (n, n, N).
+        """
         matrix = self.sensors.measurement_matrix
         latent = linalg.matvec(matrix, mean)
-        spread = (matrix * linalg.matmul(matrix, covariance)).sum(-2) + self.sensors.variance
+        spread = np.square(linalg.matmul(matrix, root)).sum(-2) + self.sensors.variance
         return censored_moments(self.sensors, latent, np.sqrt(spread))
 
     def update(
-        self, mean: Array, covariance: Array, measurement: Array, granted: NDArray[np.bool_]
+        self, mean: Array, root: Array, measurement: Array, granted: NDArray[np.bool_]
     ) -> tuple[Array, Array]:
-        """Posterior (n, N), (n, n, N) after the granted (sensors, N) measurements."""
-        root = linalg.root(covariance)
+        """Mean (n, N) and root (n, n, N) after the granted (sensors, N) measurements."""
         for sensor in np.flatnonzero(granted.any(-1)).tolist():
             for component in range(self.sensors.size):
                 value, taken = measurement[sensor, component], granted[sensor]
                 mean, root = self._take(mean, root, sensor, component, value, taken)
-        return mean, np.where(granted.any(0), linalg.gram(root), covariance)
+        return mean, root
 
-    def expected_covariance(self, mean: Array, covariance: Array) -> Array:
+    def expected_covariance(self, mean: Array, root: Array) -> Array:
         """Expected posterior covariance (sensors, n, n, N) if one sensor alone delivers.
 
         Component by component, each with the share of its variance that the possibly censored
@@ -178,7 +180,7 @@ class AssumedDensityFilter:
         """
         matrix, noise = self.sensors.measurement_matrix, self.sensors.variance
         latent = linalg.matvec(matrix, mean)
-        root = linalg.root(covariance)[None]
+        root = root[None]
         for component in range(self.sensors.size):
             row = matrix[:, component]
             scalar = Scalar.of(root, row, noise[:, component])
