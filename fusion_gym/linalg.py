@@ -189,6 +189,11 @@ def congruence(a: FloatArray, p: FloatArray) -> FloatArray:
     return product if product.shape[-2] == 1 else symmetrise(product)
 
 
+def gram(f: FloatArray) -> FloatArray:
+    """``f f^T`` of ``(..., n, k, N)``, exactly symmetric: ``(..., n, n, N)``."""
+    return matmul(f, f.swapaxes(-3, -2))
+
+
 def _inverse_root(x: FloatArray) -> FloatArray:
     """``1 / sqrt(x)`` for positive x and NaN for zero, negative or infinite x."""
     root: FloatArray = np.sqrt(x)

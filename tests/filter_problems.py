@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_gym import linalg
 from fusion_gym.systems.tobit.bound_filter import BoundConstants, BoundTobitFilter, EventError
 from fusion_gym.systems.tobit.filters import NodeFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -55,19 +56,19 @@ def random_problem(
 def outcomes(
     node_filter: NodeFilter, problem: Problem, time: int = 3
 ) -> tuple[Array, Array, Array, Array]:
-    """Delivered mean and covariance, silent mean and covariance."""
+    """Delivered mean and covariance, silent mean and covariance, in the coordinates of the state."""
     expectation = node_filter.expect(problem.mean)
     times = np.full(problem.mean.shape[-1], float(time))
-    outcomes = node_filter.outcomes(
-        problem.mean, problem.covariance, expectation, problem.held, times
-    )
+    root = linalg.root(problem.covariance)
+    matrix = linalg.matmul(problem.sensors.measurement_matrix, root)
+    outcomes = node_filter.outcomes(matrix, expectation, problem.held, times)
     innovation = problem.value - expectation.value
-    delivered = problem.mean + np.einsum("smkN,smN->skN", outcomes.correction, innovation)
+    delivered = np.einsum("smkN,smN->skN", outcomes.correction, innovation)
     return (
-        delivered,
-        outcomes.delivered_covariance,
-        outcomes.silent_mean,
-        outcomes.silent_covariance,
+        problem.mean + linalg.matvec(root, delivered),
+        linalg.congruence(root, outcomes.delivered_covariance),
+        problem.mean + linalg.matvec(root, outcomes.silent_mean),
+        linalg.congruence(root, outcomes.silent_covariance),
     )
 
 

@@ -7,10 +7,9 @@ import pytest
 from filterpy.kalman import KalmanFilter as FilterPyFilter
 
 from fusion_gym import ConfigurationError
-from fusion_gym.fusion.rules import InformationFusion
 from fusion_gym.systems.linear_plant import LinearPlant
-from fusion_gym.systems.tobit.centre import Feedback, FeedbackCentre
-from fusion_gym.systems.tobit.filters import KalmanFilter, NodeFilter
+from fusion_gym.systems.tobit.centre import FederatedCentre, Feedback
+from fusion_gym.systems.tobit.filters import KalmanFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredSystem
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
@@ -26,11 +25,11 @@ def make_system(kind: Any, share: Any) -> CensoredSystem:
     """Uncensored sensors that all differ, and a process covariance without an inverse."""
     plant = LinearPlant.create(TRANSITION, PROCESS, [2.0, -1.0], 0.4 * np.eye(2))
     sensors = CensoredSensors.create(MATRICES, VARIANCES, -np.inf, 2)
-    node_filter: NodeFilter = kind(sensors)
+    centre = FederatedCentre(kind(sensors), Feedback.in_shares(share, 3))
     return CensoredSystem(
         plant=plant,
         model=plant,
-        centre=FeedbackCentre(node_filter, InformationFusion(), Feedback.in_shares(share, 3)),
+        centre=centre,
         random_start=False,
         state_names=("x1", "x2"),
         scale=np.ones(2),

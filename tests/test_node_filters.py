@@ -130,8 +130,8 @@ def test_expectation_is_that_of_the_censored_normal(
 # --- Joseph form -------------------------------------------------------------------------------
 
 
-def joseph(correction: Array, weighted: Array, covariance: Array, noise: Array) -> Array:
-    gain = correction.T
+def joseph(weighted: Array, covariance: Array, noise: Array) -> Array:
+    gain = covariance @ weighted.T @ np.linalg.inv(weighted @ covariance @ weighted.T + noise)
     keep = np.eye(len(covariance)) - gain @ weighted
     return keep @ covariance @ keep.T + gain @ noise @ gain.T
 
@@ -141,20 +141,17 @@ def test_posterior_equals_its_joseph_form(kind: Any) -> None:
     problem = random_problem(12, 2, 3, lanes=10, threshold=0.3)
     node_filter = kind(problem.sensors)
     expectation = node_filter.expect(problem.mean)
-    outcomes = node_filter.outcomes(
-        problem.mean, problem.covariance, expectation, problem.held, np.ones(10)
-    )
+    posterior = outcomes(node_filter, problem)[1]
     for sensor in range(2):
         matrix = problem.sensors.measurement_matrix[sensor, :, :, 0]
         for lane in range(10):
             q = expectation.uncensored_probability[sensor, :, lane]
             v = expectation.truncated_variance[sensor, :, lane]
             expected = joseph(
-                outcomes.correction[sensor, :, :, lane],
                 q[:, None] * matrix,
                 problem.covariance[sensor, :, :, lane],
                 np.diag(problem.sensors.variance[sensor, :, 0] * v),
             )
-            result = outcomes.delivered_covariance[sensor, :, :, lane]
+            result = posterior[sensor, :, :, lane]
             np.testing.assert_allclose(result, expected, rtol=1e-9, atol=1e-12)
             assert np.array_equal(result, result.T)

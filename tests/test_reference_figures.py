@@ -23,8 +23,7 @@ from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.registry import make_policy
-from fusion_gym.systems.tobit.filters import Expectation, Outcomes
-from fusion_gym.systems.tobit.sensors import CensoredSensors
+from fusion_gym.systems.tobit.filters import Expectation
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 Array = NDArray[np.float64]
@@ -323,29 +322,23 @@ def test_policies_meet_their_figures(
 
 
 @dataclasses.dataclass(frozen=True)
-class WronglyInformed:
-    """The Tobit filter of sensors whose noise variance it believes to be another."""
+class WronglyInformed(TobitKalmanFilter):
+    """The Tobit filter of sensors whose noise variance it believes to be ``factor`` as large."""
 
-    sensors: CensoredSensors
-    believed: TobitKalmanFilter
+    factor: float = 1.0
 
     def expect(self, mean: Array) -> Expectation:
-        return self.believed.expect(mean)
-
-    def outcomes(self, *arguments: Any) -> Outcomes:
-        return self.believed.outcomes(*arguments)
+        sensors = self.sensors
+        variance = self.factor * sensors.variance
+        believed = dataclasses.replace(sensors, variance=variance, deviation=np.sqrt(variance))
+        result = TobitKalmanFilter(believed).expect(mean)
+        return result._replace(truncated_variance=self.factor * result.truncated_variance)
 
 
 def misinformed_task(factor: float, **options: Any) -> Task:
     task = make_task(filter="tobit", **options)
     centre = task.system.centre
-    sensors = centre.sensors
-    matrix, variance, threshold = sensors.measurement_matrix, sensors.variance, sensors.threshold
-    believed = CensoredSensors.create(
-        matrix[..., 0], factor * variance[..., 0], threshold[..., 0], 2
-    )
-    node_filter = WronglyInformed(sensors, TobitKalmanFilter(believed))
-    centre = dataclasses.replace(centre, filter=node_filter)
+    centre = dataclasses.replace(centre, filter=WronglyInformed(centre.sensors, factor))
     return dataclasses.replace(task, system=dataclasses.replace(task.system, centre=centre))
 
 

@@ -10,8 +10,6 @@ from fusion_gym import linalg
 from fusion_gym.arrays import Array, take_runs
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
-from fusion_gym.fusion.rules import InformationFusion, alike
-from fusion_gym.systems.tobit.filters import Outcomes
 
 MANY, STATES = 8, 4
 
@@ -74,36 +72,6 @@ def test_the_joint_filter_agrees_up_to_rounding() -> None:
     expected, result = one_by_one(task, state), task.system.fused_alone(state)
     np.testing.assert_allclose(result[0], expected[0], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(result[1], expected[1], rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("shared", [True, False])
-def test_informations_after_an_answer_are_the_inverses_of_what_results(shared: bool) -> None:
-    rng = np.random.default_rng(0)
-
-    def covariances(count: int) -> Array:
-        root = rng.normal(size=(count, STATES, STATES, 5))
-        return np.einsum("sijN,skjN->sikN", root, root) + np.eye(STATES)[:, :, None]
-
-    silent = np.ascontiguousarray(covariances(1 if shared else MANY))
-    silent = np.broadcast_to(silent, (MANY, *silent.shape[1:]))
-    assert alike(silent) == shared
-    delivered = np.ascontiguousarray(covariances(MANY))
-    means = rng.normal(size=(MANY, STATES, 5))
-    for granted in (
-        np.zeros((MANY, 5), dtype=np.bool_),
-        np.ones((MANY, 5), dtype=np.bool_),
-        rng.random((MANY, 5)) < 0.3,
-    ):
-        outcomes = Outcomes(means[:, None], delivered, means, silent)
-        assert outcomes.informed == shared
-        local = np.where(granted[:, None, None], delivered, silent)
-        expected = InformationFusion().fuse(means, local)
-        for _ in range(2):  # the second time from what is known by then
-            result = InformationFusion().fuse_information(means, outcomes.information(granted))
-            np.testing.assert_array_equal(result.mean, expected.mean)
-            np.testing.assert_array_equal(result.covariance, expected.covariance)
-            assert outcomes.delivered_information is not None
-        assert outcomes.informed
 
 
 @pytest.mark.parametrize("rows", [2, 7, 8, 30])

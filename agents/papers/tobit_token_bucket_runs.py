@@ -89,14 +89,14 @@ def single_sensor(sensor: int) -> Task:
 
 def record_history(task: Task, episodes: int, seed: int, policy: Policy | str = TRIGGER) -> History:
     """Run the paper's trigger, or another policy, and keep everything."""
-    rows = []
+    rows, share = [], task.system.centre.feedback.share[:, None, None]
     for batch, requests in walk(task, policy, episodes, seed):
         before, tokens = batch.state, batch.tokens
         outcome = batch.step(requests)
         state, granted = batch.delivered, outcome.granted
-        planned, expected = state.prediction.outcomes, state.prediction.expectation
+        expected, _, root, planned = state.prediction
         bounds = (planned.delivered_covariance, planned.silent_covariance)
-        bound = np.where(granted[:, None, None], *bounds)
+        bound = linalg.congruence(root, np.where(granted[:, None, None], *bounds) / share)
         values = (
             state.truth, state.measurement, state.held, before.held, outcome.requested, granted,
             batch.tokens, tokens, state.prior_mean, state.prior_covariance,

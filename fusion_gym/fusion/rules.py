@@ -88,18 +88,6 @@ def own_covariances(covariance: Array) -> Array:
     return np.stack([covariance[i, i] for i in range(len(covariance))])
 
 
-def alike(covariance: Array) -> bool:
-    """Whether the covariances (l, n, n, N) of all estimates are one and the same in memory."""
-    return len(covariance) > 1 and covariance.strides[0] == 0
-
-
-def inverses(covariance: Array) -> Array:
-    """Inverses of covariances (l, n, n, N), of those that are :func:`alike` once."""
-    if not alike(covariance):
-        return linalg.inverse(covariance)
-    return np.broadcast_to(linalg.inverse(covariance[:1]), covariance.shape)
-
-
 @dataclass(frozen=True)
 class InformationFusion(FusionRule):
     r"""Sum of the informations of independent estimates: P = (Σ P_i⁻¹)⁻¹, x = P Σ P_i⁻¹ x_i.
@@ -134,49 +122,18 @@ class InformationFusion(FusionRule):
         if active is not None:
             information = np.where(active[:, None, None], information, 0.0)
             means = np.where(active[:, None], means, 0.0)
-        return self.fuse_information(means, information)
-
-    def fuse_information(self, means: Array, information: Array) -> Fused:
-        """The same of informations P_i⁻¹ (l, n, n, N), zero for estimates that take no part."""
         fused = linalg.inverse(information.sum(0))
         mean = linalg.matvec(fused, linalg.matvec(information, means).sum(0))
         return Fused(mean, fused, lambda: linalg.matmul(fused, information))
-
-    def fuse_each(
-        self, means: Array, information: Array, others: Array, gained: Array
-    ) -> tuple[Array, Array]:
-        """The estimates joined with one of them replaced, each in its turn.
-
-        From means (l, n, N) and informations (l, n, n, N), and the ``others`` and what is
-        ``gained`` that stand for them, of the same shapes, to means (l, n, N) and covariances
-        (l, n, n, N): bitwise those of l calls of :meth:`fuse_information`.
-        """
-        fused = linalg.inverse(_replaced_in_turn(information, gained))
-        vector = _replaced_in_turn(linalg.matvec(information, means), linalg.matvec(gained, others))
-        return linalg.matvec(fused, vector), fused
 
     def fuse_single(
         self, silent: Array, delivered: Array, basis: Array | None = None
     ) -> tuple[Array, Array]:
         """See :class:`FusionRule`: informations are sums."""
-        information = inverses(silent)
+        information = linalg.inverse(silent)
         total = information.sum(0)
         gained = linalg.inverse(delivered) - information
-        return linalg.inverse(total), linalg.inverse(linalg.symmetrise(total + gained))
-
-
-def _replaced_in_turn(terms: Array, others: Array) -> Array:
-    """Sums of ``terms`` (l, …, N), in the i-th of which ``others[i]`` stands for the i-th.
-
-    (l, …, N), each summed in the order of the terms, as ``sum(0)`` does.
-    """
-    total = np.repeat(terms[:1], len(terms), axis=0)
-    total[0] = others[0]
-    for place in range(1, len(terms)):
-        before = total[place] + others[place]
-        total += terms[place]
-        total[place] = before
-    return total
+        return linalg.inverse(total), linalg.inverse(total + gained)
 
 
 @dataclass(frozen=True)

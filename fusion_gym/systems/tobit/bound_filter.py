@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.systems.tobit.filters import Expectation, Outcomes, joseph_form, linear_update
+from fusion_gym.systems.tobit.filters import Expectation, Outcomes, linear_update
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import expect_censored
 from fusion_gym.validation import ConfigurationError
@@ -177,107 +177,65 @@ class BoundTobitFilter:
         return expect_censored(self.sensors, mean)
 
     def outcomes(
-        self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
+        self, matrix: Array, expectation: Expectation, held: Array, time: Array
     ) -> Outcomes:
         """See :class:`fusion_gym.systems.tobit.filters.NodeFilter`.
 
         Source: tobit_token_bucket, equations (30) and (37). At the optimal gain (30) is
-        κ₁ P - κ₁ P C̃ᵀ Φ⁻¹ C̃ P κ₁, with Φ = κ₁ C̃ P C̃ᵀ + S and C̃ = q C.
+        κ₁ P - κ₁ P C̃ᵀ Φ⁻¹ C̃ P κ₁, with Φ = κ₁ C̃ P C̃ᵀ + S and C̃ = q C; here P = I.
         """
-        covariance = self.sensors.shrunk(covariance)
-        matrix = self.sensors.measurement_matrix
-        cross = linalg.matmul(matrix, covariance)
-        spread = linalg.matmul(cross, linalg.transpose(matrix))
         latent = expectation.latent
+        spread = linalg.gram(matrix)
         grow, shift = self.constants.second_moment
         moment = grow * spread + shift * linalg.outer(latent, latent)
-        correction, delivered = self._delivered(covariance, spread, moment, expectation, time)
-        if not self.hold:
-            return Outcomes(correction, delivered, mean, covariance)
-        silent = self._held(mean, covariance, cross, spread, moment, expectation, held)
+        correction, delivered = self._delivered(matrix, linalg.diagonal(moment), expectation, time)
+        if self.hold:
+            silent = self._held(matrix, spread, moment, expectation, held)
+        else:
+            prior = np.broadcast_to(linalg.identity(matrix.shape[2]), delivered.shape)
+            silent = np.zeros_like(delivered[:, 0]), prior
         return Outcomes(correction, delivered, *silent)
 
     def _delivered(
-        self, covariance: Array, spread: Array, moment: Array, expectation: Expectation, time: Array
+        self, matrix: Array, moments: Array, expectation: Expectation, time: Array
     ) -> tuple[Array, Array]:
         """θ = 0: correction and bound."""
         k1, k2, k3, _, _, k6, _, k8 = self.constants.kappa
         variance, threshold = self.sensors.variance, self.sensors.finite_threshold
         q = np.maximum(expectation.uncensored_probability, _SMALLEST_PROBABILITY)
         a = q * expectation.hazard * self.sensors.deviation
-        noise = q * variance + q * (1.0 - q) * (k3 * linalg.diagonal(moment) + k8 * threshold**2)
+        noise = q * variance + q * (1.0 - q) * (k3 * moments + k8 * threshold**2)
         if self.event_error is not None:
             noise = noise + k6 * self.event_error.at(time)[:, None]
-        total = linalg.outer(q, q) * (k1 * spread) + k2 * linalg.outer(a, a)
-        total = linalg.add_diagonal(total, noise)
-        weighted = q[:, :, None] * self.sensors.measurement_matrix
-        bias = np.sqrt(k2) * a
-        return linear_update(self.sensors, k1 * covariance, weighted, total, noise, bias)
+        weighted = np.sqrt(k1) * q[:, :, None] * matrix
+        correction, bound = linear_update(weighted, noise, np.sqrt(k2) * a)
+        return np.sqrt(k1) * correction, k1 * bound
 
     def _held(
-        self,
-        mean: Array,
-        covariance: Array,
-        cross: Array,
-        spread: Array,
-        moment: Array,
-        expectation: Expectation,
-        held: Array,
+        self, matrix: Array, spread: Array, moment: Array, expectation: Expectation, held: Array
     ) -> tuple[Array, Array]:
         """θ = 1: mean and bound after the update with the held value ȳ.
 
         Every term of Φ but two is scaled by q on both sides, so the update is written in units of
         q: Φ = q (N + F Fᵀ) q with F = [√κ₅ ȳ, √κ₇ (1 - q) τ]/q, whose rows may be huge and of very
         different size. :func:`_pinned_solve` takes them in without loss of digits, and the gain
-        itself, which grows as 1/q, is never formed.
+        itself, which grows as 1/q, is never formed. N is singular where a row of the prediction is
+        known; a ridge of its rounding counts as noise, so that the bound stays one.
         """
         k1, k2, _, k4, k5, _, k7, _ = self.constants.kappa
-        latent, threshold = expectation.latent, self.sensors.finite_threshold
+        threshold = self.sensors.finite_threshold
         q = np.maximum(expectation.uncensored_probability, _SMALLEST_PROBABILITY)
         bias = expectation.hazard * self.sensors.deviation
         core = k1 * spread + k4 * moment + k2 * linalg.outer(bias, bias)
-        lanes = self.sensors.starved(covariance)
-        if lanes.size:  # the squares of C x̂ and of C P Cᵀ may lie as far apart as float64 reaches
-            ridge = _RIDGE * linalg.diagonal(core[..., lanes])
-            core[..., lanes] = linalg.add_diagonal(core[..., lanes], ridge)
+        ridge = linalg.diagonal(core)
+        core = linalg.add_diagonal(core, np.where(ridge > 0.0, _RIDGE * ridge, 1.0))
         columns = _pinned_columns(held, threshold, q, np.sqrt(k5), np.sqrt(k7))
-        solved, pull = _pinned_solve(core, cross, columns)
-        whitened, pinned = np.split(solved, [cross.shape[-2]], axis=-2)
-        uncensored = latent + bias
-        step = linalg.matvec(linalg.transpose(cross), pull) - linalg.matvec(
-            linalg.transpose(whitened), uncensored
-        )
-        bound = k1 * covariance - k1**2 * linalg.matmul(linalg.transpose(cross), whitened)
-        bound = linalg.symmetrise(bound)
-        if lanes.size:
-            pulled = k1 * linalg.matmul(linalg.transpose(cross), pinned)
-            bound[..., lanes] = self._held_squares(
-                covariance[..., lanes],
-                k1 * linalg.transpose(whitened)[..., lanes],
-                latent[..., lanes],
-                bias[..., lanes],
-                pulled[..., lanes],
-            )
-        return mean + k1 * step, bound
-
-    def _held_squares(
-        self, covariance: Array, gain: Array, latent: Array, bias: Array, pulled: Array
-    ) -> Array:
-        """(30) with θ = 1 as the sum of squares that it is, true for any gain.
-
-        ``gain`` is K q, ``bias`` λ √R, and ``pulled`` K q F.
-        """
-        k1, k2, _, k4, _, _, _, _ = self.constants.kappa
-        grow, shift = self.constants.second_moment
-        matrix = self.sensors.measurement_matrix
-        observed = linalg.matmul(matrix, linalg.root(covariance))
-        offsets = np.stack((np.sqrt(k4 * shift) * latent, np.sqrt(k2) * bias), axis=-2)
-        noise = [
-            linalg.matmul(gain, np.sqrt(k4 * grow) * observed),
-            linalg.matmul(gain, offsets),
-            pulled,
-        ]
-        return joseph_form(self.sensors, k1 * covariance, matrix, gain, noise)
+        whitened, pull = _pinned_solve(core, matrix, columns)
+        across = linalg.transpose(matrix)
+        uncensored = expectation.latent + bias
+        step = linalg.matvec(across, pull) - linalg.matvec(linalg.transpose(whitened), uncensored)
+        reduction = linalg.symmetrise(linalg.matmul(across, whitened))
+        return k1 * step, k1 * linalg.identity(matrix.shape[2]) - k1**2 * reduction
 
 
 def _pinned_columns(
@@ -320,7 +278,7 @@ def _pinned_columns(
 def _pinned_solve(
     core: Array, right: Array, columns: list[tuple[Array, Array]]
 ) -> tuple[Array, Array]:
-    """(N + F Fᵀ)⁻¹ [B, F] and (N + F Fᵀ)⁻¹ F c, one column of F after another.
+    """(N + F Fᵀ)⁻¹ B and (N + F Fᵀ)⁻¹ F c, one column of F after another.
 
     ``core`` N (…, m, m, N) is positive definite, ``right`` B (…, m, n, N); ``columns`` are those
     of :func:`_pinned_columns`. Each step is the Sherman-Morrison formula: with h = M⁻¹ f,
@@ -336,5 +294,4 @@ def _pinned_solve(
         shift = shift + weight * (factor - linalg.dot(f, shift)[..., None, :])
         projected = linalg.matvec(linalg.transpose(solved), f)
         solved = solved - linalg.outer(weight, projected)
-        solved[..., n + place, :] = weight
-    return solved, shift
+    return solved[..., :n, :], shift

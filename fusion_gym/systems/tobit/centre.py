@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.fusion.rules import Fused, FusionRule, InformationFusion
+from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.systems.tobit.filters import (
     Expectation,
     KalmanFilter,
     NodeFilter,
     Outcomes,
+    joint_update,
 )
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
@@ -25,13 +26,15 @@ from fusion_gym.validation import ConfigurationError
 class CentrePrediction(NamedTuple):
     """What centre and nodes expect before anything is sent.
 
-    ``expectation`` of the measurements, ``deviation`` (sensors, m, N) of the innovation, and the
-    nodes' ``outcomes`` where there are nodes.
+    ``expectation`` of the measurements, ``deviation`` (sensors, m, N) of the innovation, ``root`` G
+    (n, n, N) of the covariance if nobody transmits, and where nodes have covariances of their own,
+    their ``outcomes`` z of x = x̂ + G z.
     """
 
     expectation: Expectation
     deviation: Array
-    outcomes: Outcomes | None
+    root: Array
+    outcomes: Outcomes | None = None
 
 
 class Posterior(NamedTuple):
@@ -107,7 +110,7 @@ class Feedback:
     the fused covariance and the process covariance are inflated, and it is the inflation of both
     that keeps information from being counted twice when the nodes' informations are added up.
 
-    Without shares every node gets the prediction as it is. Nothing keeps the common prior from
+    With shares of 1 every node gets the prediction as it is. Nothing keeps the common prior from
     being counted several times then but the fusion rule, which must be a form of covariance
     intersection. Two nodes with a common prior and independent measurements are just the
     structure for which the inverse form was derived, so "ici" keeps its bound here. With a single
@@ -116,8 +119,12 @@ class Feedback:
     Source: tobit_token_bucket, equation (51); round_robin_tobit, equation (28).
     """
 
-    sensors: int
-    share: Array | None = None
+    share: Array
+
+    @classmethod
+    def in_full(cls, sensors: int) -> Feedback:
+        """Return the feedback that gives every node the whole prediction."""
+        return cls(np.ones((sensors, 1)))
 
     @classmethod
     def in_shares(cls, share: ArrayLike | None, sensors: int) -> Feedback:
@@ -127,33 +134,22 @@ class Feedback:
             ConfigurationError: a wrong shape, an entry <= 0, or a sum other than 1.
         """
         if share is None:
-            return cls(sensors, np.full((sensors, 1), 1.0 / sensors))
+            return cls(np.full((sensors, 1), 1.0 / sensors))
         weights = validation.array("information_shares", share, (sensors,))
         if np.any(weights <= 0) or abs(weights.sum() - 1.0) > 1e-9:
             raise ConfigurationError(
                 f"information_shares = {validation.display(weights)} is not allowed: they must be "
                 f"> 0 with sum 1 (their sum is {weights.sum():.6g})"
             )
-        return cls(sensors, weights[:, None])
-
-    def distribute(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """The nodes' priors from the centre's prediction.
-
-        From (n, N) and (n, n, N) to (sensors, n, N) and (sensors, n, n, N), read-only views where
-        the entries are the same for every node.
-        """
-        means = np.broadcast_to(mean, (self.sensors, *mean.shape))
-        if self.share is None:
-            return means, np.broadcast_to(covariance, (self.sensors, *covariance.shape))
-        share = self.share[:, None, None]
-        if (self.share == self.share[0]).all():
-            return means, np.broadcast_to(covariance / share[0], (self.sensors, *covariance.shape))
-        return means, covariance / share
+        return cls(weights[:, None])
 
 
 @dataclass(frozen=True)
 class FeedbackCentre(Centre):
     """A node filter for each sensor, fusion, and the result fed back to the nodes.
+
+    Nodes and fusion work on z of x = x̂ + G z with G Gᵀ the covariance of the prediction, so that
+    only regular covariances are inverted.
 
     Source: tobit_token_bucket, equations (20)-(23), (29)-(37), (50), (51); round_robin_tobit,
     equations (18)-(28).
@@ -171,25 +167,17 @@ class FeedbackCentre(Centre):
     @property
     def predictable(self) -> bool:
         """See :class:`Centre`: with Kalman filters, where nothing is censored."""
-        return isinstance(self.filter, KalmanFilter) and self.sensors.unlimited
-
-    @property
-    def separable(self) -> bool:
-        """See :class:`Centre`: where informations add up."""
-        return isinstance(self.fusion, InformationFusion)
+        return type(self.filter) is KalmanFilter and self.sensors.unlimited
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`."""
-        nodes = self.feedback.distribute(mean, covariance)
-        expectation = self.filter.expect(nodes[0])
-        matrix = self.sensors.measurement_matrix
-        spread = (matrix * linalg.matmul(matrix, covariance)).sum(-2)
-        q = expectation.uncensored_probability
-        floor = 1e-3 * self.sensors.variance
-        deviation = np.sqrt(q * q * spread + expectation.noise_variance + floor)
-        return CentrePrediction(
-            expectation, deviation, self.filter.outcomes(*nodes, expectation, held, time)
-        )
+        expectation = self.filter.expect(mean)
+        root = linalg.root(self.sensors.regular(covariance))
+        observed = linalg.matmul(self.sensors.measurement_matrix, root)
+        deviation = _deviation(self.sensors, expectation, (observed * observed).sum(-2))
+        inflated = observed / np.sqrt(self.feedback.share)[:, None, None]
+        outcomes = self.filter.outcomes(inflated, expectation, held, time)
+        return CentrePrediction(expectation, deviation, root, outcomes)
 
     def update(
         self,
@@ -200,41 +188,148 @@ class FeedbackCentre(Centre):
         granted: NDArray[np.bool_],
     ) -> Posterior:
         """Each node takes the planned outcome of the network's answer; the centre fuses."""
-        outcomes = _outcomes(prediction)
-        delivered = mean + _correction(outcomes, prediction, measurement)
-        local_mean = np.where(granted[:, None], delivered, outcomes.silent_mean)
-        fused = self._fused(local_mean, outcomes, granted)
-        return Posterior(fused.mean, fused.covariance, local_mean)
-
-    def _fused(self, means: Array, outcomes: Outcomes, granted: NDArray[np.bool_]) -> Fused:
-        """The nodes' estimates joined; bitwise the same by informations where that is cheaper."""
-        if isinstance(self.fusion, InformationFusion) and outcomes.informed:
-            return self.fusion.fuse_information(means, outcomes.information(granted))
+        outcomes, root = _outcomes(prediction), prediction.root
+        innovation = measurement - prediction.expectation.value
+        delivered = linalg.matvec(linalg.transpose(outcomes.correction), innovation)
+        local = np.where(granted[:, None], delivered, outcomes.silent_mean)
         grant = granted[:, None, None]
-        local = np.where(grant, outcomes.delivered_covariance, outcomes.silent_covariance)
-        return self.fusion.fuse(means, local)
-
-    def single(
-        self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
-    ) -> tuple[Array, Array]:
-        """See :class:`Centre`: informations of all nodes but one stay what they are in silence."""
-        outcomes = _outcomes(prediction)
-        assert isinstance(self.fusion, InformationFusion)
-        return self.fusion.fuse_each(
-            outcomes.silent_mean,
-            outcomes.silent_information,
-            mean + _correction(outcomes, prediction, measurement),
-            outcomes.delivered_information,
+        own = np.where(grant, outcomes.delivered_covariance, outcomes.silent_covariance)
+        share = self.feedback.share[:, None]
+        local = local / np.sqrt(share)
+        fused = self.fusion.fuse(local, own / share[:, None], basis=root)
+        return Posterior(
+            mean + linalg.matvec(root, fused.mean),
+            linalg.gram(linalg.matmul(root, linalg.root(fused.covariance))),
+            mean + linalg.matvec(root, local),
         )
 
     def variances(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
     ) -> tuple[Array, Array]:
         """See :class:`Centre`; by the bound where the filter minimises one."""
-        outcomes = _outcomes(prediction)
-        fused = self.fusion.fuse_single(outcomes.silent_covariance, outcomes.delivered_covariance)
-        silent, single = (linalg.weighted_trace(covariance, weights) for covariance in fused)
+        outcomes, root = _outcomes(prediction), prediction.root
+        share = self.feedback.share[:, None, None]
+        covariances = outcomes.silent_covariance / share, outcomes.delivered_covariance / share
+        silent, single = (
+            linalg.weighted_trace(linalg.congruence(root, fused), weights)
+            for fused in self.fusion.fuse_single(*covariances, basis=root)
+        )
         return silent, silent - single
+
+
+@dataclass(frozen=True)
+class FederatedCentre(Centre):
+    """Nodes with Kalman filters whose informations add up, by the same algebra at the centre.
+
+    Nodes that share the prediction P in shares w_m with the sum 1 have Σ (w_m P⁻¹ + Cᵀ N⁻¹ C)
+    together. That is the centre's own update by one delivered scalar after another, which
+    inverts no covariance. A silent sensor of weight Z says that its innovation was zero, with the
+    noise N + Z⁻¹; a delivery adds what is missing, N⁻¹ - (N + Z⁻¹)⁻¹ = (N + N Z N)⁻¹.
+
+    Source: tobit_token_bucket, equations (20)-(23), (50), (51); round_robin_tobit, equations
+    (18)-(28).
+    """
+
+    filter: KalmanFilter
+    feedback: Feedback
+
+    @property
+    def sensors(self) -> CensoredSensors:
+        """The sensors."""
+        return self.filter.sensors
+
+    @property
+    def predictable(self) -> bool:
+        """See :class:`Centre`: with Kalman filters, where nothing is censored."""
+        return type(self.filter) is KalmanFilter and self.sensors.unlimited
+
+    @property
+    def separable(self) -> bool:
+        """See :class:`Centre`."""
+        return True
+
+    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
+        """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
+        sensors, weight = self.sensors, self.filter.silence
+        expectation, root = self.filter.expect(mean), linalg.root(covariance)
+        observed = linalg.matmul(sensors.measurement_matrix, root)
+        deviation = _deviation(sensors, expectation, (observed * observed).sum(-2))
+        if weight is not None:
+            # Both sides times √Z, so that weight 0 is no exception.
+            scale = np.sqrt(weight / (1.0 + weight * sensors.variance[..., 0]))[..., None, None]
+            nothing = np.zeros_like(expectation.value)
+            _, silent = joint_update(_stack(scale * observed), _stack(nothing))
+            root = linalg.matmul(root, linalg.root(silent))
+        return CentrePrediction(expectation, deviation, root)
+
+    def update(
+        self,
+        mean: Array,
+        covariance: Array,
+        prediction: CentrePrediction,
+        measurement: Array,
+        granted: NDArray[np.bool_],
+    ) -> Posterior:
+        """See :class:`Centre`."""
+        places = np.flatnonzero(granted.any(-1))
+        local = np.broadcast_to(mean, (len(granted), *mean.shape)).copy()
+        silent = covariance if self.filter.silence is None else linalg.gram(prediction.root)
+        if places.size:
+            taken = granted[places, None]
+            local[places] += self._correction(covariance, prediction, measurement, places, taken)
+            matrix, value = self._whitened(prediction, measurement, places)
+            matrix = np.where(taken[:, None], matrix, 0.0)
+            mean, posterior = _shifted(mean, prediction, _stack(matrix), _stack(value))
+            silent = np.where(granted.any(0), posterior, silent)
+        return Posterior(mean, silent, local)
+
+    def single(
+        self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
+    ) -> tuple[Array, Array]:
+        """See :class:`Centre`."""
+        return _shifted(mean, prediction, *self._whitened(prediction, measurement, slice(None)))
+
+    def variances(
+        self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
+    ) -> tuple[Array, Array]:
+        """See :class:`Centre`."""
+        silent = linalg.weighted_trace(linalg.gram(prediction.root), weights)
+        single = self.single(mean, covariance, prediction, prediction.expectation.value)[1]
+        return silent, silent - linalg.weighted_trace(single, weights)
+
+    def _whitened(
+        self, prediction: CentrePrediction, measurement: Array, places: Any
+    ) -> tuple[Array, Array]:
+        """What sensors would deliver, of unit noise: N^-½ q C G (…, m, n, N) and N^-½ (y - ŷ)."""
+        sensors, expectation, weight = self.sensors, prediction.expectation, self.filter.silence
+        noise = sensors.variance[places] * expectation.truncated_variance[places]
+        innovation = measurement[places] - expectation.value[places]
+        if weight is not None:
+            larger = 1.0 + weight[places, None] * noise
+            noise, innovation = noise * larger, innovation * larger
+        scale = 1.0 / np.sqrt(noise)
+        matrix = linalg.matmul(sensors.measurement_matrix[places], prediction.root)
+        scaled = scale * expectation.uncensored_probability[places]
+        return scaled[..., None, :] * matrix, scale * innovation
+
+    def _correction(
+        self,
+        covariance: Array,
+        prediction: CentrePrediction,
+        measurement: Array,
+        places: NDArray[np.intp],
+        taken: NDArray[np.bool_],
+    ) -> Array:
+        """What nodes add to their own means (…, n, N)."""
+        sensors, expectation = self.sensors, prediction.expectation
+        q = expectation.uncensored_probability[places, :, None]
+        weighted = q * sensors.measurement_matrix[places]
+        cross = linalg.matmul(weighted, covariance)
+        total = linalg.matmul(cross, linalg.transpose(weighted))
+        noise = sensors.variance[places] * expectation.truncated_variance[places]
+        total = linalg.add_diagonal(total, self.feedback.share[places, None] * noise)
+        innovation = np.where(taken, measurement[places] - expectation.value[places], 0.0)
+        return linalg.matvec(linalg.transpose(cross), linalg.solve_vector(total, innovation))
 
 
 @dataclass(frozen=True)
@@ -250,9 +345,10 @@ class SequentialCentre(Centre):
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
-        expectation = self.filter.expect(mean, covariance)
+        root = linalg.root(covariance)
+        expectation = self.filter.expect(mean, root)
         floor = 1e-3 * self.sensors.variance
-        return CentrePrediction(expectation, np.sqrt(expectation.noise_variance + floor), None)
+        return CentrePrediction(expectation, np.sqrt(expectation.noise_variance + floor), root)
 
     def update(
         self,
@@ -263,7 +359,8 @@ class SequentialCentre(Centre):
         granted: NDArray[np.bool_],
     ) -> Posterior:
         """See :class:`Centre`."""
-        mean, covariance = self.filter.update(mean, covariance, measurement, granted)
+        mean, root = self.filter.update(mean, prediction.root, measurement, granted)
+        covariance = np.where(granted.any(0), linalg.gram(root), covariance)
         local = np.broadcast_to(mean, (self.sensors.count, *mean.shape))
         return Posterior(mean, covariance, local)
 
@@ -272,14 +369,28 @@ class SequentialCentre(Centre):
     ) -> tuple[Array, Array]:
         """See :class:`Centre`; the reduction is the expected one."""
         silent = linalg.weighted_trace(covariance, weights)
-        expected = self.filter.expected_covariance(mean, covariance)
+        expected = self.filter.expected_covariance(mean, prediction.root)
         return silent, silent - linalg.weighted_trace(expected, weights)
 
 
-def _correction(outcomes: Outcomes, prediction: CentrePrediction, measurement: Array) -> Array:
-    """What a delivery would add to each node's mean (sensors, n, N)."""
-    innovation = measurement - prediction.expectation.value
-    return linalg.matvec(linalg.transpose(outcomes.correction), innovation)
+def _deviation(sensors: CensoredSensors, expectation: Expectation, spread: Array) -> Array:
+    """Standard deviation of the innovation from the variances ``spread`` of C x, all (l, m, N)."""
+    q = expectation.uncensored_probability
+    return np.sqrt(q * q * spread + expectation.noise_variance + 1e-3 * sensors.variance)
+
+
+def _stack(values: Array) -> Array:
+    """The channels of all sensors one after another, (sensors · m, …), of (sensors, m, …)."""
+    return values.reshape(-1, *values.shape[2:])
+
+
+def _shifted(
+    mean: Array, prediction: CentrePrediction, matrix: Array, value: Array
+) -> tuple[Array, Array]:
+    """Mean and covariance of x = x̂ + G z after :func:`joint_update` of z."""
+    shift, covariance = joint_update(matrix, value)
+    root = prediction.root
+    return mean + linalg.matvec(root, shift), linalg.congruence(root, covariance)
 
 
 def _outcomes(prediction: CentrePrediction) -> Outcomes:

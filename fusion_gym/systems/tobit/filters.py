@@ -4,20 +4,21 @@ Before the network answers, a node already knows everything but whether its requ
 the delivered value would be the current measurement, the alternative is the held one. So a filter
 plans both outcomes at once; a grant selects one of them. Neither covariance depends on the
 current measurement, so a policy may look at both without looking at the measurement.
+
+A node's prior is x = x̂ + G z with z ~ N(0, I) and G Gᵀ its covariance, which may be singular. The
+posterior of z is regular, whatever G is.
 """
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
-from fusion_gym.fusion.rules import alike, inverses
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.validation import ConfigurationError
 
@@ -39,60 +40,23 @@ class Expectation(NamedTuple):
     truncated_variance: Array
 
 
-_MANY, _LARGE = 6, 3  # sensors and states
+_STARVED = 1e6  # P - P Cᵀ S⁻¹ C P loses its digits where C P Cᵀ is so many times the noise
+_LARGE = 16  # states from which on a product by BLAS is faster than a sum of outer products
+_RIDGE = 1e-14  # relative, for each row: above the rounding of a Gram matrix
 
 
-@dataclass(frozen=True)
-class Outcomes:
-    """Both outcomes at every node.
+class Outcomes(NamedTuple):
+    """Both outcomes at every node, in the coordinates z of its prior.
 
     ``correction`` (sensors, m, n, N): the transposed gain of a delivery, so that the delivered
-    mean is prior + correctionᵀ innovation; ``delivered_covariance`` (sensors, n, n, N);
-    ``silent_mean`` (sensors, n, N) and ``silent_covariance`` (sensors, n, n, N).
+    mean is correctionᵀ innovation; ``delivered_covariance`` (sensors, n, n, N); ``silent_mean``
+    (sensors, n, N) and ``silent_covariance`` (sensors, n, n, N).
     """
 
     correction: Array
     delivered_covariance: Array
     silent_mean: Array
     silent_covariance: Array
-
-    @functools.cached_property
-    def silent_information(self) -> Array:
-        """The inverse (sensors, n, n, N) of the silent covariance."""
-        return inverses(self.silent_covariance)
-
-    @property
-    def informed(self) -> bool:
-        """Whether both informations are known already, or that of silence is cheap to have.
-
-        It is where many nodes have one and the same covariance, too large for a closed form.
-        """
-        if {"silent_information", "delivered_information"} <= vars(self).keys():
-            return True
-        sensors, states = self.silent_covariance.shape[:2]
-        return alike(self.silent_covariance) and sensors >= _MANY and states >= _LARGE
-
-    @functools.cached_property
-    def delivered_information(self) -> Array:
-        """The inverse (sensors, n, n, N) of the delivered covariance."""
-        return linalg.inverse(self.delivered_covariance)
-
-    def information(self, granted: NDArray[np.bool_]) -> Array:
-        """The nodes' informations (sensors, n, n, N) after the answer ``granted`` (sensors, N).
-
-        Only what was granted is inverted anew: bitwise the inverse of the covariances that result.
-        """
-        if not granted.any():
-            return self.silent_information
-        if granted.all() or "delivered_information" in vars(self):
-            grant = granted[:, None, None]
-            return np.where(grant, self.delivered_information, self.silent_information)
-        result = np.ascontiguousarray(self.silent_information).copy()
-        sensor, run = np.nonzero(granted)
-        delivered = np.moveaxis(self.delivered_covariance[sensor, :, :, run], 0, -1)
-        values = linalg.inverse(np.ascontiguousarray(delivered))
-        result[sensor, :, :, run] = np.moveaxis(values, -1, 0)
-        return result
 
 
 class NodeFilter(Protocol):
@@ -104,13 +68,13 @@ class NodeFilter(Protocol):
         ...
 
     def expect(self, mean: Array) -> Expectation:
-        """Expectation of the measurements from the prior means (sensors, n, N)."""
+        """Expectation of the measurements from the prior means (n, N) or (sensors, n, N)."""
         ...
 
     def outcomes(
-        self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
+        self, matrix: Array, expectation: Expectation, held: Array, time: Array
     ) -> Outcomes:
-        """Both outcomes from the priors (sensors, n, N), (sensors, n, n, N).
+        """Both outcomes from ``matrix`` C G (sensors, m, n, N).
 
         ``held`` (sensors, m, N) is the last delivered measurement, ``time`` (N,) the number of
         the step in its episode, counted from 1.
@@ -118,54 +82,97 @@ class NodeFilter(Protocol):
         ...
 
 
-def linear_update(
-    sensors: CensoredSensors,
-    covariance: Array,
-    matrix: Array,
-    innovation_covariance: Array,
-    noise: Array,
-    bias: Array | None = None,
-) -> tuple[Array, Array]:
-    """Correction S⁻¹ C P (…, m, n, N) and posterior covariance P - P Cᵀ S⁻¹ C P (…, n, n, N).
+def linear_update(matrix: Array, noise: Array, bias: Array | None = None) -> tuple[Array, Array]:
+    """Correction S⁻¹ B (…, m, n, N) and posterior covariance I - Bᵀ S⁻¹ B (…, n, n, N).
 
-    The minimum-variance update for ``matrix`` C (…, m, n, N) and innovation covariance
-    S = C P Cᵀ + N (…, m, m, N), with N = diag(``noise``) + ``bias`` ``bias``ᵀ, both (…, m, N).
-    Where P is far larger than what ``sensors`` leave of it, the difference has no digits left,
-    and the posterior is :func:`joseph_form` instead.
+    The minimum-variance update of z ~ N(0, I) for ``matrix`` B (…, m, n, N) and innovation
+    covariance S = B Bᵀ + N, with N = diag(``noise``) + ``bias`` ``bias``ᵀ, both (…, m, N). Where
+    the difference would lose its digits it is the Joseph form (I - K B) (I - K B)ᵀ + K N Kᵀ, with a
+    ridge in proportion to its diagonal that keeps it definite.
     """
-    cross = linalg.matmul(matrix, covariance)
-    correction = linalg.solve(innovation_covariance, cross)
-    reduction = linalg.matmul(linalg.transpose(cross), correction)
-    posterior = linalg.symmetrise(covariance - reduction)
-    lanes = sensors.starved(covariance)
+    spread = linalg.gram(matrix)
+    total = linalg.add_diagonal(spread, noise)
+    if bias is not None:
+        total += linalg.outer(bias, bias)
+    correction = linalg.solve(total, matrix)
+    size = matrix.shape[-2]
+    identity = linalg.identity(size)
+    posterior = identity - linalg.matmul(linalg.transpose(matrix), correction)
+    posterior = linalg.symmetrise(posterior)
+    large = (linalg.diagonal(spread) > _STARVED * noise).reshape(-1, spread.shape[-1]).any(0)
+    lanes = np.flatnonzero(large)
     if lanes.size:
-        gain = linalg.transpose(in_lanes(correction, lanes))
-        parts = [gain * np.sqrt(in_lanes(noise, lanes))[..., None, :, :]]
+        gain = linalg.transpose(correction[..., lanes])
+        noise = np.broadcast_to(noise, matrix.shape[:-2] + matrix.shape[-1:])
+        parts = [identity - linalg.matmul(gain, matrix[..., lanes])]
+        parts.append(gain * np.sqrt(noise[..., lanes])[..., None, :, :])
         if bias is not None:
-            parts.append(linalg.matvec(gain, in_lanes(bias, lanes))[..., None, :])
-        prior, matrix = in_lanes(covariance, lanes), in_lanes(matrix, lanes)
-        posterior[..., lanes] = joseph_form(sensors, prior, matrix, gain, parts)
+            parts.append(linalg.matvec(gain, bias[..., lanes])[..., None, :])
+        exact = linalg.gram(np.concatenate(parts, axis=-2))
+        ridge = size * _RIDGE * linalg.diagonal(exact)
+        posterior[..., lanes] = linalg.add_diagonal(exact, ridge)
     return correction, posterior
 
 
-def joseph_form(
-    sensors: CensoredSensors, covariance: Array, matrix: Array, gain: Array, noise: list[Array]
-) -> Array:
-    """(I - K C) P (I - K C)ᵀ + Σ V Vᵀ (…, n, n, N) for any gain K (…, n, m, N).
+class Scalar(NamedTuple):
+    """A scalar measurement c x + v of a prior covariance G Gᵀ.
 
-    A sum of squares, which keeps its small eigenvalues beside large ones. ``noise`` are the V
-    (…, n, k, N), what the gain makes of the measurement's noise.
-    Source: R. S. Bucy and P. D. Joseph, "Filtering for stochastic processes with applications to
-    guidance", 1968.
+    ``root`` G (…, n, n, N) · ``projection`` g = Gᵀ cᵀ and ``cross`` G g, both (…, n, N) · ``noise``
+    R (…, 1) or (…, N), the variance of v · ``variance`` S = gᵀ g + R (…, N).
     """
-    keep = linalg.identity(covariance.shape[-2]) - linalg.matmul(gain, matrix)
-    retention = linalg.matmul(keep, linalg.root(covariance))
-    return sensors.gram(np.concatenate([retention, *noise], axis=-2))
+
+    root: Array
+    projection: Array
+    cross: Array
+    noise: Array
+    variance: Array
+
+    @classmethod
+    def of(cls, root: Array, row: Array, noise: Array) -> Scalar:
+        """Return the measurement of ``row`` c (…, n, 1) or (…, n, N)."""
+        projection = linalg.matvec(linalg.transpose(root), row)
+        variance = linalg.dot(projection, projection) + noise
+        return cls(root, projection, linalg.matvec(root, projection), noise, variance)
+
+    def posterior(self, share: Array | float) -> Array:
+        """Root of P - P cᵀ c P s/S, where the measurement explains the share s of its variance.
+
+        It is G (I - w g gᵀ) with (1 - w gᵀ g)² = 1 - s gᵀ g/S, which loses no digits whatever P is.
+        Source: J. E. Potter's form; P. S. Maybeck, "Stochastic models, estimation, and control",
+        volume 1, 1979, section 7.3.
+        """
+        left = (share * self.noise + (1.0 - share) * self.variance) / self.variance
+        weight = share / (self.variance * (1.0 + np.sqrt(left)))
+        return self.root - linalg.outer(self.cross * weight[..., None, :], self.projection)
 
 
-def in_lanes(values: Array, lanes: NDArray[np.intp]) -> Array:
-    """The runs with these numbers, of values with one column a run or one for all."""
-    return values if values.shape[-1] == 1 else values[..., lanes]
+def joint_update(matrix: Array, value: Array) -> tuple[Array, Array]:
+    """Mean (…, n, N) and covariance (…, n, n, N) of z ~ N(0, I) after ``value`` = B z + v.
+
+    ``matrix`` B (…, c, n, N) and ``value`` (…, c, N) of any number of channels, v ~ N(0, I). It is
+    (I + Bᵀ B)⁻¹, or one channel after another where that sum would lose its digits.
+    """
+    size = matrix.shape[-2]
+    both = np.concatenate([matrix, value[..., None, :]], axis=-2)
+    if size < _LARGE:
+        total = (matrix[..., :, None, :] * both[..., None, :, :]).sum(-4)
+    else:
+        total = linalg.matmul(linalg.transpose(matrix), both)
+    covariance = linalg.inverse(linalg.identity(size) + total[..., :size, :])
+    mean = linalg.matvec(covariance, total[..., size, :])
+    large = (matrix * matrix).sum(-2) > _STARVED
+    lanes = np.flatnonzero(large.reshape(-1, large.shape[-1]).any(0))
+    if lanes.size:
+        root, shift = linalg.identity(size), np.zeros_like(mean[..., lanes])
+        for channel in range(matrix.shape[-3]):
+            row = matrix[..., channel, :, lanes]
+            row = np.moveaxis(row, 0, -1)
+            scalar = Scalar.of(root, row, np.ones(1))
+            residual = value[..., channel, lanes] - linalg.dot(row, shift)
+            shift = shift + scalar.cross * (residual / scalar.variance)[..., None, :]
+            root = scalar.posterior(1.0)
+        mean[..., lanes], covariance[..., lanes] = shift, linalg.gram(root)
+    return mean, covariance
 
 
 @dataclass(frozen=True)
@@ -195,6 +202,11 @@ class KalmanFilter:
 
     sensors: CensoredSensors
 
+    @property
+    def silence(self) -> Array | None:
+        """Weight Z (sensors, 1) of what a silent sensor says; ``None``: nothing."""
+        return None
+
     def expect(self, mean: Array) -> Expectation:
         """See :class:`NodeFilter`."""
         latent = linalg.matvec(self.sensors.measurement_matrix, mean)
@@ -209,19 +221,19 @@ class KalmanFilter:
         )
 
     def outcomes(
-        self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
+        self, matrix: Array, expectation: Expectation, held: Array, time: Array
     ) -> Outcomes:
         """See :class:`NodeFilter`; ``held`` and ``time`` do not matter here."""
-        matrix = self.sensors.measurement_matrix
-        innovation = linalg.congruence(matrix, covariance)
-        noise = self.sensors.variance
-        innovation = linalg.add_diagonal(innovation, noise)
-        correction, posterior = linear_update(self.sensors, covariance, matrix, innovation, noise)
-        return Outcomes(correction, posterior, mean, covariance)
+        weighted = expectation.uncensored_probability[:, :, None] * matrix
+        noise = self.sensors.variance * expectation.truncated_variance
+        correction, delivered = linear_update(weighted, noise)
+        nothing = np.zeros(matrix.shape[:1] + matrix.shape[2:])
+        prior = np.broadcast_to(linalg.identity(matrix.shape[2]), delivered.shape)
+        return Outcomes(correction, delivered, nothing, prior)
 
 
 @dataclass(frozen=True)
-class StochasticEventFilter:
+class StochasticEventFilter(KalmanFilter):
     r"""Kalman filter for which silence is a measurement too, of variance R + Z⁻¹.
 
     A sensor that stays silent with probability exp(-zᵀ Z z / 2), z its innovation and
@@ -259,7 +271,6 @@ class StochasticEventFilter:
     60(10), 2015, the estimator of the closed-loop schedule.
     """
 
-    sensors: CensoredSensors
     weight: Array
 
     @classmethod
@@ -277,24 +288,17 @@ class StochasticEventFilter:
         checked = validation.positive("stochastic_weight", weight, (sensors.count,))
         return cls(sensors, checked[:, None])
 
-    def expect(self, mean: Array) -> Expectation:
-        """See :class:`NodeFilter`; censoring is ignored."""
-        return KalmanFilter(self.sensors).expect(mean)
+    @property
+    def silence(self) -> Array:
+        """See :class:`KalmanFilter`."""
+        return self.weight
 
     def outcomes(
-        self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
+        self, matrix: Array, expectation: Expectation, held: Array, time: Array
     ) -> Outcomes:
         """See :class:`NodeFilter`; ``held`` and ``time`` do not matter here."""
-        matrix = self.sensors.measurement_matrix
-        innovation = linalg.congruence(matrix, covariance)
-        noise = self.sensors.variance
-        innovation = linalg.add_diagonal(innovation, noise)
-        correction, delivered = linear_update(self.sensors, covariance, matrix, innovation, noise)
-        # Both sides times √Z, so that weight 0 is no exception: √Z C measured with √Z S √Z + I.
-        weight = self.weight[:, None, None]
-        ones = np.ones((matrix.shape[-3], 1))
-        scaled = linalg.add_diagonal(weight * innovation, ones)
-        noise = self.weight[:, None] * noise + ones
-        matrix = np.sqrt(weight) * matrix
-        _, silent = linear_update(self.sensors, covariance, matrix, scaled, noise)
-        return Outcomes(correction, delivered, mean, silent)
+        plain = super().outcomes(matrix, expectation, held, time)
+        # Both sides times √Z, so that weight 0 is no exception: √Z C measured with √Z R √Z + I.
+        noise = 1.0 + self.weight[:, None] * expectation.noise_variance
+        _, silent = linear_update(np.sqrt(self.weight)[:, None, None] * matrix, noise)
+        return plain._replace(silent_covariance=silent)

@@ -7,14 +7,13 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.systems.tobit.centre import CentrePrediction, Posterior
-from fusion_gym.systems.tobit.filters import (
-    Expectation,
-    KalmanFilter,
-    Outcomes,
-    in_lanes,
-    joseph_form,
+from fusion_gym.systems.tobit.centre import (
+    CentrePrediction,
+    FederatedCentre,
+    Feedback,
+    Posterior,
 )
+from fusion_gym.systems.tobit.filters import KalmanFilter, joint_update
 from fusion_gym.systems.tobit.options import FeedbackOptions, refuse_fusion
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.validation import ConfigurationError
@@ -23,7 +22,7 @@ _MOST_CHANNELS = 100  # whose joint covariance is solved in every step
 
 
 @dataclass(frozen=True)
-class JointCentre:
+class JointCentre(FederatedCentre):
     r"""Kalman filter at the centre, of all measurements that arrive in a step; there are no nodes.
 
     With C and y the rows of what has arrived and R the covariance of their noises, correlations
@@ -49,25 +48,6 @@ class JointCentre:
     Source: B. D. O. Anderson and J. B. Moore, "Optimal Filtering", 1979, chapter 3.
     """
 
-    sensors: CensoredSensors
-
-    @property
-    def predictable(self) -> bool:
-        """See :class:`Centre`."""
-        return self.sensors.unlimited
-
-    @property
-    def separable(self) -> bool:
-        """See :class:`Centre`."""
-        return True
-
-    def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
-        """See :class:`Centre`; ``held`` and ``time`` do not matter here."""
-        expectation = KalmanFilter(self.sensors).expect(mean)
-        matrix, variance = self.sensors.measurement_matrix, self.sensors.variance
-        spread = (matrix * linalg.matmul(matrix, covariance)).sum(-2)
-        return CentrePrediction(expectation, np.sqrt(spread + (1.0 + 1e-3) * variance), None)
-
     def update(
         self,
         mean: Array,
@@ -78,52 +58,24 @@ class JointCentre:
     ) -> Posterior:
         """See :class:`Centre`."""
         sensors, runs = self.sensors, granted.shape[-1]
-        taken = np.repeat(granted, sensors.size, axis=0).astype(np.float64)  # (channels, N)
-        innovation = (measurement - prediction.expectation.value).reshape(-1, runs)
-        matrix = taken[:, None] * sensors.stacked_matrix
-        cross = linalg.matmul(matrix, covariance)
-        spread = linalg.matmul(cross, linalg.transpose(matrix))
+        (channels,) = np.nonzero(np.repeat(granted.any(-1), sensors.size))
+        taken = np.repeat(granted, sensors.size, axis=0)[channels].astype(np.float64)
+        innovation = (measurement - prediction.expectation.value).reshape(-1, runs)[channels]
         # A channel that has not arrived stands for nothing, with a variance of 1.
-        spread = spread + taken[:, None] * taken * sensors.noise_covariance
-        spread = linalg.add_diagonal(linalg.symmetrise(spread), 1.0 - taken)
-        correction = linalg.solve(spread, cross)
-        mean = mean + linalg.matvec(linalg.transpose(correction), innovation)
-        posterior = covariance - linalg.matmul(linalg.transpose(cross), correction)
-        posterior = linalg.symmetrise(posterior)
-        lanes = sensors.starved(covariance)
-        if lanes.size:
-            gain = linalg.transpose(in_lanes(correction, lanes))
-            noise = [linalg.matmul(gain, sensors.noise_factor)]
-            prior, rows = covariance[..., lanes], in_lanes(matrix, lanes)
-            posterior[..., lanes] = joseph_form(sensors, prior, rows, gain, noise)
+        noise = taken[:, None] * taken * sensors.noise_covariance[np.ix_(channels, channels)]
+        factor = linalg.cholesky(linalg.add_diagonal(noise, 1.0 - taken))
+        matrix = linalg.matmul(sensors.stacked_matrix[channels], prediction.root)
+        both = taken[:, None] * np.concatenate([matrix, innovation[:, None]], axis=1)
+        for k in range(len(channels)):
+            if k:
+                both[k] -= linalg.matvec(linalg.transpose(both[:k]), factor[k, :k])
+            both[k] /= factor[k, k]
+        shift, posterior = joint_update(both[:, :-1], both[:, -1])
+        posterior = linalg.congruence(prediction.root, posterior)
+        mean = mean + linalg.matvec(prediction.root, shift)
+        posterior = np.where(granted.any(0), posterior, covariance)
         local = np.broadcast_to(mean, (sensors.count, *mean.shape))
         return Posterior(mean, posterior, local)
-
-    def single(
-        self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
-    ) -> tuple[Array, Array]:
-        """See :class:`Centre`: by the sensor's own channels, up to rounding."""
-        outcomes = self._each(mean, covariance, prediction)
-        innovation = measurement - prediction.expectation.value
-        correction = linalg.matvec(linalg.transpose(outcomes.correction), innovation)
-        return mean + correction, outcomes.delivered_covariance
-
-    def variances(
-        self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
-    ) -> tuple[Array, Array]:
-        """See :class:`Centre`."""
-        silent = linalg.weighted_trace(covariance, weights)
-        single = self._each(mean, covariance, prediction)
-        return silent, silent - linalg.weighted_trace(single.delivered_covariance, weights)
-
-    def _each(self, mean: Array, covariance: Array, prediction: CentrePrediction) -> Outcomes:
-        """What each sensor alone makes of the centre's own prediction."""
-        priors = np.broadcast_to(covariance, (self.sensors.count, *covariance.shape))
-        means = np.broadcast_to(mean, (self.sensors.count, *mean.shape))
-        expectation: Expectation = prediction.expectation
-        return KalmanFilter(self.sensors).outcomes(
-            means, priors, expectation, expectation.value, mean[0]
-        )
 
 
 def joint_centre(options: FeedbackOptions, sensors: CensoredSensors) -> JointCentre:
@@ -141,4 +93,4 @@ def joint_centre(options: FeedbackOptions, sensors: CensoredSensors) -> JointCen
             f"channels: together they may have at most {_MOST_CHANNELS}, for a step costs their "
             "cube; where noises of different sensors are independent, 'kalman' is the same filter"
         )
-    return JointCentre(sensors)
+    return JointCentre(KalmanFilter(sensors), Feedback.in_full(sensors.count))

@@ -57,7 +57,8 @@ class LinearFusionOptions(FeedbackOptions):
     nodes' estimates are joined by covariance intersection.
 
     Starting state: x₀ ~ N(``initial_mean``, ``initial_covariance``), by default zero and the
-    identity. The first measurement is known to the centre free of charge.
+    identity. The first measurement is known to the centre free of charge: the first estimate is
+    that of the filter after it.
 
     The defaults are a target in one dimension, sampled every 0.1 s, with white acceleration;
     one sensor measures its position in metres, one its velocity in metres a second.
@@ -117,6 +118,7 @@ def build_linear(choice: LinearFusionOptions) -> Scenario:
     centre = make_centre(str(choice.filter), _FILTERS, choice, sensors)
     names = _names(choice.state_names, plant.size)
     system = make_system(choice, plant, centre, names, _REFERENCE_HORIZON)
+    system = replace(system, known_start=True)
     return Scenario(
         choice,
         system,

@@ -13,7 +13,13 @@ from fusion_gym.core.options import CommonOptions, plain_options
 from fusion_gym.errors import ConfigurationError, display
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
-from fusion_gym.systems.tobit.centre import Centre, Feedback, FeedbackCentre, SequentialCentre
+from fusion_gym.systems.tobit.centre import (
+    Centre,
+    FederatedCentre,
+    Feedback,
+    FeedbackCentre,
+    SequentialCentre,
+)
 from fusion_gym.systems.tobit.filters import KalmanFilter, NodeFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.system import CensoredSystem
@@ -140,7 +146,7 @@ def memory_filter_system(
     return replace(system, centre=row.make(replace(options, **changed), sensors))
 
 
-def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> FeedbackCentre:
+def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> Centre:
     """Nodes with this filter and the options' fusion.
 
     Raises:
@@ -150,12 +156,15 @@ def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> FeedbackCentr
     kind = "federated" if options.fusion is None else options.fusion
     fusion = choose_rule(kind, _STRUCTURE, sensors, options.order)
     if kind == "federated":
-        return FeedbackCentre(node, fusion, Feedback.in_shares(options.information_shares, sensors))
+        feedback = Feedback.in_shares(options.information_shares, sensors)
+        if isinstance(node, KalmanFilter):
+            return FederatedCentre(node, feedback)
+        return FeedbackCentre(node, fusion, feedback)
     _refuse(options, ("information_shares",), f"fusion={kind!r}", "fusion='federated'")
-    return FeedbackCentre(node, fusion, Feedback(sensors))
+    return FeedbackCentre(node, fusion, Feedback.in_full(sensors))
 
 
-def stochastic_centre(values: FeedbackOptions, sensors: CensoredSensors) -> FeedbackCentre:
+def stochastic_centre(values: FeedbackOptions, sensors: CensoredSensors) -> Centre:
     """The centre of ``filter="stochastic"``.
 
     Raises:

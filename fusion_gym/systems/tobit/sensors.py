@@ -13,11 +13,7 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_limits
 from fusion_gym.validation import ConfigurationError
 
-# In units of the resolution: beyond it, differences of covariances have too few digits left.
-_STARVED = 1e6
-_HUGE = 1e10  # beyond it, small eigenvalues may be lost beside large ones
-_WIDEST = 1e12  # ratio of two eigenvalues of a covariance
-_NONE = np.empty(0, dtype=np.intp)
+_RIDGE = 4e-15  # relative, for each state: twice what linalg.root takes for rounding
 _LARGEST = 1e26  # what a delivery leaves of a larger variance would drown in its rounding
 
 
@@ -164,51 +160,20 @@ class CensoredSensors:
         values = 1.0 / np.where(observed, information, np.inf)
         return np.where(observed, values, values.max() if observed.any() else np.inf)
 
-    @functools.cached_property
-    def _finest(self) -> float:
-        return float(self.resolution.min())
+    def regular(self, covariance: Array) -> Array:
+        """A regular covariance (n, n, N) that is a bound of this one, larger by its rounding.
 
-    def starved(self, covariance: Array, factor: float = _STARVED) -> NDArray[np.intp]:
-        """Numbers of the runs of a covariance (…, n, n, N) with a variance > factor resolution."""
-        if not covariance.max() > factor * self._finest:  # the usual case, told apart in no time
-            return _NONE
-        large = linalg.diagonal(covariance) > factor * self.resolution
-        return np.flatnonzero(large.reshape(-1, large.shape[-1]).any(0))
-
-    def shrunk(self, covariance: Array) -> Array:
-        """Priors of the nodes (sensors, n, n, N), all of a run scaled down where one is above 10²⁶.
-
-        In units of the resolution. That much larger than any noise, an update depends on their
-        shape alone.
+        No variance is above 10²⁶ resolutions: that much larger than any noise, an update depends
+        on the shape alone.
         """
-        lanes = self.starved(covariance, _LARGEST)
-        if not lanes.size:
-            return covariance
-        variances = linalg.diagonal(covariance[..., lanes]) / self.resolution
-        result = covariance.copy()
-        result[..., lanes] *= _LARGEST / variances.max((0, 1))
-        return result
-
-    def gram(self, factor: Array) -> Array:
-        """F Fᵀ (…, n, n, N) of F (…, n, k, N), k >= n, as far as float64 can hold it.
-
-        The eigenvalues, in units of the resolution, lie no further apart than a factor of 10¹²: the
-        largest come down first, but not below that, then the smallest go up.
-        """
-        result = linalg.matmul(factor, linalg.transpose(factor))
-        lanes = self.starved(result, _HUGE)
-        if lanes.size:
-            unit = np.sqrt(self.resolution)
-            vectors, values, _ = np.linalg.svd(
-                np.moveaxis(factor[..., lanes] / unit[:, None], -1, -3), full_matrices=False
-            )
-            variances = values**2
-            variances = np.minimum(variances, _WIDEST * np.maximum(variances[..., -1:], 1.0))
-            variances = np.maximum(variances, variances[..., :1] / _WIDEST)
-            root = vectors * np.sqrt(variances)[..., None, :]
-            root = unit[:, None] * np.moveaxis(root, -3, -1)
-            result[..., lanes] = linalg.matmul(root, linalg.transpose(root))
-        return result
+        result = linalg.add_diagonal(
+            covariance, len(covariance) * _RIDGE * linalg.diagonal(covariance)
+        )
+        limit = _LARGEST * self.resolution
+        if not result.max() > limit.min():
+            return result
+        scale = np.sqrt(limit / np.maximum(linalg.diagonal(result), limit))
+        return result * linalg.outer(scale, scale)
 
     def censored(self, measurement: Array) -> NDArray[np.bool_]:
         """Which components (sensors, m, N) lie at a threshold."""

@@ -28,6 +28,7 @@ from fusion_gym.core.system import (
 from fusion_gym.systems.linear_plant import LinearPlant, largest_ratio, variance_loss
 from fusion_gym.systems.tobit.centre import Centre, CentrePrediction
 
+_TINY = float(np.finfo(float).tiny)  # stands for a variance of zero
 _RANGE = 5.0  # whitened quantities and logarithms of variance ratios are clipped here
 
 
@@ -76,7 +77,8 @@ class CensoredSystem(System[CensoredState]):
     ``random_start`` draws the initial mean, known to the filters, in a uniformly random direction
     with the length of the plant's initial mean; for the oscillator that is a random phase.
     ``scale`` (n,) are the magnitudes by which observed state estimates are divided, and
-    ``reference`` (n,) the variances against which observed variances are taken.
+    ``reference`` (n,) the variances against which observed variances are taken. With
+    ``known_start`` the estimate begins with the first measurement of every sensor.
     """
 
     plant: LinearPlant
@@ -87,6 +89,7 @@ class CensoredSystem(System[CensoredState]):
     scale: Array
     reference: Array
     nature: Nature = AS_ASSUMED
+    known_start: bool = False
     signals = SIGNALS
     extensions = ("state_weights",)
 
@@ -199,11 +202,11 @@ class CensoredSystem(System[CensoredState]):
             direction = noise[:n] / np.sqrt(linalg.dot(noise[:n], noise[:n]))
             mean = np.sqrt(linalg.dot(mean, mean)) * direction
         truth = self.plant.start(mean, noise[n : 2 * n])
-        first = true_noise(departure, noise[:0], noise[2 * n :])[1]
-        measurement = sensors.measure(truth, first, departure)
+        own = true_noise(departure, noise[:0], noise[2 * n :])[1]
+        measurement = sensors.measure(truth, own, departure)
         runs = noise.shape[-1]
         covariance = np.broadcast_to(self.model.initial_covariance, (n, n, runs)).copy()
-        return CensoredState(
+        first = CensoredState(
             truth=truth,
             measurement=measurement,
             held=measurement,
@@ -217,6 +220,12 @@ class CensoredSystem(System[CensoredState]):
             covariance=covariance,
             departure=departure,
         )
+        if not self.known_start:
+            return first
+        prediction = self.centre.predict(mean, covariance, measurement, first.time)
+        everyone = np.ones((sensors.count, runs), dtype=np.bool_)
+        result = self.deliver(replace(first, prediction=prediction), everyone)
+        return replace(result, prediction=None)
 
     def sense(self, state: CensoredState, noise: Array) -> CensoredState:
         """The plant moves, the sensors measure, centre and nodes predict.
@@ -263,7 +272,7 @@ class CensoredSystem(System[CensoredState]):
 
     def read(self, state: CensoredState) -> Mapping[str, SignalArray | Callable[[], SignalArray]]:
         """The signals named in ``SIGNALS``."""
-        expectation, deviation, _ = sensed(state.prediction)
+        expectation, deviation = sensed(state.prediction)[:2]
 
         @functools.cache
         def variances() -> tuple[Array, Array]:
@@ -286,7 +295,9 @@ class CensoredSystem(System[CensoredState]):
         }
 
     def _log_variance(self, state: CensoredState) -> Array:
-        return np.log(linalg.diagonal(state.prior_covariance) / self.reference[:, None])
+        variances = (linalg.diagonal(state.prior_covariance), self.reference[:, None])
+        now, usual = (np.log(np.maximum(values, _TINY)) for values in variances)
+        return now - usual
 
     def visible(self, state: CensoredState) -> CensoredState:
         """The state without the truth and its departure; nothing else is hidden."""
@@ -335,5 +346,5 @@ class CensoredSystem(System[CensoredState]):
 
 
 def _whitened(state: CensoredState) -> Array:
-    expectation, deviation, _ = sensed(state.prediction)
+    expectation, deviation = sensed(state.prediction)[:2]
     return (state.measurement - expectation.value) / deviation

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import gaussian, linalg
 from fusion_gym.arrays import Array
-from fusion_gym.systems.tobit.filters import Expectation, Outcomes, joseph_form, linear_update
+from fusion_gym.systems.tobit.filters import Expectation, KalmanFilter, Scalar
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
 _FAR = 50.0  # a threshold this many deviations away never censors
@@ -76,7 +76,7 @@ def _two_sided_moments(sensors: CensoredSensors, latent: Array, deviation: Array
 
 
 @dataclass(frozen=True)
-class TobitKalmanFilter:
+class TobitKalmanFilter(KalmanFilter):
     r"""Tobit Kalman filter; when nothing arrives the prior is the posterior.
 
     S = q C P Cᵀ q + R v, K = P Cᵀ q S⁻¹ with q, v of :func:`expect_censored`.
@@ -109,22 +109,9 @@ class TobitKalmanFilter:
     tobit_token_bucket, equations (21)-(23) with κ₁ = 1 and S = diag(R v).
     """
 
-    sensors: CensoredSensors
-
     def expect(self, mean: Array) -> Expectation:
         """See :class:`NodeFilter`."""
         return expect_censored(self.sensors, mean)
-
-    def outcomes(
-        self, mean: Array, covariance: Array, expectation: Expectation, held: Array, time: Array
-    ) -> Outcomes:
-        """See :class:`NodeFilter`; ``held`` and ``time`` do not matter here."""
-        weighted = expectation.uncensored_probability[:, :, None] * self.sensors.measurement_matrix
-        innovation = linalg.congruence(weighted, covariance)
-        noise = self.sensors.variance * expectation.truncated_variance
-        innovation = linalg.add_diagonal(innovation, noise)
-        correction, posterior = linear_update(self.sensors, covariance, weighted, innovation, noise)
-        return Outcomes(correction, posterior, mean, covariance)
 
 
 @dataclass(frozen=True)
@@ -165,29 +152,27 @@ class AssumedDensityFilter:
 
     sensors: CensoredSensors
 
-    def expect(self, mean: Array, covariance: Array) -> Expectation:
-        """Moments of the measurements (sensors, m, N) under the prior (n, N), (n, n, N)."""
+    def expect(self, mean: Array, root: Array) -> Expectation:
+        """Moments of the measurements (sensors, m, N) under the prior N(mean, G Gᵀ).
+
+        ``mean`` (n, N) and ``root`` G (n, n, N).
+        """
         matrix = self.sensors.measurement_matrix
         latent = linalg.matvec(matrix, mean)
-        spread = (matrix * linalg.matmul(matrix, covariance)).sum(-2) + self.sensors.variance
+        spread = np.square(linalg.matmul(matrix, root)).sum(-2) + self.sensors.variance
         return censored_moments(self.sensors, latent, np.sqrt(spread))
 
     def update(
-        self, mean: Array, covariance: Array, measurement: Array, granted: NDArray[np.bool_]
+        self, mean: Array, root: Array, measurement: Array, granted: NDArray[np.bool_]
     ) -> tuple[Array, Array]:
-        """Posterior (n, N), (n, n, N) after the granted (sensors, N) measurements."""
-        lanes = self.sensors.starved(covariance)
-        for sensor in range(self.sensors.count):
-            if not granted[sensor].any():
-                continue
+        """Mean (n, N) and root (n, n, N) after the granted (sensors, N) measurements."""
+        for sensor in np.flatnonzero(granted.any(-1)).tolist():
             for component in range(self.sensors.size):
-                mean, covariance = self._take(
-                    mean, covariance, sensor, component, measurement[sensor, component],
-                    granted[sensor], lanes,
-                )  # fmt: skip
-        return mean, covariance
+                value, taken = measurement[sensor, component], granted[sensor]
+                mean, root = self._take(mean, root, sensor, component, value, taken)
+        return mean, root
 
-    def expected_covariance(self, mean: Array, covariance: Array) -> Array:
+    def expected_covariance(self, mean: Array, root: Array) -> Array:
         """Expected posterior covariance (sensors, n, n, N) if one sensor alone delivers.
 
         Component by component, each with the share of its variance that the possibly censored
@@ -195,38 +180,32 @@ class AssumedDensityFilter:
         """
         matrix, noise = self.sensors.measurement_matrix, self.sensors.variance
         latent = linalg.matvec(matrix, mean)
-        result = np.broadcast_to(covariance, (self.sensors.count, *covariance.shape))
-        lanes = self.sensors.starved(covariance)
+        root = root[None]
         for component in range(self.sensors.size):
             row = matrix[:, component]
-            cross = linalg.matvec(result, row)
-            variance = linalg.dot(row, cross) + noise[:, component]
-            share = np.ones_like(variance)
+            scalar = Scalar.of(root, row, noise[:, component])
+            share, deviation = np.ones_like(scalar.variance), np.sqrt(scalar.variance)
             for sign, threshold in ((1.0, self.sensors.threshold), (-1.0, self.sensors.upper)):
                 limit = threshold[:, component]
-                distance = sign * (latent[:, component] - limit) / np.sqrt(variance)
+                distance = sign * (latent[:, component] - limit) / deviation
                 distance = np.where(np.isfinite(limit), distance, _FAR)
                 share -= gaussian.upper_tail(distance) * gaussian.truncated_variance(distance)
-            result = self._explained(
-                result, row, cross, variance, noise[:, component], share, lanes
-            )
-        return result
+            root = scalar.posterior(share)
+        return linalg.gram(root)
 
     def _take(
         self,
         mean: Array,
-        covariance: Array,
+        root: Array,
         sensor: int,
         component: int,
         value: Array,
         granted: NDArray[np.bool_],
-        lanes: NDArray[np.intp],
     ) -> tuple[Array, Array]:
         row = self.sensors.measurement_matrix[sensor, component]
-        cross = linalg.matvec(covariance, row)
-        variance = linalg.dot(row, cross) + self.sensors.variance[sensor, component]
-        latent, deviation = linalg.dot(row, mean), np.sqrt(variance)
-        step = (value - latent) / variance
+        scalar = Scalar.of(root, row, self.sensors.variance[sensor, component])
+        latent, deviation = linalg.dot(row, mean), np.sqrt(scalar.variance)
+        step = (value - latent) / scalar.variance
         loss = np.ones_like(step)
         for sign, threshold in ((1.0, self.sensors.threshold), (-1.0, self.sensors.upper)):
             limit = threshold[sensor, component]
@@ -238,41 +217,7 @@ class AssumedDensityFilter:
             loss = np.where(censored, _loss(distance), loss)
         step = np.where(granted, step, 0.0)
         loss = np.where(granted, loss, 0.0)
-        noise = self.sensors.variance[sensor, component]
-        covariance = self._explained(covariance, row, cross, variance, noise, loss, lanes)
-        return mean + cross * step, covariance
-
-    def _explained(
-        self,
-        covariance: Array,
-        row: Array,
-        cross: Array,
-        variance: Array,
-        noise: Array,
-        share: Array,
-        lanes: NDArray[np.intp],
-    ) -> Array:
-        """P - P Cᵀ C P s/S, where a scalar measurement explains the share s of its variance S.
-
-        P (…, n, n, N), ``row`` C (…, n, 1), ``cross`` P Cᵀ (…, n, N), ``noise`` R (…, 1), S and s
-        (…, N). The same as :func:`joseph_form` with K = P Cᵀ s/S and the noise that makes s
-        optimal, s (1 - s)/S + R s²/S² in units of P Cᵀ; that is taken in the ``lanes`` where P is
-        large.
-        """
-        loss = share / variance
-        result = covariance - linalg.outer(cross, cross) * loss[..., None, None, :]
-        if lanes.size:
-            gain, loss = cross[..., lanes] * loss[..., None, lanes], loss[..., lanes]
-            left = loss * (1.0 - share[..., lanes]) + noise * loss * loss
-            part = cross[..., lanes] * np.sqrt(np.maximum(left, 0.0))[..., None, :]
-            result[..., lanes] = joseph_form(
-                self.sensors,
-                covariance[..., lanes],
-                row[..., None, :, :],
-                gain[..., None, :],
-                [part[..., None, :]],
-            )
-        return result
+        return mean + scalar.cross * step, scalar.posterior(loss)
 
 
 def _loss(distance: Array) -> Array:
