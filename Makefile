@@ -72,14 +72,14 @@ coverage: $(STAMP)  ## what the journeys reach: files by share, functions in run
 # One episode of every environment under its paper's rule, for the pages.
 WATCH := $(BIN)/fusion-gym watch --steps 40 --fps 6 --env fusion_gym
 films: $(STAMP)  ## the films of docs/films
-	$(WATCH)/TobitOscillator-v0 --policy dynamic_event --save docs/films/tobit_oscillator.gif
-	$(WATCH)/BiasedOscillator-v0 --policy round_robin --save docs/films/biased_oscillator.gif
-	$(WATCH)/BiasedTracking-v0 --policy round_robin --save docs/films/biased_tracking.gif
-	$(WATCH)/CorrelatedTracking-v0 --policy adaptive_innovation --save docs/films/correlated_tracking.gif
-	$(WATCH)/MarkovJumpTracking-v0 --policy local_variance:m=0.9 --save docs/films/markov_jump.gif
-	$(WATCH)/UnknownInput-v0 --policy adaptive_threshold --save docs/films/unknown_input.gif
-	$(WATCH)/RemoteEstimation-v0 --policy whittle --save docs/films/remote_estimation.gif
-	$(WATCH)/LinearFusion-v0 --policy value_of_information --save docs/films/linear_fusion.gif
+	$(WATCH)/TobitOscillator-v1 --policy dynamic_event --save docs/films/tobit_oscillator.gif
+	$(WATCH)/BiasedOscillator-v1 --policy round_robin --save docs/films/biased_oscillator.gif
+	$(WATCH)/BiasedTracking-v1 --policy round_robin --save docs/films/biased_tracking.gif
+	$(WATCH)/CorrelatedTracking-v1 --policy adaptive_innovation --save docs/films/correlated_tracking.gif
+	$(WATCH)/MarkovJumpTracking-v1 --policy local_variance:m=0.9 --save docs/films/markov_jump.gif
+	$(WATCH)/UnknownInput-v1 --policy adaptive_threshold --save docs/films/unknown_input.gif
+	$(WATCH)/RemoteEstimation-v1 --policy whittle --save docs/films/remote_estimation.gif
+	$(WATCH)/LinearFusion-v1 --policy value_of_information --save docs/films/linear_fusion.gif
 
 # Libraries beside this one: each folder of integrations/ has pins and a virtual environment of its own,
 # .venv-light, .venv-tianshou, .venv-rllib.

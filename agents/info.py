@@ -1,6 +1,6 @@
 """Show the page of an environment, rule, filter, signal, agent or config.
 
-    fusion-gym info fusion_gym/LinearFusion-v0
+    fusion-gym info fusion_gym/LinearFusion-v1
     fusion-gym info value_of_information
 
 ``fusion-gym list`` has all names.
@@ -24,7 +24,7 @@ class Info(Command):
     """Show the page of an environment, rule, filter, signal, agent or config."""
 
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
-    """A name from fusion-gym list; an environment may go without fusion_gym/ and -v0."""
+    """A name from fusion-gym list; an environment may go without fusion_gym/ and -v1."""
 
     def run(self) -> None:
         """Print the page of every entry of this name.
@@ -33,7 +33,7 @@ class Info(Command):
             ConfigurationError: an unknown name.
         """
         entries = catalogue()
-        alias = f"fusion_gym/{self.name}-v0"
+        alias = f"fusion_gym/{self.name}-v1"
         name = alias if alias in entries["environments"] else self.name
         names = [entry for named in entries.values() for entry in named]
         if name not in names:

@@ -1,6 +1,6 @@
 """Watch one or two policies through an episode, in a window or as a film.
 
-    fusion-gym watch --env fusion_gym/TobitOscillator-v0 --policy dynamic_event \\
+    fusion-gym watch --env fusion_gym/TobitOscillator-v1 --policy dynamic_event \\
         --against innovation_threshold:threshold=1 --save episode.gif
 
 Both meet the same noise, side by side and with the same axes: states and fused estimates with two

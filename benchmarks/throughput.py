@@ -27,7 +27,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.memory import Owner
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
 
-ENV = "fusion_gym/TobitOscillator-v0"
+ENV = "fusion_gym/TobitOscillator-v1"
 TURNS = 5
 # A workload takes seconds and returns environment steps per second.
 Workload = Callable[[float], float]
@@ -179,21 +179,21 @@ def main() -> None:
         "native SB3 VecEnv, 1,024, Tobit filter": native_sb3(tobit, 1024),
         "gym.make_vec, 1,024, paper's filter": vector(paper, 1024),
         "gym.make_vec, 1,024, Tobit filter": vector(tobit, 1024),
-        "CorrelatedTracking, 1,024": vector({}, 1024, "fusion_gym/CorrelatedTracking-v0"),
+        "CorrelatedTracking, 1,024": vector({}, 1024, "fusion_gym/CorrelatedTracking-v1"),
         "CorrelatedTracking, 1,024, ci": vector(
-            {"fusion": "ci"}, 1024, "fusion_gym/CorrelatedTracking-v0"
+            {"fusion": "ci"}, 1024, "fusion_gym/CorrelatedTracking-v1"
         ),
-        "MarkovJumpTracking, 1,024": vector({}, 1024, "fusion_gym/MarkovJumpTracking-v0"),
-        "UnknownInput, 1,024": vector({}, 1024, "fusion_gym/UnknownInput-v0"),
+        "MarkovJumpTracking, 1,024": vector({}, 1024, "fusion_gym/MarkovJumpTracking-v1"),
+        "UnknownInput, 1,024": vector({}, 1024, "fusion_gym/UnknownInput-v1"),
         "UnknownInput, 1,024, exact filter": vector(
-            {"filter": "predict"}, 1024, "fusion_gym/UnknownInput-v0"
+            {"filter": "predict"}, 1024, "fusion_gym/UnknownInput-v1"
         ),
         "UnknownInput, 1,024, paper's filter": vector(
-            {"filter": "paper"}, 1024, "fusion_gym/UnknownInput-v0"
+            {"filter": "paper"}, 1024, "fusion_gym/UnknownInput-v1"
         ),
-        "BiasedOscillator, 1,024": vector({}, 1024, "fusion_gym/BiasedOscillator-v0"),
-        "BiasedOscillator, 1,024, adf": vector(adf, 1024, "fusion_gym/BiasedOscillator-v0"),
-        "BiasedTracking, 1,024": vector({}, 1024, "fusion_gym/BiasedTracking-v0"),
+        "BiasedOscillator, 1,024": vector({}, 1024, "fusion_gym/BiasedOscillator-v1"),
+        "BiasedOscillator, 1,024, adf": vector(adf, 1024, "fusion_gym/BiasedOscillator-v1"),
+        "BiasedTracking, 1,024": vector({}, 1024, "fusion_gym/BiasedTracking-v1"),
     }
     figures = measured(rows, seconds)
     medians = {name: statistics.median(figure) for name, figure in figures.items()}

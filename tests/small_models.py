@@ -11,7 +11,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 import fusion_gym
 from fusion_gym.core.task import Task
 
-ENV = "fusion_gym/TobitOscillator-v0"
+ENV = "fusion_gym/TobitOscillator-v1"
 OPTIONS: dict[str, Any] = {"filter": "tobit", "horizon": 20}
 DISCRETE, LOCAL, MEMORY = {"action": "discrete"}, {"local": True}, {"memory": True}
 RELU = {"net_arch": {"pi": [8], "vf": [6, 5]}, "activation_fn": torch.nn.ReLU}

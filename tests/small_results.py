@@ -7,7 +7,7 @@ from typing import Any
 
 from fusion_gym.agents.experiments.training import write_verdict
 
-ENV = "fusion_gym/RemoteEstimation-v0"
+ENV = "fusion_gym/RemoteEstimation-v1"
 SETTING = "remote_estimation"
 ALWAYS = 0.5
 PRICES = (0.1, 0.3, 1.0)

@@ -5,7 +5,7 @@ from typing import Any
 
 import yaml
 
-ENV = "fusion_gym/TobitOscillator-v0"
+ENV = "fusion_gym/TobitOscillator-v1"
 SMALL: dict[str, Any] = {
     "episodes": 12,
     "training_seeds": 2,

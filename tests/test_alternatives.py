@@ -15,7 +15,7 @@ from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_system
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import ConfigurationError
 
-OSCILLATOR = "fusion_gym/TobitOscillator-v0"
+OSCILLATOR = "fusion_gym/TobitOscillator-v1"
 TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "paper": (OSCILLATOR, {"horizon": 6}),
     "starved": (OSCILLATOR, {"token_rate": 2.0, "initial_tokens": 3.0, "sharing": "rotating"}),
@@ -24,13 +24,13 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "estimates": (OSCILLATOR, {"filter": "tobit", "memory": True, "packet": "estimate"}),
     "heard": (OSCILLATOR, {"filter": "tobit", "memory": True, "broadcast": "packets"}),
     "single": (OSCILLATOR, {"access": "single", "sharing": "equal"}),
-    "random": ("fusion_gym/BiasedTracking-v0", {"access": "random", "memory": True}),
-    "turns": ("fusion_gym/BiasedOscillator-v0", {"access": "round_robin"}),
-    "correlated": ("fusion_gym/CorrelatedTracking-v0", {"memory": True, "noise_scale": "random"}),
-    "markov": ("fusion_gym/MarkovJumpTracking-v0", {"information": "centre"}),
-    "unknown": ("fusion_gym/UnknownInput-v0", {"memory": True, "horizon": 5}),
+    "random": ("fusion_gym/BiasedTracking-v1", {"access": "random", "memory": True}),
+    "turns": ("fusion_gym/BiasedOscillator-v1", {"access": "round_robin"}),
+    "correlated": ("fusion_gym/CorrelatedTracking-v1", {"memory": True, "noise_scale": "random"}),
+    "markov": ("fusion_gym/MarkovJumpTracking-v1", {"information": "centre"}),
+    "unknown": ("fusion_gym/UnknownInput-v1", {"memory": True, "horizon": 5}),
     "remote": (
-        "fusion_gym/RemoteEstimation-v0",
+        "fusion_gym/RemoteEstimation-v1",
         {"sensors": 2, "channel": "gilbert_elliott", "memory": True, "cost_weight": "random",
          "price_range": (0.1, 1.0)},
     ),
@@ -38,7 +38,7 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
         OSCILLATOR, {"filter": "tobit", "memory": True, "true_process_noise": (0.5, 2.0),
                      "true_transition": (0.9, 1.1), "true_threshold_shift": 0.3},
     ),
-    "many": ("fusion_gym/RemoteEstimation-v0", {"sensors": 70, "token_rate": 3.0}),
+    "many": ("fusion_gym/RemoteEstimation-v1", {"sensors": 70, "token_rate": 3.0}),
 }  # fmt: skip
 RUNS = 4
 
@@ -92,7 +92,7 @@ def test_alternatives_are_the_steps_that_would_have_been(name: str, owner: Owner
 def test_grants_of_many_sensors_are_reported_apart(sensors: int) -> None:
     """However many bits they take: each alternative is the request of one of the last sensors."""
     task = fusion_gym.make_task(
-        "fusion_gym/RemoteEstimation-v0", sensors=sensors, tokens="unlimited"
+        "fusion_gym/RemoteEstimation-v1", sensors=sensors, tokens="unlimited"
     )
     batch = EpisodeBatch.seeded(task, 512, 0)
     request = np.zeros((6, sensors, 512), dtype=np.bool_)
@@ -217,7 +217,7 @@ def test_a_training_error_that_does_not_fit_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="error = 'excess' is not allowed"):
         PrivilegedVecEnv(claimed, 2, error="excess", reference=task.system)
     with pytest.raises(ConfigurationError, match="memory_filter"):
-        reference_system("fusion_gym/RemoteEstimation-v0", {}, "adf")
+        reference_system("fusion_gym/RemoteEstimation-v1", {}, "adf")
 
 
 @pytest.mark.parametrize("local", [False, True])

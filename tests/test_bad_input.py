@@ -13,7 +13,7 @@ from fusion_gym import ConfigurationError, make_sb3_vec_env, make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 
-ENV_ID = "fusion_gym/TobitOscillator-v0"
+ENV_ID = "fusion_gym/TobitOscillator-v1"
 
 
 def make_vector(num_envs: Any = 3, **options: Any) -> Any:
@@ -205,7 +205,7 @@ ELSEWHERE: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
 @pytest.mark.parametrize(("name", "options", "parts"), ELSEWHERE, ids=lambda value: str(value)[:60])
 def test_options_elsewhere(name: str, options: dict[str, Any], parts: tuple[str, ...]) -> None:
     message = refused(
-        lambda: make_task(f"fusion_gym/{name}-v0", **options),
+        lambda: make_task(f"fusion_gym/{name}-v1", **options),
         ConfigurationError,
         (next(iter(options)), *parts),
     )
@@ -228,7 +228,7 @@ def test_number_of_environments(num_envs: Any) -> None:
     [
         (
             lambda: make_task("fusion_gym/TobitOscilator-v0"),
-            ("'fusion_gym/TobitOscilator-v0'", "did you mean 'fusion_gym/TobitOscillator-v0'"),
+            ("'fusion_gym/TobitOscilator-v0'", "did you mean 'fusion_gym/TobitOscillator-v1'"),
         ),
         (lambda: make_task("CartPole-v1"), ("'CartPole-v1'", "cartpole:CartPoleEnv")),
         (lambda: make_vector(autoreset_mode="same_step"), ("'same_step'", "mean 'SameStep'")),
@@ -307,7 +307,7 @@ CENTRE, MARKOV = {"information": "centre"}, "MarkovJumpTracking"
 def test_policies_elsewhere(
     name: str, options: dict[str, Any], spec: str, parts: tuple[str, ...]
 ) -> None:
-    task = make_task(f"fusion_gym/{name}-v0", **options)
+    task = make_task(f"fusion_gym/{name}-v1", **options)
     message = refused(lambda: make_policy(spec, task), ConfigurationError, parts)
     assert "\n" not in message
 

@@ -17,8 +17,8 @@ from fusion_gym.policies.rules.estimate_difference import EstimateDifference
 from fusion_gym.policies.rules.kullback_leibler import KullbackLeibler
 from fusion_gym.policies.rules.value_of_information import ValueOfInformation
 
-TOBIT = "fusion_gym/TobitOscillator-v0"
-CORRELATED = "fusion_gym/CorrelatedTracking-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
+CORRELATED = "fusion_gym/CorrelatedTracking-v1"
 BENCHMARK = {"filter": "tobit", "random_start": True, "token_rate": 2.0}
 Array = NDArray[Any]
 
@@ -159,7 +159,7 @@ def test_what_differs_is_measured_in_the_states_unit_or_whitened() -> None:
         np.testing.assert_array_equal(value.T[single.T], value.max(0)[selected])
 
 
-@pytest.mark.parametrize("env_id", [TOBIT, "fusion_gym/BiasedOscillator-v0"])
+@pytest.mark.parametrize("env_id", [TOBIT, "fusion_gym/BiasedOscillator-v1"])
 def test_a_sensor_without_memory_looks_at_what_its_measurement_would_change(env_id: str) -> None:
     """A threshold on |W^½ (x̂(s) - x̂)|."""
     task = task_of(env_id, access="any")

@@ -149,9 +149,8 @@ def test_envelopes_hold_rules_that_know_no_more_than_their_class(path: Path) -> 
         for vertex in content["vertices"]:
             key = json.dumps(vertex["options"], sort_keys=True)
             if key not in tasks:
-                tasks[key] = fusion_gym.make_task(
-                    stored["env"], **(stored["options"] | vertex["options"])
-                )
+                env = stored["env"].replace("-v0", "-v1")  # measured in an earlier version
+                tasks[key] = fusion_gym.make_task(env, **(stored["options"] | vertex["options"]))
             assert make_policy(vertex["policy"], tasks[key]).knowledge == replace_value(
                 vertex["knows"]
             )

@@ -10,7 +10,7 @@ from gymnasium.wrappers import TimeAwareObservation
 import fusion_gym
 from fusion_gym.validation import ConfigurationError
 
-TOBIT = "fusion_gym/TobitOscillator-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
 
 
 def steps_of(env: Any) -> int:

@@ -16,8 +16,8 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
 
-OSCILLATOR = "fusion_gym/BiasedOscillator-v0"
-TRACKING = "fusion_gym/BiasedTracking-v0"
+OSCILLATOR = "fusion_gym/BiasedOscillator-v1"
+TRACKING = "fusion_gym/BiasedTracking-v1"
 EPISODES = 1000
 
 

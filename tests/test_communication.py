@@ -13,11 +13,11 @@ from fusion_gym.core.memory import Owner
 from fusion_gym.core.task import Task
 from fusion_gym.validation import ConfigurationError
 
-TOBIT = "fusion_gym/TobitOscillator-v0"
-CORRELATED = "fusion_gym/CorrelatedTracking-v0"
-JUMP = "fusion_gym/MarkovJumpTracking-v0"
-INPUT = "fusion_gym/UnknownInput-v0"
-REMOTE = "fusion_gym/RemoteEstimation-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
+CORRELATED = "fusion_gym/CorrelatedTracking-v1"
+JUMP = "fusion_gym/MarkovJumpTracking-v1"
+INPUT = "fusion_gym/UnknownInput-v1"
+REMOTE = "fusion_gym/RemoteEstimation-v1"
 LINEAR = {"filter": "kalman", "censoring_threshold": -np.inf, "tokens": "unlimited"}
 LINEAR |= {"memory": True, "token_rate": 2.0}
 RUNS, STEPS = 3, 20
@@ -137,7 +137,7 @@ def test_nodes_receive_by_default_what_the_papers_let_them_receive(
 
 
 def test_a_single_sensor_looks_one_step_ahead() -> None:
-    task = fusion_gym.make_task("fusion_gym/TobitOscillator-v0", filter="tobit", memory=True)
+    task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1", filter="tobit", memory=True)
     beliefs = EpisodeBatch.seeded(task, 2, 0, "own").beliefs()
     for ask in (beliefs.loss, beliefs.value):
         with pytest.raises(ValueError, match="steps = 2 is not allowed here: it must be 1"):

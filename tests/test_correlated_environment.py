@@ -15,7 +15,7 @@ from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
 from fusion_gym.policies.rules.random import Random
 from fusion_gym.validation import ConfigurationError
 
-build = partial(make_task, "fusion_gym/CorrelatedTracking-v0")
+build = partial(make_task, "fusion_gym/CorrelatedTracking-v1")
 
 Array = NDArray[np.float64]
 

@@ -22,7 +22,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
 
-build = partial(make_task, "fusion_gym/CorrelatedTracking-v0")
+build = partial(make_task, "fusion_gym/CorrelatedTracking-v1")
 
 Array = NDArray[np.float64]
 EVENT = AdaptiveInnovation()

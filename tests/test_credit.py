@@ -9,7 +9,7 @@ import fusion_gym
 from fusion_gym.agents.training.counterfactual import CounterfactualPPO, RolloutBatch
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 
-ENV = "fusion_gym/TobitOscillator-v0"
+ENV = "fusion_gym/TobitOscillator-v1"
 
 
 def env_of(runs: int = 5, **options: Any) -> PrivilegedVecEnv:

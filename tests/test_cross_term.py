@@ -22,7 +22,7 @@ from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.intervals import Interval
 from fusion_gym.policies.registry import make_policy
 
-OSCILLATOR, INPUT = "fusion_gym/TobitOscillator-v0", "fusion_gym/UnknownInput-v0"
+OSCILLATOR, INPUT = "fusion_gym/TobitOscillator-v1", "fusion_gym/UnknownInput-v1"
 ORDINARY = {"filter": "tobit", "random_start": True, "token_rate": 2, "horizon": 30}
 PAPER = ORDINARY | {"filter": "paper"}
 
@@ -81,7 +81,7 @@ def test_where_the_filter_is_good_none_is_reported_under_any_policy() -> None:
     result = measured(OSCILLATOR, ORDINARY, usual_policies(task), episodes=150)
     assert all(part.compatible for part in result.values())
     assert result["random:rate=0.03"].rate < result["random:rate=0.3"].rate < 0.3
-    exact = measured("fusion_gym/RemoteEstimation-v0", {"horizon": 20}, ["always"])["always"]
+    exact = measured("fusion_gym/RemoteEstimation-v1", {"horizon": 20}, ["always"])["always"]
     assert (exact.floor, exact.share) == (0.0, Interval(0.0, 0.0, 0.0))
 
 

@@ -15,7 +15,7 @@ from fusion_gym.policies.base import owner_of
 
 
 def test_earlier_values_mean_the_present_ones() -> None:
-    task: Any = fusion_gym.make_task("fusion_gym/TobitOscillator-v0", memory=True)
+    task: Any = fusion_gym.make_task("fusion_gym/TobitOscillator-v1", memory=True)
     old: Any = "coordinator"
     with pytest.warns(DeprecationWarning, match="knower = 'coordinator_memory'"):
         assert covers("coordinator_memory", "scheduler")  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ import pytest
 
 import fusion_gym
 
-ENV_ID = "fusion_gym/TobitOscillator-v0"
+ENV_ID = "fusion_gym/TobitOscillator-v1"
 
 
 @pytest.fixture(autouse=True)
@@ -72,7 +72,7 @@ def test_silence_costs_about_one_a_step() -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_a_bound_starved_for_thousands_of_steps_does_not_overflow() -> None:
-    env = gymnasium.make("fusion_gym/TobitOscillator-v0", horizon=2500)
+    env = gymnasium.make("fusion_gym/TobitOscillator-v1", horizon=2500)
     env.reset(seed=0)
     for _ in range(2500):
         observation, reward, _, truncated, _ = env.step(np.zeros(3, dtype=np.int8))

@@ -20,7 +20,7 @@ from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.evaluation.metrics import METRICS, paired_difference, summarise
 from fusion_gym.policies.registry import make_policy
 
-ENV_ID = "fusion_gym/TobitOscillator-v0"
+ENV_ID = "fusion_gym/TobitOscillator-v1"
 OPTIONS: dict[str, Any] = {"horizon": 12, "token_cost": (3.0, 2.0, 1.0), "token_rate": 2.0}
 
 
@@ -256,7 +256,7 @@ def test_envelope_by_hand() -> None:
 def test_the_zoo_and_the_evaluation_come_with_the_package_and_torch_does_not() -> None:
     lines = (
         "import sys, fusion_gym",
-        "task = fusion_gym.make_task('fusion_gym/TobitOscillator-v0', horizon=3)",
+        "task = fusion_gym.make_task('fusion_gym/TobitOscillator-v1', horizon=3)",
         "fusion_gym.evaluation.run_episodes(task, fusion_gym.make_policy('always', task), 2, 0)",
         "assert fusion_gym.zoo.names() and fusion_gym.policy_names()",
         "assert not {'torch', 'stable_baselines3'} & sys.modules.keys()",

@@ -277,7 +277,7 @@ REFUSED = [
     ("zoo:nobody", {}, "zoo = 'nobody'"),
     ("zoo:tobit_oscillator_sensors,deterministic=false", {}, "deterministic = False"),
     ("zoo:tobit_oscillator_sensors,price=9", {}, "price"),
-    ("zoo:tobit_oscillator_sensors", {"env": "fusion_gym/CorrelatedTracking-v0"}, "layout"),
+    ("zoo:tobit_oscillator_sensors", {"env": "fusion_gym/CorrelatedTracking-v1"}, "layout"),
 ]
 
 

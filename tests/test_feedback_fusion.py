@@ -13,10 +13,10 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]
-TOBIT = "fusion_gym/TobitOscillator-v0"
-BIASED = "fusion_gym/BiasedOscillator-v0"
-TRACKING = "fusion_gym/BiasedTracking-v0"
-CORRELATED = "fusion_gym/CorrelatedTracking-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
+BIASED = "fusion_gym/BiasedOscillator-v1"
+TRACKING = "fusion_gym/BiasedTracking-v1"
+CORRELATED = "fusion_gym/CorrelatedTracking-v1"
 STRUCTURE = Structure("all nodes start from the same prediction", ("information shares",))
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import fusion_gym
 
-ENV_ID = "fusion_gym/TobitOscillator-v0"  # three sensors
+ENV_ID = "fusion_gym/TobitOscillator-v1"  # three sensors
 KINDS = {"binary": {}, "discrete": {"action": "discrete"}, "single": {"access": "single"}}
 RUNS = 2
 

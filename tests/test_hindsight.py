@@ -18,9 +18,9 @@ from fusion_gym.policies.hindsight import find_schedules
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-REMOTE = "fusion_gym/RemoteEstimation-v0"
-TOBIT = "fusion_gym/TobitOscillator-v0"
-TRACKING = "fusion_gym/BiasedTracking-v0"
+REMOTE = "fusion_gym/RemoteEstimation-v1"
+TOBIT = "fusion_gym/TobitOscillator-v1"
+TRACKING = "fusion_gym/BiasedTracking-v1"
 
 
 def cheapest(task: Task, price: float, seed: int) -> float:

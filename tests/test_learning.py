@@ -116,7 +116,7 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = {
         "name": "source",
         "title": "one source",
-        "environment": {"id": "fusion_gym/RemoteEstimation-v0", "options": {"horizon": 5}},
+        "environment": {"id": "fusion_gym/RemoteEstimation-v1", "options": {"horizon": 5}},
         "price_range": [0.1, 1.0],
     }
     options = {
@@ -278,7 +278,7 @@ def test_a_front_beside_the_optimum_or_the_best_of_schedules(
             {"front": "plain", "against": "schedules", "schedules": ("never",)},
             r"information = 'sensors' is not allowed in small: .* has 'centre'",
         ),
-        ({"front": "source"}, r"id = 'fusion_gym/RemoteEstimation-v0' is not allowed in small"),
+        ({"front": "source"}, r"id = 'fusion_gym/RemoteEstimation-v1' is not allowed in small"),
         ({"front": "narrow"}, r"price_range = \[0.01, 0.1\] is not allowed .* has \[0.001, 0.1\]"),
         ({"against": "local_none"}, r"class = 'local_none' is not allowed"),
     ],

@@ -16,8 +16,8 @@ from fusion_gym.policies.model import tag_model
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-TOBIT = "fusion_gym/TobitOscillator-v0"
-CORRELATED = "fusion_gym/CorrelatedTracking-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
+CORRELATED = "fusion_gym/CorrelatedTracking-v1"
 GLOBAL = {CORRELATED: {"fused_innovation", "log_deviation", "estimate"}}
 
 

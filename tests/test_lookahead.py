@@ -14,9 +14,9 @@ from fusion_gym.policies.lookahead import Lookahead
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-REMOTE = "fusion_gym/RemoteEstimation-v0"
-TOBIT = "fusion_gym/TobitOscillator-v0"
-TRACKING = "fusion_gym/BiasedTracking-v0"
+REMOTE = "fusion_gym/RemoteEstimation-v1"
+TOBIT = "fusion_gym/TobitOscillator-v1"
+TRACKING = "fusion_gym/BiasedTracking-v1"
 
 
 def played(task: Task, runs: int = 30, steps: int = 5) -> EpisodeBatch:

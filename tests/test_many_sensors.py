@@ -13,7 +13,7 @@ from fusion_gym.solvers.task import source_problems
 
 def task_of(**options: object) -> Task:
     few = {"sensors": 3, "tokens": "limited", "token_rate": 0.5, "initial_tokens": 1.0}
-    return make_task("fusion_gym/RemoteEstimation-v0", **few, horizon=5, **options)
+    return make_task("fusion_gym/RemoteEstimation-v1", **few, horizon=5, **options)
 
 
 def test_the_floor_of_sources_that_are_alike_is_that_of_all_together() -> None:

@@ -19,13 +19,13 @@ from fusion_gym.solvers.tokens import TokenLevels
 from fusion_gym.validation import ConfigurationError
 
 MANY = 200
-REMOTE = "fusion_gym/RemoteEstimation-v0"
+REMOTE = "fusion_gym/RemoteEstimation-v1"
 
 
 def linear(sensors: int, states: int = 3, **options: Any) -> Task:
     rng = np.random.default_rng(0)
     return fusion_gym.make_task(
-        "fusion_gym/LinearFusion-v0",
+        "fusion_gym/LinearFusion-v1",
         transition=(0.9 * np.eye(states)).tolist(),
         process_covariance=np.eye(states).tolist(),
         measurement_matrices=rng.normal(size=(sensors, states)).tolist(),

@@ -21,7 +21,7 @@ from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.rules.constant import Always
 from fusion_gym.policies.rules.random import Random
 
-build = partial(make_task, "fusion_gym/MarkovJumpTracking-v0")
+build = partial(make_task, "fusion_gym/MarkovJumpTracking-v1")
 
 Array = NDArray[np.float64]
 FILTERS = ("centralised", "imm")

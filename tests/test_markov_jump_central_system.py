@@ -12,7 +12,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-build = partial(make_task, "fusion_gym/MarkovJumpTracking-v0")
+build = partial(make_task, "fusion_gym/MarkovJumpTracking-v1")
 
 FILTERS = ("centralised", "imm")
 each_filter = pytest.mark.parametrize("where", FILTERS)

@@ -22,7 +22,7 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.centre_variance import CentreVariance
 from fusion_gym.policies.rules.random import Random
 
-build = partial(make_task, "fusion_gym/MarkovJumpTracking-v0")
+build = partial(make_task, "fusion_gym/MarkovJumpTracking-v1")
 
 Array = NDArray[np.float64]
 RMSE = 0.022  # relative: four standard errors

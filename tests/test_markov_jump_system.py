@@ -13,7 +13,7 @@ from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.rules.centre_variance import CentreVariance
 from fusion_gym.policies.rules.local_variance import LocalVariance
 
-build = partial(make_task, "fusion_gym/MarkovJumpTracking-v0")
+build = partial(make_task, "fusion_gym/MarkovJumpTracking-v1")
 
 
 # --- the system ----------------------------------------------------------------------------------

@@ -16,8 +16,8 @@ from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.model import ModelPolicy, tag_model
 from fusion_gym.policies.registry import make_policy
 
-ENV_ID = "fusion_gym/TobitOscillator-v0"
-BIASED = "fusion_gym/BiasedOscillator-v0"
+ENV_ID = "fusion_gym/TobitOscillator-v1"
+BIASED = "fusion_gym/BiasedOscillator-v1"
 
 
 @pytest.mark.parametrize("options", [{}, {"action": "discrete"}, {"access": "single"}])

@@ -13,7 +13,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import ConfigurationError
 
-ENV = "fusion_gym/CorrelatedTracking-v0"
+ENV = "fusion_gym/CorrelatedTracking-v1"
 
 
 def experiment(algorithm: str = "ppo", local: bool = False, **options: Any) -> Experiment:

@@ -13,8 +13,8 @@ from fusion_gym.core import batch as batch_module
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.noise import PhiloxNoise
 
-TOBIT = "fusion_gym/TobitOscillator-v0"
-REMOTE = "fusion_gym/RemoteEstimation-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
+REMOTE = "fusion_gym/RemoteEstimation-v1"
 DRAWN: Any = {"cost_weight": "random", "price_range": (0.001, 1.0), "access": "random"}
 SEEDS = [0, 1, 2**32, 2**63, 2**64 - 1, 2**64, 2**64 + 1, 2**128, 2**128 + 1, 3**200]
 
@@ -215,7 +215,7 @@ CHAIN = {
 }
 RANK_ONE = {"process_gain": [0.16, 0.18], "measurement_variance": 0.5}
 FULL = {"process_covariance": [[0.3, 0.1], [0.1, 0.2]], "measurement_covariances": 0.25}
-LINEAR = "fusion_gym/LinearFusion-v0"
+LINEAR = "fusion_gym/LinearFusion-v1"
 
 
 @pytest.mark.parametrize("powers", [(3, 3, 3), (-7, 4, 11), (12, 0, -9)])

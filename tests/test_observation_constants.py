@@ -67,7 +67,7 @@ PHYSICAL: dict[tuple[str, str], Any] = {
 }
 
 
-LAST = ("fusion_gym/UnknownInput-v0", "log_deviation", "open-loop deviation")
+LAST = ("fusion_gym/UnknownInput-v1", "log_deviation", "open-loop deviation")
 
 
 def check(batch: EpisodeBatch, env_id: str) -> set[tuple[str, str]]:
@@ -75,7 +75,7 @@ def check(batch: EpisodeBatch, env_id: str) -> set[tuple[str, str]]:
     done = set()
     for name, (block, entries) in visible_entries(batch).items():
         for word, value in block.constants.items():
-            # In UnknownInput-v0 that is of the last estimate, which no signal has.
+            # In UnknownInput-v1 that is of the last estimate, which no signal has.
             if (name, word) not in PHYSICAL or (env_id, name, word) == LAST:
                 continue
             column = np.asarray(value)[..., None] if np.ndim(value) else value
@@ -103,7 +103,7 @@ def test_entries_give_back_what_was_measured(env_id: str) -> None:
 
 
 def test_the_clock_and_the_price_are_decoded() -> None:
-    batch = batch_of("fusion_gym/TobitOscillator-v0")
+    batch = batch_of("fusion_gym/TobitOscillator-v1")
     result = visible_entries(batch)
     block, left = result["time_left"]
     np.testing.assert_allclose(left * block.constants["horizon"], 100 - 7, rtol=1e-6)

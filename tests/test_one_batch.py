@@ -19,7 +19,7 @@ from fusion_gym.envs.one_batch import one_batch
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
-TOBIT = "fusion_gym/TobitOscillator-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
 
 
 def play(envs: Any, steps: int) -> list[Any]:

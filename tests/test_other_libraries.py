@@ -11,9 +11,9 @@ from pettingzoo.test.state_test import test_parallel_env as pettingzoos_check_of
 
 import fusion_gym
 
-TOBIT = "fusion_gym/TobitOscillator-v0"
-CORRELATED = "fusion_gym/CorrelatedTracking-v0"
-BIASED = "fusion_gym/BiasedOscillator-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
+CORRELATED = "fusion_gym/CorrelatedTracking-v1"
+BIASED = "fusion_gym/BiasedOscillator-v1"
 
 
 def vector(mode: str, num_envs: int = 3, **options: Any) -> Any:

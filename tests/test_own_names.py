@@ -22,7 +22,7 @@ from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-TOBIT = "fusion_gym/TobitOscillator-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
 MODULE = '''
 from dataclasses import dataclass
 

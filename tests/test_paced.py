@@ -14,7 +14,7 @@ from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.paced import Paced
 
-ENV_ID = "fusion_gym/TobitOscillator-v0"
+ENV_ID = "fusion_gym/TobitOscillator-v1"
 LENGTH = 400
 
 

@@ -20,7 +20,7 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.random import Random
 from fusion_gym.validation import ConfigurationError
 
-ENV_ID = "fusion_gym/MarkovJumpTracking-v0"
+ENV_ID = "fusion_gym/MarkovJumpTracking-v1"
 
 
 def markov(**options: Any) -> Task:
@@ -164,7 +164,7 @@ def test_an_entry_that_cannot_be_true_is_reproduced(
 
 
 def test_systems_whose_covariances_depend_on_the_data_are_refused() -> None:
-    task = fusion_gym.make_task("fusion_gym/TobitOscillator-v0")
+    task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1")
     with pytest.raises(ConfigurationError, match=r"CensoredSystem.* not depend on the data"):
         make_policy("periodic_optimum", task)
     with pytest.raises(ConfigurationError, match="CensoredSystem"):

@@ -26,11 +26,11 @@ def _forgetful(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def correlated(**options: Any) -> Task:
-    return fusion_gym.make_task("fusion_gym/CorrelatedTracking-v0", **options)
+    return fusion_gym.make_task("fusion_gym/CorrelatedTracking-v1", **options)
 
 
 def unknown(**options: Any) -> Task:
-    return fusion_gym.make_task("fusion_gym/UnknownInput-v0", **options)
+    return fusion_gym.make_task("fusion_gym/UnknownInput-v1", **options)
 
 
 def biased(name: str = "Tracking", **options: Any) -> Task:
@@ -41,7 +41,7 @@ def biased(name: str = "Tracking", **options: Any) -> Task:
         "censoring_threshold": -np.inf,
         "censoring_upper": np.inf,
     }
-    return fusion_gym.make_task(f"fusion_gym/Biased{name}-v0", **free | options)
+    return fusion_gym.make_task(f"fusion_gym/Biased{name}-v1", **free | options)
 
 
 def all_schedules(packets: int, period: int, sensors: int) -> NDArray[np.bool_]:
@@ -190,7 +190,7 @@ def test_brute_force_of_uncensored_nodes(name: str) -> None:
         biased(filter="adf"),
         biased(censoring_upper=1000.0),
         biased(censoring_threshold=[[-1000.0], [-np.inf]]),
-        fusion_gym.make_task("fusion_gym/RemoteEstimation-v0"),
+        fusion_gym.make_task("fusion_gym/RemoteEstimation-v1"),
     ],
     ids=["paper", "hold", "tobit", "adf", "upper", "lower", "remote"],
 )

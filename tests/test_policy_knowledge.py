@@ -37,37 +37,37 @@ from fusion_gym.policies.registry import (
 from fusion_gym.validation import ConfigurationError
 
 ENVIRONMENTS: dict[str, tuple[str, Values]] = {
-    "tobit": ("TobitOscillator-v0", {"filter": "tobit", "random_start": True}),
-    "tobit, centre": ("TobitOscillator-v0", {"filter": "tobit", "information": "centre"}),
-    "correlated": ("CorrelatedTracking-v0", {"token_rate": 1.0}),
-    "markov": ("MarkovJumpTracking-v0", {"token_rate": 1.0}),
-    "markov, imm": ("MarkovJumpTracking-v0", {"filter": "imm", "tokens": "unlimited"}),
-    "unknown input": ("UnknownInput-v0", {"token_rate": 0.5}),
-    "biased": ("BiasedTracking-v0", {"access": "random"}),
+    "tobit": ("TobitOscillator-v1", {"filter": "tobit", "random_start": True}),
+    "tobit, centre": ("TobitOscillator-v1", {"filter": "tobit", "information": "centre"}),
+    "correlated": ("CorrelatedTracking-v1", {"token_rate": 1.0}),
+    "markov": ("MarkovJumpTracking-v1", {"token_rate": 1.0}),
+    "markov, imm": ("MarkovJumpTracking-v1", {"filter": "imm", "tokens": "unlimited"}),
+    "unknown input": ("UnknownInput-v1", {"token_rate": 0.5}),
+    "biased": ("BiasedTracking-v1", {"access": "random"}),
     "remote, losses": (
-        "RemoteEstimation-v0",
+        "RemoteEstimation-v1",
         {"sensors": 2, "cost_weight": 3.0, "channel": "gilbert_elliott"},
     ),
     "remote, one link": (
-        "RemoteEstimation-v0",
+        "RemoteEstimation-v1",
         {"sensors": 2, "cost_weight": 0.3, "access": "single", "noise_deviation": (1.0, 1.5)},
     ),
 }
 # What a sensor remembers and hears, and what a scheduler does.
 REMEMBERING: dict[str, tuple[str, Values]] = {
-    "tobit, memory": ("TobitOscillator-v0", {"filter": "tobit", "memory": True}),
-    "biased, memory, estimates": ("BiasedTracking-v0", {"memory": True, "packet": "estimate"}),
+    "tobit, memory": ("TobitOscillator-v1", {"filter": "tobit", "memory": True}),
+    "biased, memory, estimates": ("BiasedTracking-v1", {"memory": True, "packet": "estimate"}),
     "correlated, memory, told": (
-        "CorrelatedTracking-v0",
+        "CorrelatedTracking-v1",
         {"token_rate": 1.0, "memory": True, "broadcast": "estimate"},
     ),
     "correlated, memory, overheard": (
-        "CorrelatedTracking-v0",
+        "CorrelatedTracking-v1",
         {"token_rate": 1.0, "memory": True, "broadcast": "packets"},
     ),
-    "correlated, told": ("CorrelatedTracking-v0", {"token_rate": 1.0, "broadcast": "estimate"}),
+    "correlated, told": ("CorrelatedTracking-v1", {"token_rate": 1.0, "broadcast": "estimate"}),
     "remote, losses, memory": (
-        "RemoteEstimation-v0",
+        "RemoteEstimation-v1",
         {"sensors": 2, "channel": "gilbert_elliott", "memory": True},
     ),
 }

@@ -12,7 +12,7 @@ from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-ENV_ID = "fusion_gym/TobitOscillator-v0"
+ENV_ID = "fusion_gym/TobitOscillator-v1"
 SPAN = (0.001, 0.1)
 
 

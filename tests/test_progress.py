@@ -19,7 +19,7 @@ from fusion_gym.agents.output import progress
 from fusion_gym.agents.output.progress import progress_bar
 
 EVALUATE = [
-    *("--env", "fusion_gym/TobitOscillator-v0", "--set", "horizon=20"),
+    *("--env", "fusion_gym/TobitOscillator-v1", "--set", "horizon=20"),
     *("--policies", "always", "never", "--episodes", "3"),
 ]
 EVERY = [*everything.COMMANDS, *everything.MAINTENANCE]

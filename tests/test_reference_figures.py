@@ -27,7 +27,7 @@ from fusion_gym.systems.tobit.filters import Expectation
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 
 Array = NDArray[np.float64]
-ENV_ID = "fusion_gym/TobitOscillator-v0"
+ENV_ID = "fusion_gym/TobitOscillator-v1"
 EPISODES, PRINTED_EPISODES, SEED = 1500, 500, 70_000
 
 

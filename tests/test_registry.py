@@ -22,7 +22,7 @@ from fusion_gym.validation import ConfigurationError
 
 @pytest.fixture(scope="module")
 def task() -> Task:
-    return fusion_gym.make_task("fusion_gym/TobitOscillator-v0", filter="tobit", random_start=True)
+    return fusion_gym.make_task("fusion_gym/TobitOscillator-v1", filter="tobit", random_start=True)
 
 
 class Steady(Rule):
@@ -65,7 +65,7 @@ def test_a_policy_of_ones_own_is_in_every_list(task: Task) -> None:
         with pytest.raises(ConfigurationError, match=message):
             make_policy(text, task)
     centre = fusion_gym.make_task(
-        "fusion_gym/TobitOscillator-v0", filter="tobit", information="centre"
+        "fusion_gym/TobitOscillator-v1", filter="tobit", information="centre"
     )
     with pytest.raises(ConfigurationError, match="policy 'mine': signal 'measurement'"):
         make_policy("mine", centre)

@@ -17,8 +17,8 @@ from fusion_gym.solvers.single import solve_average
 from fusion_gym.solvers.task import source_problems
 from fusion_gym.validation import ConfigurationError
 
-build_tracking = partial(make_task, "fusion_gym/CorrelatedTracking-v0")
-build = partial(make_task, "fusion_gym/RemoteEstimation-v0")
+build_tracking = partial(make_task, "fusion_gym/CorrelatedTracking-v1")
+build = partial(make_task, "fusion_gym/RemoteEstimation-v1")
 
 LOSSY: dict[str, Any] = {
     "channel": "gilbert_elliott",

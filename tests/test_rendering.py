@@ -15,8 +15,8 @@ import fusion_gym
 from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.validation import ConfigurationError
 
-TOBIT = "fusion_gym/TobitOscillator-v0"
-PICTURE = "fusion_gym/BiasedOscillator-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
+PICTURE = "fusion_gym/BiasedOscillator-v1"
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
 

@@ -6,8 +6,9 @@ from typing import Any
 from command_runs import call
 from small_results import small_results
 
-from fusion_gym.agents.experiments.report import read_results, update_pages
-from fusion_gym.agents.experiments.verdict import write_cases
+from fusion_gym.agents.experiments.report import read_results, robustness_text, update_pages
+from fusion_gym.agents.experiments.tables import write_rows
+from fusion_gym.agents.experiments.verdict import read_cases, write_cases
 
 PAGE = """# A page
 
@@ -46,10 +47,12 @@ def test_perturbed_cases_are_counted(tmp_path: Path) -> None:
     }
     report = {"class": "sensors", "cases": cases, "episodes": 2, "sha256": "0"}
     write_cases(tmp_path / "tobit_oscillator", report)
+    write_rows(tmp_path / "tobit_oscillator", "setting", [{"env": "fusion_gym/TobitOscillator-v0"}])
     titles = {"tobit_oscillator": "Tobit oscillator, with an option"}
     text = update_pages(PAGE.format(name="robustness"), {}, tmp_path, titles)
     expected = "| Tobit oscillator | as they are | -20.0% [-30.0%, -10.0%] | 1 | 1 | 1 | "
     assert f"{expected}+2.0% [+1.0%, +3.0%], louder |" in text
     assert "trained over draws" not in text
+    assert robustness_text(read_cases(tmp_path, [*titles]), titles).count("version v0") == 1
     nothing = update_pages(PAGE.format(name="robustness"), {}, tmp_path / "absent", titles)
     assert "- Nothing has been tried so far." in nothing

@@ -58,7 +58,7 @@ def a_paper(name: str, calls: Calls) -> paper.Paper:
 
     return paper.Paper(
         name, [a_piece(piece) for piece in PIECES],
-        {"figure_5": paper.PaperFigure("first", draw, (2.0, 1.5))}, "fusion_gym/TobitOscillator-v0",
+        {"figure_5": paper.PaperFigure("first", draw, (2.0, 1.5))}, "fusion_gym/TobitOscillator-v1",
         {"m": paper.Parameter((0.5,), paper.numbers_within(at_least=0.0))}, ("horizon",),
     )  # fmt: skip
 

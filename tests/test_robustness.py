@@ -108,8 +108,8 @@ def test_a_rule_runs_as_tuned_in_the_world_of_the_case(folder: Path, tmp_path: P
 
 def test_change_is_the_ratio_of_the_errors() -> None:
     """Of the same rule the ratio itself, with an interval that holds about 95 % of tries."""
-    task = make_task("fusion_gym/RemoteEstimation-v0", horizon=20, tokens="unlimited")
-    loud = make_task("fusion_gym/RemoteEstimation-v0", horizon=20, true_process_noise=2.0)
+    task = make_task("fusion_gym/RemoteEstimation-v1", horizon=20, tokens="unlimited")
+    loud = make_task("fusion_gym/RemoteEstimation-v1", horizon=20, true_process_noise=2.0)
     names = ("never", "always")
     before, after = (
         {name: run_episodes(item, make_policy(name, item), 50, 0) for name in names}

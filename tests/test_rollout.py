@@ -14,9 +14,9 @@ from fusion_gym.policies.base import Policy
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-REMOTE, TRACKING = "fusion_gym/RemoteEstimation-v0", "fusion_gym/BiasedTracking-v0"
-TOBIT, MARKOV = "fusion_gym/TobitOscillator-v0", "fusion_gym/MarkovJumpTracking-v0"
-CORRELATED, INPUT = "fusion_gym/CorrelatedTracking-v0", "fusion_gym/UnknownInput-v0"
+REMOTE, TRACKING = "fusion_gym/RemoteEstimation-v1", "fusion_gym/BiasedTracking-v1"
+TOBIT, MARKOV = "fusion_gym/TobitOscillator-v1", "fusion_gym/MarkovJumpTracking-v1"
+CORRELATED, INPUT = "fusion_gym/CorrelatedTracking-v1", "fusion_gym/UnknownInput-v1"
 VALUE = "value_of_information:threshold=0.05,at_most=1"
 CASES: dict[str, tuple[str, dict[str, Any], str]] = {
     "tobit": (TOBIT, {"filter": "tobit", "memory": True, "packet": "estimate"}, VALUE),

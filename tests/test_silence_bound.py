@@ -118,7 +118,7 @@ def test_the_policy_of_the_lattices_costs_no_less(seed: int) -> None:
 
 @cache
 def oscillator_bound() -> Any:
-    return silence_bound(make_task("fusion_gym/TobitOscillator-v0", **OSCILLATOR), (0.03, 0.1))
+    return silence_bound(make_task("fusion_gym/TobitOscillator-v1", **OSCILLATOR), (0.03, 0.1))
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def oscillator_bound() -> Any:
 )
 def test_never_above_the_interval_of_a_policy(policy: str, tokens: str) -> None:
     options = OSCILLATOR | {"token_rate": 2.0, "tokens": tokens}
-    task = make_task("fusion_gym/TobitOscillator-v0", **options)
+    task = make_task("fusion_gym/TobitOscillator-v1", **options)
     results = run_episodes(task, make_policy(policy, task), 300, 0)
     bound, _ = oscillator_bound().at(float(results.rate.mean()))
     assert bound < mean_interval(results.mse).low
@@ -146,20 +146,20 @@ def test_never_above_the_interval_of_a_policy(policy: str, tokens: str) -> None:
 def test_the_bound_is_tight_where_every_measurement_arrives_uncensored() -> None:
     """The Kalman filter of all measurements is the floor, but for the first measurement."""
     options = {"filter": "kalman", "censoring_threshold": -np.inf, "horizon": 100}
-    result = everything_delivered("fusion_gym/TobitOscillator-v0", options, (), 200)
-    model = silence_model(make_task("fusion_gym/TobitOscillator-v0", **options))
+    result = everything_delivered("fusion_gym/TobitOscillator-v1", options, (), 200)
+    model = silence_model(make_task("fusion_gym/TobitOscillator-v1", **options))
     assert 0.9 * result["own"].mean < model.floor < result["own"].mean
 
 
 def test_a_better_filter_leaves_less_where_everything_is_delivered() -> None:
     result = everything_delivered(
-        "fusion_gym/TobitOscillator-v0", {"random_start": True}, ("paper", "adf"), 100
+        "fusion_gym/TobitOscillator-v1", {"random_start": True}, ("paper", "adf"), 100
     )
     assert result["adf"].high < result["paper"].low
 
 
 def test_halving_the_lattice_moves_the_bound_by_less_than_one_per_cent() -> None:
-    task = make_task("fusion_gym/TobitOscillator-v0", **OSCILLATOR)
+    task = make_task("fusion_gym/TobitOscillator-v1", **OSCILLATOR)
     model, bound = silence_model(task), oscillator_bound()
     for rate in (0.03, 0.1):
         value, cost = bound.at(rate)
@@ -248,7 +248,7 @@ def test_coordinates_make_noise_and_curvature_diagonal() -> None:
 def test_tasks_without_the_bound_and_other_values_are_refused(
     env: str, options: dict[str, Any], change: dict[str, Any], message: str
 ) -> None:
-    task = make_task(f"fusion_gym/{env}-v0", **options)
+    task = make_task(f"fusion_gym/{env}-v1", **options)
     with pytest.raises(ConfigurationError, match=f"^{message}") as caught:
         silence_bound(task, **{"rates": (0.1,)} | change)
     assert "\n" not in str(caught.value)
@@ -266,7 +266,7 @@ def test_tasks_without_the_bound_and_other_values_are_refused(
     ],
 )
 def test_where_it_applies_silence_is_prediction(env: str, options: dict[str, Any]) -> None:
-    task = make_task(f"fusion_gym/{env}-v0", horizon=5, **options)
+    task = make_task(f"fusion_gym/{env}-v1", horizon=5, **options)
     assert silence_model(task).floor > 0.0
     system = task.system
     draw = np.random.default_rng(0)
@@ -284,7 +284,7 @@ def test_where_it_applies_silence_is_prediction(env: str, options: dict[str, Any
 
 def test_the_command_writes_what_it_prints(tmp_path: Path) -> None:
     file = tmp_path / "bound.json"
-    words = ["--env", "fusion_gym/TobitOscillator-v0", "--set", "filter=tobit", "horizon=5"]
+    words = ["--env", "fusion_gym/TobitOscillator-v1", "--set", "filter=tobit", "horizon=5"]
     words += ["--episodes", "8", "--filters", "tobit", "adf", "--json", str(file)]
     ended = succeed("bound", [*words, "--rates", "0.1", "--accuracy", "0.1"])
     report = json.loads(file.read_text())
@@ -292,4 +292,4 @@ def test_the_command_writes_what_it_prints(tmp_path: Path) -> None:
     row = report["bounds"][0]
     assert report["floor"] < row["bound"]
     assert f"{row['bound']:.5g}" in ended.out
-    refusal("bound", ["--env", "fusion_gym/UnknownInput-v0", "--rates", "0.1"])
+    refusal("bound", ["--env", "fusion_gym/UnknownInput-v1", "--rates", "0.1"])

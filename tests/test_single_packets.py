@@ -18,7 +18,7 @@ def task_of(**options: Any) -> Task:
     rng = np.random.default_rng(3)
     transition = 0.3 * rng.normal(size=(STATES, STATES))
     return fusion_gym.make_task(
-        "fusion_gym/LinearFusion-v0",
+        "fusion_gym/LinearFusion-v1",
         transition=transition.tolist(),
         process_covariance=(0.2 * np.eye(STATES)).tolist(),
         measurement_matrices=rng.normal(size=(MANY, 2, STATES)).tolist(),
@@ -95,7 +95,7 @@ def test_sources_believe_as_with_all_covariances(monkeypatch: pytest.MonkeyPatch
         ("scheduler", {}), ("own", {}), ("own", {"broadcast": "estimate"}),
         ("scheduler", {"channel": "independent"}),
     ):  # fmt: skip
-        task = fusion_gym.make_task("fusion_gym/RemoteEstimation-v0", sensors=5, **options)
+        task = fusion_gym.make_task("fusion_gym/RemoteEstimation-v1", sensors=5, **options)
         result = []
         for means_alone in (True, False):
             if not means_alone:

@@ -20,9 +20,9 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.systems.unknown_input.fusion import tracked_intersection
 
 Array = NDArray[np.float64]
-CORRELATED = "fusion_gym/CorrelatedTracking-v0"
-JUMP = "fusion_gym/MarkovJumpTracking-v0"
-UNKNOWN = "fusion_gym/UnknownInput-v0"
+CORRELATED = "fusion_gym/CorrelatedTracking-v1"
+JUMP = "fusion_gym/MarkovJumpTracking-v1"
+UNKNOWN = "fusion_gym/UnknownInput-v1"
 PAIRS = {"ci": covariance_intersection, "ici": inverse_covariance_intersection}
 
 

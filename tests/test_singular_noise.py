@@ -11,9 +11,9 @@ import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 
-TOBIT = "fusion_gym/TobitOscillator-v0"
-TRACKING = "fusion_gym/BiasedTracking-v0"
-LINEAR = "fusion_gym/LinearFusion-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
+TRACKING = "fusion_gym/BiasedTracking-v1"
+LINEAR = "fusion_gym/LinearFusion-v1"
 HALF = [[0.5, 0.0], [0.0, 0.5]]
 _TURN = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
 PLANTS: dict[str, dict[str, Any]] = {

@@ -24,7 +24,7 @@ def test_environment_pages_get_their_tables() -> None:
     text = environment_pages.with_tables("# A page\n\nText.\n\n## One\n\nMore.\n", "biased")
     heads = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     assert heads[:3] == ["A page", "One", "From the code"]
-    for name in ("BiasedOscillator-v0", "BiasedTracking-v0"):
+    for name in ("BiasedOscillator-v1", "BiasedTracking-v1"):
         assert {f"{head} of {name}" for head in environment_pages.SECTIONS} <= set(heads)
         assert f"`fusion_gym/{name}`" in text.partition("## One")[0]
 

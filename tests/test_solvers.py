@@ -281,7 +281,7 @@ def test_dual_bound_of_an_episode() -> None:
 def test_dual_bound_of_channels_that_start_in_a_state(start: str) -> None:
     """It lies below what always transmitting costs, and is the optimum where tokens abound."""
     task = make_task(
-        "fusion_gym/RemoteEstimation-v0",
+        "fusion_gym/RemoteEstimation-v1",
         sensors=3,
         channel="gilbert_elliott",
         channel_transition=((0.95, 0.05), (0.05, 0.95)),

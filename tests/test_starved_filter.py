@@ -11,7 +11,7 @@ from reference_tobit import exact_float, exact_matrix
 import fusion_gym
 from fusion_gym.core.batch import EpisodeBatch
 
-TOBIT = "fusion_gym/TobitOscillator-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 

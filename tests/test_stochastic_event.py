@@ -18,8 +18,8 @@ from fusion_gym.policies.rules.stochastic_event import StochasticEvent
 from fusion_gym.systems.tobit.filters import KalmanFilter, StochasticEventFilter
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
-OSCILLATOR = "fusion_gym/TobitOscillator-v0"
-TRACKING = "fusion_gym/BiasedTracking-v0"
+OSCILLATOR = "fusion_gym/TobitOscillator-v1"
+TRACKING = "fusion_gym/BiasedTracking-v1"
 INFINITY = float("inf")
 DEVIATIONS = 4.5  # tolerance of a Monte Carlo mean, in its standard errors
 

@@ -25,7 +25,7 @@ OFFERED: list[tuple[str, dict[str, Any], set[str]]] = [
 
 
 def system_of(name: str, options: dict[str, Any]) -> System[Any]:
-    return fusion_gym.make_task(f"fusion_gym/{name}-v0", **options).system
+    return fusion_gym.make_task(f"fusion_gym/{name}-v1", **options).system
 
 
 @pytest.mark.parametrize(("name", "options", "expected"), OFFERED)

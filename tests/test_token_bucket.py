@@ -181,7 +181,7 @@ def test_round_robin_access_resonates_where_grants_differ(
 )
 def test_a_bucket_that_favours_sensors_is_warned_of(options: dict[str, Any], message: str) -> None:
     with pytest.warns(UserWarning, match=message):
-        make_task("fusion_gym/TobitOscillator-v0", **options)
+        make_task("fusion_gym/TobitOscillator-v1", **options)
 
 
 @given(

@@ -17,7 +17,7 @@ from fusion_gym.core.system import covers
 from fusion_gym.policies.registry import make_policy, policy_names
 from fusion_gym.policies.settings import parse_value
 
-ENV_ID = "fusion_gym/TobitOscillator-v0"
+ENV_ID = "fusion_gym/TobitOscillator-v1"
 SENSORS = 3
 
 

@@ -16,12 +16,12 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.solvers.silence import silence_bound
 from fusion_gym.validation import ConfigurationError
 
-TOBIT = "fusion_gym/TobitOscillator-v0"
-BIASED = "fusion_gym/BiasedOscillator-v0"
-CORRELATED = "fusion_gym/CorrelatedTracking-v0"
-JUMP = "fusion_gym/MarkovJumpTracking-v0"
-INPUT = "fusion_gym/UnknownInput-v0"
-REMOTE = "fusion_gym/RemoteEstimation-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
+BIASED = "fusion_gym/BiasedOscillator-v1"
+CORRELATED = "fusion_gym/CorrelatedTracking-v1"
+JUMP = "fusion_gym/MarkovJumpTracking-v1"
+INPUT = "fusion_gym/UnknownInput-v1"
+REMOTE = "fusion_gym/RemoteEstimation-v1"
 RUNS = 40_000
 AS_ASSUMED = {
     "true_process_noise": 1,

@@ -18,7 +18,7 @@ from fusion_gym.agents.papers.unknown_input import record_run
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import make_task
 
-build = partial(make_task, "fusion_gym/UnknownInput-v0")
+build = partial(make_task, "fusion_gym/UnknownInput-v1")
 
 Array = NDArray[np.float64]
 

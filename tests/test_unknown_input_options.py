@@ -12,7 +12,7 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import make_task
 from fusion_gym.validation import ConfigurationError
 
-build = partial(make_task, "fusion_gym/UnknownInput-v0")
+build = partial(make_task, "fusion_gym/UnknownInput-v1")
 
 
 def shape(n: int, q: int, sensors: int, m: int) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.fusion.several import covariance_intersection_many
 from fusion_gym.systems.unknown_input.examples import EXAMPLES, two_carts
 
-build = partial(make_task, "fusion_gym/UnknownInput-v0")
+build = partial(make_task, "fusion_gym/UnknownInput-v1")
 
 Array = NDArray[np.float64]
 CARTS = EXAMPLES["two_carts"]

@@ -16,7 +16,7 @@ from fusion_gym.evaluation.watching import watch
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
-TOBIT = "fusion_gym/TobitOscillator-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
 
 
 def frames(*names: str, seed: int = 3, steps: int | None = None, **options: Any) -> list[Any]:

@@ -13,7 +13,7 @@ from fusion_gym.solvers.single import solve_average
 from fusion_gym.solvers.source import SourceProblem
 from fusion_gym.validation import ConfigurationError
 
-ENV = "fusion_gym/RemoteEstimation-v0"
+ENV = "fusion_gym/RemoteEstimation-v1"
 
 
 def cost(policy: str, episodes: int = 400, **options: Any) -> tuple[float, float]:
@@ -95,4 +95,4 @@ def test_what_it_asks_for() -> None:
     with pytest.raises(ConfigurationError, match=r"coefficient = 1\.2 of source 0"):
         make_policy("whittle", fusion_gym.make_task(ENV, coefficient=1.2))
     with pytest.raises(ConfigurationError, match="only remote estimation"):
-        make_policy("whittle", fusion_gym.make_task("fusion_gym/TobitOscillator-v0"))
+        make_policy("whittle", fusion_gym.make_task("fusion_gym/TobitOscillator-v1"))

@@ -8,7 +8,7 @@ import yaml
 
 from fusion_gym.agents.training.algorithms import TABLE
 
-ENV = "fusion_gym/TobitOscillator-v0"
+ENV = "fusion_gym/TobitOscillator-v1"
 _SIZES = {"n_steps": 16, "batch_size": 128, "n_epochs": 1, "memory": 8}
 _SIZES |= {"buffer_size": 2000, "learning_starts": 100}
 SMALL: dict[str, dict[str, Any]] = {

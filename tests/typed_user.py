@@ -35,7 +35,7 @@ from fusion_gym.systems.tobit.linear import LinearFusionOptions
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
 from fusion_gym.validation import number
 
-OSCILLATOR = "fusion_gym/TobitOscillator-v0"
+OSCILLATOR = "fusion_gym/TobitOscillator-v1"
 
 
 def step_one() -> float:

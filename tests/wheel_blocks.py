@@ -52,7 +52,7 @@ LISTED = (
     Listed("fusion-gym train --config tobit_oscillator_front", "minutes; wheel_smoke.py trains it"),
     Listed("fusion-gym train ", "minutes", "--timesteps 1024"),
     Listed("fusion-gym compare ", "minutes, for more than a hundred policies"),
-    Listed("fusion-gym evaluate --env fusion_gym/RemoteEstimation-v0", "minutes", "--episodes 4"),
+    Listed("fusion-gym evaluate --env fusion_gym/RemoteEstimation-v1", "minutes", "--episodes 4"),
     Listed(f"{MAINTENANCE} table ", "minutes, for policies that search for their schedules"),
     Listed(f"{MAINTENANCE} mismatch ", "half a minute", "--episodes 20"),
     Listed("fusion-gym watch ", "half a minute, for a film of all of an episode", "--steps 10"),

@@ -39,7 +39,7 @@ for name in ("agents", "configs", "tests", "benchmarks"):
     except ImportError:
         continue
     raise AssertionError(f"the package installs a top-level name {name}")
-env = gym.make("fusion_gym/TobitOscillator-v0")
+env = gym.make("fusion_gym/TobitOscillator-v1")
 env.reset(seed=0)
 env.step(env.action_space.sample())
 assert len(fusion_gym.zoo.names()) > 10

@@ -446,6 +446,8 @@ class EnvelopeStore(NamedTuple):
     def read(self, setting: Setting) -> dict[str, Any]:
         """Return a setting's envelopes, made from these inputs; no classes if none are there.
 
+        Rules that were tuned in an earlier version of the environment are rules of this one too.
+
         Raises:
             ConfigurationError: as :func:`read_envelopes`, they were made from other inputs, or
                 they name code.
@@ -454,7 +456,10 @@ class EnvelopeStore(NamedTuple):
         if not path.exists():
             return {"classes": {}, "curves": []}
         content = read_envelopes(path.parent)
-        check_inputs(envelope_inputs(self.suite, setting), content["inputs"], repr(str(path)))
+        inputs, name = envelope_inputs(self.suite, setting), content["env"].rpartition("-v")[0]
+        if name == setting.environment.id.rpartition("-v")[0]:
+            inputs["environment"]["id"] = content["env"]
+        check_inputs(inputs, content["inputs"], repr(str(path)))
         refuse_code([entry["vertices"] for entry in content["classes"].values()], str(path))
         return content
 

@@ -4,7 +4,7 @@ A new column of a page is a new entry in the rows of one of these frames.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.evaluation.envelope import EnvelopePoint, height
 from fusion_gym.validation import ConfigurationError, choice
 
@@ -34,11 +35,11 @@ KNOWING = {
 }
 # Where a kind of knowledge is nothing of its own, and why.
 _REASONS = {
-    ("memory", "fusion_gym/MarkovJumpTracking-v0"): "nodes remember by themselves",
-    ("memory", "fusion_gym/RemoteEstimation-v0"): "nothing to remember",
-    (ESTIMATE, "fusion_gym/MarkovJumpTracking-v0"): "packets hold the node's estimate",
-    (ESTIMATE, "fusion_gym/UnknownInput-v0"): "the centre begins anew from what was sent",
-    (ESTIMATE, "fusion_gym/RemoteEstimation-v0"): "a packet is the value itself",
+    ("memory", "MarkovJumpTracking"): "nodes remember by themselves",
+    ("memory", "RemoteEstimation"): "nothing to remember",
+    (ESTIMATE, "MarkovJumpTracking"): "packets hold the node's estimate",
+    (ESTIMATE, "UnknownInput"): "the centre begins anew from what was sent",
+    (ESTIMATE, "RemoteEstimation"): "a packet is the value itself",
 }
 _MARKED = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -214,17 +215,22 @@ class SettingResults:
             ]
         return min(rows, key=lambda row: "memory" not in row["knows"], default={})
 
+    @property
+    def plant(self) -> str:
+        """The environment's name without its version."""
+        return str(self.verdict["env"]).partition("/")[2].rpartition("-v")[0]
+
     def reason(self, kind: str) -> str:
         """Return why there is nothing of a kind, in a word."""
         absent = f"fewer than half of {RATES} rates in common" if self.worth(kind) else ""
-        return _REASONS.get((kind, self.verdict["env"]), absent or "not compared")
+        return _REASONS.get((kind, self.plant), absent or "not compared")
 
     def middle(self, name: str) -> str:
         """Return a class's agents against its rules over the middle, or why there is nothing."""
         if name in self.classes:
             middle = self.classes[name].get("middle")
             return share(middle) if middle else "no price in the middle"
-        return _REASONS.get(("memory", self.verdict["env"]), "no agents")
+        return _REASONS.get(("memory", self.plant), "no agents")
 
     def sides(self) -> dict[str, list[Row]]:
         """Return the fronts whose middle lies below, above or on both sides of the rules."""
@@ -340,6 +346,14 @@ def _render(template: str, **values: Any) -> str:
     """Return a template's text; it may call every function of this module."""
     text = TEMPLATES.get_template(template).render(globals() | values)
     return text.rstrip("\n") + "\n"
+
+
+def note_of(envs: Iterable[str]) -> str:
+    """Return which earlier versions of the environments were measured; empty where none was."""
+    earlier = sorted({env.rpartition("-")[2] for env in envs if env not in ENVIRONMENTS})
+    if not earlier:
+        return ""
+    return f"**Measured in version {', '.join(earlier)} of the environments**, an earlier one."
 
 
 # Parts of other pages.

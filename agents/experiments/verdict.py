@@ -374,6 +374,7 @@ def read_cases(results: Path, settings: Sequence[str]) -> list[dict[str, Any]]:
                 if "kind" in row:
                     case[row["kind"]] = row
             report = {key: own[0][key] for key in ("episodes", "sha256")}
+            report["env"] = read_rows(folder, "setting")[0]["env"]
             result.append({"setting": name, "class": of, "cases": cases} | report)
     return result
 

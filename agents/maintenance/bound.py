@@ -1,6 +1,6 @@
 """Print what no policy can undercut: floors, and a proven lower bound of the error at each rate.
 
-    python -m fusion_gym.agents.maintenance bound --env fusion_gym/TobitOscillator-v0 \\
+    python -m fusion_gym.agents.maintenance bound --env fusion_gym/TobitOscillator-v1 \\
         --set filter=tobit random_start=true token_rate=2 --filters tobit adf --rates 0.03 0.1
 
 Rates are transmissions a sensor and step; ``docs/bounds.md`` has the proof and says where it does

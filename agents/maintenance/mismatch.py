@@ -1,7 +1,7 @@
 """Measure whether a training may take the mismatch for the error: the cross term, in a setting.
 
     python -m fusion_gym.agents.maintenance mismatch \\
-        --env fusion_gym/UnknownInput-v0 --set token_rate=2
+        --env fusion_gym/UnknownInput-v1 --set token_rate=2
     python -m fusion_gym.agents.maintenance mismatch \\
         --config correlated_tracking_front --episodes 2000
 

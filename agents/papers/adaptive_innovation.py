@@ -457,7 +457,7 @@ PAPER = Paper(
         "figure_8": _figure(partial(_draw_errors, fusion="sici"), (7.2, 5.6), "scales", "sici"),
         "figure_9": _figure(_draw_ellipses, (7.6, 6.6), "first"),
     },
-    "fusion_gym/CorrelatedTracking-v0",
+    "fusion_gym/CorrelatedTracking-v1",
     {
         "scales": Parameter((0.8, 0.6, 0.4), numbers_within(above=0.0, at_most=1.0)),
         "policy": Parameter(TRIGGER, policy_of(TRIGGER)),

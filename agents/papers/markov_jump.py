@@ -420,7 +420,7 @@ PAPER = Paper(
         "figure_4": PaperFigure("tracking", _draw_errors, (7.2, 5.0)),
         "figure_5": PaperFigure("schedule", _draw_traces, (7.2, 3.9)),
     },
-    "fusion_gym/MarkovJumpTracking-v0",
+    "fusion_gym/MarkovJumpTracking-v1",
     {
         "m": Parameter((0.0, 0.9, 1.3, 1.5), numbers_within(at_least=0.0)),
         "policies": Parameter((), policy_list),

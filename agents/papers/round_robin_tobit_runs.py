@@ -19,8 +19,8 @@ from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 from .numbers import Number, Verdict
 from .walk import walk, walk_in_parts
 
-OSCILLATOR = "fusion_gym/BiasedOscillator-v0"
-TRACKING = "fusion_gym/BiasedTracking-v0"
+OSCILLATOR = "fusion_gym/BiasedOscillator-v1"
+TRACKING = "fusion_gym/BiasedTracking-v1"
 STATES = 3  # x1, x2, b
 PAPER_RUNS = 1000
 _RESAMPLES = 500

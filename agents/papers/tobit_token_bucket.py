@@ -382,7 +382,7 @@ PAPER = Paper(
         "figure_9": PaperFigure("errors", partial(_draw_errors, sensor=1), (7.2, 5.4)),
         "figure_10": PaperFigure("errors", partial(_draw_errors, sensor=2), (7.2, 5.4)),
     },
-    "fusion_gym/TobitOscillator-v0",
+    "fusion_gym/TobitOscillator-v1",
     {"policy": Parameter(TRIGGER, policy_of())},
     (
         *("horizon", "token_rate", "token_capacity", "initial_tokens"),

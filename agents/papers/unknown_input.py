@@ -448,7 +448,7 @@ PAPER = Paper(
         ),
         "figure_7": _figure(_draw_instants, 2.6),
     },
-    "fusion_gym/UnknownInput-v0",
+    "fusion_gym/UnknownInput-v1",
     {"policy": Parameter(TRIGGER, policy_of(TRIGGER))},
     ("horizon", "rho_bar", "rho_initial", "adaptation"),
 )  # fmt: skip

@@ -67,6 +67,12 @@ TABLES = {
 }
 _MARKED = re.compile(rf"(<!-- ({'|'.join(TABLES)}): (.*?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
+_FIRST = "v0: first version."
+_SECOND = (
+    "v1: covariances may be singular, sensors share tokens in turns, noise is counted, not drawn "
+    "in sequence."
+)
+
 
 def page(env_id: str, task: Task | None = None) -> str:
     """The page of a registered environment: of a task of it, or with its defaults.
@@ -96,7 +102,7 @@ def page(env_id: str, task: Task | None = None) -> str:
         horizon=task.horizon,
         options=kind.__name__,
         arguments="\n".join(f"    {plain_marks(line)}" for line in list_options(options_in(kind))),
-        history="\n".join(f"- {text}" for text in ["v0: first version.", *versions]),
+        history="\n".join(f"- {text}" for text in [_FIRST, _SECOND, *versions]),
     )
 
 

@@ -1,7 +1,7 @@
 """The registered environments' classes, made from their options when they are first asked for.
 
 ``TobitOscillatorEnv`` and ``TobitOscillatorVectorEnv`` are what ``gym.make`` and ``gym.make_vec``
-build for ``fusion_gym/TobitOscillator-v0``; ``help`` shows their page, with every option.
+build for ``fusion_gym/TobitOscillator-v1``; ``help`` shows their page, with every option.
 """
 
 import inspect

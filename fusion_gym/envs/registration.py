@@ -65,23 +65,23 @@ class FusionSpec(EnvSpec):
 
 
 ENVIRONMENTS: dict[str, str | Build] = {
-    "fusion_gym/TobitOscillator-v0": "fusion_gym.systems.tobit.oscillator:build_tobit",
-    "fusion_gym/CorrelatedTracking-v0": "fusion_gym.systems.correlated.environment:build_adaptive",
-    "fusion_gym/MarkovJumpTracking-v0": "fusion_gym.systems.markov_jump.environment:build_markov",
-    "fusion_gym/UnknownInput-v0": "fusion_gym.systems.unknown_input.environment:build_unknown",
-    "fusion_gym/BiasedOscillator-v0": "fusion_gym.systems.tobit.biased:build_biased_oscillator",
-    "fusion_gym/BiasedTracking-v0": "fusion_gym.systems.tobit.biased:build_biased_tracking",
-    "fusion_gym/LinearFusion-v0": "fusion_gym.systems.tobit.linear:build_linear",
-    "fusion_gym/RemoteEstimation-v0": "fusion_gym.systems.remote.environment:build_remote",
+    "fusion_gym/TobitOscillator-v1": "fusion_gym.systems.tobit.oscillator:build_tobit",
+    "fusion_gym/CorrelatedTracking-v1": "fusion_gym.systems.correlated.environment:build_adaptive",
+    "fusion_gym/MarkovJumpTracking-v1": "fusion_gym.systems.markov_jump.environment:build_markov",
+    "fusion_gym/UnknownInput-v1": "fusion_gym.systems.unknown_input.environment:build_unknown",
+    "fusion_gym/BiasedOscillator-v1": "fusion_gym.systems.tobit.biased:build_biased_oscillator",
+    "fusion_gym/BiasedTracking-v1": "fusion_gym.systems.tobit.biased:build_biased_tracking",
+    "fusion_gym/LinearFusion-v1": "fusion_gym.systems.tobit.linear:build_linear",
+    "fusion_gym/RemoteEstimation-v1": "fusion_gym.systems.remote.environment:build_remote",
 }
 
 
 def class_name(env_id: str) -> str:
     """Name of an environment's class in :mod:`fusion_gym.envs.registered`, without the ending.
 
-    ``fusion_gym/TobitOscillator-v0`` is TobitOscillator, ``mine/Tank-v1`` mine_Tank_v1.
+    ``fusion_gym/TobitOscillator-v1`` is TobitOscillator, ``mine/Tank-v1`` mine_Tank_v1.
     """
-    own = env_id.removeprefix("fusion_gym/").removesuffix("-v0")
+    own = env_id.removeprefix("fusion_gym/").removesuffix("-v1")
     return own if own.isidentifier() else "".join(c if c.isalnum() else "_" for c in env_id)
 
 
@@ -136,6 +136,9 @@ def base_of(env_id: str) -> tuple[str, dict[str, Any]]:
     module, colon, name = env_id.rpartition(":")
     if colon:
         imported("env", env_id, module)
+    newer = f"{name.removesuffix('-v0')}-v1"
+    if name not in gymnasium.registry and newer in ENVIRONMENTS:
+        raise validation.refusal("environment", name, f"{newer!r}: its dynamics have changed")
     if name in ENVIRONMENTS or name not in gymnasium.registry:
         validation.keys("environment", [name], ENVIRONMENTS)
         return name, {}

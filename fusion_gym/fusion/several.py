@@ -44,7 +44,7 @@ class CovarianceIntersection(FusionRule):
         w=\arg\min\ \mathrm{tr}\,P\quad\text{over}\quad w_i\ge0,\ \ \sum_i w_i=1
         $$
 
-        Any weights give a bound. In ``UnknownInput-v0`` ``ci`` follows the minimum from step to
+        Any weights give a bound. In ``UnknownInput-v1`` ``ci`` follows the minimum from step to
         step to within 1 % of the trace, and ``exact_ci`` finds it at every step.
 
     Assumes: the P_i bound their own error covariances; nothing of their correlations.

@@ -64,7 +64,7 @@ class Lookahead:
     Source: none of one paper; receding-horizon control of the decisions, with the value of
     :mod:`fusion_gym.core.beliefs`.
 
-    Example: ``lookahead:price=0.03`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    Example: ``lookahead:price=0.03`` in ``fusion_gym/TobitOscillator-v1 filter=tobit
     random_start=True token_rate=2 memory=True``.
     """
 

@@ -43,7 +43,7 @@ class OptimalPolicy:
     Markovian state", IEEE Trans. Automatic Control 65, 2020, for one source
     (:mod:`fusion_gym.solvers`).
 
-    Example: ``optimal`` in ``fusion_gym/RemoteEstimation-v0``.
+    Example: ``optimal`` in ``fusion_gym/RemoteEstimation-v1``.
     """
 
     stateless: ClassVar[bool] = True

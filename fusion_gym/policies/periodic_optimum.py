@@ -41,10 +41,10 @@ class PeriodicOptimum:
     The trace is the plain one of the fused error's covariance:
 
     - the actual covariance, thus the mean squared error, if the system claims only a bound but
-      can tell (CorrelatedTracking-v0; where the noise scale is drawn, the mean over scales);
-    - else the claimed one. It is the mean squared error in MarkovJumpTracking-v0 with matrix
+      can tell (CorrelatedTracking-v1; where the noise scale is drawn, the mean over scales);
+    - else the claimed one. It is the mean squared error in MarkovJumpTracking-v1 with matrix
       weights or at a centre, and of uncensored Kalman filters with federated fusion. Under
-      covariance intersection it is a bound, and in UnknownInput-v0 a claim under the filter's
+      covariance intersection it is a bound, and in UnknownInput-v1 a claim under the filter's
       model of the input, so the best schedule by the claim need not have the smallest error.
 
     ``average="steady"`` takes its mean over the steady state and supposes that an episode is long
@@ -81,7 +81,7 @@ class PeriodicOptimum:
     solutions of the infinite-horizon linear sensor scheduling problem", IEEE Trans. Automatic
     Control 59, 2014.
 
-    Example: ``periodic_optimum:packets=2,period=6`` in ``fusion_gym/MarkovJumpTracking-v0``.
+    Example: ``periodic_optimum:packets=2,period=6`` in ``fusion_gym/MarkovJumpTracking-v1``.
     """
 
     knowledge: ClassVar[Knowledge] = "clock"
@@ -237,7 +237,7 @@ def _cycle(system: System[Any]) -> int:
         raise ConfigurationError(
             f"policy 'periodic_optimum' is not allowed with {type(system).__name__}: it must be a "
             "system whose covariances do not depend on the data but on what is delivered, such as "
-            "MarkovJumpTracking-v0 with filter='local' or 'centralised', CorrelatedTracking-v0, "
-            "or UnknownInput-v0 with filter='random_walk' or 'predict'"
+            "MarkovJumpTracking-v1 with filter='local' or 'centralised', CorrelatedTracking-v1, "
+            "or UnknownInput-v1 with filter='random_walk' or 'predict'"
         )
     return system.covariance_cycle

@@ -69,7 +69,7 @@ class Rollout:
     optimization", Journal of Heuristics 3, 1997.
 
     Example: ``rollout:samples=8,price=0.03,base=value_of_information:price=0.006,at_most=1`` in
-    ``fusion_gym/TobitOscillator-v0 filter=tobit random_start=True token_rate=2 memory=True``.
+    ``fusion_gym/TobitOscillator-v1 filter=tobit random_start=True token_rate=2 memory=True``.
     """
 
     stateless: ClassVar[bool] = False  # it draws

@@ -48,7 +48,7 @@ class WhittleIndex:
     Source: P. Whittle, "Restless bandits: activity allocation in a changing world", Journal of
     Applied Probability 25A, 1988.
 
-    Example: ``whittle:price=5`` in ``fusion_gym/RemoteEstimation-v0 sensors=2 cost_weight=5.0``.
+    Example: ``whittle:price=5`` in ``fusion_gym/RemoteEstimation-v1 sensors=2 cost_weight=5.0``.
     """
 
     stateless: ClassVar[bool] = True

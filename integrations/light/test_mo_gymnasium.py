@@ -21,7 +21,7 @@ from mo_gymnasium.wrappers.vector import MOSyncVectorEnv
 from integrations.page import run
 
 os.environ.setdefault("WANDB_MODE", "disabled")
-TOBIT = "fusion_gym/TobitOscillator-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
 OPTIONS: dict[str, Any] = {"reward": "vector", "filter": "tobit", "horizon": 10}
 
 

@@ -18,7 +18,7 @@ from fusion_gym.evaluation import run_episodes
 from integrations.page import ROOT, command
 
 ENTRIES = yaml.safe_load((ROOT / "configs" / "rl_zoo3" / "ppo.yml").read_text())
-TOBIT = "fusion_gym/TobitOscillator-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +37,9 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 def test_the_pages_command_trains_in_one_batch(trained: tuple[Path, str]) -> None:
     folder, output = trained
-    run = folder / "ppo" / "fusion_gym-TobitOscillator-v0_1"
+    run = folder / "ppo" / "fusion_gym-TobitOscillator-v1_1"
     assert (run / "best_model.zip").exists()
-    assert "one_batch" in (run / "fusion_gym-TobitOscillator-v0" / "config.yml").read_text()
+    assert "one_batch" in (run / "fusion_gym-TobitOscillator-v1" / "config.yml").read_text()
     evaluated = np.load(run / "evaluations.npz")
     assert set(evaluated["ep_lengths"].ravel().tolist()) == {100}
     assert (evaluated["results"] < 0.0).all()
@@ -52,7 +52,7 @@ def test_the_pages_command_trains_in_one_batch(trained: tuple[Path, str]) -> Non
 def test_its_model_is_a_policy_of_this_package(trained: tuple[Path, str]) -> None:
     """Evaluated here as rl-zoo3 evaluated it: the options of the file, both times."""
     folder, _ = trained
-    model = folder / "ppo" / "fusion_gym-TobitOscillator-v0_1" / "best_model.zip"
+    model = folder / "ppo" / "fusion_gym-TobitOscillator-v1_1" / "best_model.zip"
     ((_, options),) = ENTRIES[TOBIT]["vec_env_wrapper"][0].items()
     task = fusion_gym.make_task(TOBIT, **options)
     policy = fusion_gym.make_policy(f"model:{model}", task)
@@ -78,7 +78,7 @@ def test_options_of_the_command_line_come_first(
 ) -> None:
     """In training and in evaluation; and the file serves every environment that it names."""
     words = ["-n", "100", "-f", str(tmp_path), "--eval-freq", "8"]
-    words += ["--env", "fusion_gym/RemoteEstimation-v0", "--env-kwargs", "horizon:7"]
+    words += ["--env", "fusion_gym/RemoteEstimation-v1", "--env-kwargs", "horizon:7"]
     words += ["--hyperparams", "n_envs:4", "n_steps:16", "batch_size:32"]
     monkeypatch.setattr(sys, "argv", [*command("rl-zoo3")[2:], *words])
     monkeypatch.chdir(ROOT)

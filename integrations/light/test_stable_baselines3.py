@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 import fusion_gym
 from integrations.page import run
 
-NAME = "fusion_gym:fusion_gym/TobitOscillator-v0"
+NAME = "fusion_gym:fusion_gym/TobitOscillator-v1"
 OPTIONS: dict[str, Any] = {"filter": "tobit", "horizon": 20, "token_rate": 2.0}
 
 

@@ -12,7 +12,7 @@ from pettingzoo.test import parallel_api_test
 import fusion_gym
 from integrations.page import run
 
-TOBIT = "fusion_gym/TobitOscillator-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
 
 
 def test_the_page() -> None:

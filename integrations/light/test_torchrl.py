@@ -19,7 +19,7 @@ from torchrl.objectives.value import GAE
 import fusion_gym
 from integrations.page import run
 
-TOBIT = "fusion_gym/TobitOscillator-v0"
+TOBIT = "fusion_gym/TobitOscillator-v1"
 OPTIONS: dict[str, Any] = {"filter": "tobit", "horizon": 5}
 ENDS = [False, False, False, False, True] * 2 + [False] * 2
 

@@ -14,7 +14,7 @@ from ray.rllib.algorithms.ppo import PPOConfig
 
 from integrations.page import run
 
-NAME = "fusion_gym:fusion_gym/TobitOscillator-v0"
+NAME = "fusion_gym:fusion_gym/TobitOscillator-v1"
 OPTIONS = {"filter": "tobit", "horizon": 20}
 SMALL = {"train_batch_size": 256, "minibatch_size": 64, "num_epochs": 1}
 

@@ -22,7 +22,7 @@ from torch.distributions import Bernoulli, Independent
 import fusion_gym
 from integrations.page import run
 
-NAME = "fusion_gym:fusion_gym/TobitOscillator-v0"
+NAME = "fusion_gym:fusion_gym/TobitOscillator-v1"
 
 
 def make() -> gym.Env[Any, Any]:

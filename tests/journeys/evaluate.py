@@ -1,6 +1,6 @@
 import fusion_gym
 
-task = fusion_gym.make_task("fusion_gym/TobitOscillator-v0", filter="tobit", token_rate=2.0)
+task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1", filter="tobit", token_rate=2.0)
 print(f"{'policy':33} rate    MSE, 95 % interval")
 for name in ("never", "periodic:period=6", "innovation_threshold:threshold=2", "always"):
     policy = fusion_gym.make_policy(name, task)

@@ -2,7 +2,7 @@ from stable_baselines3 import PPO
 
 import fusion_gym
 
-env_id, options = "fusion_gym/TobitOscillator-v0", {"filter": "tobit", "cost_weight": 0.03}
+env_id, options = "fusion_gym/TobitOscillator-v1", {"filter": "tobit", "cost_weight": 0.03}
 envs = fusion_gym.make_sb3_vec_env(env_id, num_envs=128, seed=0, **options)
 model = PPO("MlpPolicy", envs, n_steps=32, batch_size=1024, gamma=0.95, seed=0)
 model.learn(50_000).save("agent.zip")

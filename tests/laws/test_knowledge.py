@@ -240,7 +240,7 @@ EXACT: list[tuple[str, dict[str, Any]]] = [
 @pytest.mark.parametrize(("name", "options"), EXACT)
 def test_innovations_have_the_variance_that_is_claimed(name: str, options: dict[str, Any]) -> None:
     """Under random requests: the mean square of each channel that is sampled at a step is 1."""
-    task = fusion_gym.make_task(f"fusion_gym/{name}-v0", **options)
+    task = fusion_gym.make_task(f"fusion_gym/{name}-v1", **options)
     batch, squares = EpisodeBatch.seeded(task, 8000, 0), []
     for request in requests(task, 8000, 12, rate=0.3):
         signals = read(batch)

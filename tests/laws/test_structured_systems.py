@@ -82,20 +82,20 @@ def test_variances_and_means_are_those_of_fifty_digits(numbers: range) -> None:
 def test_the_longest_horizon_is_named_and_right(growth: float) -> None:
     options = {"transition": [[growth, 0.0], [0.1, 0.5]], "filter": "kalman"}
     with pytest.raises(ConfigurationError, match="horizon = 3000 is not allowed") as error:
-        make_task("fusion_gym/LinearFusion-v0", horizon=3000, **options)
+        make_task("fusion_gym/LinearFusion-v1", horizon=3000, **options)
     found = re.search(r"at most (\d+)", str(error.value))
     assert found
     longest = int(found[1])
-    task = make_task("fusion_gym/LinearFusion-v0", horizon=longest, **options)
+    task = make_task("fusion_gym/LinearFusion-v1", horizon=longest, **options)
     with pytest.raises(ConfigurationError, match="horizon"):
-        make_task("fusion_gym/LinearFusion-v0", horizon=longest + 1, **options)
+        make_task("fusion_gym/LinearFusion-v1", horizon=longest + 1, **options)
     if longest < 400:
         assert max(largest_errors(task, longest, 3, censored=False)) <= 1e-9
 
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_step_names_run_step_and_quantity(family: str) -> None:
-    task = make_task(f"fusion_gym/{family}-v0", horizon=5)
+    task = make_task(f"fusion_gym/{family}-v1", horizon=5)
     batch = EpisodeBatch.seeded(task, 3, seed=0)
     nobody = np.zeros((task.sensors, 3), dtype=np.bool_)
     batch.step(nobody)
@@ -108,7 +108,7 @@ def test_a_step_names_run_step_and_quantity(family: str) -> None:
 
 
 def test_a_step_names_an_entry_of_the_observation() -> None:
-    task = fusion_gym.make_task("fusion_gym/LinearFusion-v0")
+    task = fusion_gym.make_task("fusion_gym/LinearFusion-v1")
     batch = EpisodeBatch.seeded(task, 2, seed=0)
     batch.observe()
     batch.state.prior_covariance = batch.state.prior_covariance.copy()

@@ -46,7 +46,7 @@ class AdaptiveInnovation(Rule):
 
     Source: adaptive_innovation, equations (9)-(11), defaults of Section 6.
 
-    Example: ``adaptive_innovation`` in ``fusion_gym/CorrelatedTracking-v0``.
+    Example: ``adaptive_innovation`` in ``fusion_gym/CorrelatedTracking-v1``.
     """
 
     threshold: PerSensor = parameter(0.6, not_negative_parameter)

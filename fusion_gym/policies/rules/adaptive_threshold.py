@@ -49,7 +49,7 @@ class AdaptiveThreshold(Rule):
 
     Source: unknown_input, equations (5)-(7), defaults of Section 4.
 
-    Example: ``adaptive_threshold`` in ``fusion_gym/UnknownInput-v0``.
+    Example: ``adaptive_threshold`` in ``fusion_gym/UnknownInput-v1``.
     """
 
     rho_bar: PerSensor = 0.05

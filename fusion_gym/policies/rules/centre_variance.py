@@ -39,7 +39,7 @@ class CentreVariance(Rule):
     Source: the threshold is that of S. Trimpe and R. D'Andrea, "Event-based state estimation with
     variance-based triggering", IEEE Trans. Automatic Control 59, 2014; the choice is ours.
 
-    Example: ``centre_variance:threshold=2.5`` in ``fusion_gym/MarkovJumpTracking-v0``.
+    Example: ``centre_variance:threshold=2.5`` in ``fusion_gym/MarkovJumpTracking-v1``.
     """
 
     threshold: float = parameter(1.6, validation.number, at_least=0.0)

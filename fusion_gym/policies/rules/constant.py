@@ -22,7 +22,7 @@ class Always(Rule):
 
     Source: none; the end of the trade-off at which everything is sent that the tokens pay for.
 
-    Example: ``always`` in ``fusion_gym/TobitOscillator-v0 filter=tobit random_start=True
+    Example: ``always`` in ``fusion_gym/TobitOscillator-v1 filter=tobit random_start=True
     tokens=unlimited``.
     """
 
@@ -46,7 +46,7 @@ class Never(Rule):
 
     Source: none; the end of the trade-off at which the centre only predicts.
 
-    Example: ``never`` in ``fusion_gym/TobitOscillator-v0 filter=tobit random_start=True
+    Example: ``never`` in ``fusion_gym/TobitOscillator-v1 filter=tobit random_start=True
     token_rate=2``.
     """
 

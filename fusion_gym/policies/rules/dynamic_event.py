@@ -54,7 +54,7 @@ class DynamicEvent(Rule):
 
     Source: tobit_token_bucket, equations (11)-(15).
 
-    Example: ``dynamic_event:scale=3`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    Example: ``dynamic_event:scale=3`` in ``fusion_gym/TobitOscillator-v1 filter=tobit
     random_start=True token_rate=2``.
     """
 

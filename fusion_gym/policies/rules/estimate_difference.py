@@ -50,7 +50,7 @@ class EstimateDifference(BeliefRule):
     IEEE CDC 2004; G. M. Lipsa and N. C. Martins, "Remote state estimation with communication costs
     for first-order LTI systems", IEEE Trans. Automatic Control 56, 2011.
 
-    Example: ``estimate_difference:threshold=0.25`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    Example: ``estimate_difference:threshold=0.25`` in ``fusion_gym/TobitOscillator-v1 filter=tobit
     random_start=True token_rate=2 memory=True``.
     """
 

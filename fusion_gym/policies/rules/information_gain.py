@@ -34,7 +34,7 @@ class InformationGain(Rule):
     Source: none; the greedy choice of sensors by predicted variance, here in proportion to the
     tokens that it costs.
 
-    Example: ``information_gain:threshold=0.2`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    Example: ``information_gain:threshold=0.2`` in ``fusion_gym/TobitOscillator-v1 filter=tobit
     random_start=True token_rate=2``.
     """
 

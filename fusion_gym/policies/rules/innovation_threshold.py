@@ -45,7 +45,7 @@ class InnovationThreshold(Rule):
     scheduling: trade-off between communication rate and estimation quality", IEEE Trans.
     Automatic Control 58, 2013 (there with the maximum norm of the whitened innovation).
 
-    Example: ``innovation_threshold:threshold=1.2`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    Example: ``innovation_threshold:threshold=1.2`` in ``fusion_gym/TobitOscillator-v1 filter=tobit
     random_start=True token_rate=2``.
     """
 

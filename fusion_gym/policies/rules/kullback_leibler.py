@@ -45,7 +45,7 @@ class KullbackLeibler(BeliefRule):
     Source: J. W. Marck and J. Sijs, "Relevant sampling applied to event-based state-estimation",
     SENSORCOMM 2010.
 
-    Example: ``kullback_leibler:threshold=0.8,at_most=1`` in ``fusion_gym/TobitOscillator-v0
+    Example: ``kullback_leibler:threshold=0.8,at_most=1`` in ``fusion_gym/TobitOscillator-v1
     filter=tobit random_start=True token_rate=2 memory=True``.
     """
 

@@ -32,7 +32,7 @@ class LocalVariance(Rule):
 
     Source: markov_jump, equation (33).
 
-    Example: ``local_variance:m=0.9`` in ``fusion_gym/MarkovJumpTracking-v0``.
+    Example: ``local_variance:m=0.9`` in ``fusion_gym/MarkovJumpTracking-v1``.
     """
 
     m: PerSensor = parameter(0.9, each_number)

@@ -40,7 +40,7 @@ class Paced(Rule):
 
     Source: none; the balanced sequence of a rate r, ⌊(t + 1) r + φ⌋ - ⌊t r + φ⌋.
 
-    Example: ``paced:rate=0.07`` in ``fusion_gym/TobitOscillator-v0 filter=tobit random_start=True
+    Example: ``paced:rate=0.07`` in ``fusion_gym/TobitOscillator-v1 filter=tobit random_start=True
     token_rate=2``.
     """
 

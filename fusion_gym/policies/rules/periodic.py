@@ -31,7 +31,7 @@ class Periodic(Rule):
 
     Source: none; what an event trigger is usually compared with.
 
-    Example: ``periodic:period=15`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    Example: ``periodic:period=15`` in ``fusion_gym/TobitOscillator-v1 filter=tobit
     random_start=True token_rate=2``.
     """
 
@@ -67,7 +67,7 @@ class RoundRobin(Rule):
     Source: round_robin_tobit, equation (4), for the protocol in which one sensor a step may
     transmit.
 
-    Example: ``round_robin:period=5`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    Example: ``round_robin:period=5`` in ``fusion_gym/TobitOscillator-v1 filter=tobit
     random_start=True token_rate=2``.
     """
 

@@ -28,7 +28,7 @@ class Random(Rule):
 
     Source: none; what an event trigger is usually compared with.
 
-    Example: ``random:rate=0.07`` in ``fusion_gym/TobitOscillator-v0 filter=tobit random_start=True
+    Example: ``random:rate=0.07`` in ``fusion_gym/TobitOscillator-v1 filter=tobit random_start=True
     token_rate=2``.
     """
 

@@ -35,7 +35,7 @@ class SendOnDelta(Rule):
     Source: M. Miskowicz, "Send-on-delta concept: an event-based data reporting strategy",
     Sensors 6, 2006.
 
-    Example: ``send_on_delta:threshold=3`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    Example: ``send_on_delta:threshold=3`` in ``fusion_gym/TobitOscillator-v1 filter=tobit
     random_start=True token_rate=2``.
     """
 

@@ -51,7 +51,7 @@ class StochasticEvent(Rule):
     event-triggered sensor schedule for remote state estimation", IEEE Trans. Automatic Control
     60(10), 2015, the closed-loop schedule.
 
-    Example: ``stochastic_event:weight=0.3`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    Example: ``stochastic_event:weight=0.3`` in ``fusion_gym/TobitOscillator-v1 filter=tobit
     random_start=True token_rate=2``.
     """
 

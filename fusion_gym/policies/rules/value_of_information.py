@@ -56,7 +56,7 @@ class ValueOfInformation(BeliefRule):
 
     Sources: see :mod:`fusion_gym.core.beliefs`.
 
-    Example: ``value_of_information:threshold=0.03,at_most=1`` in ``fusion_gym/TobitOscillator-v0
+    Example: ``value_of_information:threshold=0.03,at_most=1`` in ``fusion_gym/TobitOscillator-v1
     filter=tobit random_start=True token_rate=2 memory=True``.
     """
 

@@ -36,7 +36,7 @@ class VarianceThreshold(Rule):
     Source: after S. Trimpe and R. D'Andrea, "Event-based state estimation with variance-based
     triggering", IEEE Trans. Automatic Control 59, 2014.
 
-    Example: ``variance_threshold:threshold=0.25`` in ``fusion_gym/TobitOscillator-v0 filter=tobit
+    Example: ``variance_threshold:threshold=0.25`` in ``fusion_gym/TobitOscillator-v1 filter=tobit
     random_start=True token_rate=2``.
     """
 
