@@ -273,6 +273,15 @@ def cholesky(a: FloatArray) -> FloatArray:
 
 
 @np.errstate(all="ignore")
+def whiten(a: FloatArray, b: FloatArray) -> FloatArray:
+    """``L^-1 b`` (..., n, m, N) with L the Cholesky factor of `a`, as :func:`cholesky` reads it."""
+    work, scale = _equilibrate(a)
+    x: FloatArray = b * scale[..., :, None, :]
+    _eliminate(work, x)
+    return x
+
+
+@np.errstate(all="ignore")
 def root(a: FloatArray) -> FloatArray:
     """Some F with ``F F^T = a``, ``(..., n, n, N)``, of any symmetric positive semi-definite `a`.
 
@@ -289,7 +298,7 @@ def root(a: FloatArray) -> FloatArray:
         return scale[..., :, None, :] * _by_lane(_root_of_stack, rest)
     result = np.zeros_like(rest)
     if size == 2:
-        correlation = np.clip(rest[..., 1, 0, :], -1.0, 1.0)
+        correlation = np.minimum(np.maximum(rest[..., 1, 0, :], -1.0), 1.0)
         left = (1.0 - correlation) * (1.0 + correlation)
         result[..., 0, 0, :] = scale[..., 0, :]
         result[..., 1, 0, :] = scale[..., 1, :] * correlation

@@ -56,7 +56,7 @@ def random_problem(
 def outcomes(
     node_filter: NodeFilter, problem: Problem, time: int = 3
 ) -> tuple[Array, Array, Array, Array]:
-    """Delivered mean and covariance, silent mean and covariance, in the coordinates of the state."""
+    """Delivered mean and covariance, silent mean and covariance, of the state."""
     expectation = node_filter.expect(problem.mean)
     times = np.full(problem.mean.shape[-1], float(time))
     root = linalg.root(problem.covariance)

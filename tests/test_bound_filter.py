@@ -241,7 +241,7 @@ def test_holding_and_predicting_differ_only_without_a_delivery() -> None:
     assert np.array_equal(held[0], predicted[0])
     assert np.array_equal(held[1], predicted[1])
     assert np.array_equal(predicted[2], problem.mean)
-    assert np.array_equal(predicted[3], problem.covariance)
+    np.testing.assert_allclose(predicted[3], problem.covariance, rtol=1e-12)
     assert not np.allclose(held[2], problem.mean)
 
 

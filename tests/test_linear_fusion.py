@@ -57,7 +57,7 @@ def test_the_centre_is_the_optimal_filter(states: int, sizes: list[int]) -> None
     task = fusion_gym.make_task(LINEAR, tokens="unlimited", **options)
     batch = EpisodeBatch.seeded(task, 400, 0)
     generator = np.random.default_rng(1)
-    covariance = options["initial_covariance"]
+    covariance = reference(options, list(range(len(sizes))), options["initial_covariance"])
     normalised = []
     for _ in range(25):
         requests = generator.random(len(sizes)) < 0.3
@@ -86,6 +86,8 @@ def test_estimates_are_those_of_filterpy() -> None:
     beside.x, beside.P = options["initial_mean"].copy(), options["initial_covariance"].copy()
     beside.F, beside.Q = options["transition"], options["process_covariance"]
     beside.H, beside.R = matrix, np.diag([0.3, 0.2, 0.5])
+    first = batch.state.held[..., 0]  # known to the centre
+    beside.update(np.concatenate([first[0], first[1, :1]]))
     for _ in range(30):
         measured = batch.signals()["measurement"][..., 0]
         assert measured[1, 1] == 0.0  # the second sensor has one channel

@@ -13,7 +13,8 @@ from fusion_gym.systems.nonlinear import NonlinearSystem
 
 IMAGINED = {"imagine", "imagination_channels"}
 OFFERED: list[tuple[str, dict[str, Any], set[str]]] = [
-    ("TobitOscillator", {}, {"adopt", "fused_alone"}),
+    ("TobitOscillator", {}, {"adopt"}),
+    ("TobitOscillator", {"filter": "tobit"}, {"adopt", "fused_alone"}),
     ("TobitOscillator", {"filter": "adf"}, {"adopt"}),
     ("LinearFusion", {}, {"adopt", "covariance_cycle", "fused_alone"}),
     ("MarkovJumpTracking", {}, {"covariance_cycle"}),

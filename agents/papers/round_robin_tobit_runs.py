@@ -11,7 +11,7 @@ from fusion_gym import gaussian
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy
-from fusion_gym.systems.tobit.centre import FeedbackCentre
+from fusion_gym.systems.tobit.centre import FederatedCentre
 from fusion_gym.systems.tobit.filters import Expectation
 from fusion_gym.systems.tobit.system import CensoredSystem
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
@@ -238,6 +238,6 @@ def reading_task(reading: str, **options: Any) -> Task:
         return task
     system = censored(task)
     centre = system.centre
-    assert isinstance(centre, FeedbackCentre)
+    assert isinstance(centre, FederatedCentre)
     filter_ = PrintedTobitFilter(centre.sensors, printed)
     return replace(task, system=replace(system, centre=replace(centre, filter=filter_)))

@@ -89,7 +89,8 @@ def single_sensor(sensor: int) -> Task:
 
 def record_history(task: Task, episodes: int, seed: int, policy: Policy | str = TRIGGER) -> History:
     """Run the paper's trigger, or another policy, and keep everything."""
-    rows, share = [], task.system.centre.feedback.share[:, None, None]
+    system: Any = task.system
+    rows, share = [], system.centre.feedback.share[:, None, None]
     for batch, requests in walk(task, policy, episodes, seed):
         before, tokens = batch.state, batch.tokens
         outcome = batch.step(requests)

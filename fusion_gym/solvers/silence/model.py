@@ -11,11 +11,14 @@ from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.solvers.silence.problem import SilenceProblem
 from fusion_gym.systems.tobit.bound_filter import BoundTobitFilter
-from fusion_gym.systems.tobit.centre import Centre, FeedbackCentre, SequentialCentre
+from fusion_gym.systems.tobit.centre import (
+    Centre,
+    FederatedCentre,
+    FeedbackCentre,
+    SequentialCentre,
+)
 from fusion_gym.systems.tobit.filters import KalmanFilter
-from fusion_gym.systems.tobit.joint import JointCentre
 from fusion_gym.systems.tobit.system import CensoredSystem
-from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
 from fusion_gym.validation import ConfigurationError
 
 
@@ -92,10 +95,10 @@ def _system(task: Task) -> CensoredSystem:
 
 def _predicts(centre: Centre) -> bool:
     """Whether A x̂ is all that the centre makes of a step without deliveries."""
-    if isinstance(centre, (SequentialCentre, JointCentre)):
+    if isinstance(centre, SequentialCentre):
         return True
-    if not isinstance(centre, FeedbackCentre):
+    if not isinstance(centre, (FeedbackCentre, FederatedCentre)):
         return False
     if isinstance(centre.filter, BoundTobitFilter):
         return not centre.filter.hold
-    return isinstance(centre.filter, (KalmanFilter, TobitKalmanFilter))
+    return isinstance(centre.filter, KalmanFilter) and centre.filter.silence is None

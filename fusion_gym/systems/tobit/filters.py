@@ -141,8 +141,8 @@ class Scalar(NamedTuple):
         Source: J. E. Potter's form; P. S. Maybeck, "Stochastic models, estimation, and control",
         volume 1, 1979, section 7.3.
         """
-        left = (share * self.noise + (1.0 - share) * self.variance) / self.variance
-        weight = share / (self.variance * (1.0 + np.sqrt(left)))
+        left = share * self.noise + (1.0 - share) * self.variance
+        weight = share / (self.variance + np.sqrt(left * self.variance))
         return self.root - linalg.outer(self.cross * weight[..., None, :], self.projection)
 
 

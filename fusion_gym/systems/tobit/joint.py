@@ -59,17 +59,15 @@ class JointCentre(FederatedCentre):
         """See :class:`Centre`."""
         sensors, runs = self.sensors, granted.shape[-1]
         (channels,) = np.nonzero(np.repeat(granted.any(-1), sensors.size))
+        if not channels.size:
+            return Posterior(mean, covariance, np.broadcast_to(mean, (sensors.count, *mean.shape)))
         taken = np.repeat(granted, sensors.size, axis=0)[channels].astype(np.float64)
         innovation = (measurement - prediction.expectation.value).reshape(-1, runs)[channels]
         # A channel that has not arrived stands for nothing, with a variance of 1.
         noise = taken[:, None] * taken * sensors.noise_covariance[np.ix_(channels, channels)]
-        factor = linalg.cholesky(linalg.add_diagonal(noise, 1.0 - taken))
         matrix = linalg.matmul(sensors.stacked_matrix[channels], prediction.root)
         both = taken[:, None] * np.concatenate([matrix, innovation[:, None]], axis=1)
-        for k in range(len(channels)):
-            if k:
-                both[k] -= linalg.matvec(linalg.transpose(both[:k]), factor[k, :k])
-            both[k] /= factor[k, k]
+        both = linalg.whiten(linalg.add_diagonal(noise, 1.0 - taken), both)
         shift, posterior = joint_update(both[:, :-1], both[:, -1])
         posterior = linalg.congruence(prediction.root, posterior)
         mean = mean + linalg.matvec(prediction.root, shift)
