@@ -321,7 +321,7 @@ def draw(family: str, number: int, horizon: int) -> Drawn:
     random = np.random.default_rng([list(FAMILIES).index(family), number])
     drawn = FAMILIES[family](random, horizon)
     options = drawn.options | {"tokens": "unlimited"}
-    return Drawn(f"fusion_gym/{drawn.env_id}-v0", options, drawn.known)
+    return Drawn(f"fusion_gym/{drawn.env_id}-v1", options, drawn.known)
 
 
 def request(random: np.random.Generator, step: int, sensors: int, runs: int) -> NDArray[np.bool_]:

@@ -101,7 +101,6 @@ def test_an_unknown_option() -> None:
 
 
 # What a process noise of rank one leaves of it is no covariance that could be inverted.
-SINGULAR = ((0.0, 0.01, 5e-05), (0.0, 1.0, 0.01), (0.0, 0.0, 1.0))
 GILBERT_ELLIOTT, MEMORY = {"channel": "gilbert_elliott"}, {"memory": True}
 ESTIMATE = {"packet": "estimate"}
 UNSTABLE = (((1.1, 0.0), (0.0, 1.0)),) * 2
@@ -111,7 +110,6 @@ ELSEWHERE: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     ("RemoteEstimation", {"token_capacity": 0.5}, ("token_capacity = 0.5", "initial_tokens = 1.0")),
     ("RemoteEstimation", {"coefficient": 9.0}, ("coefficient = 9.0", "horizon = 200", "1e+32")),
     ("CorrelatedTracking", {"token_capacity": 3.5}, ("= 3.5", "initial_tokens = 10.0")),
-    ("CorrelatedTracking", {"transition": SINGULAR}, ("((0.0, 0.01, 5e-05)", "singular")),
     ("UnknownInput", {"input_amplitude": 0.0}, ("input_amplitude = 0.0", "nothing to estimate")),
     ("BiasedOscillator", {"censoring_threshold": 1e9}, ("1000000000.0", "censoring_upper")),
     ("BiasedOscillator", {"censoring_threshold": 5.0}, ("is not allowed",)),

@@ -50,7 +50,7 @@ def exactly_filtered(number: int, horizon: int) -> tuple[Drawn, bool]:
     kind = number % 3
     if kind == 0:
         drawn = draw_linear(np.random.default_rng([9, number]), horizon, exact=True)
-        return Drawn(f"fusion_gym/{drawn.env_id}-v0", drawn.options, drawn.known), False
+        return Drawn(f"fusion_gym/{drawn.env_id}-v1", drawn.options, drawn.known), False
     drawn = draw(("TobitOscillator", "BiasedOscillator")[kind - 1], number, horizon)
     name = ("tobit", "paper")[kind - 1] if number % 2 else "kalman"
     own = ("fusion", "stochastic_weight", "bias_aware", "silent")
