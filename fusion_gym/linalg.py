@@ -294,6 +294,8 @@ def root(a: FloatArray) -> FloatArray:
         return scale[..., None, :]
     unit = np.where(scale == 0.0, 0.0, 1.0 / scale)
     rest = unit[..., :, None, :] * a * unit[..., None, :, :]
+    for k in range(size):  # exactly, for rounding must not decide which pivot is the first
+        rest[..., k, k, :] = np.where(scale[..., k, :] == 0.0, 0.0, 1.0)
     if size >= _LARGE:
         return scale[..., :, None, :] * _by_lane(_root_of_stack, rest)
     result = np.zeros_like(rest)

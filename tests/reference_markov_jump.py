@@ -232,9 +232,15 @@ class Run:
 
 
 def root(matrix: Array) -> Array:
-    """The factor V sqrt(D) of a covariance, as the library draws with it."""
-    values, vectors = np.linalg.eigh(matrix)
-    result: Array = vectors * np.sqrt(values)
+    """The pivoted Cholesky factor of the correlations, scaled, as the library draws with it."""
+    scale = np.sqrt(np.diag(matrix))
+    left, columns = matrix / np.outer(scale, scale), []
+    np.fill_diagonal(left, 1.0)
+    for _ in scale:
+        pivot = int(np.argmax(np.diag(left)))
+        columns.append(left[:, pivot] / np.sqrt(left[pivot, pivot]))
+        left = left - np.outer(columns[-1], columns[-1])
+    result: Array = scale[:, None] * np.stack(columns, axis=1)
     return result
 
 

@@ -63,7 +63,7 @@ def test_the_weights_are_the_rewards() -> None:
 @pytest.mark.parametrize(
     ("env_id", "options", "filter", "share"),
     [
-        (OSCILLATOR, PAPER, "paper", -0.25),
+        (OSCILLATOR, PAPER, "paper", -0.18),
         (INPUT, {"tokens": "limited", "token_rate": 2, "horizon": 60}, None, -0.13),
     ],
 )

@@ -7,7 +7,7 @@ from command_runs import call
 from small_results import small_results
 
 from fusion_gym.agents.experiments.report import read_results, robustness_text, update_pages
-from fusion_gym.agents.experiments.tables import write_rows
+from fusion_gym.agents.experiments.tables import read_rows, write_rows
 from fusion_gym.agents.experiments.verdict import read_cases, write_cases
 
 PAGE = """# A page
@@ -47,7 +47,8 @@ def test_perturbed_cases_are_counted(tmp_path: Path) -> None:
     }
     report = {"class": "sensors", "cases": cases, "episodes": 2, "sha256": "0"}
     write_cases(tmp_path / "tobit_oscillator", report)
-    write_rows(tmp_path / "tobit_oscillator", "setting", [{"env": "fusion_gym/TobitOscillator-v0"}])
+    setting = read_rows(Path(__file__).parents[1] / "results" / "tobit_oscillator", "setting")
+    write_rows(tmp_path / "tobit_oscillator", "setting", setting)
     titles = {"tobit_oscillator": "Tobit oscillator, with an option"}
     text = update_pages(PAGE.format(name="robustness"), {}, tmp_path, titles)
     expected = "| Tobit oscillator | as they are | -20.0% [-30.0%, -10.0%] | 1 | 1 | 1 | "

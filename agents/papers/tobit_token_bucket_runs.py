@@ -96,8 +96,10 @@ def record_history(task: Task, episodes: int, seed: int, policy: Policy | str = 
         outcome = batch.step(requests)
         state, granted = batch.delivered, outcome.granted
         expected, _, root, planned = state.prediction
-        bounds = (planned.delivered_covariance, planned.silent_covariance)
-        bound = linalg.congruence(root, np.where(granted[:, None, None], *bounds) / share)
+        bound = np.full((*state.local_mean.shape[:2], *state.covariance.shape[1:]), np.nan)
+        if planned is not None:
+            bounds = (planned.delivered_covariance, planned.silent_covariance)
+            bound = linalg.congruence(root, np.where(granted[:, None, None], *bounds) / share)
         values = (
             state.truth, state.measurement, state.held, before.held, outcome.requested, granted,
             batch.tokens, tokens, state.prior_mean, state.prior_covariance,

@@ -31,7 +31,7 @@ class PhiloxNoise:
     """The default :class:`NoiseSource`: a Philox generator with the seed as its key.
 
     The counter's words are the episode, the purpose and the chunk of steps, so any part of an
-    episode is drawn by itself. Seeds from 2⁶⁴ on are hashed.
+    episode is drawn alone. Seeds from 2⁶⁴ on are hashed.
 
     Source: Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
     """

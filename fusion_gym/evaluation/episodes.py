@@ -11,7 +11,7 @@ from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
-from fusion_gym.fusion.intersection import whiten
+from fusion_gym.fusion.intersection import orthonormalise
 from fusion_gym.policies.base import Policy, owner_of, refused_signals
 
 BATCH = 1024  # episodes side by side; fixed, so that results do not depend on the machine
@@ -83,7 +83,7 @@ def _normalised_error(error: Array, covariance: Array) -> Array:
     lanes = np.flatnonzero(np.isnan(result) & np.isfinite(covariance).all((0, 1)))
     if lanes.size:
         root = linalg.root(covariance.take(lanes, axis=-1))
-        inverse = whiten(root[None])[:, len(error) : 2 * len(error)]
+        inverse = orthonormalise(root[None])[:, len(error) : 2 * len(error)]
         unit = linalg.matvec(inverse, error.take(lanes, axis=-1))
         result[lanes] = linalg.dot(unit, unit) / np.maximum(inverse.any(1).sum(0), 1)
     return result

@@ -44,7 +44,7 @@ class DiagonalPair(NamedTuple):
 
 
 @np.errstate(all="ignore")
-def whiten(roots: Array) -> Array:
+def orthonormalise(roots: Array) -> Array:
     """Coordinates in which Σ F_i F_iᵀ is the identity, from the roots F_i (l, n, n, N).
 
     Rows (n, (l + 2) n, N) of (W_1, …, W_l, T, Vᵀ) with F_i = V W_i and T V = I, zeros from the rank
@@ -78,7 +78,7 @@ def diagonalise(
 
     With P_A = C Cᵀ, the rows of G = C⁻¹ chol(P_B) are made orthogonal: their squared norms are
     b / a, each to its own relative accuracy. The rotations turn Cᵀ into Vᵀ and C⁻¹ into V⁻¹. Where
-    P_A or P_B is nearly singular, the rows of :func:`whiten` take the place of those of G: those of
+    P_A or P_B is nearly singular, the rows of :func:`orthonormalise` replace those of G: those of
     P_A are made orthogonal, then those of P_B, which the first ones do not tell where b is small.
     """
     pair = np.stack(np.broadcast_arrays(covariance_a, covariance_b))
@@ -98,7 +98,7 @@ def diagonalise(
     regular = np.square(linalg.diagonal(factor)) > REGULAR * linalg.diagonal(pair)
     lanes = np.flatnonzero(~regular.all((0, 1)))
     if lanes.size:
-        rows = whiten(linalg.root(pair.take(lanes, axis=-1)))
+        rows = orthonormalise(linalg.root(pair.take(lanes, axis=-1)))
         _orthogonalise(rows)
         rows[:, : 2 * size] = np.roll(rows[:, : 2 * size], size, 1)
         _orthogonalise(rows)

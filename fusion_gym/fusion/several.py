@@ -18,7 +18,7 @@ from fusion_gym.fusion.intersection import (
     SequentialIntersection,
     best_of_pair,
     information_fusion,
-    whiten,
+    orthonormalise,
 )
 from fusion_gym.fusion.rules import Active, Fused, FusionRule, own_covariances
 
@@ -178,7 +178,7 @@ def _constrained(
     least = np.where(selected[:, None], linalg.diagonal(own), np.inf).min(0)[:, None]
     root = linalg.root(first.covariance)
     root *= (root * root > _NOTHING * least).any(0) & (least > 0.0)
-    half = np.stack([whiten(linalg.root(item)[None])[:, size : 2 * size] for item in own])
+    half = np.stack([orthonormalise(linalg.root(item)[None])[:, size : 2 * size] for item in own])
     legs = linalg.matmul(half, root)
     information = linalg.matmul(linalg.transpose(legs), legs)
     information = linalg.add_diagonal(
