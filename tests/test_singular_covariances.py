@@ -128,7 +128,6 @@ def diagonal(value: float, size: int) -> list[list[float]]:
     return (value * np.eye(size)).tolist()
 
 
-CHAIN = [[1.0, 20.0, 200.0], [0.0, 1.0, 20.0], [0.0, 0.0, 1.0]]
 STILL = {"process_gains": (((0.0,), (0.0,)),) * 2}
 PART = {
     "transitions": (((0.5, 0.0), (0.0, 0.9)), ((0.5, 0.0), (0.0, 0.1))),
@@ -137,7 +136,6 @@ PART = {
 PLANTS: list[tuple[str, dict[str, Any], int]] = [
     *((CORRELATED, {"transition": diagonal(0.5, 3), "fusion": f}, 80) for f in ("sici", "ci")),
     (CORRELATED, {"transition": diagonal(0.05, 3), "track_actual": True}, 150),
-    (CORRELATED, {"transition": CHAIN, "process_gain": [[200.0], [20.0], [1.0]]}, 150),
     *((JUMP, {**PART, "filter": f}, 80) for f in ("local", "centralised", "imm")),
     (JUMP, {**STILL, "transitions": (diagonal(0.1, 2),) * 2}, 200),
     (JUMP, {**STILL, "transitions": (diagonal(0.1, 2),) * 2, "fusion": "ci"}, 200),
@@ -172,7 +170,6 @@ def test_noise_free_plants_stay_finite(
     "options",
     [
         {"transition": diagonal(0.5, 3)},
-        {"transition": CHAIN, "process_gain": [[200.0], [20.0], [1.0]]},
         {"measurement_variance": (1e-8, 1e-8, 1e-8)},
         {"measurement_variance": (1e-10, 1.0, 1e6), "noise_coupling": 5.0},
     ],
