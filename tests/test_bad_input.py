@@ -101,6 +101,7 @@ def test_an_unknown_option() -> None:
 
 
 # What a process noise of rank one leaves of it is no covariance that could be inverted.
+CHAIN = ((1.0, 20.0, 200.0), (0.0, 1.0, 20.0), (0.0, 0.0, 1.0))
 GILBERT_ELLIOTT, MEMORY = {"channel": "gilbert_elliott"}, {"memory": True}
 ESTIMATE = {"packet": "estimate"}
 UNSTABLE = (((1.1, 0.0), (0.0, 1.0)),) * 2
@@ -172,6 +173,11 @@ ELSEWHERE: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     ("LinearFusion", {"censoring_threshold": 1.0, "censoring_upper": 0.0}, ()),
     ("LinearFusion", {"transition": [[2.0, 0.0], [0.0, 1.5]]}, ()),
     # Correlated and jumping plants
+    (
+        "CorrelatedTracking",
+        {"horizon": 150, "transition": CHAIN, "process_gain": [[200.0], [20.0], [1.0]]},
+        ("horizon = 150", "at most 49"),
+    ),
     ("CorrelatedTracking", {"noise_scale": 0.0}, ("noise_scale = 0.0", "> 0")),
     ("CorrelatedTracking", {"noise_scale": 1.5}, ("noise_scale = 1.5", "<= 1")),
     ("CorrelatedTracking", {"fusion": "information"}, ("= 'information'", "process noise")),

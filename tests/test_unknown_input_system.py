@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from reference_markov_jump import root
 from scipy.linalg import null_space
 from scipy.special import ndtr
 
@@ -29,8 +30,7 @@ def reference(
     a, b, w = a1 @ a1, a1 @ b1 + b1, a1 @ w1 @ a1.T + w1
     cs = np.array(CARTS["measurement_matrices"])
     vs = [np.diag(v) for v in CARTS["measurement_covariance"]]
-    values, vectors = np.linalg.eigh(w)
-    factor = vectors * np.sqrt(values)
+    factor = root(w)
     x = np.sqrt(0.1) * start[:4]
     held = [cs[i] @ x + np.sqrt(vs[i]) @ start[4 + 2 * i : 6 + 2 * i] for i in range(3)]
     phase = 2 * np.pi * ndtr(start[10:])

@@ -78,8 +78,8 @@ def diagonalise(
 
     With P_A = C Cᵀ, the rows of G = C⁻¹ chol(P_B) are made orthogonal: their squared norms are
     b / a, each to its own relative accuracy. The rotations turn Cᵀ into Vᵀ and C⁻¹ into V⁻¹. Where
-    P_A or P_B is nearly singular, the rows of :func:`orthonormalise` replace those of G: those of
-    P_A are made orthogonal, then those of P_B, which the first ones do not tell where b is small.
+    P_A or P_B is nearly singular, the rows of :func:`orthonormalise` replace G: first the rows of
+    P_A are made orthogonal, then the rows of P_B, for the first do not tell where b is small.
     """
     pair = np.stack(np.broadcast_arrays(covariance_a, covariance_b))
     size, factor = len(covariance_a), linalg.cholesky(pair)

@@ -13,8 +13,7 @@ from fusion_gym.solvers.silence.problem import SilenceProblem
 from fusion_gym.systems.tobit.bound_filter import BoundTobitFilter
 from fusion_gym.systems.tobit.centre import (
     Centre,
-    FederatedCentre,
-    FeedbackCentre,
+    NodeCentre,
     SequentialCentre,
 )
 from fusion_gym.systems.tobit.filters import KalmanFilter
@@ -97,7 +96,7 @@ def _predicts(centre: Centre) -> bool:
     """Whether A x̂ is all that the centre makes of a step without deliveries."""
     if isinstance(centre, SequentialCentre):
         return True
-    if not isinstance(centre, (FeedbackCentre, FederatedCentre)):
+    if not isinstance(centre, NodeCentre):
         return False
     if isinstance(centre.filter, BoundTobitFilter):
         return not centre.filter.hold

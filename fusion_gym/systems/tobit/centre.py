@@ -145,18 +145,10 @@ class Feedback:
 
 
 @dataclass(frozen=True)
-class FeedbackCentre(Centre):
-    """A node filter for each sensor, fusion, and the result fed back to the nodes.
-
-    Nodes and fusion work on z of x = x̂ + G z with G Gᵀ the covariance of the prediction, so that
-    only regular covariances are inverted.
-
-    Source: tobit_token_bucket, equations (20)-(23), (29)-(37), (50), (51); round_robin_tobit,
-    equations (18)-(28).
-    """
+class NodeCentre(Centre):
+    """A centre with a node filter for each sensor, which gets the result back."""
 
     filter: NodeFilter
-    fusion: FusionRule
     feedback: Feedback
 
     @property
@@ -168,6 +160,20 @@ class FeedbackCentre(Centre):
     def predictable(self) -> bool:
         """See :class:`Centre`: with Kalman filters, where nothing is censored."""
         return type(self.filter) is KalmanFilter and self.sensors.unlimited
+
+
+@dataclass(frozen=True)
+class FeedbackCentre(NodeCentre):
+    """A node filter for each sensor, fusion, and the result fed back to the nodes.
+
+    Nodes and fusion work on z of x = x̂ + G z with G Gᵀ the covariance of the prediction, so that
+    only regular covariances are inverted.
+
+    Source: tobit_token_bucket, equations (20)-(23), (29)-(37), (50), (51); round_robin_tobit,
+    equations (18)-(28).
+    """
+
+    fusion: FusionRule
 
     def predict(self, mean: Array, covariance: Array, held: Array, time: Array) -> CentrePrediction:
         """See :class:`Centre`."""
@@ -218,7 +224,7 @@ class FeedbackCentre(Centre):
 
 
 @dataclass(frozen=True)
-class FederatedCentre(Centre):
+class FederatedCentre(NodeCentre):
     """Nodes with Kalman filters whose informations add up, by the same algebra at the centre.
 
     Nodes that share the prediction P in shares w_m with the sum 1 have Σ (w_m P⁻¹ + Cᵀ N⁻¹ C)
@@ -231,17 +237,6 @@ class FederatedCentre(Centre):
     """
 
     filter: KalmanFilter
-    feedback: Feedback
-
-    @property
-    def sensors(self) -> CensoredSensors:
-        """The sensors."""
-        return self.filter.sensors
-
-    @property
-    def predictable(self) -> bool:
-        """See :class:`Centre`: with Kalman filters, where nothing is censored."""
-        return type(self.filter) is KalmanFilter and self.sensors.unlimited
 
     @property
     def separable(self) -> bool:

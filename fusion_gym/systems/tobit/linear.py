@@ -57,8 +57,8 @@ class LinearFusionOptions(FeedbackOptions):
     nodes' estimates are joined by covariance intersection.
 
     Starting state: x₀ ~ N(``initial_mean``, ``initial_covariance``), by default zero and the
-    identity. The first measurement is known to the centre free of charge: the first estimate is
-    that of the filter after it.
+    identity. The first measurement is known to the centre free of charge: the first estimate
+    uses it.
 
     The defaults are a target in one dimension, sampled every 0.1 s, with white acceleration;
     one sensor measures its position in metres, one its velocity in metres a second.

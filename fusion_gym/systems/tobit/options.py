@@ -159,9 +159,9 @@ def feedback_centre(options: FeedbackOptions, node: NodeFilter) -> Centre:
         feedback = Feedback.in_shares(options.information_shares, sensors)
         if isinstance(node, KalmanFilter):
             return FederatedCentre(node, feedback)
-        return FeedbackCentre(node, fusion, feedback)
+        return FeedbackCentre(node, feedback, fusion)
     _refuse(options, ("information_shares",), f"fusion={kind!r}", "fusion='federated'")
-    return FeedbackCentre(node, fusion, Feedback.in_full(sensors))
+    return FeedbackCentre(node, Feedback.in_full(sensors), fusion)
 
 
 def stochastic_centre(values: FeedbackOptions, sensors: CensoredSensors) -> Centre:
