@@ -1,9 +1,8 @@
 """Trained agents, small and ready to use: ``zoo:NAME`` is a policy like any other.
 
 Beside each ``NAME.zip`` stands ``NAME.json``: its environment and options, how it was trained, its
-test numbers, and the SHA-256 of the model. ``trained_in`` is the earlier version of the
-environment, if any, in which it was trained and its numbers measured. The models are ordinary files
-of Stable-Baselines3; ``zoo:NAME`` reads their plain parts and weights alone.
+test numbers, and the SHA-256 of the model. The models are ordinary files of Stable-Baselines3;
+``zoo:NAME`` reads their plain parts and weights alone.
 """
 
 import hashlib
