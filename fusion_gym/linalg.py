@@ -293,20 +293,21 @@ def root(a: FloatArray) -> FloatArray:
     if size == 1:
         return scale[..., None, :]
     unit = np.where(scale == 0.0, 0.0, 1.0 / scale)
+    result = np.zeros_like(a)
+    if size == 2:
+        correlation = unit[..., 1, :] * a[..., 1, 0, :] * unit[..., 0, :]
+        correlation = np.minimum(np.maximum(correlation, -1.0), 1.0)
+        left = (1.0 - correlation) * (1.0 + correlation)
+        left[left <= size * _ROUNDING] = 0.0
+        result[..., 0, 0, :] = scale[..., 0, :]
+        result[..., 1, 0, :] = scale[..., 1, :] * correlation
+        result[..., 1, 1, :] = scale[..., 1, :] * np.sqrt(left)
+        return result
     rest = unit[..., :, None, :] * a * unit[..., None, :, :]
     for k in range(size):  # exactly, for rounding must not decide which pivot is the first
         rest[..., k, k, :] = np.where(scale[..., k, :] == 0.0, 0.0, 1.0)
     if size >= _LARGE:
         return scale[..., :, None, :] * _by_lane(_root_of_stack, rest)
-    result = np.zeros_like(rest)
-    if size == 2:
-        correlation = np.minimum(np.maximum(rest[..., 1, 0, :], -1.0), 1.0)
-        left = (1.0 - correlation) * (1.0 + correlation)
-        result[..., 0, 0, :] = scale[..., 0, :]
-        result[..., 1, 0, :] = scale[..., 1, :] * correlation
-        left = np.where(left <= size * _ROUNDING, 0.0, left)
-        result[..., 1, 1, :] = scale[..., 1, :] * np.sqrt(left)
-        return result
     for k in range(size):
         left = diagonal(rest)
         first = left.argmax(-2)[..., None, :]

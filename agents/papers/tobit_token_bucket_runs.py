@@ -96,14 +96,15 @@ def record_history(task: Task, episodes: int, seed: int, policy: Policy | str = 
         outcome = batch.step(requests)
         state, granted = batch.delivered, outcome.granted
         expected, _, root, planned = state.prediction
-        bound = np.full((*state.local_mean.shape[:2], *state.covariance.shape[1:]), np.nan)
+        local = system.local_means(state)
+        bound = np.full((*local.shape[:2], *state.covariance.shape[1:]), np.nan)
         if planned is not None:
             bounds = (planned.delivered_covariance, planned.silent_covariance)
             bound = linalg.congruence(root, np.where(granted[:, None, None], *bounds) / share)
         values = (
             state.truth, state.measurement, state.held, before.held, outcome.requested, granted,
             batch.tokens, tokens, state.prior_mean, state.prior_covariance,
-            expected.uncensored_probability, expected.hazard, state.local_mean, bound, state.mean,
+            expected.uncensored_probability, expected.hazard, local, bound, state.mean,
             state.covariance,
         )  # fmt: skip
         rows.append([np.array(value) for value in values])

@@ -159,7 +159,7 @@ class Block:
         for name in ("knowledge", "node"):
             object.__setattr__(self, name, deprecation.current(name, getattr(self, name)))
 
-    @property
+    @functools.cached_property
     def shape(self) -> tuple[int, ...]:
         """Shape of the entries, without the batch axis."""
         return tuple(len(axis) for axis in self.labels)

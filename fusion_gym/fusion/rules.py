@@ -85,7 +85,7 @@ def own_covariances(covariance: Array) -> Array:
     """The estimates' own covariances (l, n, n, N), also where the joint one is given."""
     if covariance.ndim == 4:
         return covariance
-    return np.stack([covariance[i, i] for i in range(len(covariance))])
+    return linalg.symmetrise(np.stack([covariance[i, i] for i in range(len(covariance))]))
 
 
 @dataclass(frozen=True)

@@ -93,6 +93,12 @@ def test_the_longest_horizon_is_named_and_right(growth: float) -> None:
         assert max(largest_errors(task, longest, 3, censored=False)) <= 1e-9
 
 
+def test_a_growth_that_the_unknown_input_hides_is_refused() -> None:
+    drawn = draw("UnknownInput", 15, 1000)
+    with pytest.raises(ConfigurationError, match="it must be at most 6, for"):
+        make_task(drawn.env_id, **drawn.options)
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_step_names_run_step_and_quantity(family: str) -> None:
     task = make_task(f"fusion_gym/{family}-v1", horizon=5)

@@ -26,6 +26,7 @@ _SMALLEST_PROBABILITY = 1e-290
 # The same where a held value is divided by q, and the ratio is squared.
 _SMALLEST_DIVISOR = 1e-140
 _RIDGE = 1e-14  # relative: just above the rounding of a sum
+_LEAST = 1e-290  # a variance below it has no inverse
 
 
 @dataclass(frozen=True)
@@ -228,7 +229,7 @@ class BoundTobitFilter:
         bias = expectation.hazard * self.sensors.deviation
         core = k1 * spread + k4 * moment + k2 * linalg.outer(bias, bias)
         ridge = linalg.diagonal(core)
-        core = linalg.add_diagonal(core, np.where(ridge > 0.0, _RIDGE * ridge, 1.0))
+        core = linalg.add_diagonal(core, np.where(ridge > _LEAST, _RIDGE * ridge, 1.0))
         columns = _pinned_columns(held, threshold, q, np.sqrt(k5), np.sqrt(k7))
         whitened, pull = _pinned_solve(core, matrix, columns)
         across = linalg.transpose(matrix)
@@ -282,16 +283,19 @@ def _pinned_solve(
 
     ``core`` N (…, m, m, N) is positive definite, ``right`` B (…, m, n, N); ``columns`` are those
     of :func:`_pinned_columns`. Each step is the Sherman-Morrison formula: with h = M⁻¹ f,
-    (M + f fᵀ)⁻¹ = M⁻¹ - h hᵀ/(1 + fᵀ h), and (M + f fᵀ)⁻¹ f = h/(1 + fᵀ h).
+    (M + f fᵀ)⁻¹ = M⁻¹ - h hᵀ/(1 + fᵀ h), and (M + f fᵀ)⁻¹ f = h/(1 + fᵀ h). It is written with f of
+    unit size, for fᵀ h may overflow.
     """
     n = right.shape[-2]
-    stacked = np.concatenate([right, *(f[..., None, :] for f, _ in columns)], axis=-2)
+    sizes = [np.maximum(np.abs(f).max(-2, keepdims=True), 1e-150) for f, _ in columns]
+    units = [f / size for (f, _), size in zip(columns, sizes, strict=True)]
+    stacked = np.concatenate([right, *(unit[..., None, :] for unit in units)], axis=-2)
     solved = linalg.solve(core, stacked)
-    shift = np.zeros_like(columns[0][0])
-    for place, (f, factor) in enumerate(columns):
+    shift = np.zeros_like(units[0])
+    for place, (unit, size, (_, factor)) in enumerate(zip(units, sizes, columns, strict=True)):
         h = solved[..., n + place, :]
-        weight = h / (1.0 + linalg.dot(f, h))[..., None, :]
-        shift = shift + weight * (factor - linalg.dot(f, shift)[..., None, :])
-        projected = linalg.matvec(linalg.transpose(solved), f)
+        weight = h / ((1.0 / size) ** 2 + linalg.dot(unit, h)[..., None, :])
+        shift = shift + weight * (factor / size - linalg.dot(unit, shift)[..., None, :])
+        projected = linalg.matvec(linalg.transpose(solved), unit)
         solved = solved - linalg.outer(weight, projected)
     return solved[..., :n, :], shift

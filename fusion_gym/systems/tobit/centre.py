@@ -37,15 +37,6 @@ class CentrePrediction(NamedTuple):
     outcomes: Outcomes | None = None
 
 
-class Posterior(NamedTuple):
-    """``mean`` (n, N) and ``covariance`` (n, n, N) of the centre, ``local_mean`` (sensors, n, N)
-    of the nodes before any feedback (the centre's own where it filters by itself)."""
-
-    mean: Array
-    covariance: Array
-    local_mean: Array
-
-
 class Centre(Protocol):
     """Nodes and centre behind one interface."""
 
@@ -75,9 +66,24 @@ class Centre(Protocol):
         prediction: CentrePrediction,
         measurement: Array,
         granted: NDArray[np.bool_],
-    ) -> Posterior:
-        """The posterior after the granted (sensors, N) of the measurements (sensors, m, N)."""
+    ) -> tuple[Array, Array]:
+        """Posterior mean (n, N) and covariance (n, n, N).
+
+        It takes the ``granted`` (sensors, N) of the measurements (sensors, m, N).
+        """
         ...
+
+    def local_means(
+        self,
+        mean: Array,
+        covariance: Array,
+        prediction: CentrePrediction,
+        measurement: Array,
+        granted: NDArray[np.bool_],
+    ) -> Array:
+        """Means (sensors, n, N) of the nodes before any feedback, of a centre alone its own."""
+        own = self.update(mean, covariance, prediction, measurement, granted)[0]
+        return np.broadcast_to(own, (len(granted), *own.shape))
 
     def single(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
@@ -192,22 +198,36 @@ class FeedbackCentre(NodeCentre):
         prediction: CentrePrediction,
         measurement: Array,
         granted: NDArray[np.bool_],
-    ) -> Posterior:
+    ) -> tuple[Array, Array]:
         """Each node takes the planned outcome of the network's answer; the centre fuses."""
-        outcomes, root = _outcomes(prediction), prediction.root
+        outcomes, root, share = _outcomes(prediction), prediction.root, self.feedback.share[:, None]
+        grant = granted[:, None, None]
+        own = np.where(grant, outcomes.delivered_covariance, outcomes.silent_covariance)
+        local = self._shift(prediction, measurement, granted)
+        fused = self.fusion.fuse(local, own / share[:, None], basis=root)
+        return mean + linalg.matvec(root, fused.mean), linalg.congruence(root, fused.covariance)
+
+    def local_means(
+        self,
+        mean: Array,
+        covariance: Array,
+        prediction: CentrePrediction,
+        measurement: Array,
+        granted: NDArray[np.bool_],
+    ) -> Array:
+        """See :class:`Centre`."""
+        local = self._shift(prediction, measurement, granted)
+        return mean + linalg.matvec(prediction.root, local)
+
+    def _shift(
+        self, prediction: CentrePrediction, measurement: Array, granted: NDArray[np.bool_]
+    ) -> Array:
+        """The nodes' means (sensors, n, N) of z."""
+        outcomes = _outcomes(prediction)
         innovation = measurement - prediction.expectation.value
         delivered = linalg.matvec(linalg.transpose(outcomes.correction), innovation)
         local = np.where(granted[:, None], delivered, outcomes.silent_mean)
-        grant = granted[:, None, None]
-        own = np.where(grant, outcomes.delivered_covariance, outcomes.silent_covariance)
-        share = self.feedback.share[:, None]
-        local = local / np.sqrt(share)
-        fused = self.fusion.fuse(local, own / share[:, None], basis=root)
-        return Posterior(
-            mean + linalg.matvec(root, fused.mean),
-            linalg.gram(linalg.matmul(root, linalg.root(fused.covariance))),
-            mean + linalg.matvec(root, local),
-        )
+        return local / np.sqrt(self.feedback.share[:, None])
 
     def variances(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array
@@ -264,19 +284,35 @@ class FederatedCentre(NodeCentre):
         prediction: CentrePrediction,
         measurement: Array,
         granted: NDArray[np.bool_],
-    ) -> Posterior:
+    ) -> tuple[Array, Array]:
         """See :class:`Centre`."""
         places = np.flatnonzero(granted.any(-1))
-        local = np.broadcast_to(mean, (len(granted), *mean.shape)).copy()
         silent = covariance if self.filter.silence is None else linalg.gram(prediction.root)
-        if places.size:
-            taken = granted[places, None]
-            local[places] += self._correction(covariance, prediction, measurement, places, taken)
-            matrix, value = self._whitened(prediction, measurement, places)
-            matrix = np.where(taken[:, None], matrix, 0.0)
-            mean, posterior = _shifted(mean, prediction, _stack(matrix), _stack(value))
-            silent = np.where(granted.any(0), posterior, silent)
-        return Posterior(mean, silent, local)
+        if not places.size:
+            return mean, silent
+        matrix, value = self._whitened(prediction, measurement, places)
+        matrix = np.where(granted[places, None, None], matrix, 0.0)
+        mean, posterior = _shifted(mean, prediction, _stack(matrix), _stack(value))
+        return mean, np.where(granted.any(0), posterior, silent)
+
+    def local_means(
+        self,
+        mean: Array,
+        covariance: Array,
+        prediction: CentrePrediction,
+        measurement: Array,
+        granted: NDArray[np.bool_],
+    ) -> Array:
+        """See :class:`Centre`."""
+        sensors, expectation = self.sensors, prediction.expectation
+        weighted = expectation.uncensored_probability[:, :, None] * sensors.measurement_matrix
+        cross = linalg.matmul(weighted, covariance)
+        total = linalg.matmul(cross, linalg.transpose(weighted))
+        noise = sensors.variance * expectation.truncated_variance
+        total = linalg.add_diagonal(total, self.feedback.share[:, None] * noise)
+        innovation = np.where(granted[:, None], measurement - expectation.value, 0.0)
+        shift = linalg.matvec(linalg.transpose(cross), linalg.solve_vector(total, innovation))
+        return mean + shift
 
     def single(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, measurement: Array
@@ -307,25 +343,6 @@ class FederatedCentre(NodeCentre):
         scaled = scale * expectation.uncensored_probability[places]
         return scaled[..., None, :] * matrix, scale * innovation
 
-    def _correction(
-        self,
-        covariance: Array,
-        prediction: CentrePrediction,
-        measurement: Array,
-        places: NDArray[np.intp],
-        taken: NDArray[np.bool_],
-    ) -> Array:
-        """What nodes add to their own means (…, n, N)."""
-        sensors, expectation = self.sensors, prediction.expectation
-        q = expectation.uncensored_probability[places, :, None]
-        weighted = q * sensors.measurement_matrix[places]
-        cross = linalg.matmul(weighted, covariance)
-        total = linalg.matmul(cross, linalg.transpose(weighted))
-        noise = sensors.variance[places] * expectation.truncated_variance[places]
-        total = linalg.add_diagonal(total, self.feedback.share[places, None] * noise)
-        innovation = np.where(taken, measurement[places] - expectation.value[places], 0.0)
-        return linalg.matvec(linalg.transpose(cross), linalg.solve_vector(total, innovation))
-
 
 @dataclass(frozen=True)
 class SequentialCentre(Centre):
@@ -352,12 +369,10 @@ class SequentialCentre(Centre):
         prediction: CentrePrediction,
         measurement: Array,
         granted: NDArray[np.bool_],
-    ) -> Posterior:
+    ) -> tuple[Array, Array]:
         """See :class:`Centre`."""
         mean, root = self.filter.update(mean, prediction.root, measurement, granted)
-        covariance = np.where(granted.any(0), linalg.gram(root), covariance)
-        local = np.broadcast_to(mean, (self.sensors.count, *mean.shape))
-        return Posterior(mean, covariance, local)
+        return mean, np.where(granted.any(0), linalg.gram(root), covariance)
 
     def variances(
         self, mean: Array, covariance: Array, prediction: CentrePrediction, weights: Array

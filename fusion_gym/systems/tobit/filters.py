@@ -99,9 +99,9 @@ def linear_update(matrix: Array, noise: Array, bias: Array | None = None) -> tup
     identity = linalg.identity(size)
     posterior = identity - linalg.matmul(linalg.transpose(matrix), correction)
     posterior = linalg.symmetrise(posterior)
-    large = (linalg.diagonal(spread) > _STARVED * noise).reshape(-1, spread.shape[-1]).any(0)
-    lanes = np.flatnonzero(large)
-    if lanes.size:
+    large = linalg.diagonal(spread) > _STARVED * noise
+    if large.any():
+        lanes = np.flatnonzero(large.reshape(-1, large.shape[-1]).any(0))
         gain = linalg.transpose(correction[..., lanes])
         noise = np.broadcast_to(noise, matrix.shape[:-2] + matrix.shape[-1:])
         parts = [identity - linalg.matmul(gain, matrix[..., lanes])]
@@ -161,8 +161,8 @@ def joint_update(matrix: Array, value: Array) -> tuple[Array, Array]:
     covariance = linalg.inverse(linalg.identity(size) + total[..., :size, :])
     mean = linalg.matvec(covariance, total[..., size, :])
     large = (matrix * matrix).sum(-2) > _STARVED
-    lanes = np.flatnonzero(large.reshape(-1, large.shape[-1]).any(0))
-    if lanes.size:
+    if large.any():
+        lanes = np.flatnonzero(large.reshape(-1, large.shape[-1]).any(0))
         root, shift = linalg.identity(size), np.zeros_like(mean[..., lanes])
         for channel in range(matrix.shape[-3]):
             row = matrix[..., channel, :, lanes]

@@ -7,12 +7,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.systems.tobit.centre import (
-    CentrePrediction,
-    FederatedCentre,
-    Feedback,
-    Posterior,
-)
+from fusion_gym.systems.tobit.centre import Centre, CentrePrediction, FederatedCentre, Feedback
 from fusion_gym.systems.tobit.filters import KalmanFilter, joint_update
 from fusion_gym.systems.tobit.options import FeedbackOptions, refuse_fusion
 from fusion_gym.systems.tobit.sensors import CensoredSensors
@@ -55,12 +50,12 @@ class JointCentre(FederatedCentre):
         prediction: CentrePrediction,
         measurement: Array,
         granted: NDArray[np.bool_],
-    ) -> Posterior:
+    ) -> tuple[Array, Array]:
         """See :class:`Centre`."""
         sensors, runs = self.sensors, granted.shape[-1]
         (channels,) = np.nonzero(np.repeat(granted.any(-1), sensors.size))
         if not channels.size:
-            return Posterior(mean, covariance, np.broadcast_to(mean, (sensors.count, *mean.shape)))
+            return mean, covariance
         taken = np.repeat(granted, sensors.size, axis=0)[channels].astype(np.float64)
         innovation = (measurement - prediction.expectation.value).reshape(-1, runs)[channels]
         # A channel that has not arrived stands for nothing, with a variance of 1.
@@ -71,9 +66,9 @@ class JointCentre(FederatedCentre):
         shift, posterior = joint_update(both[:, :-1], both[:, -1])
         posterior = linalg.congruence(prediction.root, posterior)
         mean = mean + linalg.matvec(prediction.root, shift)
-        posterior = np.where(granted.any(0), posterior, covariance)
-        local = np.broadcast_to(mean, (sensors.count, *mean.shape))
-        return Posterior(mean, posterior, local)
+        return mean, np.where(granted.any(0), posterior, covariance)
+
+    local_means = Centre.local_means
 
 
 def joint_centre(options: FeedbackOptions, sensors: CensoredSensors) -> JointCentre:

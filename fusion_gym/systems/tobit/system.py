@@ -39,9 +39,8 @@ class CensoredState:
     ``truth`` (n, N) · ``measurement`` (l, m, N) · ``held`` (l, m, N), the last delivered
     measurement · ``age`` (l, N), steps since then · ``time`` (N,), the step in the episode ·
     ``prior_mean`` (n, N), ``prior_covariance`` (n, n, N), the centre's prediction · ``prediction``,
-    what is expected of the measurements · ``local_mean`` (l, n, N), the nodes' posterior before
-    the feedback · ``mean`` (n, N), ``covariance`` (n, n, N), the fused posterior ·
-    ``departure`` (4, N) of the truth from the model, if it departs.
+    what is expected of the measurements · ``mean`` (n, N), ``covariance`` (n, n, N), the fused
+    posterior · ``departure`` (4, N) of the truth from the model, if it departs.
     """
 
     truth: Array
@@ -52,7 +51,6 @@ class CensoredState:
     prior_mean: Array
     prior_covariance: Array
     prediction: CentrePrediction | None
-    local_mean: Array
     mean: Array
     covariance: Array
     departure: Array | None = None
@@ -215,7 +213,6 @@ class CensoredSystem(System[CensoredState]):
             prior_mean=mean,
             prior_covariance=covariance,
             prediction=None,
-            local_mean=np.broadcast_to(mean, (sensors.count, *mean.shape)).copy(),
             mean=mean,
             covariance=covariance,
             departure=departure,
@@ -254,15 +251,10 @@ class CensoredSystem(System[CensoredState]):
         Source: tobit_token_bucket, equations (20), (22), (30), (50).
         """
         prior, prediction = (state.prior_mean, state.prior_covariance), sensed(state.prediction)
-        posterior = self.centre.update(*prior, prediction, state.measurement, granted)
-        return replace(
-            state,
-            held=np.where(granted[:, None], state.measurement, state.held),
-            age=np.where(granted, 0.0, state.age),
-            local_mean=posterior.local_mean,
-            mean=posterior.mean,
-            covariance=posterior.covariance,
-        )
+        mean, covariance = self.centre.update(*prior, prediction, state.measurement, granted)
+        held = np.where(granted[:, None], state.measurement, state.held)
+        age = np.where(granted, 0.0, state.age)
+        return replace(state, held=held, age=age, mean=mean, covariance=covariance)
 
     def fused_alone(self, state: CensoredState) -> tuple[Array, Array]:
         """See :class:`System`."""
@@ -322,12 +314,14 @@ class CensoredSystem(System[CensoredState]):
             state,
             mean=np.where(runs, mean, state.mean),
             covariance=np.where(runs, covariance, state.covariance),
-            local_mean=np.where(runs, mean, state.local_mean),
         )
 
     def local_means(self, state: CensoredState) -> Array:
         """The nodes' posterior means (sensors, n, N) before the feedback."""
-        return state.local_mean
+        if state.prediction is None:
+            return np.broadcast_to(state.mean, (len(state.age), *state.mean.shape))
+        prior, granted = (state.prior_mean, state.prior_covariance), state.age == 0.0
+        return self.centre.local_means(*prior, state.prediction, state.measurement, granted)
 
     def open_loop(self, horizon: int) -> Array:
         """Mean error variance (n,) over t = 1..horizon of a centre that only predicts."""
