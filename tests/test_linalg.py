@@ -247,9 +247,3 @@ def test_a_lane_is_the_same_alone_and_in_the_batch(seed: int, n: int, count: int
         linalg.quadratic(v, a)[..., lane], linalg.quadratic(vector, item)[..., 0]
     )
     np.testing.assert_array_equal(linalg.dot(v, v)[..., lane], linalg.dot(vector, vector)[..., 0])
-
-
-def test_the_root_of_nearly_equal_states_has_the_third_which_tells_them_apart() -> None:
-    factor = np.array([[1.0, 0.0], [1.0, 6e-8], [0.0, 1.0]])
-    covariance = (factor @ factor.T)[..., None]
-    np.testing.assert_allclose(linalg.gram(linalg.root(covariance)), covariance, rtol=0, atol=1e-14)
