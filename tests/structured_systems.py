@@ -22,6 +22,7 @@ Options = dict[str, Any]
 PATTERNS = ("never", "rarely", "always", "random", "bursts")
 _DECAYS = (0.0, 0.05, 0.5, 0.9, 1.0)
 _GROWTHS = (1.02, 1.05, 1.1, 1.3)
+_HIDDEN = 40  # steps of most episodes of the exact filter of an unknown input
 _LARGEST = 300.0  # by which most growing directions grow in an episode
 
 
@@ -252,6 +253,8 @@ def _unknown_input(random: np.random.Generator, horizon: int) -> Drawn:
         "fusion": _pick(random, "ci", "sci", "sici", *(["ici"] if sensors == 2 else [])),
         "horizon": plant.horizon,
     }
+    if kind == "predict" and random.random() < 0.9:  # inputs often hide what grows
+        options["horizon"] = min(plant.horizon, _HIDDEN)
     return Drawn("UnknownInput", options)
 
 

@@ -12,7 +12,7 @@ from fusion_gym.core.system import System
 from fusion_gym.errors import ConfigurationError, DivergenceError
 
 # By comparison with 50 digits: within them, means are right to 1e-9 of a deviation, variances too.
-_LARGEST_ERROR = 1e32  # of squares on average: rewards are also handed on as float32
+LARGEST_ERROR = 1e32  # of squares on average: rewards are also handed on as float32
 _LARGEST_SIGNAL, _LARGEST_LOSS = 1e12, 1e7
 
 
@@ -28,7 +28,7 @@ def admit(system: System[Any], horizon: int) -> Array:
         return open_loop
     signal, variance = system.rounding(horizon)
     why = (
-        f"float64 holds a mean squared error without transmissions up to {_LARGEST_ERROR:g} (here "
+        f"float64 holds a mean squared error without transmissions up to {LARGEST_ERROR:g} (here "
         f"{open_loop.max():.3g}), measurements with a mean square up to {_LARGEST_SIGNAL:g} times "
         f"their noise's variance (here {signal:.3g}), and variances of which a packet leaves one "
         f"part in {_LARGEST_LOSS:g} (here in {variance:.3g})"
@@ -45,7 +45,7 @@ def admit(system: System[Any], horizon: int) -> Array:
 
 def _fits(system: System[Any], horizon: int) -> bool:
     lost = np.array((system.open_loop(horizon).max(), *system.rounding(horizon)))
-    return bool((lost <= (_LARGEST_ERROR, _LARGEST_SIGNAL, _LARGEST_LOSS)).all())
+    return bool((lost <= (LARGEST_ERROR, _LARGEST_SIGNAL, _LARGEST_LOSS)).all())
 
 
 def require_finite(

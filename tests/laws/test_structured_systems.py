@@ -95,8 +95,8 @@ def test_the_longest_horizon_is_named_and_right(growth: float) -> None:
 
 def test_a_growth_that_the_unknown_input_hides_is_refused() -> None:
     drawn = draw("UnknownInput", 15, 1000)
-    with pytest.raises(ConfigurationError, match="it must be at most 6, for"):
-        make_task(drawn.env_id, **drawn.options)
+    with pytest.raises(ConfigurationError, match="and sensor 0: the input hides a direction"):
+        make_task(drawn.env_id, **drawn.options | {"horizon": 1000})
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
+from fusion_gym.core.admission import LARGEST_ERROR
 from fusion_gym.core.nature import Nature
 from fusion_gym.core.options import CommonOptions, Scenario, Tokens
 from fusion_gym.fusion.table import Structure, choose_rule
@@ -290,7 +291,14 @@ def _nodes(
         tables = BoundTables.create(joint, model, bound, factor, horizon)
         return TableNodes.create(model, sensors, tables, fusion)
     if kind == "predict":
-        return RunNodes(model, sensors, ExactInputStateFilter(model, joint), fusion)
+        exact = ExactInputStateFilter(model, joint)
+        for sensor in np.flatnonzero(~(exact.growth(horizon) <= LARGEST_ERROR)):
+            raise ConfigurationError(
+                f"horizon = {horizon} is not allowed with filter='predict' and sensor {sensor}: "
+                f"the input hides a direction whose variance grows by more than {LARGEST_ERROR:g}; "
+                "use a smaller horizon, another sensor, or filter='random_walk'"
+            )
+        return RunNodes(model, sensors, exact, fusion)
     if hold is not None:
         hold = validation.not_negative("hold_variance", hold, (sensors.count,))
         hold = hold[:, None, None, None]

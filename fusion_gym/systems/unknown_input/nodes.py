@@ -94,10 +94,6 @@ class Nodes(ABC):
         ``weights`` (s,) weigh the entries of the trace.
         """
 
-    def growth(self, horizon: int) -> float:
-        """Factor by which a variance of a node that receives everything grows; 0 if it cannot."""
-        return 0.0
-
     def _start(self, runs: int) -> tuple[Array, Array, Array]:
         """Means (l, s, N) and (s, N) and a covariance (s, s, N), all the initial ones."""
         first, initial = self.model.initial_mean, self.model.initial_covariance
@@ -278,19 +274,6 @@ class RunNodes(Nodes):
         together, single = self.fusion.fuse_single(silent, delivered)
         start = linalg.weighted_trace(together, weights)
         return start, start - linalg.weighted_trace(single, weights)
-
-    @np.errstate(all="ignore")
-    def growth(self, horizon: int) -> float:
-        """See :class:`Nodes`: without limit where the input hides a growing direction."""
-        result, first = 0.0, None
-        if isinstance(self.filter, ExactInputStateFilter):
-            covariance = _own(self.start(1).covariance)
-            for _ in range(horizon):
-                covariance = self.filter.update(covariance, self.sensors.covariance)[1]
-                variance = linalg.diagonal(covariance)
-                first = variance if first is None else first
-                result = float(np.fmax.reduce(variance / first, axis=None, initial=result))
-        return result
 
     def _outcome(
         self, estimates: Estimates, prediction: NodePrediction, granted: NDArray[np.bool_]

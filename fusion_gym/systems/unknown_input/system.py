@@ -308,8 +308,7 @@ class UnknownInputSystem(System[UnknownInputState]):
         plant, sensors = self.plant, self.nodes.sensors
         moments = plant.second_moments(self.signal, horizon, plant.initial_mean[:, 0])
         deviation = np.sqrt(linalg.diagonal(sensors.covariance))
-        signal = largest_ratio(moments[:, : plant.size], sensors.matrix[..., 0] / deviation)
-        return signal, self.nodes.growth(horizon)
+        return largest_ratio(moments[:, : plant.size], sensors.matrix[..., 0] / deviation), 0.0
 
     def _deviation(self, state: UnknownInputState) -> Array:
         """The innovation's deviation (l, m, N or 1)."""
