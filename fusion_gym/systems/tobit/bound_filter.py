@@ -8,6 +8,7 @@ K_t; C{Υ∘Ω}Cᵀ is Υ∘(C Ω Cᵀ); without a delivery the filter really up
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -287,14 +288,16 @@ def _pinned_solve(
     unit size, for fᵀ h may overflow.
     """
     n = right.shape[-2]
-    sizes = [np.maximum(np.abs(f).max(-2, keepdims=True), 1e-150) for f, _ in columns]
+    # Powers of two, which no rounding depends on.
+    exponents = [math.frexp(float(np.abs(f).max()))[1] for f, _ in columns]
+    sizes = [2.0 ** max(exponent, -400) for exponent in exponents]
     units = [f / size for (f, _), size in zip(columns, sizes, strict=True)]
     stacked = np.concatenate([right, *(unit[..., None, :] for unit in units)], axis=-2)
     solved = linalg.solve(core, stacked)
     shift = np.zeros_like(units[0])
     for place, (unit, size, (_, factor)) in enumerate(zip(units, sizes, columns, strict=True)):
         h = solved[..., n + place, :]
-        weight = h / ((1.0 / size) ** 2 + linalg.dot(unit, h)[..., None, :])
+        weight = h / (size**-2.0 + linalg.dot(unit, h))[..., None, :]
         shift = shift + weight * (factor / size - linalg.dot(unit, shift)[..., None, :])
         projected = linalg.matvec(linalg.transpose(solved), unit)
         solved = solved - linalg.outer(weight, projected)
