@@ -19,8 +19,9 @@ import pydantic
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
-from fusion_gym.evaluation.intervals import Interval
+from fusion_gym.evaluation.intervals import Interval, mean_interval
 from fusion_gym.evaluation.metrics import METRICS, paired_difference, robust_summary, summarise
+from fusion_gym.policies.base import Policy
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError, refusal
 
@@ -31,6 +32,8 @@ from .output import tables
 from .output.files import read_json, write
 from .output.progress import progress_bar, remark, writing
 from .training.environment import environment_of
+
+_DRAWN = 100  # episodes by which drawn actions are compared with the likeliest
 
 
 class Quantiles(pydantic.BaseModel):
@@ -129,6 +132,7 @@ def evaluate(command: Evaluate) -> dict[str, Any]:
             report["policies"][name] = summarise(results[name])
             report["quantiles"][name] = robust_summary(results[name])
             write(command.json, report)
+            warn_of_draws(name, task, policy, results[name], command.seed)
     differences = {
         name: paired_difference(result, results[command.reference])
         for name, result in results.items()
@@ -147,6 +151,25 @@ def evaluate(command: Evaluate) -> dict[str, Any]:
     )
     console.print(tables.state_table(task.system.state_names, report["policies"]))
     return report
+
+
+def warn_of_draws(
+    name: str, task: Task, policy: Policy, results: EpisodeResults, seed: int
+) -> None:
+    """Say it where an agent whose likeliest actions were taken does otherwise by drawn ones."""
+    if not getattr(policy, "deterministic", False):
+        return
+    drawn = make_policy(f"{name},deterministic=false", task)
+    episodes = min(results.episodes, _DRAWN)
+    difference = mean_interval(
+        run_episodes(task, drawn, episodes, seed).returns - results.returns[:episodes]
+    )
+    if difference.low > 0.0 or difference.high < 0.0:
+        remark(
+            f"{name} takes its likeliest actions; drawn actions change the return by "
+            f"{difference.mean:+.3g} [{difference.low:+.3g}, {difference.high:+.3g}] in {episodes} "
+            f"episodes: {name},deterministic=false evaluates them"
+        )
 
 
 def evaluation_report(

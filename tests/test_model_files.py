@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from command_runs import succeed
 from sb3_contrib import QRDQN
 from small_models import DISCRETE, ENV, MODELS, OPTIONS, Recipe
 from stable_baselines3 import DQN, PPO
@@ -428,3 +429,13 @@ def test_commands_load_foreign_code_with_trust_alone(
             command.main()
         monkeypatch.setattr(sys, "argv", [*line, "--trust"])
         command.main()
+
+
+def test_evaluate_says_where_drawn_actions_do_otherwise(saved: Callable[[str], Saved]) -> None:
+    agent, rule = f"model:{saved('ppo').carded}", "innovation_threshold"
+    words = ["--env", ENV, "--set", "filter=tobit", "horizon=20", "--episodes", "40", "--policies"]
+    message = f"{agent},deterministic=false evaluates them"
+    ended = succeed("evaluate", [*words, agent, rule])
+    assert ended.err.count("drawn actions change the return") == 1
+    assert message in ended.err
+    assert message not in succeed("evaluate", [*words, f"{agent},deterministic=false"]).err
