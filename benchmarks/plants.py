@@ -22,6 +22,7 @@ from rich.table import Table
 
 from fusion_gym.agents.output import tables
 from fusion_gym.agents.output.ending import report_errors
+from fusion_gym.agents.training.run import holds_training
 from fusion_gym.validation import choice
 
 PLANTS: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("plants.yaml").read_text())
@@ -80,7 +81,11 @@ def compare(options: dict[str, Any], folder: Path, arguments: argparse.Namespace
     plant, front = folder / "plant.yaml", folder / "front"
     plant.write_text(yaml.safe_dump(options))
     train = ["train", "--config", "linear_fusion_front", "--set", f"system={plant}"]
-    train += ["--output", str(front), *(["--resume"] if arguments.resume else [])]
+    train += [
+        "--output",
+        str(front),
+        *(["--resume"] if arguments.resume and holds_training(front) else []),
+    ]
     train += [] if arguments.timesteps is None else ["--timesteps", str(arguments.timesteps)]
     beside = ["compare", "--config", str(front / "config.yaml"), "--sweep", "scale_free_sweep"]
     beside += ["--policy", f"model:{front / 'best_model.zip'}", "--prices", "7"]
