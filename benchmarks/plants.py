@@ -81,11 +81,8 @@ def compare(options: dict[str, Any], folder: Path, arguments: argparse.Namespace
     plant, front = folder / "plant.yaml", folder / "front"
     plant.write_text(yaml.safe_dump(options))
     train = ["train", "--config", "linear_fusion_front", "--set", f"system={plant}"]
-    train += [
-        "--output",
-        str(front),
-        *(["--resume"] if arguments.resume and holds_training(front) else []),
-    ]
+    train += ["--output", str(front)]
+    train += ["--resume"] if arguments.resume and holds_training(front) else []
     train += [] if arguments.timesteps is None else ["--timesteps", str(arguments.timesteps)]
     beside = ["compare", "--config", str(front / "config.yaml"), "--sweep", "scale_free_sweep"]
     beside += ["--policy", f"model:{front / 'best_model.zip'}", "--prices", "7"]
