@@ -8,8 +8,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 import fusion_gym
+from fusion_gym.envs import single
 
 ENV_ID = "fusion_gym/TobitOscillator-v1"
 
@@ -79,3 +81,13 @@ def test_a_bound_starved_for_thousands_of_steps_does_not_overflow() -> None:
         assert np.isfinite(reward)
         assert np.isfinite(observation).all()
     assert truncated
+
+
+def test_the_slow_way_to_train_is_named_once() -> None:
+    single._warn_of_single_steps.cache_clear()
+    with pytest.warns(UserWarning, match="make_sb3_vec_env"):
+        DummyVecEnv([lambda: gymnasium.make("fusion_gym/TobitOscillator-v1")]).reset()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        DummyVecEnv([lambda: gymnasium.make("fusion_gym/TobitOscillator-v1")]).reset()
+        gymnasium.make("fusion_gym/TobitOscillator-v1").reset()

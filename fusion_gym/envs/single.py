@@ -1,5 +1,8 @@
 """Gymnasium's single environment: the batched core with one run."""
 
+import functools
+import sys
+import warnings
 from typing import Any
 
 import gymnasium
@@ -63,6 +66,8 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
             ConfigurationError: an unknown option.
         """
         validation.reset_options(options, [])
+        if self._seeded is None and _stepped_one_by_one():
+            _warn_of_single_steps()
         super().reset(seed=seed)
         if self.np_random is not self._seeded:
             self._seeded = self.np_random
@@ -114,6 +119,25 @@ class FusionEnv(Specified, gymnasium.Env[Any, Any]):
     def action_masks(self) -> NDArray[np.bool_]:
         """Open choices (choices,), for sb3-contrib's MaskablePPO."""
         return self.view.masks(self.batch.grantable())[0]
+
+
+def _stepped_one_by_one() -> bool:
+    """Whether Stable-Baselines3 has wrapped the environment and resets it."""
+    frame = sys._getframe(2)
+    while frame.f_back is not None:
+        frame = frame.f_back
+        if frame.f_globals.get("__name__") == "stable_baselines3.common.vec_env.dummy_vec_env":
+            return True
+    return False
+
+
+@functools.cache
+def _warn_of_single_steps() -> None:
+    warnings.warn(
+        "Stable-Baselines3 steps this environment one episode at a time; "
+        "fusion_gym.make_sb3_vec_env(id, 64) steps 64 in one batch, many times as fast",
+        stacklevel=3,
+    )
 
 
 def _first(infos: Infos) -> Infos:
