@@ -79,7 +79,7 @@ films: $(STAMP)  ## the films of docs/films
 	$(WATCH)/MarkovJumpTracking-v1 --policy local_variance:m=0.9 --save docs/films/markov_jump.gif
 	$(WATCH)/UnknownInput-v1 --policy adaptive_threshold --save docs/films/unknown_input.gif
 	$(WATCH)/RemoteEstimation-v1 --policy whittle --save docs/films/remote_estimation.gif
-	$(WATCH)/LinearFusion-v1 --policy value_of_information --save docs/films/linear_fusion.gif
+	$(WATCH)/LinearFusion-v2 --policy value_of_information --save docs/films/linear_fusion.gif
 
 # Libraries beside this one: each folder of integrations/ has pins and a virtual environment of its own,
 # .venv-light, .venv-tianshou, .venv-rllib.

@@ -1,6 +1,6 @@
 """Show the page of an environment, rule, filter, signal, agent or config.
 
-    fusion-gym info fusion_gym/LinearFusion-v1
+    fusion-gym info fusion_gym/LinearFusion-v2
     fusion-gym info value_of_information
 
 ``fusion-gym list`` has all names.

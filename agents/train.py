@@ -1,7 +1,7 @@
 """Train a Stable-Baselines3 agent on the native vector environment.
 
     fusion-gym train --config tobit_oscillator_ppo [--resume]
-    fusion-gym train --env fusion_gym/LinearFusion-v1 --algorithm ppo --timesteps 200000
+    fusion-gym train --env fusion_gym/LinearFusion-v2 --algorithm ppo --timesteps 200000
 
 Into the config's ``output`` folder go, as they are made: ``config.yaml``, ``latest.zip`` (the
 checkpoint), ``best_model.zip`` (best return on the validation seeds), ``validation.jsonl``,

@@ -6,7 +6,7 @@ A vehicle moves in a hall of 12 m by 12 m. On every wall an ultrasonic sensor ra
 reports its largest distance for all that is farther away, so in the middle of the hall both of an
 axis say no more than that it is there: each measurement is clipped to what the sensor covers. All
 four share one packet in five steps. The options are in ``vehicle.yaml``, for
-``gym.make("fusion_gym/LinearFusion-v1", system="vehicle.yaml")``.
+``gym.make("fusion_gym/LinearFusion-v2", system="vehicle.yaml")``.
 
 Where the parameters come from:
 
@@ -47,7 +47,7 @@ RULES = {
 
 def main(episodes: int = 1000) -> None:
     """Print tokens a step, mean squared error of the position and consistency of every rule."""
-    task = fusion_gym.make_task("fusion_gym/LinearFusion-v1", system=str(FILE))
+    task = fusion_gym.make_task("fusion_gym/LinearFusion-v2", system=str(FILE))
     print(f"{episodes} episodes, seeds 0 to {episodes - 1}; 95 % intervals")
     print(f"{'rule':36s}{'packets a step':>15s}   {'MSE of the position, m²':26s}{'NEES':>6s}")
     for label, name in RULES.items():

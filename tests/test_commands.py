@@ -101,13 +101,13 @@ def test_list_and_info_show_every_entry() -> None:
 
 
 def test_a_training_needs_no_config(monkeypatch: pytest.MonkeyPatch) -> None:
-    words = "train --env fusion_gym/LinearFusion-v1 --set horizon=9 --timesteps 64 --seed 3"
+    words = "train --env fusion_gym/LinearFusion-v2 --set horizon=9 --timesteps 64 --seed 3"
     monkeypatch.setattr(sys, "argv", words.split())
     experiment = command_line.read_command(Train).experiment()
     assert experiment.environment.options == {"horizon": 9}
     assert (experiment.algorithm.name, experiment.output) == ("ppo", "runs/linearfusion_v1_ppo")
     assert (experiment.training.timesteps, experiment.training.seed) == (64, 3)
-    for more in ([], ["--env", "fusion_gym/LinearFusion-v1", "--config", "tobit_oscillator_ppo"]):
+    for more in ([], ["--env", "fusion_gym/LinearFusion-v2", "--config", "tobit_oscillator_ppo"]):
         assert "give one of them" in call("train", more).err
     given = ["--config", "tobit_oscillator_ppo", "--algorithm", "dqn"]
     assert "the config names the algorithm" in call("train", given).err

@@ -15,7 +15,7 @@ from fusion_gym.solvers.silence.model import silence_model
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]
-LINEAR = "fusion_gym/LinearFusion-v1"
+LINEAR = "fusion_gym/LinearFusion-v2"
 SIZES = (1, 2, 1)
 A = np.array([[0.98, 0.2], [-0.1, 0.95]])
 W = np.array([[0.05, 0.02], [0.02, 0.1]])

@@ -25,6 +25,7 @@ from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.onnx_check import onnx_agreement
 from fusion_gym.policies.base import owner_of
+from fusion_gym.policies.card import ModelView
 from fusion_gym.policies.model import ModelPolicy, tag_model
 from fusion_gym.policies.onnx_card import onnx_card
 from fusion_gym.policies.onnx_graph import DecisionGraph, save_graph
@@ -34,7 +35,7 @@ from fusion_gym.validation import ConfigurationError
 
 def requests_at(name: str) -> tuple[ModelPolicy, Task]:
     model, task = MODELS[name].build()
-    return ModelPolicy(model, task, local="local" in MODELS[name].options), task
+    return ModelPolicy(model, task, trained=ModelView(local="local" in MODELS[name].options)), task
 
 
 def written(agent: ModelPolicy, path: Path) -> DecisionGraph:

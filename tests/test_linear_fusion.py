@@ -16,7 +16,7 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 Array = NDArray[np.float64]
-LINEAR = "fusion_gym/LinearFusion-v1"
+LINEAR = "fusion_gym/LinearFusion-v2"
 
 
 def system(seed: int, states: int, sizes: list[int]) -> dict[str, Any]:

@@ -25,7 +25,7 @@ REMOTE = "fusion_gym/RemoteEstimation-v1"
 def linear(sensors: int, states: int = 3, **options: Any) -> Task:
     rng = np.random.default_rng(0)
     return fusion_gym.make_task(
-        "fusion_gym/LinearFusion-v1",
+        "fusion_gym/LinearFusion-v2",
         transition=(0.9 * np.eye(states)).tolist(),
         process_covariance=np.eye(states).tolist(),
         measurement_matrices=rng.normal(size=(sensors, states)).tolist(),

@@ -86,4 +86,4 @@ def test_prices_are_for_agents_that_see_one() -> None:
     with pytest.raises(ConfigurationError, match=r"prices = 3 .* no agent"):
         requests_at("always", 3).policies_of(task)
     with pytest.raises(ConfigurationError, match=r"prices = 3 .* no price_range"):
-        requests_at("model:a.zip", 3).policies_of(make_task("fusion_gym/LinearFusion-v1"))
+        requests_at("model:a.zip", 3).policies_of(make_task("fusion_gym/LinearFusion-v2"))

@@ -215,7 +215,7 @@ CHAIN = {
 }
 RANK_ONE = {"process_gain": [0.16, 0.18], "measurement_variance": 0.5}
 FULL = {"process_covariance": [[0.3, 0.1], [0.1, 0.2]], "measurement_covariances": 0.25}
-LINEAR = "fusion_gym/LinearFusion-v1"
+LINEAR = "fusion_gym/LinearFusion-v2"
 
 
 @pytest.mark.parametrize("powers", [(3, 3, 3), (-7, 4, 11), (12, 0, -9)])

@@ -11,7 +11,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 
-ENV = "fusion_gym/LinearFusion-v1"
+ENV = "fusion_gym/LinearFusion-v2"
 
 
 @pytest.mark.parametrize("name", PLANTS)

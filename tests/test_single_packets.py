@@ -18,7 +18,7 @@ def task_of(**options: Any) -> Task:
     rng = np.random.default_rng(3)
     transition = 0.3 * rng.normal(size=(STATES, STATES))
     return fusion_gym.make_task(
-        "fusion_gym/LinearFusion-v1",
+        "fusion_gym/LinearFusion-v2",
         transition=transition.tolist(),
         process_covariance=(0.2 * np.eye(STATES)).tolist(),
         measurement_matrices=rng.normal(size=(MANY, 2, STATES)).tolist(),

@@ -15,7 +15,7 @@ from fusion_gym.systems.tobit.tobit_filter import AssumedDensityFilter
 
 TOBIT = "fusion_gym/TobitOscillator-v1"
 TRACKING = "fusion_gym/BiasedTracking-v1"
-LINEAR = "fusion_gym/LinearFusion-v1"
+LINEAR = "fusion_gym/LinearFusion-v2"
 HALF = [[0.5, 0.0], [0.0, 0.5]]
 _TURN = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
 PLANTS: dict[str, dict[str, Any]] = {

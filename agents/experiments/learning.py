@@ -22,6 +22,7 @@ from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.beside import run_beside
 from fusion_gym.evaluation.envelope import EnvelopePoint, best_mse, height, lower_hull
 from fusion_gym.evaluation.episodes import EpisodeResults
+from fusion_gym.policies.card import ModelView
 from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.validation import ConfigurationError, choice
 
@@ -59,7 +60,10 @@ def meter(experiment: Experiment, prices: Sequence[float], episodes: int) -> Mea
     local, seed = experiment.environment.local, experiment.validation.seed
 
     def measure(model: BaseAlgorithm, seconds: float) -> dict[str, Any]:
-        policies = [ModelPolicy(model, task, price=price, local=local) for price in prices]
+        policies = [
+            ModelPolicy(model, task, price=price, trained=ModelView(local=local))
+            for price in prices
+        ]
         result = run_beside(task, policies, episodes, seed)
         points = [[float(brief.rate.mean()), float(brief.mse.mean())] for brief in result]
         return {"cpu_seconds": seconds, "front": points}

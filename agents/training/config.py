@@ -78,6 +78,17 @@ class Experiment(Strict):
             mode="json", exclude={"output": True, "training": {"timesteps": True, "threads": True}}
         )
 
+    def resolved(self, settings: Mapping[str, Any]) -> Experiment:
+        """Return the experiment with the numbers that its environment's ``"auto"`` stood for."""
+        options = self.environment.options
+        numbers = {
+            name: settings[name]
+            for name in ("reward_scale", "price_range")
+            if options.get(name, "auto") == "auto" and settings[name] is not None
+        }
+        environment = self.environment.model_copy(update={"options": options | numbers})
+        return self.model_copy(update={"environment": environment})
+
     def changed(
         self, output: str | Path | None, options: Mapping[str, Any] | None = None, **training: Any
     ) -> Experiment:

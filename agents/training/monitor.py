@@ -19,6 +19,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.card import ModelView
 from fusion_gym.policies.model import ModelPolicy
 
 from ..output.files import replacing, write_text
@@ -149,7 +150,9 @@ class Progress(Callback):
     def validate(self) -> None:
         """Run the validation episodes, log them, and keep the model if it is the best so far."""
         settings = self.experiment.validation
-        policy = ModelPolicy(self.model, self.task, local=self.experiment.environment.local)
+        policy = ModelPolicy(
+            self.model, self.task, trained=ModelView(local=self.experiment.environment.local)
+        )
         results = run_episodes(self.task, policy, settings.episodes, settings.seed)
         record: dict[str, Any] = {
             "timesteps": self.num_timesteps,

@@ -107,8 +107,9 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
     """
     if not task.belief_features:
         return ()
-    deviation = np.sqrt(task.open_loop)
-    whole = float((task.relative_weights * task.open_loop).sum())
+    nominal = task.open_loop if task.nominal_error is None else task.nominal_error[:, None]
+    deviation = np.sqrt(np.where(nominal > 0.0, nominal, 1.0))
+    whole = float((task.relative_weights * nominal).sum())
 
     def difference(beliefs: Beliefs) -> Array:
         return np.arcsinh(_DIFFERENCE * beliefs.difference / deviation)
@@ -122,16 +123,16 @@ def belief_blocks(task: Task, owner: Owner) -> tuple[Block, ...]:
     differences = partial(
         Block,
         meaning=f"arsinh of {_DIFFERENCE:g} times what is believed beyond the centre's estimate, "
-        "in open-loop deviations",
+        "in nominal deviations",
         limit=_DIFFERENCE_LIMIT,
-        constants={"open-loop deviations": deviation[:, 0]},
+        constants={"nominal deviations": deviation[:, 0]},
     )
     values = partial(
         Block,
         meaning=f"{_VALUE:g} times the signed root of the squared norm of that, and of what a "
-        "packet is expected to take off it, over open loop",
+        "packet is expected to take off it, over the nominal error",
         limit=_VALUE_LIMIT,
-        constants={"open loop": whole, "squared norm": task.relative_weights[:, 0]},
+        constants={"nominal error": whole, "squared norm": task.relative_weights[:, 0]},
     )
     if owner == "own":
         own: Any = {"knowledge": "own_memory" if task.memory else "own", "node": "own"}
@@ -217,6 +218,16 @@ class ObservationLayout:
             result = np.ascontiguousarray(rows.T, dtype=np.float32)
         np.maximum(result, self.low, out=result)
         return np.minimum(result, self.high, out=result)
+
+    def replace_beliefs(
+        self, observation: NDArray[np.float32], beliefs: Beliefs
+    ) -> NDArray[np.float32]:
+        """Return observations (N, entries) whose entries of beliefs have this layout's scale."""
+        rows = np.concatenate([block.fill(beliefs) for block in self._memory])
+        first = sum(len(block.places) for block in self._own)
+        places, result = slice(first, first + len(rows)), observation.copy()
+        result[:, places] = np.clip(rows.T, self.low[places], self.high[places])
+        return result
 
 
 def block_entries(block: Block) -> list[ObservationEntry]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +23,11 @@ ErrorKind = Literal["squared", "trace", "maximum"]
 Broadcast = Literal["none", "estimate", "packets"]
 Feature = Literal["difference", "value"]
 Action = Literal["binary", "discrete"]
+# What the scale of the reward depends on, beside plant and sensors.
+_SCALING = (
+    "access", "tokens", "token_rate", "token_capacity", "initial_tokens", "token_cost", "sharing",
+    "horizon",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -99,11 +104,18 @@ class CommonOptions:
     cost_weight: float | Literal["random"] = 0.01
     """Price of a token in the reward. ``"random"`` draws it from ``price_range`` for each episode,
     evenly in its logarithm."""
-    price_range: ArrayLike | None = None
-    """Pair (low, high) of prices. With it the observation shows the price."""
+    price_range: ArrayLike | Literal["auto"] | None = None
+    """Pair (low, high) of prices. With it the observation shows the price. ``"auto"`` simulates
+    rules: it takes the prices at which the best value of information with memory sends 60 and 12 %
+    of what the bucket sustains, but at least two packets of each sensor in an episode."""
     state_weights: ArrayLike | None = None
-    """Weights of the states' squared errors in the reward. By default never transmitting costs
-    about 1 a step."""
+    """Weights of the states' squared errors in the reward. By default all states count alike."""
+    reward_scale: float | Literal["auto"] | None = "auto"
+    """Factor of the state weights. ``"auto"`` simulates a moderate policy and takes the factor with
+    which its error costs 1 a step; given ``state_weights`` then stay as they are. That policy
+    requests at an even pace: half of what the bucket sustains, or a quarter of all packets where
+    tokens are unlimited. The entries of ``belief_features`` scale by its errors as well. With
+    ``None`` the error without transmissions takes its place."""
     true_process_noise: ArrayLike = 1.0
     """Factor of the true deviation of the process noise. The filters assume 1. A pair (low, high)
     is drawn from for each episode."""
@@ -124,13 +136,20 @@ class CommonOptions:
             raise refusal("information", "local", allowed)
         declaration.check(self)
 
+    def nominal(self) -> Self:
+        """Return the options whose simulation scales the reward: plant, sensors and network."""
+        common = (item for item in fields(CommonOptions) if item.name not in _SCALING)
+        plain = {item.name: getattr(type(self), item.name) for item in common}
+        plain["reward_scale"] = None if self.reward_scale is None else 1.0
+        return replace(self, **plain)
+
 
 @dataclass(frozen=True)
 class Scenario:
     """What an environment makes of its options: all that is its own of a task.
 
     ``state_weights`` (n,) weigh the squared errors in the reward if the options give none; ``None``
-    weighs all states alike, so that open loop costs one a step. ``policy_defaults`` are the
+    weighs all states alike. ``reward_scale`` multiplies them. ``policy_defaults`` are the
     scenario's own parameters of named policies.
 
     ``feedback`` says that every node hears the centre's estimate by construction.

@@ -46,6 +46,8 @@ class Task:
     belongs to the problem: a termination, no truncation. Without ``own_number`` a sensor that
     decides by itself does not see which one it is, so that sensors of one kind learn together.
     With ``vector_reward`` the environments pay the two terms of the reward one by one.
+    ``nominal_error`` (n,) are the mean squared errors by which entries of beliefs scale
+    (:mod:`fusion_gym.core.scale`); ``None`` are those without transmissions.
     ``settings`` is what a user chose, for reports; ``policy_defaults`` the scenario's own
     parameters of named policies.
 
@@ -69,6 +71,7 @@ class Task:
     clock: bool = False
     own_number: bool = True
     vector_reward: bool = False
+    nominal_error: Array | None = None
     settings: dict[str, Any] = field(default_factory=dict)
     policy_defaults: dict[str, dict[str, Any]] = field(default_factory=dict)
 
@@ -95,10 +98,13 @@ class Task:
             )
 
     @classmethod
-    def create(cls, scenario: Scenario, limit: int | None = None) -> Task:
+    def create(
+        cls, scenario: Scenario, limit: int | None = None, nominal_error: Array | None = None
+    ) -> Task:
         """The scenario's system with its options' network, reward and episode.
 
-        ``limit`` shortens the episode without changing any scale.
+        ``limit`` shortens the episode without changing any scale. The options hold numbers, no
+        ``"auto"`` (:func:`fusion_gym.core.scale.resolve`).
 
         Raises:
             ConfigurationError: a value that is not allowed.
@@ -111,12 +117,18 @@ class Task:
         if system.nature != (nature := Nature.create(options)):
             nature.refuse("here", f"the truth of {type(system).__name__} is its model")
         horizon = validation.horizon(options.horizon)
+        weights, open_loop = options.state_weights, admit(system, horizon)
+        weights = scenario.state_weights if weights is None else weights
+        if options.reward_scale is not None:
+            factor = validation.number("reward_scale", options.reward_scale, above=0.0)
+            ratios = np.ones(()) if weights is None else weights
+            weights = factor * validation.not_negative("state_weights", ratios, open_loop.shape)
         reward = Reward.create(
             options.error,
             options.error_weight,
             Price.create(options.cost_weight, options.price_range),
-            scenario.state_weights if options.state_weights is None else options.state_weights,
-            admit(system, horizon),
+            weights,
+            open_loop,
         )
         how = communication(scenario)
         return cls(
@@ -136,6 +148,7 @@ class Task:
             clock=options.clock,
             own_number=options.own_number,
             vector_reward=options.reward == "vector",
+            nominal_error=nominal_error,
             settings=plain_options(asdict(options)),
             policy_defaults=scenario.policy_defaults,
         )

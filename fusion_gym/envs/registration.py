@@ -16,6 +16,7 @@ from gymnasium.envs.registration import EnvSpec, parse_env_id
 from fusion_gym import validation
 from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.rehearsal import rehearse
+from fusion_gym.core.scale import resolve
 from fusion_gym.core.task import Task
 from fusion_gym.envs.option_file import read_options
 from fusion_gym.envs.option_text import Option, list_options, options_in
@@ -25,6 +26,7 @@ from fusion_gym.validation import ConfigurationError
 Build = Callable[[Any], Scenario]
 _REGISTERED = "fusion_gym.envs.registered"
 _CLASSES = ("Env", "VectorEnv")
+_VERSION = re.compile(r"(?<=^fusion_gym/)(\w+)-v\d+$")
 
 
 class FusionSpec(EnvSpec):
@@ -71,7 +73,7 @@ ENVIRONMENTS: dict[str, str | Build] = {
     "fusion_gym/UnknownInput-v1": "fusion_gym.systems.unknown_input.environment:build_unknown",
     "fusion_gym/BiasedOscillator-v1": "fusion_gym.systems.tobit.biased:build_biased_oscillator",
     "fusion_gym/BiasedTracking-v1": "fusion_gym.systems.tobit.biased:build_biased_tracking",
-    "fusion_gym/LinearFusion-v1": "fusion_gym.systems.tobit.linear:build_linear",
+    "fusion_gym/LinearFusion-v2": "fusion_gym.systems.tobit.linear:build_linear",
     "fusion_gym/RemoteEstimation-v1": "fusion_gym.systems.remote.environment:build_remote",
 }
 
@@ -81,7 +83,7 @@ def class_name(env_id: str) -> str:
 
     ``fusion_gym/TobitOscillator-v1`` is TobitOscillator, ``mine/Tank-v1`` mine_Tank_v1.
     """
-    own = env_id.removeprefix("fusion_gym/").removesuffix("-v1")
+    own = _VERSION.sub(r"\1", env_id).removeprefix("fusion_gym/")
     return own if own.isidentifier() else "".join(c if c.isalnum() else "_" for c in env_id)
 
 
@@ -136,9 +138,10 @@ def base_of(env_id: str) -> tuple[str, dict[str, Any]]:
     module, colon, name = env_id.rpartition(":")
     if colon:
         imported("env", env_id, module)
-    newer = f"{name.removesuffix('-v0')}-v1"
-    if name not in gymnasium.registry and newer in ENVIRONMENTS:
-        raise validation.refusal("environment", name, f"{newer!r}: its dynamics have changed")
+    if name not in gymnasium.registry:
+        for newer in ENVIRONMENTS:
+            if _VERSION.sub(r"\1", newer) == _VERSION.sub(r"\1", name) != name:
+                raise validation.refusal("environment", name, f"{newer!r}, its present version")
     if name in ENVIRONMENTS or name not in gymnasium.registry:
         validation.keys("environment", [name], ENVIRONMENTS)
         return name, {}
@@ -254,7 +257,8 @@ def _checked(build: Build, options: CommonOptions, limit: int | None) -> Task:
     }
     try:
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # results are checked
-            task = Task.create(build(options), limit)
+            options, nominal_error = resolve(options, build)
+            task = Task.create(build(options), limit, nominal_error)
             if args:
                 rehearse(task)
     except ConfigurationError as error:

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import sb3_contrib
 import stable_baselines3
 import torch
@@ -66,11 +67,15 @@ _HARMLESS = {
 
 @dataclass(frozen=True)
 class ModelView:
-    """What a model was trained to see: the entries by name (if the file says), whose, the price."""
+    """What a model was trained to see: the entries by name (if the file says), whose, the price.
+
+    ``nominal_error`` (n,) scales the entries of beliefs.
+    """
 
     observation_names: tuple[str, ...] | None = None
     local: bool = False
     price_range: tuple[float, float] | None = None
+    nominal_error: tuple[float, ...] | None = None
 
     @classmethod
     def read(cls, data: Mapping[str, Any]) -> ModelView:
@@ -81,13 +86,32 @@ class ModelView:
         """
         card_entry = _entry(data)
         names, span = card_entry.get("observation_names"), card_entry.get("price_range")
+        error = card_entry.get("nominal_error")
         if names is not None and not _are_words(names):
             raise ConfigurationError("observation_names is not allowed: it must be a list of words")
         return cls(
             None if names is None else tuple(names),
             validation.boolean("local", card_entry.get("local", False)),
             None if span is None else Price.create("random", span).span,
+            None if error is None else _errors(error),
         )
+
+    def on(self, task: Task) -> Task:
+        """Return the task with the price and the scale that the model was trained with.
+
+        Raises:
+            ConfigurationError: the model has no scale, or one of another number of states.
+        """
+        if self.price_range is not None and task.reward.price.span is None:
+            price = Price(None, self.price_range)
+            task = replace(task, reward=replace(task.reward, price=price))
+        error, own = self.nominal_error, task.nominal_error
+        if own is None or not task.belief_features or self.observation_names is None:
+            return task
+        if error is None or len(error) != len(own):
+            allowed = f"{len(own)} numbers, for the task scales beliefs by them; train it again"
+            raise validation.refusal("nominal_error", error, allowed)
+        return replace(task, nominal_error=np.array(error))
 
 
 @dataclass(frozen=True)
@@ -132,6 +156,8 @@ def model_card(algorithm: str, model: BaseAlgorithm, task: Task, local: bool) ->
         "local": local,
         "price_range": task.reward.price.span,
     }
+    if task.nominal_error is not None:
+        entries["nominal_error"] = task.nominal_error.tolist()
     policy: Any = model.policy
     if type(policy) is not POLICIES.get(algorithm) or set(model.policy_kwargs) - _HARMLESS:
         return entries
@@ -194,6 +220,10 @@ def _table(data: Mapping[str, Any], key: str) -> dict[str, Any]:
     if not isinstance(result, dict):
         raise ConfigurationError(f"it is no Stable-Baselines3 model (its {key} is no table)")
     return result
+
+
+def _errors(value: Any) -> tuple[float, ...]:
+    return tuple(validation.not_negative("nominal_error", value, np.shape(value)).tolist())
 
 
 def _are_words(value: Any) -> bool:

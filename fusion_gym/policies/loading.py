@@ -25,7 +25,7 @@ from fusion_gym.policies.card import (
     ModelView,
     algorithm_of,
 )
-from fusion_gym.policies.model import ModelPolicy, priced
+from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.policies.network import NetworkShape
 from fusion_gym.validation import ConfigurationError
 
@@ -54,7 +54,7 @@ def load_model_policy(
         data = read_plain(file)
         observed = ModelView.read(data)
         load = _unpickled if trust else _rebuilt
-        model, action = load(file, data, priced(task, observed.price_range), observed)
+        model, action = load(file, data, observed.on(task), observed)
     except NeedsTrust as error:
         raise ConfigurationError(
             f"model {path!r} is more than a card and weights: {error}; --trust, or "
@@ -63,7 +63,7 @@ def load_model_policy(
     except ConfigurationError as error:
         raise ConfigurationError(f"model {path!r} is not allowed: {error}") from None
     task = dataclasses.replace(task, action=action)
-    return ModelPolicy(model, task, deterministic, price, observed.local, observed.price_range)
+    return ModelPolicy(model, task, deterministic, price, observed)
 
 
 def _rebuilt(

@@ -1,18 +1,19 @@
 """A Stable-Baselines3 agent as a policy, and the card that is saved with it."""
 
-import dataclasses
 from typing import Any
 
 import numpy as np
 from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from fusion_gym.core.observation import ObservationLayout
 from fusion_gym.core.reward import Price
 from fusion_gym.core.system import Knowledge, Signals, least_covering
 from fusion_gym.core.task import Task
 from fusion_gym.envs.views import Rows, make_view
 from fusion_gym.policies.base import Requests
-from fusion_gym.policies.card import ENTRY, algorithm_name, model_card
+from fusion_gym.policies.belief_rule import beliefs_of
+from fusion_gym.policies.card import ENTRY, ModelView, algorithm_name, model_card
 from fusion_gym.validation import ConfigurationError
 
 
@@ -28,9 +29,10 @@ def tag_model(model: BaseAlgorithm, task: Task, local: bool = False) -> None:
 class ModelPolicy:
     """Asks a Stable-Baselines3 model, which sees the task's observation and nothing else.
 
-    A model that was trained to see the price of a token (``price_range``) can be asked for any
-    point of its trade-off: ``price`` stands for the task's own price, whether or not the task
-    shows it. With ``local`` every sensor asks the model by itself, about its own view.
+    ``trained`` is what the model was trained to see. If it saw the price of a token, it can be
+    asked for any point of its trade-off: ``price`` stands for the task's own price, whether or not
+    the task shows it. Entries of beliefs scale as in its training. A local model is asked by every
+    sensor, about its own view.
 
     Raises:
         ConfigurationError: a price for a model that knows none, or outside its range.
@@ -42,14 +44,17 @@ class ModelPolicy:
         task: Task,
         deterministic: bool = True,
         price: float | None = None,
-        local: bool = False,
-        price_range: tuple[float, float] | None = None,
+        trained: ModelView | None = None,
     ) -> None:
+        trained = ModelView() if trained is None else trained
         self.model = model
         self.deterministic = deterministic
         self._visible = task.reward.price.span is not None
-        self.task = priced(task, price_range)
-        self.view = make_view(self.task, local)
+        self.task = trained.on(task)
+        self.view = make_view(self.task, trained.local)
+        same = np.array_equal(self.task.nominal_error, task.nominal_error)  # type: ignore[arg-type]
+        owner = self.view.owner or "scheduler"
+        self._layout = None if same else ObservationLayout(self.task, owner)
         self._memory: Any = None  # of a recurrent policy
         self.stateless = deterministic and not isinstance(model, RecurrentPPO)
         self.knowledge: Knowledge = self.view.knowledge
@@ -94,16 +99,11 @@ class ModelPolicy:
     def rows(self, signals: Signals) -> Rows:
         """What the model is shown, (N·rows_per_run, entries) float32."""
         observation = signals["observation"]
+        if self._layout is not None:
+            beliefs = beliefs_of(signals, own=self.view.owner == "own")
+            observation = self._layout.replace_beliefs(observation, beliefs)
         if self.price is not None:
             own = observation[:, :-1] if self._visible else observation  # the price comes last
             column = np.full((len(own), 1), self.price, dtype=np.float32)
             observation = np.concatenate((own, column), axis=1)
         return self.view.rows(observation)
-
-
-def priced(task: Task, price_range: tuple[float, float] | None) -> Task:
-    """The task with the price in its observation, if the model saw one and the task shows none."""
-    if price_range is None or task.reward.price.span is not None:
-        return task
-    price = Price(None, (price_range[0], price_range[1]))
-    return dataclasses.replace(task, reward=dataclasses.replace(task.reward, price=price))

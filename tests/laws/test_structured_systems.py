@@ -82,13 +82,13 @@ def test_variances_and_means_are_those_of_fifty_digits(numbers: range) -> None:
 def test_the_longest_horizon_is_named_and_right(growth: float) -> None:
     options = {"transition": [[growth, 0.0], [0.1, 0.5]], "filter": "kalman"}
     with pytest.raises(ConfigurationError, match="horizon = 3000 is not allowed") as error:
-        make_task("fusion_gym/LinearFusion-v1", horizon=3000, **options)
+        make_task("fusion_gym/LinearFusion-v2", horizon=3000, **options)
     found = re.search(r"at most (\d+)", str(error.value))
     assert found
     longest = int(found[1])
-    task = make_task("fusion_gym/LinearFusion-v1", horizon=longest, **options)
+    task = make_task("fusion_gym/LinearFusion-v2", horizon=longest, **options)
     with pytest.raises(ConfigurationError, match="horizon"):
-        make_task("fusion_gym/LinearFusion-v1", horizon=longest + 1, **options)
+        make_task("fusion_gym/LinearFusion-v2", horizon=longest + 1, **options)
     if longest < 400:
         assert max(largest_errors(task, longest, 3, censored=False)) <= 1e-9
 
@@ -114,7 +114,7 @@ def test_a_step_names_run_step_and_quantity(family: str) -> None:
 
 
 def test_a_step_names_an_entry_of_the_observation() -> None:
-    task = fusion_gym.make_task("fusion_gym/LinearFusion-v1")
+    task = fusion_gym.make_task("fusion_gym/LinearFusion-v2")
     batch = EpisodeBatch.seeded(task, 2, seed=0)
     batch.observe()
     batch.state.prior_covariance = batch.state.prior_covariance.copy()

@@ -49,6 +49,7 @@ class CorrelatedTrackingOptions(CommonOptions):
 
     filters: ClassVar[Mapping[str, type]] = {"": RobustKalmanFilter}  # without a choice
     structure: ClassVar[Structure | None] = _STRUCTURE
+    reward_scale: float | Literal["auto"] | None = None
     transition: ArrayLike = ((1.0, _T, _T * _T / 2), (0.0, 1.0, _T), (0.0, 0.0, 1.0))
     """Φ of equations (1) and (64), (n, n)."""
     process_gain: ArrayLike = ((_T * _T / 2,), (_T,), (1.0,))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 from numpy.typing import ArrayLike
 
@@ -65,6 +65,7 @@ class MarkovJumpTrackingOptions(CommonOptions):
 
     filters: ClassVar[Mapping[str, type]] = FILTERS
     structure: ClassVar[Structure | None] = _STRUCTURE
+    reward_scale: float | Literal["auto"] | None = None
     transitions: ArrayLike = (((0.8, 0.2 * _T), (0.0, 0.6)), ((1.0, _T), (0.0, _T)))
     """Φ of each mode, equation (1), (modes, n, n). The plant must be mean-square stable."""
     process_gains: ArrayLike = (((1.5,), (0.6,)), ((0.5 * _T * _T,), (_T,)))

@@ -40,6 +40,7 @@ class RemoteEstimationOptions(CommonOptions):
     error plus ``cost_weight`` for each transmission.
     """
 
+    reward_scale: float | Literal["auto"] | None = None
     sensors: int = 1
     """Number of sources, each with one sensor."""
     coefficient: ArrayLike = 1.0

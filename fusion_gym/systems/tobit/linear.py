@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -65,6 +65,7 @@ class LinearFusionOptions(FeedbackOptions):
     """
 
     filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
+    reward_scale: float | Literal["auto"] | None = "auto"
     transition: ArrayLike = ((1.0, _STEP), (0.0, 1.0))
     """A of x(t+1) = A x(t) + w(t), (n, n)."""
     process_covariance: ArrayLike = (
@@ -98,6 +99,17 @@ class LinearFusionOptions(FeedbackOptions):
     ``"joint"``, one Kalman filter at the centre. With censored sensors it is ``"adf"``, one
     assumed-density filter at the centre. ``"tobit"`` is the Tobit Kalman filter. ``"stochastic"``
     is the Kalman filter for the policy ``stochastic_event``."""
+
+    def nominal(self) -> LinearFusionOptions:
+        """Return the options whose simulation scales the reward: whatever the filter, the same."""
+        return replace(
+            super().nominal(),
+            filter=None,
+            fusion=None,
+            information_shares=None,
+            order=None,
+            stochastic_weight=None,
+        )
 
 
 def build_linear(choice: LinearFusionOptions) -> Scenario:

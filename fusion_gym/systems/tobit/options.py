@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 from numpy.typing import ArrayLike
 
@@ -37,6 +37,7 @@ class FeedbackOptions(CommonOptions):
     """Options of the fusion and its feedback; ``None`` is the default of the filter or the rule."""
 
     structure: ClassVar[Structure | None] = _STRUCTURE
+    reward_scale: float | Literal["auto"] | None = None
     fusion: Annotated[str | None, _STRUCTURE.offered] = None
     """Rule that joins the nodes' estimates, by default ``"federated"`` (tobit_token_bucket,
     equations (50) and (51)). ``"ci"`` is covariance intersection, ``"ici"`` its inverse form for

@@ -70,6 +70,7 @@ class UnknownInputOptions(CommonOptions):
 
     filters: ClassVar[Mapping[str, type]] = FILTERS
     structure: ClassVar[Structure | None] = _STRUCTURE
+    reward_scale: float | Literal["auto"] | None = None
     example: Annotated[str, EXAMPLES] = "two_carts"
     """Example that gives the numbers of all options that are ``None``."""
     transition: ArrayLike | None = None

@@ -1,0 +1,187 @@
+"""What the options' ``"auto"`` stands for: the scale of a reward, and the prices that matter.
+
+Both are found by seeded simulations of the plant as assumed, whatever its filter, each once.
+"""
+
+import json
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.options import CommonOptions, Scenario, plain_options
+from fusion_gym.core.task import Task
+from fusion_gym.core.token_bucket import TokenBucket
+from fusion_gym.errors import ConfigurationError, display
+
+Build = Callable[[Any], Scenario]
+_RUNS, _STEPS, _SEED = 32, 200, 20_261_124
+# A pace that comes up at a step may be computed a rounding below it: 49 · (1/49) < 1.
+_ROUNDING = 1e-9
+# Of the packets that the tokens sustain, at the lowest and at the highest price; packets of a
+# sensor in an episode.
+_MOST, _LEAST, _PACKETS = 0.6, 0.12, 2.0
+_STORED: dict[tuple[Any, ...], Any] = {}
+
+
+def resolve(options: CommonOptions, build: Build) -> tuple[CommonOptions, Array | None]:
+    """Return the options with numbers for ``"auto"``, and the nominal error where one scales.
+
+    Raises:
+        ConfigurationError: a value that is not allowed, or a plant that has no such number.
+    """
+    error, factor = None, options.reward_scale
+    if factor is not None:
+        error, whole = _stored(_nominal, options.nominal(), build)
+        if not _is_auto(factor):
+            factor = validation.number("reward_scale", factor, above=0.0)
+        elif options.state_weights is not None:
+            factor = 1.0
+        elif 0.0 < whole < np.inf:
+            factor = _rounded(1.0 / whole)
+        else:
+            raise ConfigurationError(
+                "reward_scale = 'auto' is not allowed here: packets at an even pace leave mean "
+                f"squared errors of {display(error)}; they must be finite, and one > 0"
+            )
+        options = replace(options, reward_scale=factor)
+    if _is_auto(options.price_range):
+        rules = replace(
+            options.nominal(),
+            memory=True,
+            error_weight=options.error_weight,
+            state_weights=options.state_weights,
+            reward_scale=options.reward_scale,
+        )
+        options = replace(options, price_range=_stored(price_range, rules, build))
+    return options, error
+
+
+def nominal_rate(bucket: TokenBucket, access: str) -> float:
+    """Return packets a sensor and step: half of what the tokens sustain, or a quarter of all."""
+    return sustained_rate(bucket, access) / (4.0 if bucket.unlimited else 2.0)
+
+
+def sustained_rate(bucket: TokenBucket, access: str) -> float:
+    """Return the packets a sensor and step that the network sustains."""
+    most = 1.0 if access == "any" else 1.0 / len(bucket.cost)
+    return most if bucket.unlimited else min(most, bucket.rate / float(bucket.cost.sum()))
+
+
+def nominal_error(task: Task) -> Array:
+    """Return each state's mean squared error (n,) where sensors request at an even pace.
+
+    A sensor requests when its pace has come up and the network's access rule admits it. Where no
+    packet is sustained, these are the errors without transmissions.
+    """
+    rate, sensors = nominal_rate(task.bucket, task.access), task.sensors
+    if rate == 0.0:
+        return task.open_loop[:, 0]
+    batch = _batch(task, 1)
+    total = np.zeros(len(task.open_loop))
+    due = np.repeat(np.arange(sensors)[:, None] / sensors + _ROUNDING, _RUNS, axis=1)
+    for _ in range(batch.task.horizon):
+        due += rate
+        requests = (due >= 1.0) & batch.admitted()
+        due -= requests
+        total += batch.step(requests).squared_error.mean(-1)
+    return total / batch.task.horizon
+
+
+def price_range(task: Task) -> tuple[float, float]:
+    """Return the prices at which value of information sends 60 and 12 % of what is sustained.
+
+    At least two packets of each sensor in an episode. At each price that is the rule with the
+    threshold of the least cost: prices are slopes of the lower envelope of error against tokens.
+
+    Raises:
+        ConfigurationError: no transmission lowers the error.
+    """
+    spent, error = _envelope(*_sweep(task))
+    if len(spent) < 3:
+        raise ConfigurationError(
+            "price_range = 'auto' is not allowed here: transmissions do not lower the error"
+        )
+    sustained = sustained_rate(task.bucket, task.access) * float(task.bucket.cost.sum())
+    least = _PACKETS * float(task.bucket.cost.sum()) / task.horizon
+    shares = sustained * _MOST, max(sustained * _LEAST, least)
+    middle = np.sqrt(spent[1:] * np.maximum(spent[:-1], 0.25 * spent[1]))
+    slopes = np.log(np.diff(-error) / np.diff(spent))
+    low, high = np.exp(np.interp(np.log(shares), np.log(middle), slopes)).tolist()
+    return _rounded(low), _rounded(max(high, 2.0 * low))
+
+
+def _nominal(task: Task) -> tuple[Array, float]:
+    error = nominal_error(task)
+    return error, float(task.reward.state_weights[:, 0] @ error)
+
+
+def _sweep(task: Task) -> tuple[Array, Array]:
+    """Tokens and error a step (rules,) of value of information, on the same noise.
+
+    Of rising thresholds, each with at most 1, 2, 4, … sensors a step.
+    """
+    usual = task.error_scale * float((task.relative_weights[:, 0] * nominal_error(task)).sum())
+    levels = usual / float(task.bucket.cost.mean()) * np.geomspace(3e-3, 3e2, 21)
+    counts = 2 ** np.arange(task.sensors.bit_length())
+    least = np.tile(np.repeat(levels, _RUNS), len(counts)) * task.bucket.cost
+    most = np.repeat(counts, len(levels) * _RUNS)
+    batch = _batch(task, len(levels) * len(counts))
+    total = np.zeros((2, len(most)))
+    for _ in range(batch.task.horizon):
+        value = task.error_scale * batch.beliefs().value()
+        rank = np.argsort(np.argsort(-value, axis=0), axis=0)
+        outcome = batch.step((value >= least) & (rank < most))
+        total += outcome.cost, -outcome.reward_error
+    spent, error = total.reshape(2, -1, _RUNS).mean(-1) / batch.task.horizon
+    return spent, error
+
+
+def _envelope(spent: Array, error: Array) -> tuple[Array, Array]:
+    """The vertices of the lower convex envelope, from the fewest tokens to the least error."""
+    vertices: list[int] = []
+    for point in np.lexsort((error, spent)).tolist():
+        while len(vertices) > 1 and _above(vertices[-2], vertices[-1], point, spent, error):
+            vertices.pop()
+        vertices.append(point)
+    vertices = vertices[: 1 + int(np.argmin(error[vertices]))]
+    return spent[vertices], error[vertices]
+
+
+def _above(left: int, middle: int, right: int, spent: Array, error: Array) -> bool:
+    """Whether the middle point lies on or above the chord of the others."""
+    rise = (error[middle] - error[left]) * (spent[right] - spent[left])
+    return bool(rise >= (error[right] - error[left]) * (spent[middle] - spent[left]))
+
+
+def _batch(task: Task, copies: int) -> EpisodeBatch:
+    """A batch of as many copies of the simulation's runs."""
+    batch = EpisodeBatch(replace(task, horizon=min(task.horizon, _STEPS)), _RUNS * copies)
+    seeds = np.tile(np.arange(_SEED, _SEED + _RUNS), copies)
+    batch.seed(np.arange(len(seeds)), seeds.tolist())
+    batch.reset()
+    return batch
+
+
+def _stored(simulate: Callable[[Task], Any], options: CommonOptions, build: Build) -> Any:
+    """The result of a simulation of options, which runs once."""
+    key = simulate, build, json.dumps(plain_options(asdict(options)))
+    if key not in _STORED:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            _STORED[key] = simulate(Task.create(build(options)))
+    return _STORED[key]
+
+
+def _rounded(value: float) -> float:
+    """To three digits, so that another machine finds the same."""
+    return float(f"{value:.3g}")
+
+
+def _is_auto(value: Any) -> bool:
+    return isinstance(value, str) and value == "auto"
