@@ -63,6 +63,7 @@ def test_metrics_against_a_plain_loop(task: Task, spec: str) -> None:
             claimed = covariance[..., 0]
             rows["squared_error"].append(info["squared_error"])
             rows["mse"].append(info["squared_error"].sum())
+            rows["error_cost"].append(-info["reward_error"])
             rows["bound_trace"].append(np.trace(claimed))
             rows["nees"].append(error @ np.linalg.solve(claimed, error) / 2)
             rows["rate"].append(info["granted"])

@@ -15,15 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_results import CLASSES, ENV, SETTING, small_model, small_results
 
-from fusion_gym.agents.compare import comparison_table
+from fusion_gym.agents.compare import Point, price_table, rate_table
 from fusion_gym.agents.experiments.tables import read_rows, write_rows
 from fusion_gym.agents.output import pareto_figure
 from fusion_gym.agents.output.palette import AGENTS, RULES
 from fusion_gym.agents.output.pareto_figure import Differences, Limits, Panel, Series
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.envelope import BaselineComparison
+from fusion_gym.evaluation.envelope import compare_at_price, compare_with_envelope
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.evaluation.intervals import Interval
 from fusion_gym.policies.registry import make_policy
 
 ABSENT = "ABSENT"
@@ -169,6 +168,12 @@ def test_no_error_at_all_can_be_drawn_and_compared(tmp_path: Path) -> None:
     assert all(path.stat().st_size > 10_000 for path in paths)
     task = make_task(ENV, horizon=3)
     results = run_episodes(task, make_policy("always", task), 2, 0)
-    nothing = BaselineComparison(Interval(0.0, 0.0, 0.0), 0.0, ("always",))
-    table = comparison_table({"always": nothing}, {"always": results})
-    assert list(table.columns[5].cells) == ["–"]
+    point = Point(
+        "always",
+        1.0,
+        0.0,
+        compare_at_price(results, {"always": results}, 0.0),
+        compare_with_envelope(results, {"always": results}),
+    )
+    assert list(rate_table([point]).columns[5].cells) == ["–"]
+    assert list(price_table([point], {"always": results}).columns[6].cells) == ["–"]

@@ -63,7 +63,7 @@ def test_the_pace_keeps_to_the_turns_of_the_access_rule(access: str) -> None:
 def test_without_tokens_the_scale_is_open_loop() -> None:
     task = fusion_gym.make_task(LINEAR, token_rate=0, initial_tokens=0, **{
         key: value for key, value in DRIFT.items() if key != "token_rate"})  # fmt: skip
-    assert task.reward.state_weights[:, 0] @ task.open_loop[:, 0] == pytest.approx(1.0)
+    assert task.reward.state_weights[:, 0] @ task.open_loop[:, 0] == pytest.approx(1.0, rel=0.005)
 
 
 def test_filters_departures_and_settings_share_one_scale() -> None:
@@ -149,3 +149,51 @@ def test_a_model_with_a_card_without_a_scale_is_refused(tmp_path: Path) -> None:
     model.save(tmp_path / "agent.zip")
     with pytest.raises(ConfigurationError, match="nominal_error = None is not allowed"):
         make_policy(f"model:{tmp_path / 'agent.zip'}", fusion_gym.make_task(LINEAR, **options))
+
+
+FRONT: dict[str, Any] = {"memory": True, "cost_weight": "random", "price_range": "auto"}
+
+
+def test_prices_reach_from_60_to_12_percent_of_what_is_sustained() -> None:
+    """At the ends of the range the cheapest of many thresholds sends about that much."""
+    task = fusion_gym.make_task(LINEAR, **FRONT, **DRIFT)
+    assert task.settings["price_range"] == list(task.reward.price.span or ())
+    shares = []
+    for price in task.reward.price.span or ():
+        costs = {}
+        for threshold in price * np.geomspace(0.05, 1.0, 13):
+            rule = f"value_of_information:price={threshold:g},at_most=1"
+            results = run_episodes(task, make_policy(rule, task), 200, 0)
+            cost = float((results.error_cost + price * results.tokens).mean())
+            costs[cost] = float(results.tokens.mean()) / 1.5
+        shares.append(costs[min(costs)])
+    assert shares == pytest.approx([0.6, 0.12], rel=0.25)
+
+
+def test_units_and_filters_change_no_prices() -> None:
+    usual = fusion_gym.make_task(LINEAR, **FRONT, **DRIFT).reward.price.span
+    for other in ({"filter": "adf"}, {"true_process_noise": 2.0}):
+        assert fusion_gym.make_task(LINEAR, **FRONT, **DRIFT, **other).reward.price.span == usual
+    low, high = usual or (0.0, 0.0)
+    double = fusion_gym.make_task(LINEAR, error_weight=2.0, **FRONT, **DRIFT).reward.price.span
+    assert double == pytest.approx((2.0 * low, 2.0 * high), rel=0.01)
+
+
+def test_short_episodes_keep_two_packets_of_each_sensor() -> None:
+    long = fusion_gym.make_task(LINEAR, **FRONT, **DRIFT).reward.price.span
+    short = fusion_gym.make_task(LINEAR, horizon=25, **FRONT, **DRIFT).reward.price.span
+    assert long is not None
+    assert short is not None
+    assert short[1] < 0.5 * long[1]
+
+
+@pytest.mark.parametrize("value", ["open", [2.0, 1.0], [1.0, 1.0], 3.0])
+def test_other_prices_are_refused(value: object) -> None:
+    with pytest.raises(ConfigurationError, match="price_range = "):
+        fusion_gym.make_task(LINEAR, cost_weight="random", price_range=value)
+
+
+def test_prices_are_refused_where_transmissions_bring_nothing() -> None:
+    blind = {"measurement_covariances": 1e12, "initial_covariance": np.eye(2) * 1e-3}
+    with pytest.raises(ConfigurationError, match="price_range = 'auto' is not allowed here"):
+        fusion_gym.make_task(LINEAR, **FRONT, **blind)

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 import pydantic
 
+from fusion_gym.core.reward import Price
 from fusion_gym.envs.registration import make_task
 from fusion_gym.validation import ConfigurationError
 
@@ -378,22 +379,27 @@ def front_prices(price_range: tuple[float, float], count: int) -> list[float]:
 
 
 class SweepCurve(Strict):
-    """A baseline swept over one parameter: ``policy`` holds ``{value}`` in its place."""
+    """A baseline swept over one parameter: ``policy`` holds ``{value}`` in its place.
+
+    Or ``{price}``: the values are then multiples of the task's price, or of the middle of its
+    range.
+    """
 
     label: str
     policy: str
     values: tuple[float | int, ...] = pydantic.Field(min_length=1)
 
-    @property
-    def policies(self) -> list[str]:
+    def policies(self, price: Price) -> list[str]:
         """One policy text a value."""
-        return [self.policy.replace("{value}", f"{value:g}") for value in self.values]
+        name = "{price}" if "{price}" in self.policy else "{value}"
+        middle = float(price.draw(np.array([0.5]))[0]) if name == "{price}" else 1.0
+        return [self.policy.replace(name, f"{middle * value:g}") for value in self.values]
 
     @pydantic.field_validator("policy")
     @classmethod
     def _has_place(cls, policy: str) -> str:
-        if "{value}" not in policy:
-            raise ValueError("must hold {value} where the swept parameter stands")
+        if ("{value}" in policy) == ("{price}" in policy):
+            raise ValueError("must hold {value} or {price} where the swept parameter stands")
         return policy
 
 
@@ -403,10 +409,9 @@ class Sweep(Strict):
     curves: tuple[SweepCurve, ...]
     points: tuple[str, ...] = ()
 
-    @property
-    def policies(self) -> list[str]:
+    def policies(self, price: Price) -> list[str]:
         """Every policy text of the sweep, each once, in order."""
-        texts = [text for curve in self.curves for text in curve.policies]
+        texts = [text for curve in self.curves for text in curve.policies(price)]
         return list(dict.fromkeys([*self.points, *texts]))
 
 

@@ -86,7 +86,8 @@ class Experiment(Strict):
             for name in ("reward_scale", "price_range")
             if options.get(name, "auto") == "auto" and settings[name] is not None
         }
-        environment = self.environment.model_copy(update={"options": options | numbers})
+        given = {name: value for name, value in options.items() if name not in numbers}
+        environment = self.environment.model_copy(update={"options": given | numbers})
         return self.model_copy(update={"environment": environment})
 
     def changed(

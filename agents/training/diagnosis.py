@@ -4,12 +4,14 @@
 it does not.
 """
 
+import warnings
 from typing import Any
 
 import numpy as np
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.core.scale import sustained_rate
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults
 
@@ -72,3 +74,20 @@ def by_price(task: Task, prices: Array, results: EpisodeResults) -> list[dict[st
         for place in range(PARTS)
         if (selection := part == place).any()
     ]
+
+
+def warn_of_unused_tokens(task: Task, results: EpisodeResults) -> None:
+    """Warn of an agent that spends less than half of its tokens at its lowest price.
+
+    Warns:
+        UserWarning: it does; names its share of what the bucket sustains.
+    """
+    sustained = sustained_rate(task.bucket, task.access) * float(task.bucket.cost.sum())
+    share = float(results.tokens.mean()) / sustained if sustained else 1.0
+    if share < 0.5 and not task.bucket.unlimited:
+        warnings.warn(
+            f"at its lowest price the agent spends {share:.0%} of the tokens that the bucket "
+            "sustains: a lower price, or a reward_scale above the present "
+            f"{task.settings.get('reward_scale')}, lets it use more",
+            stacklevel=2,
+        )

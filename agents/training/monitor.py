@@ -18,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
-from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.card import ModelView
 from fusion_gym.policies.model import ModelPolicy
 
@@ -149,11 +149,7 @@ class Progress(Callback):
 
     def validate(self) -> None:
         """Run the validation episodes, log them, and keep the model if it is the best so far."""
-        settings = self.experiment.validation
-        policy = ModelPolicy(
-            self.model, self.task, trained=ModelView(local=self.experiment.environment.local)
-        )
-        results = run_episodes(self.task, policy, settings.episodes, settings.seed)
+        results = self._run()
         record: dict[str, Any] = {
             "timesteps": self.num_timesteps,
             "return": float((results.returns * self._weights()).mean()),
@@ -181,6 +177,16 @@ class Progress(Callback):
                 self.logger.record(f"validation/{key}_{where}", part[key])
         self.logger.dump(self.num_timesteps)
         self._show(record)
+
+    def run_cheapest(self) -> EpisodeResults:
+        """Return the validation episodes of the model at its lowest price."""
+        span = self.task.reward.price.span
+        return self._run(None if span is None else span[0])
+
+    def _run(self, price: float | None = None) -> EpisodeResults:
+        settings, local = self.experiment.validation, self.experiment.environment.local
+        policy = ModelPolicy(self.model, self.task, price=price, trained=ModelView(local=local))
+        return run_episodes(self.task, policy, settings.episodes, settings.seed)
 
     def _show(self, record: dict[str, Any]) -> None:
         """A validation to the bar, and to whoever watches and may end the training."""

@@ -26,7 +26,7 @@ from .checked import load_checked
 from .checkpoint import Journal, read_journal, restore
 from .config import Experiment
 from .constraint import TargetRate, rate_score
-from .diagnosis import Traffic
+from .diagnosis import Traffic, warn_of_unused_tokens
 from .models import make_env, make_model, warn_of_cross_term
 from .monitor import Interrupt, Measure, Progress, Stop
 
@@ -185,6 +185,8 @@ def _learn(
         finished = model.num_timesteps >= total
         if finished:
             progress.finish()
+            if not quiet and experiment.training.target_rate is None:
+                warn_of_unused_tokens(scored, progress.run_cheapest())
         progress.save()
         if finished:
             with replacing(folder / "final_model.zip") as partial:

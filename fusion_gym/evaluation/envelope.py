@@ -10,6 +10,8 @@ from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import Interval, mean_interval
 from fusion_gym.validation import ConfigurationError
 
+FAR_APART = 1.5
+
 
 class EnvelopePoint(NamedTuple):
     """A policy on the envelope: its name, mean rate per sensor and step, mean squared error."""
@@ -121,12 +123,14 @@ class BaselineComparison(NamedTuple):
     """A policy against the envelope at its own rate, over paired episodes.
 
     ``difference`` is the policy's MSE minus the envelope's, ``envelope`` the envelope's MSE,
-    ``between`` the policies that were mixed.
+    ``between`` the policies that were mixed. ``far_apart`` says that their rates differ by more
+    than ``FAR_APART`` times: a rule between them would lie below the line.
     """
 
     difference: Interval
     envelope: float
     between: tuple[str, ...]
+    far_apart: bool = False
 
 
 def compare_with_envelope(
@@ -138,6 +142,7 @@ def compare_with_envelope(
         ConfigurationError: no baselines, other numbers of episodes, or a rate below every
             baseline's (there the envelope does not exist).
     """
+    _check_pairs(results, baselines)
     hull = lower_envelope(baselines)
     rate = float(results.rate.mean())
     shares = mixture(hull, rate)
@@ -146,13 +151,56 @@ def compare_with_envelope(
             f"rate = {rate:.4f} is below every baseline's (the smallest is {hull[0].rate:.4f}): "
             "add 'never' to the baselines"
         )
-    if any(baselines[name].episodes != results.episodes for name in shares):
-        raise ConfigurationError(
-            "episodes differ between policy and baselines: they must be paired"
-        )
     envelope = _mixed(baselines, shares)
+    between = tuple(name for name, share in shares.items() if share > 0.0)
+    rates = [float(baselines[name].rate.mean()) for name in between]
     return BaselineComparison(
         difference=mean_interval(results.mse - envelope),
         envelope=float(envelope.mean()),
-        between=tuple(name for name, share in shares.items() if share > 0.0),
+        between=between,
+        far_apart=max(rates) > FAR_APART * min(rates),
     )
+
+
+class PriceComparison(NamedTuple):
+    """A policy against the best baseline at one price of a token, over paired episodes.
+
+    ``difference`` is the policy's cost minus that of the baseline ``best``, whose mean is
+    ``cost``. Negative: the policy is better.
+    """
+
+    price: float
+    best: str
+    cost: float
+    difference: Interval
+
+    @property
+    def relative(self) -> float:
+        """The difference as a share of the baseline's cost."""
+        return self.difference.mean / self.cost
+
+
+def compare_at_price(
+    results: EpisodeResults, baselines: Mapping[str, EpisodeResults], price: float
+) -> PriceComparison:
+    """Return the paired difference of cost = error + price · tokens, a step, to the best baseline.
+
+    The baseline of the least mean on these episodes, which favours the baselines.
+
+    Raises:
+        ConfigurationError: no baselines, or other numbers of episodes.
+    """
+    _check_pairs(results, baselines)
+    costs = {name: item.error_cost + price * item.tokens for name, item in baselines.items()}
+    best = min(costs, key=lambda name: float(costs[name].mean()))
+    difference = results.error_cost + price * results.tokens - costs[best]
+    return PriceComparison(price, best, float(costs[best].mean()), mean_interval(difference))
+
+
+def _check_pairs(results: EpisodeResults, baselines: Mapping[str, EpisodeResults]) -> None:
+    if not baselines:
+        raise ConfigurationError("policies = {} is not allowed: at least one baseline is needed")
+    if any(item.episodes != results.episodes for item in baselines.values()):
+        raise ConfigurationError(
+            "episodes differ between policy and baselines: they must be paired"
+        )

@@ -21,15 +21,17 @@ BATCH = 1024  # episodes side by side; fixed, so that results do not depend on t
 class EpisodeResults:
     """What E episodes of horizon H brought, each entry averaged over an episode's steps.
 
-    ``mse`` (E,) squared error of the fused estimate, summed over states · ``bound_trace`` (E,)
-    trace of the claimed covariance · ``nees`` (E,) normalised squared error divided by the number
-    of directions with a variance, 1 for a consistent filter · ``rate`` and ``requests``
-    (E, sensors) · ``tokens`` (E,) spent and ``denied`` (E,) requests refused, per step ·
+    ``mse`` (E,) squared error of the fused estimate, summed over states · ``error_cost`` (E,) the
+    error as the reward counts it, >= 0 · ``bound_trace`` (E,) trace of the claimed covariance ·
+    ``nees`` (E,) normalised squared error divided by the number of directions with a variance, 1
+    for a consistent filter · ``rate`` and ``requests`` (E, sensors) · ``tokens`` (E,) spent and
+    ``denied`` (E,) requests refused, per step ·
     ``returns`` (E,) sum of the rewards · ``diverged`` (E,) share of diverged steps ·
     ``squared_error`` (H, n), the mean over episodes at each time and state.
     """
 
     mse: Array
+    error_cost: Array
     bound_trace: Array
     nees: Array
     rate: Array
@@ -99,7 +101,7 @@ def _run_batch(
     mse, trace, nees = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
     tokens, denied, returns = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
     rate, requests = np.zeros((sensors, episodes)), np.zeros((sensors, episodes))
-    diverged = np.zeros(episodes)
+    diverged, error_cost = np.zeros(episodes), np.zeros(episodes)
     squared_error = np.empty((horizon, states))
     for step in range(horizon):
         outcome = batch.step(policy(batch.signals().limit(refused)))
@@ -114,11 +116,13 @@ def _run_batch(
         tokens += outcome.cost
         denied += (outcome.requested & ~outcome.granted).sum(0)
         returns += outcome.reward
+        error_cost -= outcome.reward_error
         diverged += outcome.diverged
         if progress is not None:
             progress(episodes)
     return EpisodeResults(
         mse=mse / horizon,
+        error_cost=error_cost / horizon,
         bound_trace=trace / horizon,
         nees=nees / horizon,
         rate=(rate / horizon).T,
