@@ -101,7 +101,7 @@ class CommonOptions:
     covariances, or its ``"module:name"``."""
     error_weight: float = 1.0
     """Weight of the reward's error term."""
-    cost_weight: float | Literal["random"] = 0.01
+    cost_weight: float | Literal["random"] = 0.5
     """Price of a token in the reward. ``"random"`` draws it from ``price_range`` for each episode,
     evenly in its logarithm."""
     price_range: ArrayLike | Literal["auto"] | None = None
@@ -142,6 +142,14 @@ class CommonOptions:
         plain = {item.name: getattr(type(self), item.name) for item in common}
         plain["reward_scale"] = None if self.reward_scale is None else 1.0
         return replace(self, **plain)
+
+
+@dataclass(frozen=True)
+class PaperOptions(CommonOptions):
+    """Options of an environment whose reward scales by the error without transmissions."""
+
+    reward_scale: float | Literal["auto"] | None = None
+    cost_weight: float | Literal["random"] = 0.01
 
 
 @dataclass(frozen=True)

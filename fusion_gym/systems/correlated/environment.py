@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import CommonOptions, Scenario, Tokens
+from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.core.reward import equal_weights
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.correlated.filters import JointErrorCovariance, RobustKalmanFilter
@@ -29,7 +29,7 @@ _STRUCTURE = Structure(common="all contain the same process noise", prediction=T
 
 
 @dataclass(frozen=True)
-class CorrelatedTrackingOptions(CommonOptions):
+class CorrelatedTrackingOptions(PaperOptions):
     """A target's position, velocity and acceleration, each measured by a sensor of its own.
 
     Three states driven by one noise, sampled every 0.01. Sensor 0 measures the position, sensor 1
@@ -49,7 +49,6 @@ class CorrelatedTrackingOptions(CommonOptions):
 
     filters: ClassVar[Mapping[str, type]] = {"": RobustKalmanFilter}  # without a choice
     structure: ClassVar[Structure | None] = _STRUCTURE
-    reward_scale: float | Literal["auto"] | None = None
     transition: ArrayLike = ((1.0, _T, _T * _T / 2), (0.0, 1.0, _T), (0.0, 0.0, 1.0))
     """Φ of equations (1) and (64), (n, n)."""
     process_gain: ArrayLike = ((_T * _T / 2,), (_T,), (1.0,))

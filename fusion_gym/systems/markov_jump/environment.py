@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 from numpy.typing import ArrayLike
 
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import CommonOptions, Scenario, Tokens
+from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.fusion.rules import FusionRule
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.markov_jump.central_system import MarkovJumpCentralSystem
@@ -38,7 +38,7 @@ _STRUCTURE = Structure(common="all contain the same process noise", holds=("join
 
 
 @dataclass(frozen=True)
-class MarkovJumpTrackingOptions(CommonOptions):
+class MarkovJumpTrackingOptions(PaperOptions):
     """A target that jumps between two motions, seen by three fading, asynchronous sensors.
 
     Position and velocity follow one of two linear motions, chosen by a Markov chain that nobody
@@ -65,7 +65,6 @@ class MarkovJumpTrackingOptions(CommonOptions):
 
     filters: ClassVar[Mapping[str, type]] = FILTERS
     structure: ClassVar[Structure | None] = _STRUCTURE
-    reward_scale: float | Literal["auto"] | None = None
     transitions: ArrayLike = (((0.8, 0.2 * _T), (0.0, 0.6)), ((1.0, _T), (0.0, _T)))
     """Φ of each mode, equation (1), (modes, n, n). The plant must be mean-square stable."""
     process_gains: ArrayLike = (((1.5,), (0.6,)), ((0.5 * _T * _T,), (_T,)))

@@ -17,14 +17,14 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.channel import Channel, InitialState
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import CommonOptions, Scenario, Tokens
+from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.core.task import make_bucket
 from fusion_gym.systems.remote.system import RemoteEstimationSystem
 from fusion_gym.validation import ConfigurationError
 
 
 @dataclass(frozen=True)
-class RemoteEstimationOptions(CommonOptions):
+class RemoteEstimationOptions(PaperOptions):
     """Scalar sources that drift away from what the centre believes, and a price for every packet.
 
     The problem whose optimum is known. Source i follows x(t+1) = a x(t) + w(t), w ~ N(0, σ²), and
@@ -40,7 +40,6 @@ class RemoteEstimationOptions(CommonOptions):
     error plus ``cost_weight`` for each transmission.
     """
 
-    reward_scale: float | Literal["auto"] | None = None
     sensors: int = 1
     """Number of sources, each with one sensor."""
     coefficient: ArrayLike = 1.0

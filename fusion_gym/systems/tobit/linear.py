@@ -65,7 +65,6 @@ class LinearFusionOptions(FeedbackOptions):
     """
 
     filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
-    reward_scale: float | Literal["auto"] | None = "auto"
     transition: ArrayLike = ((1.0, _STEP), (0.0, 1.0))
     """A of x(t+1) = A x(t) + w(t), (n, n)."""
     process_covariance: ArrayLike = (
@@ -91,6 +90,8 @@ class LinearFusionOptions(FeedbackOptions):
     """Lower limit τ: one number, one per sensor, or a list for each sensor with one per channel."""
     censoring_upper: ArrayLike | Sequence[ArrayLike] = np.inf
     """Upper limit υ: one number, one per sensor, or a list for each sensor with one per channel."""
+    reward_scale: float | Literal["auto"] | None = "auto"
+    cost_weight: float | Literal["random"] = 0.5
     token_rate: float = 1.0
     token_capacity: float = 15.0
     initial_tokens: float = 6.0

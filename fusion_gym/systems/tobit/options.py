@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 from numpy.typing import ArrayLike
 
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import CommonOptions, plain_options
+from fusion_gym.core.options import PaperOptions, plain_options
 from fusion_gym.errors import ConfigurationError, display
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.linear_plant import LinearPlant, typical_magnitude
@@ -33,11 +33,10 @@ _STRUCTURE = Structure(
 
 
 @dataclass(frozen=True)
-class FeedbackOptions(CommonOptions):
+class FeedbackOptions(PaperOptions):
     """Options of the fusion and its feedback; ``None`` is the default of the filter or the rule."""
 
     structure: ClassVar[Structure | None] = _STRUCTURE
-    reward_scale: float | Literal["auto"] | None = None
     fusion: Annotated[str | None, _STRUCTURE.offered] = None
     """Rule that joins the nodes' estimates, by default ``"federated"`` (tobit_token_bucket,
     equations (50) and (51)). ``"ci"`` is covariance intersection, ``"ici"`` its inverse form for

@@ -18,7 +18,7 @@ from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.admission import LARGEST_ERROR
 from fusion_gym.core.nature import Nature
-from fusion_gym.core.options import CommonOptions, Scenario, Tokens
+from fusion_gym.core.options import PaperOptions, Scenario, Tokens
 from fusion_gym.fusion.table import Structure, choose_rule
 from fusion_gym.systems.unknown_input.bound_filter import BoundTables
 from fusion_gym.systems.unknown_input.examples import EXAMPLES
@@ -50,7 +50,7 @@ FILTERS: dict[str, type] = {
 
 
 @dataclass(frozen=True)
-class UnknownInputOptions(CommonOptions):
+class UnknownInputOptions(PaperOptions):
     """Two carts, tied by springs, under a force that nobody knows, seen in part by three sensors.
 
     The state is the positions and velocities of two carts; the force on the first is unknown to
@@ -70,7 +70,6 @@ class UnknownInputOptions(CommonOptions):
 
     filters: ClassVar[Mapping[str, type]] = FILTERS
     structure: ClassVar[Structure | None] = _STRUCTURE
-    reward_scale: float | Literal["auto"] | None = None
     example: Annotated[str, EXAMPLES] = "two_carts"
     """Example that gives the numbers of all options that are ``None``."""
     transition: ArrayLike | None = None
