@@ -61,7 +61,7 @@ BAD_OPTIONS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
     ({"transition": np.ones((140, 140))}, ("(any, any)", "up to 100", "(140, 140)")),
     # Numbers that float64 cannot square, divide by or wait for
     ({"measurement_variance": 1e308}, ("1e+308", "at most 1e+15")),
-    ({"initial_covariance": np.diag([1e-32, 1e-32])}, ("1e-32", "positive definite")),
+    ({"initial_covariance": np.diag([1.0, -1.0])}, ("-1.0", "positive semi-definite")),
     ({"horizon": 10**9}, ("1000000000", "<= 50000")),
     ({"transition": ((1, 2), (3, 4))}, ("((1, 2), (3, 4))", "horizon = 100", "up to 1e+32")),
     (

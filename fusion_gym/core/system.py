@@ -216,7 +216,7 @@ def log_deviation(covariance: Array, reference: Array) -> Array:
     """
     possible = np.where(reference > 0.0, reference, np.inf)
     with np.errstate(divide="ignore"):
-        return 0.5 * np.log(linalg.diagonal(covariance) / possible[:, None])
+        return 0.5 * np.log(np.maximum(linalg.diagonal(covariance), 0.0) / possible[:, None])
 
 
 def numbered(count: int) -> tuple[str, ...]:
