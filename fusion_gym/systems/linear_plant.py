@@ -115,7 +115,7 @@ class LinearPlant(Plant):
     def predict(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Prior mean (n, N) and covariance A P Aᵀ + W (n, n, N) of the next state.
 
-        Where A P Aᵀ cancels, as it may where P is singular, it is that of a root of P.
+        Where A P Aᵀ cancels, as it may where P is singular, it is (A F)(A F)ᵀ with a root F of P.
 
         Source: tobit_token_bucket, equations (21) and (29).
         """
@@ -130,7 +130,7 @@ class LinearPlant(Plant):
 
     @functools.cached_property
     def _cancelling(self) -> Array:
-        """C (n, n, 1): variances of A P Aᵀ below C times those of P have lost digits."""
+        """C (n, n, 1): a variance of A P Aᵀ below C diag(P) has lost digits."""
         return _CANCELLED * self.size * self.transition**2
 
     def open_loop(self, horizon: int) -> Array:
