@@ -78,7 +78,7 @@ class SettingResults:
     def verdict(self) -> Row:
         """The setting itself."""
         rows = read_rows(self.folder, VERDICT)
-        if len(rows) != 1 or rows[0]["always"] <= 0.0:
+        if len(rows) > 1 or rows[0]["always"] <= 0.0:
             path = str(self.folder / f"{VERDICT}.csv")
             raise ConfigurationError(
                 f"results = {path!r}: always = {[row['always'] for row in rows]} is not allowed: "
@@ -91,11 +91,17 @@ class SettingResults:
         """The classes with agents, each with its ``points``, errors ``at`` rates and envelope."""
         parts = {"points": "points", "at": "equal_rates", "envelope": "envelope"}
         tables = {part: group_by(read_rows(self.folder, t), "class") for part, t in parts.items()}
+        fronts = {row.pop("class"): row for row in read_rows(self.folder, "fronts")}
+        for part, table in parts.items():
+            if differing := sorted(fronts.keys() ^ tables[part].keys()):
+                path = str(self.folder / f"{table}.csv")
+                raise ConfigurationError(
+                    f"results = {path!r} is not allowed: it must have rows of the same classes as "
+                    f"fronts.csv, and not differ in {differing[0]!r}"
+                )
         return {
-            (name := row.pop("class")): {"broadcast": None}
-            | row
-            | {part: every.get(name, []) for part, every in tables.items()}
-            for row in read_rows(self.folder, "fronts")
+            name: {"broadcast": None} | row | {part: every[name] for part, every in tables.items()}
+            for name, row in fronts.items()
         }
 
     @cached_property
