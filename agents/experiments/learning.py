@@ -17,7 +17,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.reward import Price
-from fusion_gym.deprecation import replace_value
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.beside import run_beside
 from fusion_gym.evaluation.envelope import EnvelopePoint, best_mse, height, lower_hull
@@ -597,7 +596,7 @@ def best_known(
     """
     result, folder = {}, setup.store.results / setup.setting.name
     rollout, episodes = rollout_of(folder)
-    same = replace_value(setup.envelope(setup.course.against)["knows"]) == "scheduler_memory"
+    same = setup.envelope(setup.course.against)["knows"] == "scheduler_memory"
     inside = same and bool(rollout) and rollout[0].rate <= rate <= rollout[-1].rate
     below, own = best_mse(envelope, rate), height(rollout, rate) if inside else None
     if own is not None and below is not None:
