@@ -18,7 +18,7 @@ from fusion_gym.evaluation.envelope import EnvelopePoint, height
 from fusion_gym.validation import ConfigurationError, choice
 
 from ..output.markup import NONE, code, markup_number, plain_text, ranged, share
-from .config import NOMINAL, SOLVED
+from .config import NOMINAL
 from .envelopes import at_least, bound_of, hull_of, path_of, read_envelopes, rollout_of
 from .tables import VERDICT, Row, group_by, read_rows
 from .verdict import MIDDLE, RATES, SHARES, is_gain, read_cases
@@ -447,14 +447,6 @@ def envelopes_text(results: Path) -> str:
     folders = [path.parent for path in sorted(results.glob("*/classes.csv"))]
     settings = {folder: read_envelopes(folder) for folder in folders}
     return _render("envelopes.md", settings=settings, shares=SHARES)
-
-
-# How fast agents learn.
-
-
-def learning_text(courses: Sequence[Row]) -> str:
-    """Return the page of how fast agents learn."""
-    return _render("learning.md", courses=courses, SOLVED=SOLVED)
 
 
 # The quick benchmark beside the full one.
