@@ -1,4 +1,4 @@
-"""The benchmark, part by part: rules, agents, perturbed cases, learning, and its pages.
+"""The benchmark, part by part: rules, agents, perturbed cases, and its pages.
 
     fusion-gym benchmark [--parts agents report] [--envs NAME …] [--quick] [--resume]
 
@@ -6,8 +6,7 @@ The part ``envelopes`` tunes the rules of each class of knowledge, chooses the v
 lower envelope on tuning seeds, measures them on the test seeds, and commits them with a SHA-256.
 ``agents`` trains agents of every class and tests them beside these rules, which it tunes where they
 are missing. ``robustness`` tests rules and agents where the truth is not what they assume.
-``learning`` measures how fast fronts with memory and counterfactual credit are learned. ``report``
-writes pages and figures of all tables in the results folder.
+``report`` writes pages and figures of all tables in the results folder.
 
 Every finished piece of work stays in the work folder. ``--resume`` keeps those that were made from
 the same inputs by the same code, and goes on with trainings there; both hold pickles.
@@ -27,7 +26,6 @@ from .experiments.classes import classes_of, names_of, trained_classes
 from .experiments.config import Setting, Suite, load_suite
 from .experiments.envelopes import SHIPPED, EnvelopeStore
 from .experiments.figures import write_report
-from .experiments.learning import LearningSetup, learn
 from .experiments.report import agreement_text
 from .experiments.robustness import RobustTrial, try_cases, usual_class
 from .experiments.training import SettingWork, run_benchmark
@@ -38,12 +36,12 @@ from .output.progress import writing
 from .output.tables import console
 
 USUAL = Path("results")  # of the full benchmark
-Part = Literal["envelopes", "agents", "robustness", "learning", "report"]
+Part = Literal["envelopes", "agents", "robustness", "report"]
 
 
 @dataclass(frozen=True)
 class Benchmark(Long):
-    """The benchmark of policies: rules, agents, perturbed cases, learning, and its pages."""
+    """The benchmark of policies: rules, agents, perturbed cases, and its pages."""
 
     config: str = "benchmark"
     """The suite: a YAML file, or the name of a shipped config."""
@@ -114,10 +112,9 @@ class Benchmark(Long):
         Raises:
             ConfigurationError: there are some.
         """
-        last = {"envelopes": "{}/classes.csv", "agents": "{}/verdict.csv"}
-        last |= {"robustness": "{}/robustness.csv", "learning": "learning/{}/learning.csv"}
+        last = {"envelopes": "classes", "agents": "verdict", "robustness": "robustness"}
         tables = [
-            last[part].format(item.name)
+            f"{item.name}/{last[part]}.csv"
             for part in set(self.parts) & last.keys()
             for item in settings
         ]
@@ -145,20 +142,10 @@ class Benchmark(Long):
             trial.check()
             if self.agents or "agents" not in self.parts:
                 trial.check_agents()
-        setups = [
-            LearningSetup(suite, setting, setting.course, store, folders)
-            for setting in settings
-            if setting.course is not None and "learning" in self.parts
-        ]
-        for setup in setups:
-            setup.check()
         coming = {(setting.name, of.name) for setting, classes in tuned for of in classes}
-        for setting, name in [
-            *((trial.setting, trial.of.name) for trial in trials),
-            *((setup.setting, name) for setup in setups for name in setup.classes),
-        ]:
-            if (setting.name, name) not in coming:
-                store.envelope(setting, name)
+        for trial in trials:
+            if (trial.setting.name, trial.of.name) not in coming:
+                store.envelope(trial.setting, trial.of.name)
         if not pool.local:
             with pool.connect():  # nobody is there, or a package is absent
                 pass
@@ -171,8 +158,6 @@ class Benchmark(Long):
                 run_benchmark(every, self.classes or names_of(suite), pool)
             if trials:
                 try_cases(trials, pool)
-            if setups:
-                learn(setups, pool)
         if self.quick and "agents" in self.parts:
             text = agreement_text(folders.results, USUAL, [setting.name for setting in settings])
             console().print(Markdown(text))

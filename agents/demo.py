@@ -26,7 +26,7 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import Long
-from .experiments.config import Course, load_suite
+from .experiments.config import Setting, Suite, front_prices, load_suite
 from .experiments.envelopes import (
     SHIPPED,
     EnvelopeStore,
@@ -37,10 +37,11 @@ from .experiments.envelopes import (
     policy_with_options,
     read_tests,
     rollout_of,
+    rule_tests,
     run_test,
 )
 from .experiments.figures import envelope_series, fine_rates, limits_of
-from .experiments.learning import LearningSetup
+from .experiments.tables import Row
 from .experiments.workers import Call, Folders, Pool, missing, run_training, side_by_side
 from .input.options import Episodes, OutputFolder, Steps
 from .output import figures, palette, tables
@@ -50,17 +51,17 @@ from .output.folders import alone_in
 from .output.markup import NONE, share
 from .output.pareto_figure import Differences, Panel, Series, draw_pareto
 from .output.progress import writing
+from .training.checked import load_checked
 from .training.config import Experiment
 from .training.run import earlier, holds_training
 
 SETTING = "tobit_oscillator"
 TEAM = Pool(2)
-# Beside the course of the setting, a scheduler's: sensors that decide locally.
-LOCAL = Course(
-    front="tobit_oscillator_front_local",
-    memoryless="local_estimate",
-    against="local_estimate_memory",
-)
+# The training's config, and the classes of rules beside its agent, without memory and with it.
+COMPARED = {
+    "scheduler": ("tobit_oscillator_front", "sensors", "sensors_memory"),
+    "local": ("tobit_oscillator_front_local", "local_estimate", "local_estimate_memory"),
+}
 TITLES = {
     "scheduler": "A scheduler that sees all new measurements",
     "local": "Local sensors, which receive the centre's estimate",
@@ -68,57 +69,79 @@ TITLES = {
 
 
 class Learner(NamedTuple):
-    """A course of the demo, with its training."""
+    """An agent of the demo, the committed rules beside it, and where its files are.
+
+    ``classes`` names the rules' classes, ``"without"`` memory and ``"with"`` it.
+    """
 
     name: str
-    setup: LearningSetup
+    suite: Suite
+    setting: Setting
+    envelopes: Row
     experiment: Experiment
+    classes: dict[str, str]
+    folders: Folders
 
     @property
     def folder(self) -> Path:
         """Where its files are."""
-        return self.setup.folders.results
+        return self.folders.results
 
     @property
-    def classes(self) -> dict[str, str]:
-        """The classes of rules beside the agent, without memory and with it."""
-        course = self.setup.course
-        return {"without": str(course.memoryless), "with": course.against}
+    def model(self) -> Path:
+        """The file of the finished agent."""
+        return Path(self.experiment.output) / "best_model.zip"
+
+    @property
+    def prices(self) -> list[float]:
+        """The prices at which the agent is tested."""
+        return front_prices(self.setting.price_range, self.suite.prices)
 
     @property
     def agents(self) -> list[Test]:
         """The tests of the finished agent at each price."""
-        return self.setup.agents(Path(self.experiment.output) / "best_model.zip")
+        priced = ("cost_weight", "price_range")
+        world = self.experiment.environment.options.items()
+        options = tuple((key, value) for key, value in world if key not in priced)
+        requested = (self.suite.prices, self.suite.episodes, self.suite.seed)
+        return Test.at_prices(self.setting, options, f"model:{self.model}", *requested)
+
+    def envelope(self, which: str) -> Row:
+        """Return the committed rules without memory, or with it."""
+        return dict(self.envelopes["classes"][self.classes[which]])
+
+    def tests(self, which: str) -> list[Test]:
+        """Return the tests of the rules without memory, or with it."""
+        vertices = self.envelope(which)["vertices"]
+        return rule_tests(self.setting, vertices, self.suite.episodes, self.suite.seed)
 
     def rules(self, which: str) -> dict[str, EpisodeResults]:
         """Return what the rules without memory, or with it, do on the test episodes."""
-        tests = self.setup.rules(self.classes[which])
-        return read_tests(tests, self.setup.folders.cache)
+        return read_tests(self.tests(which), self.folders.cache)
 
     def calls(self) -> list[Call]:
         """Return the tests of its agent and of its rules that were not run before."""
-        rules = [test for name in self.classes.values() for test in self.setup.rules(name)]
-        return missing(run_test, [*self.agents, *rules], self.setup.folders.cache)
+        rules = [test for which in self.classes for test in self.tests(which)]
+        return missing(run_test, [*self.agents, *rules], self.folders.cache)
 
 
 def learners_of(output: Path, episodes: int, timesteps: int | None) -> list[Learner]:
-    """Return the demo's courses.
+    """Return the agents of the demo, to be trained.
 
     Raises:
         ConfigurationError: a shipped file that is absent, damaged or made from other settings.
     """
     suite = load_suite("benchmark")
-    store = EnvelopeStore(suite, SHIPPED)
     setting = next(setting for setting in suite.settings if setting.name == SETTING)
+    envelopes = EnvelopeStore(suite, SHIPPED).read(setting)
     suite = suite.model_copy(update={"episodes": episodes})
-    assert setting.course is not None
     result = []
-    for name, course in zip(TITLES, (setting.course, LOCAL), strict=True):
+    for name, (config, without, remembering) in COMPARED.items():
+        experiment = load_checked(Experiment, config)
+        experiment = experiment.changed(output / name / "agent", timesteps=timesteps)
+        classes = {"without": without, "with": remembering}
         folders = Folders(output / name, output / name)
-        setup = LearningSetup(suite, setting, course, store, folders)
-        setup.check()
-        experiment = setup.front.changed(output / name / "agent", timesteps=timesteps)
-        result.append(Learner(name, setup, experiment))
+        result.append(Learner(name, suite, setting, envelopes, experiment, classes, folders))
     return result
 
 
@@ -186,12 +209,12 @@ def report_of(learner: Learner) -> dict[str, Any]:
     ``difference`` to it, as a share of it, with its 95 % interval over episodes; nothing of a
     class whose rules all transmit more. ``mean`` is the mean of the differences at all prices.
     """
-    setup = learner.setup
+    suite, environment = learner.suite, learner.setting.environment
     points: list[dict[str, Any]] = []
     shares: dict[str, list[Any]] = {name: [] for name in learner.classes.values()}
-    results = read_tests(learner.agents, setup.folders.cache).values()
+    results = read_tests(learner.agents, learner.folders.cache).values()
     rules = {name: learner.rules(which) for which, name in learner.classes.items()}
-    for price, value in zip(setup.prices, results, strict=True):
+    for price, value in zip(learner.prices, results, strict=True):
         rate = float(value.rate.mean())
         point = {"price": price, "rate": rate, "mse": mean_interval(value.mse)._asdict()}
         points.append(point | {"rules": {}})
@@ -202,15 +225,14 @@ def report_of(learner: Learner) -> dict[str, Any]:
                 difference = mean_interval(shares[name][-1])._asdict()
                 beside = {"mse": float(below.mean()), "difference": difference}
                 points[-1]["rules"][name] = beside
-    model = Path(learner.experiment.output) / "best_model.zip"
     return {
-        "setting": setup.setting.name,
-        "env": setup.setting.environment.id,
-        "options": setup.setting.environment.options,
-        "episodes": setup.suite.episodes,
-        "seed": setup.suite.seed,
-        "model": hashlib.sha256(model.read_bytes()).hexdigest(),
-        "classes": {name: setup.envelope(name)["sha256"] for name in shares},
+        "setting": learner.setting.name,
+        "env": environment.id,
+        "options": environment.options,
+        "episodes": suite.episodes,
+        "seed": suite.seed,
+        "model": hashlib.sha256(learner.model.read_bytes()).hexdigest(),
+        "classes": {of: learner.envelope(which)["sha256"] for which, of in learner.classes.items()},
         "points": points,
         "mean": {
             name: mean_interval(np.mean(own, axis=0))._asdict()
@@ -222,7 +244,7 @@ def report_of(learner: Learner) -> dict[str, Any]:
 
 def front_table(learner: Learner, report: Mapping[str, Any]) -> Table:
     """A row a price: the agent, and the rules of both classes at its rate."""
-    bucket = envelope_task(learner.setup.setting).bucket
+    bucket = envelope_task(learner.setting).bucket
     caption = (
         f"{report['episodes']:,} episodes, the same for all, and all under the same token bucket: "
         f"{bucket.rate:g} tokens a step, at most {bucket.capacity:g}, {bucket.cost[0, 0]:g} a "
@@ -259,7 +281,7 @@ def draw_front(learner: Learner, report: Mapping[str, Any]) -> None:
     The band and the strip below hold 95 % intervals over episodes. The proven bound and the rollout
     are a scheduler's.
     """
-    always = learner.setup.envelopes["always"]
+    always = learner.envelopes["always"]
     rates, scheduler = fine_rates(always), not learner.experiment.environment.local
     rules = {which: learner.rules(which) for which in learner.classes}
     style = palette.AGENTS_MEMORY._replace(label="the agent, at seven prices")
@@ -293,12 +315,12 @@ def single_rules(learner: Learner) -> list[list[tuple[float, float]]]:
     Each is as far from its envelope as on tuning episodes, which are easier or harder than the
     test's.
     """
-    content = learner.setup.envelope(learner.classes["without"])
+    content = learner.envelope("without")
     vertices = sorted(content["vertices"], key=lambda vertex: vertex["tuning_rate"])
     rates = [vertex["tuning_rate"] for vertex in vertices]
     harder = [v["test_mse"]["mean"] / v["tuning_mse"]["mean"] for v in vertices]
     curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    for row in learner.setup.envelopes["curves"]:
+    for row in learner.envelopes["curves"]:
         if row["family"] in content["families"] and row["options"] in ({}, content["options"]):
             error = float(row["mse"] * np.interp(row["rate"], rates, harder))
             key = row["family"], str(row["options"])
@@ -322,14 +344,13 @@ def simulations(rules: Mapping[str, EpisodeResults], episodes: int) -> list[tupl
 
 def draw_episodes(learner: Learner) -> None:
     """One episode of the agent at its middle price, and of the rule whose rate is nearest."""
-    setup, name = learner.setup, learner.classes["with"]
-    place, rules = len(setup.prices) // 2, learner.rules("with")
+    place, rules = len(learner.prices) // 2, learner.rules("with")
     agent = learner.agents[place]
-    (result,) = read_tests([agent], setup.folders.cache).values()
+    (result,) = read_tests([agent], learner.folders.cache).values()
     nearest = min(rules, key=lambda rule: abs(rules[rule].rate.mean() - result.rate.mean()))
-    rule = next(test for test in setup.rules(name) if test.name == nearest)
-    options = setup.envelope(name)["options"].items()
-    who = policy_with_options(f"agent at price {setup.prices[place]:.4g}", options)
+    rule = next(test for test in learner.tests("with") if test.name == nearest)
+    options = learner.envelope("with")["options"].items()
+    who = policy_with_options(f"agent at price {learner.prices[place]:.4g}", options)
     for kind, test, label in (("agent", agent, who), ("rule", rule, rule.name)):
         task = test.task()
         trajectory = record_episode(task, make_policy(test.policy, task), test.seed)

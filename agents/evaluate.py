@@ -75,7 +75,7 @@ class Evaluate(EnvironmentOptions, Long):
     """Seed of the first episode."""
     reference: str | None = None
     """One of the policies: print paired differences to it."""
-    json: Annotated[Path | None, OutputFile()] = None
+    json: Annotated[Path | None, OutputFile(".json")] = None
     """Write the results to this file."""
     resume: bool = False
     """Keep what the JSON already holds."""

@@ -33,7 +33,7 @@ class Export(EnvironmentOptions, Command):
 
     model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
     """An agent: zoo:NAME, model:PATH or the path of a .zip, with ,price=PRICE for one price."""
-    onnx: Annotated[Path, OutputFile()]
+    onnx: Annotated[Path, OutputFile(".onnx")]
     """The file to write."""
     trust: bool = False
     """Run code of files: what they name as module:name, and what model:PATH holds besides data."""

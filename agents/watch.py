@@ -18,12 +18,13 @@ from fusion_gym.core.task import Task
 from fusion_gym.envs.drawing import Frame, Window
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.watching import watch
+from fusion_gym.importing import require
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 
 from .command_line import EnvironmentOptions, Long
 from .input.options import OutputFile, Seed, Whole
-from .output.films import checked_film, save_film
+from .output.films import ENDINGS, save_film
 from .output.progress import progress_bar, writing
 from .training.environment import environment_of
 
@@ -36,7 +37,7 @@ class Watch(EnvironmentOptions, Long):
     """A rule or reference by name, zoo:NAME, model:PATH or module:Class."""
     against: Annotated[str | None, tyro.conf.arg(metavar="NAME[:key=value,…]")] = None
     """Another policy beside it, on the same noise."""
-    save: Annotated[Path | None, OutputFile()] = None
+    save: Annotated[Path | None, OutputFile(*ENDINGS)] = None
     """Write a film, .gif or .mp4, instead of showing a window."""
     seed: Seed = 0
     """Seed of the episode."""
@@ -52,7 +53,7 @@ class Watch(EnvironmentOptions, Long):
             ConfigurationError: anything that is not allowed, before the first step.
         """
         if self.save is not None:
-            checked_film("save", self.save)
+            require("save", "render", "imageio", "imageio_ffmpeg")
         env_id, options, _ = environment_of(self.env, self.config, self.options)
         task = make_task(env_id, **options)
         names = [self.policy] if self.against is None else [self.policy, self.against]

@@ -288,7 +288,7 @@ def covariance(field: str, value: ArrayLike, size: int, *, definite: bool = Fals
         raise refusal(
             field, matrix, f"positive definite (its smallest eigenvalue is {smallest:.3g})"
         )
-    if smallest < -1e-12 * scale:
+    if smallest < -1e-12 * scale or (np.diagonal(matrix) < 0.0).any():
         raise refusal(
             field, matrix, f"positive semi-definite (its smallest eigenvalue is {smallest:.3g})"
         )

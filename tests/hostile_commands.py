@@ -70,6 +70,7 @@ SETTINGS = [
     "horizon=2.5", "horizon=None", "horizon={[]:1}", "horizon=" + "(" * 300, "cost_weight=nan",
     "token_rate=-1", "information=nobody", "access=1", "render_mode=human",
     "self=1", "env=3", "system=code.yaml", "system=itself.yaml", "horizon=1\n", "error=os:nothing",
+    "error=os.path:join",
 ]  # fmt: skip
 WHOLE = ["-1", "0", "nan", "1.5", "many", "9" * 30]
 REAL = ["-1", "0", "2", "nan", "inf", "much"]

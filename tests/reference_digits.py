@@ -117,11 +117,22 @@ def tobit(latent: Any, variance: Any, low: float, high: float) -> tuple[Any, Any
     return q, value, ratio
 
 
-def largest_errors(task: Task, steps: int, runs: int, *, censored: bool) -> tuple[float, float]:
+def after_silence(horizon: int, step: int, sensors: int, runs: int) -> NDArray[np.bool_]:
+    """Requests (sensors, N) of runs that are silent at first, the longer the later; then of one
+    sensor, then of all."""
+    first = (horizon - 3) * np.arange(1, runs + 1) // runs
+    alone = np.arange(sensors)[:, None] == np.arange(runs) % sensors
+    return np.asarray((step > first) | ((step == first) & alone))
+
+
+def largest_errors(
+    task: Task, steps: int, runs: int, *, censored: bool, silent: bool = False
+) -> tuple[float, float]:
     """Of variances, over each state's own, and of means, in deviations, on the same deliveries.
 
-    ``censored`` says whether the task's filter is the Tobit Kalman filter. Variances that float64
-    does not hold in full, below 1e-290, are left out.
+    ``censored`` says whether the task's filter is the Tobit Kalman filter, ``silent`` whether
+    deliveries come after silence. Variances that float64 does not hold in full, below 1e-290, are
+    left out.
     """
     random, batch = np.random.default_rng(0), EpisodeBatch.seeded(task, runs, seed=0)
     system = task.system
@@ -144,7 +155,10 @@ def largest_errors(task: Task, steps: int, runs: int, *, censored: bool) -> tupl
     variance_error = mean_error = mpf(0)
     for step in range(min(steps, task.horizon)):
         measurement = batch.state.measurement
-        outcome = batch.step(request(random, step, task.sensors, runs))
+        requests = request(random, step, task.sensors, runs)
+        if silent:
+            requests = after_silence(task.horizon, step, task.sensors, runs)
+        outcome = batch.step(requests)
         mean, covariance = (exact(value) for value in system.fused(batch.delivered))
         for run, one in enumerate(filters):
             one.step(measurement[..., run], outcome.granted[:, run])

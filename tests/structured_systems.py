@@ -1,11 +1,13 @@
 """Random systems of every family with the structure that breaks estimators, and what a run keeps.
 
 Noise of rank 0 and 1, repeated poles and Jordan blocks, states that nobody sees, decaying, dead and
-growing directions, states of very different scales, sensors of unequal size, long silence.
+growing directions, states of very different scales, starts that are known, sensors of unequal size,
+long silence.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -98,11 +100,20 @@ def draw_plant(
     if growth > 1.0 and random.random() < 0.9:
         horizon = min(horizon, int(np.log(_LARGEST) / np.log(growth)))
     root = random.normal(size=(size, size)) * 0.1
+    own = random.spawn(1)[0]  # the other draws stay as they are
+    unknown = np.ones(size) if own.random() < 0.6 else own.random(size) < own.choice((0.0, 0.5))
+    reached = factor.any(1)
+    for _ in range(size):
+        reached |= (transition != 0.0) @ reached
+    if not (dead and (unknown.any() or reached.any())):  # somebody must be uncertain some time
+        unknown = np.maximum(unknown, ~reached)
+    alone = np.count_nonzero(transition, axis=1) == (np.diagonal(transition) != 0.0)
+    still |= alone & (unknown == 0.0) & ~factor.any(1)
     return Plant(
         transition=transition * scale[:, None] / scale,
         factor=factor * scale[:, None],
         mean=random.choice((0.0, 5.0)) * random.normal(size=size) * scale,
-        start=(root @ root.T + 0.1 * np.eye(size)) * scale[:, None] * scale,
+        start=(root @ root.T + 0.1 * np.eye(size)) * np.outer(unknown * scale, unknown * scale),
         scale=scale,
         horizon=horizon,
         known=tuple(np.flatnonzero(still).tolist()),
@@ -348,7 +359,9 @@ class Survey:
         """Run an episode of the system and note what it breaks."""
         self.drawn += 1
         try:
-            task = make_task(drawn.env_id, **drawn.options)
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", message=".*float64 holds means only")
+                task = make_task(drawn.env_id, **drawn.options)
         except ConfigurationError as error:
             self.refused[reason(str(error))] += 1
             return

@@ -223,7 +223,7 @@ def test_demo_from_training_to_figures(tmp_path: Path, monkeypatch: pytest.Monke
     assert point["mse"]["mean"] == pytest.approx(float(results.mse.mean()))
     # The line through the rules, once more.
     rules = []
-    for vertex in learner.setup.envelope(remembering)["vertices"]:
+    for vertex in learner.envelope("with")["vertices"]:
         task = fusion_gym.make_task(ENV, **report["options"], **vertex["options"])
         brought = run_episodes(task, make_policy(vertex["policy"], task), 2, 0)
         rules.append((float(brought.rate.mean()), float(brought.mse.mean())))
@@ -241,14 +241,13 @@ def test_demo_from_training_to_figures(tmp_path: Path, monkeypatch: pytest.Monke
 def test_the_demo_trains_in_the_setting_of_its_rules(tmp_path: Path) -> None:
     """What differs from the environment of the rules with memory is the price, which is drawn."""
     for learner in demo.learners_of(tmp_path, 1, None):
-        setup = learner.setup
-        plain, remembering = (setup.envelope(name) for name in learner.classes.values())
+        plain, remembering = (learner.envelope(which) for which in learner.classes)
         assert (plain["memory"], remembering["memory"]) == (False, True)
         assert plain["mode"] == remembering["mode"]
         environment = learner.experiment.environment
         assert (environment.id, environment.local) == (ENV, plain["mode"] == "local")
-        price = {"cost_weight": "random", "price_range": setup.setting.price_range}
-        rules = setup.setting.environment.options | remembering["options"]
+        price = {"cost_weight": "random", "price_range": learner.setting.price_range}
+        rules = learner.setting.environment.options | remembering["options"]
         assert json.dumps(environment.options, sort_keys=True) == json.dumps(
             rules | price, sort_keys=True
         )

@@ -32,7 +32,6 @@ from fusion_gym.agents.output.markup import code, page_of
 from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
 from fusion_gym.core.system import covers
-from fusion_gym.deprecation import replace_value
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
@@ -151,10 +150,8 @@ def test_envelopes_hold_rules_that_know_no_more_than_their_class(path: Path) -> 
             if key not in tasks:
                 env = stored["env"].replace("-v0", "-v1")  # measured in an earlier version
                 tasks[key] = fusion_gym.make_task(env, **(stored["options"] | vertex["options"]))
-            assert make_policy(vertex["policy"], tasks[key]).knowledge == replace_value(
-                vertex["knows"]
-            )
-            assert covers(replace_value(content["knows"]), replace_value(vertex["knows"]))
+            assert make_policy(vertex["policy"], tasks[key]).knowledge == vertex["knows"]
+            assert covers(content["knows"], vertex["knows"])
 
 
 def test_trainings_of_the_committed_suite(tmp_path: Path) -> None:

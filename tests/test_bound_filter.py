@@ -26,7 +26,9 @@ from reference_tobit import (
 )
 from scipy import stats
 
+import fusion_gym
 from fusion_gym import ConfigurationError
+from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.systems.tobit.bound_filter import BoundConstants, EventError
 from fusion_gym.systems.tobit.sensors import CensoredSensors
 
@@ -250,3 +252,21 @@ def test_holding_needs_independent_rows() -> None:
     with pytest.raises(ConfigurationError, match=r"measurement_matrices with row ranks \[1\]"):
         make_bound_filter(sensors, hold=True)
     assert make_bound_filter(sensors, hold=False).sensors is sensors
+
+
+@pytest.mark.parametrize("kind", ["kalman", "tobit", "adf", "stochastic"])
+def test_other_filters_take_two_equal_rows_for_one_of_half_the_variance(kind: str) -> None:
+    weight = {"stochastic_weight": 1.0} if kind == "stochastic" else {}
+    free = weight | {"filter": kind, "censoring_threshold": -np.inf}
+    covariances = []
+    for channels in (1, 2):
+        rows, variance = [[[1.0, 0.0]] * channels], 0.5 * channels
+        options = free | {"measurement_matrices": rows, "measurement_variance": variance}
+        task = fusion_gym.make_task("fusion_gym/TobitOscillator-v1", **options)
+        batch = EpisodeBatch.seeded(task, 1, seed=0)
+        for _ in range(9):
+            batch.step(np.ones((1, 1), dtype=np.bool_))
+        covariances.append(task.system.fused(batch.delivered)[1])
+    np.testing.assert_allclose(*covariances, rtol=1e-12)
+    with pytest.raises(ConfigurationError, match="row ranks"):
+        fusion_gym.make_task("fusion_gym/TobitOscillator-v1", measurement_matrices=rows)

@@ -64,6 +64,19 @@ def test_all_that_is_not_allowed_is_reported_in_one_line(here: Path) -> None:
     assert {str(item): message for item in tries() if (message := flaw(item, here))} == {}
 
 
+def test_no_output_replaces_an_input(here: Path) -> None:
+    config = "id: fusion_gym/RemoteEstimation-v1\n"
+    for name, message in (
+        ("config.yaml", "it must be a file that ends with .json"),
+        ("config.json", "it must be another file than that of config"),
+    ):
+        Path(name).write_text(config)
+        error = refusal("evaluate", ["--config", name, "--policies", "always", "--json", name])
+        assert error == f"error: json = {name!r} is not allowed: {message}"
+        assert Path(name).read_text() == config
+    assert "ends with .onnx" in refusal("export", ["zoo:nobody", "--onnx", "config.yaml"])
+
+
 def test_a_full_disk_in_a_training_is_reported(here: Path) -> None:
     """The config fits, the first model does not."""
     error = refusal("train", line("train", BASES["train"]), limit=2_000)

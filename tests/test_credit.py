@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 
 import fusion_gym
@@ -12,16 +13,25 @@ from fusion_gym.envs.privileged import PrivilegedVecEnv
 ENV = "fusion_gym/TobitOscillator-v1"
 
 
-def env_of(runs: int = 5, **options: Any) -> PrivilegedVecEnv:
-    return PrivilegedVecEnv(fusion_gym.make_task(ENV, filter="tobit", **options), runs)
+def env_of(runs: int = 5, local: bool = False, **options: Any) -> PrivilegedVecEnv:
+    return PrivilegedVecEnv(fusion_gym.make_task(ENV, filter="tobit", **options), runs, local=local)
 
 
-def test_the_surrogate_is_clipped_from_below() -> None:
-    """min(ρ A, clip(ρ) A) (Schulman et al. 2017), of alternatives and of what came later."""
-    env = env_of()
-    model = CounterfactualPPO("MlpPolicy", env, ent_coef=0.0, vf_coef=0.0, batch_size=30)
+@pytest.mark.parametrize("kind", ["all", "flips", "local"])
+def test_the_surrogate_is_clipped_from_below(kind: Any) -> None:
+    """min(ρ A, clip(ρ) A) (Schulman et al. 2017), of alternatives and of what came later.
+
+    What came later is weighed with the whole action's ratio, the product of its factors', or
+    where sensors decide by themselves with each sensor's own.
+    """
+    env = env_of(local=kind == "local")
+    model = CounterfactualPPO(
+        *("MlpPolicy", env), ent_coef=0.0, vf_coef=0.0, batch_size=30,
+        alternatives=None if kind == "local" else kind,
+    )  # fmt: skip
     generator = torch.Generator().manual_seed(3)
-    observations = torch.randn((6, *env.observation_space.shape), generator=generator)  # type: ignore[misc]
+    rows = (6, 3) if kind == "local" else (6,)
+    observations = torch.randn((*rows, *env.observation_space.shape), generator=generator)  # type: ignore[misc]
     decisions = model._decisions
     new = decisions.log_probabilities(model._logits(observations, None)).detach()
     old = (new + torch.randn(new.shape, generator=generator)).log_softmax(-1)
@@ -38,7 +48,8 @@ def test_the_surrogate_is_clipped_from_below() -> None:
 
     ratio, taken = (new - old).exp().numpy(), (new - old).gather(-1, choice[..., None])
     gain = (old.exp().numpy() * clipped(ratio, advantages.numpy())).sum((-1, -2))
-    late = clipped(taken.sum((-1, -2)).exp().numpy(), surplus.numpy())
+    change = taken[..., 0] if kind == "local" else taken.sum((-1, -2))[:, None]
+    late = clipped(change.exp().numpy(), surplus.numpy()[:, None]).sum(-1)
     np.testing.assert_allclose(float(loss.detach()), -(gain + late).mean(), rtol=1e-4)
 
 

@@ -13,10 +13,8 @@ from page_blocks import blocks_of, imported
 import fusion_gym
 from fusion_gym.agents.experiments.config import load_suite
 from fusion_gym.agents.experiments.figures import report_text
-from fusion_gym.agents.experiments.learning import read_learning
 from fusion_gym.agents.experiments.report import (
     envelopes_text,
-    learning_text,
     read_results,
     robustness_text,
     update_pages,
@@ -111,12 +109,9 @@ def test_files_and_names_of_the_library_that_the_texts_name_exist() -> None:
 def test_the_committed_pages_say_what_the_results_say() -> None:
     results = ROOT / "results"
     settings, cases = read_results(results), read_cases(results, list(TITLES))
-    learned = [results / "learning" / name for name in TITLES]
-    courses = [read_learning(path) for path in learned if (path / "learning.csv").exists()]
     for folder, text in {
         ".": report_text(settings),
         "envelopes": envelopes_text(results),
-        "learning": learning_text(courses),
         "robustness": robustness_text(cases, TITLES),
     }.items():
         assert (results / folder / "README.md").read_text() == text, folder

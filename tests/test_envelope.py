@@ -22,7 +22,6 @@ from fusion_gym.agents.experiments.tuning import (
     search_family,
 )
 from fusion_gym.core.system import covers
-from fusion_gym.deprecation import replace_value
 from fusion_gym.evaluation.beside import run_beside
 from fusion_gym.evaluation.envelope import EnvelopePoint, lower_hull
 from fusion_gym.evaluation.episodes import run_episodes
@@ -143,9 +142,7 @@ def test_envelopes_are_committed_and_kept(tmp_path: Path) -> None:
         ]
         assert tuned[name] == lower_hull(tuned[name]), "chosen on the tuning seeds"
         assert len(content["searches"]) == 2
-        assert all(
-            covers(replace_value(content["knows"]), replace_value(v["knows"])) for v in listed
-        )
+        assert all(covers(content["knows"], v["knows"]) for v in listed)
         if not content["memory"]:
             assert not any("memory" in v["options"] for v in listed)
     # On the tuning seeds no class is worse than one that it contains.

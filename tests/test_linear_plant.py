@@ -131,7 +131,7 @@ def test_open_loop_is_what_simulation_gives() -> None:
         ({"transition": [[1.0, 0.0]]}, "transition", "shape"),
         ({"process_covariance": [[1.0, 0.5], [0.0, 1.0]]}, "process_covariance", "symmetric"),
         ({"process_covariance": [[1.0, 2.0], [2.0, 1.0]]}, "process_covariance", "semi-definite"),
-        ({"initial_covariance": [[1.0, 1.0], [1.0, 1.0]]}, "initial_covariance", "definite"),
+        ({"initial_covariance": [[1.0, 1.1], [1.1, 1.0]]}, "initial_covariance", "semi-definite"),
     ],
 )
 def test_bad_matrices_are_refused(change: dict[str, Any], field: str, reason: str) -> None:

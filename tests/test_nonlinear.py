@@ -111,6 +111,20 @@ def test_a_linear_case_is_filterpys(linear: Any) -> None:
         np.testing.assert_allclose(covariance[..., 0], beside.P, atol=1e-12)
 
 
+def test_a_known_start_is_the_limit_of_uncertain_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    results = []
+    for start in (0.0, 1e-12):
+        monkeypatch.setitem(globals(), "START", start * np.eye(2))
+        system = Linear()
+        noise = np.random.default_rng(0).standard_normal((6, 6, 3))
+        state = system.start(noise[0, :4])
+        assert (state.covariance == start * np.eye(2)[..., None]).all()
+        for step in noise[1:]:
+            state = system.deliver(system.sense(state, step[:4]), step[4:] > 0.0)
+        results.append(np.concatenate([state.mean, state.covariance.reshape(4, 3)]))
+    np.testing.assert_allclose(*results, rtol=1e-4, atol=1e-5)
+
+
 def test_open_loop_by_simulation(linear: Any) -> None:
     plant = LinearPlant.create(A, W, MEAN, START)
     # A mean of squares over 1,000 correlated runs: about 1/√500 of it.

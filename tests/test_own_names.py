@@ -178,6 +178,10 @@ def test_an_error_of_ones_own(own: Path) -> None:
         (lambda task: make_policy("own_names:Oldest:step=5", task), "did you mean 'steps'"),
         (lambda task: fusion_gym.make_task(TOBIT, error="own_names:wrong"), "of shape"),
         (lambda task: fusion_gym.make_task(TOBIT, error="own_names:below"), ">= 0"),
+        *(
+            (lambda task, name=name: fusion_gym.make_task(TOBIT, error=name), f"error = '{name}'")
+            for name in ("os.path:join", "math:sqrt", "json:loads", "own_names:wrong")
+        ),
     ],
 )
 def test_what_cannot_be_had_is_reported_in_one_line(own: Path, make: Any, message: str) -> None:

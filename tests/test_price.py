@@ -124,8 +124,8 @@ KINDS = "it must be one of 'squared', 'trace', 'maximum', a function, or 'module
      "error = 'test_price:<lambda>' is not allowed: of errors (2, 3) it must return numbers "
      ">= 0 of shape (3,), and returned [-1.0, -1.0, -1.0] of shape (3,)"),
     ({"error": "os:system"},
-     "error = 'posix:system' is not allowed: it must take errors (n, N) and covariances (n, n, N), "
-     "and return numbers: system() takes at most 1 argument (2 given)"),
+     "error = 'os:system' is not allowed: it must take errors (n, N) and covariances (n, n, N), "
+     "and return numbers >= 0 (N,) (TypeError: system() takes at most 1 argument (2 given))"),
 ])  # fmt: skip
 def test_a_reward_that_cannot_be_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError) as caught:

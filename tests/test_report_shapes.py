@@ -26,6 +26,7 @@ from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 
 ABSENT = "ABSENT"
+ROOT = Path(__file__).parents[1]
 REPORT = ["--parts", "report", "--results"]
 
 
@@ -61,6 +62,27 @@ def test_results_of_another_shape(
     assert contents(setting) == before
     assert error.startswith("error: results = ")
     assert message in error
+
+
+@pytest.mark.parametrize(
+    "table", ["envelope", "equal_rates", "fronts", "points", "policies", "runs", "verdict"]
+)
+def test_a_table_of_results_without_rows_is_refused(tmp_path: Path, table: str) -> None:
+    file = small_results(tmp_path) / f"{table}.csv"
+    file.write_text(file.read_text().splitlines()[0] + "\n")
+    error = refusal("benchmark", [*REPORT, str(tmp_path)])
+    assert error.startswith("error: results = ")
+    assert "rows" in error
+    if table != "fronts":
+        assert str(file) in error
+
+
+@pytest.mark.parametrize("table", ["classes", "robustness", "rollout", "setting", "vertices"])
+def test_a_committed_table_without_rows_is_refused(tmp_path: Path, table: str) -> None:
+    shutil.copytree(ROOT / "results" / SETTING, tmp_path / SETTING)
+    file = tmp_path / SETTING / f"{table}.csv"
+    file.write_text(file.read_text().splitlines()[0] + "\n")
+    assert f"{str(file)!r} has no rows" in refusal("benchmark", [*REPORT, str(tmp_path)])
 
 
 def test_json_of_an_earlier_version_is_refused(tmp_path: Path) -> None:

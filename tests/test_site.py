@@ -33,14 +33,14 @@ def test_links_lead_to_what_there_is() -> None:
     text = (
         "[a](step.md) [b](../results/README.md#overview) [c](../fusion_gym/linalg.py) "
         "[d](../nowhere.md) [e](https://example.org) ![f](../results/overview.png) "
-        "[g](../results/learning)"
+        "[g](../results/robustness)"
     )
     changed = places.with_links(text, "docs/use.md", "use.md")
     assert changed == (
         "[a](step.md) [b](results/report.md#overview) "
         f"[c]({places.REPOSITORY}/blob/main/fusion_gym/linalg.py) [d](../nowhere.md) "
         "[e](https://example.org) ![f](results/overview.png) "
-        f"[g]({places.REPOSITORY}/tree/main/results/learning)"
+        f"[g]({places.REPOSITORY}/tree/main/results/robustness)"
     )
     assert places.with_links("[a](biased.md)", "docs/use.md", "x/y.md") == "[a](../biased.md)"
 

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 import fusion_gym
+from fusion_gym.core.memory import Memory
 from fusion_gym.core.options import CommonOptions, Scenario
-from fusion_gym.core.system import CAPABILITIES, System
+from fusion_gym.core.system import CAPABILITIES, Block, Signal, System
 from fusion_gym.core.task import Task
 from fusion_gym.systems.nonlinear import NonlinearSystem
+from fusion_gym.validation import ConfigurationError
 
 IMAGINED = {"imagine", "imagination_channels"}
 OFFERED: list[tuple[str, dict[str, Any], set[str]]] = [
@@ -63,3 +65,20 @@ def test_a_task_takes_systems_of_the_base_class_only() -> None:
     system: Any = object()
     with pytest.raises(fusion_gym.ConfigurationError, match="system = "):
         Task.create(Scenario(CommonOptions(), system))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Signal("x", "coordinator", "(N)", "x"), "knowledge = 'coordinator' is not"),  # type: ignore[arg-type]
+        (lambda: Block("x", "x", np.copy, knowledge="coordinator"), "knowledge = 'coordinator'"),  # type: ignore[arg-type]
+        (lambda: Block("x", "x", np.copy, node="told"), "node = 'told' is not allowed: it must be"),  # type: ignore[arg-type]
+        (
+            lambda: Memory(fusion_gym.make_task("fusion_gym/LinearFusion-v2"), "coordinator"),
+            "owner = 'coordinator' is not allowed",
+        ),  # type: ignore[arg-type]
+    ],
+)
+def test_an_unknown_class_or_owner_is_refused(make: Any, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        make()

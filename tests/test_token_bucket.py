@@ -172,11 +172,33 @@ def test_round_robin_access_resonates_where_grants_differ(
     assert bucket.resonates == (np.ptp(grants) > 3)
 
 
+@given(
+    costs=st.lists(eighths, min_size=2, max_size=5),
+    rate=eighths,
+    sharing=st.sampled_from(SHARING_RULES),
+)
+def test_no_turn_is_lost_in_the_end_unless_cheaper_sensors_are_favoured(
+    costs: list[float], rate: float, sharing: str
+) -> None:
+    sensors = len(costs)
+    bucket = TokenBucket.create(rate, sensors * max(costs), 0.0, costs, sensors, sharing)
+    tokens, grants, rounds = bucket.start(1), np.zeros(sensors), 4 * sensors + 4
+    for step in range(rounds * sensors):
+        request = (np.arange(sensors) == step % sensors)[:, None]
+        granted, _, tokens, _ = bucket.grant(tokens, request, np.full(1, step))
+        grants += granted[:, 0] * (step >= rounds * sensors // 2)
+    if min(costs) < max(costs):
+        assert bucket.favours_cheaper or (grants == rounds // 2).all()
+    assert not (bucket.favours_cheaper and rate >= max(costs))
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"token_capacity": 8.0, "initial_tokens": 1.0, "sharing": "turns"}, "below 9, the cost"),
         ({"access": "round_robin", "token_rate": 1.0}, "some of the 3 sensors more often"),
+        ({"access": "round_robin", "token_rate": 1.0, "token_cost": [1, 3, 3]}, "dearer sensors"),
+        ({"access": "random", "token_rate": 1.0, "token_cost": [1, 3, 3]}, "dearer sensors"),
     ],
 )
 def test_a_bucket_that_favours_sensors_is_warned_of(options: dict[str, Any], message: str) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from fusion_gym import linalg
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.system import Signals
@@ -20,6 +21,7 @@ TOBIT = "fusion_gym/TobitOscillator-v1"
 BIASED = "fusion_gym/BiasedOscillator-v1"
 CORRELATED = "fusion_gym/CorrelatedTracking-v1"
 JUMP = "fusion_gym/MarkovJumpTracking-v1"
+LINEAR = "fusion_gym/LinearFusion-v2"
 INPUT = "fusion_gym/UnknownInput-v1"
 REMOTE = "fusion_gym/RemoteEstimation-v1"
 RUNS = 40_000
@@ -98,6 +100,19 @@ def test_truth_and_measurements_change_in_proportion(env_id: str, option: str) -
 
 
 class TestNoise:
+    @pytest.mark.parametrize("factor", [0.5, 2.0])
+    @pytest.mark.parametrize("env_id", [TOBIT, BIASED, LINEAR])
+    def test_the_free_first_measurement_has_the_true_noise(
+        self, env_id: str, factor: float
+    ) -> None:
+        upper = {} if env_id == TOBIT else {"censoring_upper": np.inf}
+        free = {"censoring_threshold": -np.inf, **upper}
+        task, states = sensed(env_id, steps=0, true_measurement_noise=factor, **free)
+        sensors = task.system.centre.sensors
+        latent = linalg.matvec(sensors.measurement_matrix, states[0].truth)
+        noise = (states[0].measurement - latent) / sensors.deviation
+        assert close_variance(noise, factor**2)
+
     def test_shared_noise_multiplies_the_scale(self) -> None:
         """In correlated tracking the sensors' noise has a part of the plant's, which grows too."""
         _, states = sensed(

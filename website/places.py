@@ -12,7 +12,6 @@ REPOSITORY = "https://github.com/fusion-gym/fusion-gym"
 PAGES = {
     "results/README.md": "results/report.md",
     "results/envelopes/README.md": "results/envelopes.md",
-    "results/learning/README.md": "results/learning.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
 }

@@ -1,4 +1,4 @@
-"""The one description of the experiments: settings, rules, agents, cases and courses."""
+"""The one description of the experiments: settings, rules, agents, and cases."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fusion_gym.core.reward import Price
 from fusion_gym.envs.registration import make_task
 from fusion_gym.validation import ConfigurationError
 
-from ..training.algorithms import AlgorithmConfig, AnyAlgorithm, PPOConfig, settings
+from ..training.algorithms import AlgorithmConfig, AnyAlgorithm, settings
 from ..training.checked import Positive, Rate, Share, Strict, parse, read_yaml
 from ..training.config import EnvironmentConfig
 
@@ -106,78 +106,6 @@ class Case(Strict):
 NOMINAL = Case(name="as_assumed", title="as assumed")  # the case without a perturbation
 
 
-class Plain(Strict):
-    """Plain PPO without memory in the suite's settings, for comparison.
-
-    It ends below the memoryless envelope, or after ``budget`` times the processor seconds that the
-    fronts' trainings took.
-    """
-
-    every: Positive = 100_000
-    seeds: Positive = 2
-    budget: Rate = 3.0
-    timesteps: Positive = 3_200_000
-    num_envs: Positive = 256
-    algorithm: AnyAlgorithm = PPOConfig(name="ppo")
-
-
-class Learning(Strict):
-    """How learning is measured: at ``prices`` prices, ``every`` so many steps.
-
-    A measurement has ``episodes`` episodes at each price. A finished front is judged in the
-    ``inner`` part of the range of prices, in the logarithm. ``timesteps`` replaces those of the
-    fronts' configs.
-    """
-
-    prices: Positive = 7
-    inner: tuple[Share, Share] = (0.05, 0.95)
-    every: Positive = 50_000
-    episodes: Positive = 128
-    timesteps: Positive | None = None
-    plain: Plain = Plain()
-
-    def algorithm_of(self, course: Course) -> AlgorithmConfig:
-        """Return plain PPO's hyper-parameters in a setting, checked again.
-
-        Raises:
-            ValueError: a hyper-parameter that is unknown or not allowed.
-        """
-        return settings(self.plain.algorithm.model_dump() | course.plain.algorithm)
-
-
-class PlainChanges(Strict):
-    """What is other in a setting; ``longer`` multiplies the length."""
-
-    longer: Longer = 1.0
-    algorithm: dict[str, Any] = pydantic.Field(default_factory=dict)
-
-
-SOLVED = ("optimum", "schedules")  # what fronts are compared with by costs
-
-
-class Course(Strict):
-    """A front to train in a setting, and what it is compared with.
-
-    ``front`` is the training's config, ``memoryless`` the class of the committed envelope to get
-    below while learning. The finished front is compared with ``against``: a class of the committed
-    envelope, the ``optimum`` at each price, or the best of ``schedules`` there; a share of
-    ``allowed`` above it is still good.
-    """
-
-    front: str
-    memoryless: str | None = None
-    against: str
-    schedules: tuple[str, ...] = ()
-    allowed: Rate = 0.01
-    plain: PlainChanges = PlainChanges()
-
-    @pydantic.model_validator(mode="after")
-    def _scheduled(self) -> Course:
-        if (self.against == "schedules") != bool(self.schedules):
-            raise ValueError("schedules and against: schedules stand together")
-        return self
-
-
 class Setting(Strict):
     """One environment in one setting; ``families`` are labels, all of them by default.
 
@@ -195,8 +123,7 @@ class Setting(Strict):
     about how many steps a second they train, for the time that is told to remain.
 
     ``cases`` are perturbed cases: names of the suite's, or cases of its own. ``drawn`` are options
-    that agents trained over draws have: pairs, drawn anew in every episode. ``course`` is what
-    learns there.
+    that agents trained over draws have: pairs, drawn anew in every episode.
     """
 
     name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
@@ -226,7 +153,6 @@ class Setting(Strict):
     hindsight: Hindsight | None = None
     cases: tuple[str | Case, ...] = ()
     drawn: dict[str, Any] = pydantic.Field(default_factory=dict)
-    course: Course | None = None
 
     def with_options(self, options: dict[str, Any]) -> Setting:
         """Return the setting with these options of the environment in the place of its own."""
@@ -257,7 +183,6 @@ class Suite(Strict):
     algorithms: dict[Mode, dict[str, Any]] = pydantic.Field(default_factory=dict)
     families: tuple[Family, ...]
     cases: tuple[Case, ...] = ()
-    learning: Learning = Learning()
     quick: dict[str, Any] = pydantic.Field(default_factory=dict)
     settings: tuple[Setting, ...]
 
@@ -319,8 +244,6 @@ class Suite(Strict):
                 self.algorithm_of(setting, mode)
             self.tuning_of(setting)
             self.cases_of(setting)
-            if setting.course is not None:
-                self.learning.algorithm_of(setting.course)
             for name in setting.families or ():
                 if name not in labels:
                     raise ValueError(f"families of {setting.name}: {name!r} is none of {labels}")

@@ -13,13 +13,11 @@ from ..output.markup import page_of
 from ..output.overview_figure import Dot, OverviewRow
 from ..output.pareto_figure import Differences, Limits, Panel, Series
 from .envelopes import at_least, rollout_of
-from .learning import read_learning
 from .report import (
     KNOWING,
     SettingResults,
     envelopes_text,
     kind_of,
-    learning_text,
     read_results,
     robustness_text,
     text_of,
@@ -49,9 +47,6 @@ def write_report(results: Path, titles: Mapping[str, str], pages: Mapping[Path, 
         texts[results / "envelopes"] = envelopes_text(results)
     if cases := read_cases(results, list(titles)):
         texts[results / "robustness"] = robustness_text(cases, titles)
-    learned = [results / "learning" / name for name in titles]
-    if courses := [read_learning(path) for path in learned if (path / "learning.csv").exists()]:
-        texts[results / "learning"] = learning_text(courses)
     if pages or not texts or any(results.glob("*/verdict.*")):
         settings = read_results(results)
         updated = {

@@ -18,7 +18,7 @@ from fusion_gym.evaluation.envelope import EnvelopePoint, height
 from fusion_gym.validation import ConfigurationError, choice
 
 from ..output.markup import NONE, code, markup_number, plain_text, ranged, share
-from .config import NOMINAL, SOLVED
+from .config import NOMINAL
 from .envelopes import at_least, bound_of, hull_of, path_of, read_envelopes, rollout_of
 from .tables import VERDICT, Row, group_by, read_rows
 from .verdict import MIDDLE, RATES, SHARES, is_gain, read_cases
@@ -78,7 +78,7 @@ class SettingResults:
     def verdict(self) -> Row:
         """The setting itself."""
         rows = read_rows(self.folder, VERDICT)
-        if len(rows) != 1 or rows[0]["always"] <= 0.0:
+        if len(rows) > 1 or rows[0]["always"] <= 0.0:
             path = str(self.folder / f"{VERDICT}.csv")
             raise ConfigurationError(
                 f"results = {path!r}: always = {[row['always'] for row in rows]} is not allowed: "
@@ -91,11 +91,17 @@ class SettingResults:
         """The classes with agents, each with its ``points``, errors ``at`` rates and envelope."""
         parts = {"points": "points", "at": "equal_rates", "envelope": "envelope"}
         tables = {part: group_by(read_rows(self.folder, t), "class") for part, t in parts.items()}
+        fronts = {row.pop("class"): row for row in read_rows(self.folder, "fronts")}
+        for part, table in parts.items():
+            if differing := sorted(fronts.keys() ^ tables[part].keys()):
+                path = str(self.folder / f"{table}.csv")
+                raise ConfigurationError(
+                    f"results = {path!r} is not allowed: it must have rows of the same classes as "
+                    f"fronts.csv, and not differ in {differing[0]!r}"
+                )
         return {
-            (name := row.pop("class")): {"broadcast": None}
-            | row
-            | {part: every.get(name, []) for part, every in tables.items()}
-            for row in read_rows(self.folder, "fronts")
+            name: {"broadcast": None} | row | {part: every[name] for part, every in tables.items()}
+            for name, row in fronts.items()
         }
 
     @cached_property
@@ -441,14 +447,6 @@ def envelopes_text(results: Path) -> str:
     folders = [path.parent for path in sorted(results.glob("*/classes.csv"))]
     settings = {folder: read_envelopes(folder) for folder in folders}
     return _render("envelopes.md", settings=settings, shares=SHARES)
-
-
-# How fast agents learn.
-
-
-def learning_text(courses: Sequence[Row]) -> str:
-    """Return the page of how fast agents learn."""
-    return _render("learning.md", courses=courses, SOLVED=SOLVED)
 
 
 # The quick benchmark beside the full one.

@@ -25,6 +25,11 @@ from ..output.files import replacing
 
 Row = dict[str, Any]
 VERDICT = "verdict"  # the table of a setting that is written last
+# Whoever writes these has a row for them.
+_NEVER_EMPTY = (
+    *("setting", "classes", "vertices", "runs", "policies", VERDICT, "bounds", "rollout"),
+    *("robustness", "robustness_points"),
+)
 _ENDS = {"mean": "", "low": "_low", "high": "_high"}  # of an interval's columns
 
 
@@ -110,8 +115,8 @@ def read_rows(folder: Path, table: str, option: str = "results") -> list[Row]:
     """Return a table's rows, intervals and JSON as values, without what is empty.
 
     Raises:
-        ConfigurationError: it cannot be read, or a column or cell is not what the table has; names
-            ``option``, the file, the column and the cell.
+        ConfigurationError: it cannot be read, has no rows where it needs some, or a column or cell
+            is not what the table has; names ``option``, the file, the column and the cell.
     """
     path, columns = folder / f"{table}.csv", TABLES[table]
     source = f"{option} = {str(path)!r}"
@@ -126,6 +131,8 @@ def read_rows(folder: Path, table: str, option: str = "results") -> list[Row]:
         raise ConfigurationError(
             f"{source} has other columns than the table {table!r}: {display(differing[0])}"
         )
+    if table in _NEVER_EMPTY and not cells:
+        raise ConfigurationError(f"{source} has no rows: it must have at least one below its head")
     rows = []
     for line in cells:
         filled = {name: cell for name, cell in zip(header, line, strict=True) if cell}

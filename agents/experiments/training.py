@@ -12,7 +12,6 @@ import torch
 
 from fusion_gym.core.system import least_covering
 from fusion_gym.core.task import Task
-from fusion_gym.deprecation import replace_value
 from fusion_gym.evaluation.envelope import points_of
 from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.hindsight import run_hindsight
@@ -346,7 +345,7 @@ def policies_of(work: SettingWork, runs: Sequence[BenchmarkRun]) -> list[Row]:
     task, vertices, genie = envelope_task(work.setting), work.vertices, work.setting.genie
     families: dict[str, Row] = {}
     for vertex in vertices:
-        own = [replace_value(v["knows"]) for v in vertices if v["family"] == vertex["family"]]
+        own = [v["knows"] for v in vertices if v["family"] == vertex["family"]]
         if vertex["family"] not in work.setting.points:
             families[vertex["name"]] = {"family": vertex["family"], "knows": least_covering(own)}
     for name in work.setting.points:

@@ -197,17 +197,6 @@ def interval(front: AgentFront, grid: Array) -> dict[str, float]:
     return {"mean": mean, "low": float(low), "high": float(high)}
 
 
-def excess(returns: Array, best: Array) -> dict[str, float]:
-    """The cost above the optimum's, as a share of it, with its paired 95 % interval.
-
-    Of the returns (E,) of a policy and of the optimum on the same episodes.
-    """
-    optimum = -float(best.mean())
-    return {
-        name: value / optimum for name, value in mean_interval(best - returns)._asdict().items()
-    }
-
-
 SHARES = (0.05, 0.1, 0.2, 0.4)  # of the rate that transmitting always gets
 
 

@@ -1,7 +1,7 @@
 """What an option may be: marks in the types of a command's fields, checked before anything runs.
 
     episodes: Annotated[int, Whole(at_least=1)] = 1000
-    json: Annotated[Path | None, OutputFile()] = None
+    json: Annotated[Path | None, OutputFile(".json")] = None
 
 ``None`` stands for an option that is not given; of a list every entry is checked.
 """
@@ -73,11 +73,18 @@ class OutputFolder(Mark):
 
 
 class OutputFile(Mark):
-    """A file that can be replaced, or made."""
+    """A file that can be replaced, or made; its ending says that it holds what is written."""
+
+    def __init__(self, *endings: str) -> None:
+        self.endings = endings
 
     def check(self, option: str, value: Any) -> None:
-        """Try its folder out, and leave nothing behind."""
-        writable_file(option, Path(value))
+        """Look at its ending, unless it is a device; try its folder out, and leave nothing."""
+        path = Path(value)
+        device = os.path.exists(path) and not os.path.isfile(path)  # false where it cannot be seen
+        if path.suffix.lower() not in self.endings and not device:
+            raise refusal(option, str(path), f"a file that ends with {' or '.join(self.endings)}")
+        writable_file(option, path)
 
 
 # Beyond these numbers nothing ends, or finds room.
@@ -101,6 +108,17 @@ def check_options(values: Any) -> None:
             if isinstance(mark, Mark) and value is not None:
                 for entry in value if isinstance(value, tuple) else (value,):
                     mark.check(field.name, entry)
+            if isinstance(mark, OutputFile) and value is not None:
+                _refuse_input(values, field.name, value)
+
+
+def _refuse_input(values: Any, option: str, path: Path) -> None:
+    """Refuse to replace a file that another option names."""
+    for name in {field.name for field in fields(values)} - {option}:
+        other = getattr(values, name)
+        named = isinstance(other, str | Path) and os.path.exists(other) and os.path.exists(path)
+        if named and path.samefile(other):
+            raise refusal(option, str(path), f"another file than that of {name}")
 
 
 def writable_folder(option: str, folder: Path) -> None:

@@ -53,7 +53,7 @@ class Bound(Long):
     """Episodes in which everything is delivered."""
     seed: Seed = 0
     """Seed of the first episode."""
-    json: Annotated[Path | None, OutputFile()] = None
+    json: Annotated[Path | None, OutputFile(".json")] = None
     """Write the results to this file."""
     tables: Annotated[Path | None, OutputFolder()] = None
     """Write the bound at the rates as bounds.csv and bounds_at.csv into this setting's folder."""

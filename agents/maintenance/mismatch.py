@@ -42,7 +42,7 @@ class Mismatch(EnvironmentOptions, Long):
     """Episodes of each policy."""
     seed: Seed = 0
     """Seed of the first episode."""
-    json: Annotated[Path | None, OutputFile()] = None
+    json: Annotated[Path | None, OutputFile(".json")] = None
     """Write the results to this file."""
 
     keeps = False

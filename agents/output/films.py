@@ -8,25 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from fusion_gym.envs.drawing import Frame
-from fusion_gym.importing import require
-from fusion_gym.validation import ConfigurationError
 
 from .files import replacing
 
 ENDINGS = (".gif", ".mp4")
-
-
-def checked_film(option: str, path: Path) -> None:
-    """Whether a film can be written under this name.
-
-    Raises:
-        ConfigurationError: another ending, or what writes films is absent.
-    """
-    if path.suffix.lower() not in ENDINGS:
-        raise ConfigurationError(
-            f"{option} = {str(path)!r} is not allowed: it must end with {' or '.join(ENDINGS)}"
-        )
-    require(option, "render", "imageio", "imageio_ffmpeg")
 
 
 def save_film(frames: Iterable[Frame], path: Path, fps: int) -> None:

@@ -14,7 +14,6 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
@@ -30,9 +29,6 @@ from .checkpoint import Journal
 from .config import Experiment
 from .constraint import rate_score
 from .diagnosis import by_price, prices_of
-
-# Handed the model and the processor's seconds of its training; more for a validation's record.
-Measure = Callable[[BaseAlgorithm, float], dict[str, Any]]
 
 
 class Interrupt:
@@ -77,10 +73,9 @@ class Progress(Callback):
         bar: Bar,
         journal: Journal,
         watch: Callable[[dict[str, Any]], bool] | None = None,
-        measure: Measure | None = None,
     ) -> None:
         super().__init__()
-        self.watch, self.stopped, self.measure = watch, False, measure
+        self.watch, self.stopped = watch, False
         self.experiment, self.folder, self.task = experiment, folder, task
         self.interrupt, self.bar, self.journal = interrupt, bar, journal
         self.target = experiment.training.target_rate
@@ -156,8 +151,6 @@ class Progress(Callback):
             "mse": float(results.mse.mean()),
             "rate": float(results.rate.mean()),
         }
-        if self.measure is not None:
-            record |= self.measure(self.model, self.journal.cpu_seconds)
         parts = by_price(self.task, self.prices, results)
         if parts:
             record["prices"] = parts
@@ -171,6 +164,7 @@ class Progress(Callback):
         self._write_records()
         for key in ("return", "mse", "rate"):
             self.logger.record(f"validation/{key}", record[key])
+        self.logger.record("validation/cpu_seconds", self.journal.cpu_seconds)
         for part in parts:
             where = f"price_{part['low']:.3g}-{part['high']:.3g}"
             for key in ("mse", "rate"):

@@ -28,7 +28,7 @@ from .config import Experiment
 from .constraint import TargetRate, rate_score
 from .diagnosis import Traffic, warn_of_unused_tokens
 from .models import make_env, make_model, warn_of_cross_term
-from .monitor import Interrupt, Measure, Progress, Stop
+from .monitor import Interrupt, Progress, Stop
 
 # Training seeds lie far from the validation's and from the small numbers that tests use.
 TRAINING_SEEDS = 1_000_000_000
@@ -111,14 +111,11 @@ def train(
     resume: bool = False,
     quiet: bool = False,
     watch: Callable[[dict[str, Any]], bool] | None = None,
-    measure: Measure | None = None,
 ) -> dict[str, Any]:
     """Run the training and return its summary; ``quiet`` shows neither bar nor summary.
 
     ``watch`` is handed each validation's record, those of earlier stretches first, and may end the
-    training by returning true. ``measure`` is handed the model at each validation, and the
-    processor's seconds that it has been trained for (validations are none of it), and returns what
-    is added to the record.
+    training by returning true.
 
     The summary has ``timesteps``, ``finished``, ``steps_per_second``, ``seconds`` by activity (of
     all stretches together), the best validation, and a hash of the inputs.
@@ -147,13 +144,12 @@ def train(
             writing(("checkpoints, models and validations", folder))
         plain = experiment.model_dump(mode="json")
         write_text(folder / "config.yaml", yaml.safe_dump(plain, sort_keys=False))
-        return _learn(experiment, folder, model, env, scored, journal, quiet, watch, measure)
+        return _learn(experiment, folder, model, env, scored, journal, quiet, watch)
 
 
 def _learn(
     experiment: Experiment, folder: Path, model: BaseAlgorithm, env: FusionSB3VecEnv, scored: Task,
     journal: Journal, quiet: bool, watch: Callable[[dict[str, Any]], bool] | None,
-    measure: Measure | None,
 ) -> dict[str, Any]:  # fmt: skip
     """Train what remains, write the results and return the summary."""
     model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
@@ -162,7 +158,7 @@ def _learn(
         Interrupt() as interrupt,
         progress_bar(total, f"training {experiment.algorithm.name}", begun, quiet) as bar,
     ):
-        progress = Progress(experiment, folder, scored, interrupt, bar, journal, watch, measure)
+        progress = Progress(experiment, folder, scored, interrupt, bar, journal, watch)
         progress.init_callback(model)
         callbacks: list[BaseCallback] = [Traffic(), progress]
         if experiment.training.target_rate is not None:

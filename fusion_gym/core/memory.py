@@ -15,12 +15,12 @@ What follows from the memory is in :mod:`fusion_gym.core.beliefs`.
 
 import copy
 from collections.abc import Callable, Mapping
-from typing import Any, Self
+from typing import Any, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_gym import deprecation
+from fusion_gym import validation
 from fusion_gym.arrays import Array, merge_runs, take_runs
 from fusion_gym.core.beliefs import (
     Beliefs,
@@ -47,7 +47,7 @@ class Memory:
     """
 
     def __init__(self, task: Task, owner: Owner) -> None:
-        owner = deprecation.current("owner", owner)
+        validation.choice("owner", owner, get_args(Owner))
         self.task, self.owner = task, owner
         own = owner == "own"
         if own and task.packet == "estimate":

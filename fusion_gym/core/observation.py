@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_gym import deprecation
 from fusion_gym.arrays import Array
 from fusion_gym.core.beliefs import Beliefs
 from fusion_gym.core.memory import Owner
@@ -182,7 +181,6 @@ class ObservationLayout:
         def visible(blocks: tuple[Block, ...]) -> tuple[Block, ...]:
             return tuple(block for block in blocks if covers(task.knowledge, block.knowledge))
 
-        owner = deprecation.current("owner", owner)
         self._task, self._owner = task, owner
         self._own, self._network = visible(task.system.observation), visible(network_blocks(task))
         self._memory = visible(belief_blocks(task, owner))

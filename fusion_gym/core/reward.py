@@ -41,11 +41,11 @@ def _at_rest(open_loop: Array) -> ConfigurationError:
     )
 
 
-def _cost(error: str | Cost) -> str | Cost:
-    """A kind as it is, or the function that ``error`` is or names.
+def _cost(error: str | Cost, states: int) -> str | Cost:
+    """A kind as it is, or the function that ``error`` is or names, tried out on some errors.
 
     Raises:
-        ConfigurationError: neither, or a function that cannot be imported.
+        ConfigurationError: neither, or a function that cannot be imported or is of another kind.
     """
     own = import_named("error", error) if isinstance(error, str) and ":" in error else error
     if own not in ERROR_KINDS if isinstance(own, str) else not callable(own):
@@ -54,7 +54,32 @@ def _cost(error: str | Cost) -> str | Cost:
         hint = f" (did you mean {near!r}?)" if near else ""
         allowed = f"one of {listed}, a function, or 'module:name' of one{hint}"
         raise validation.refusal("error", own, allowed)
+    if not isinstance(own, str):
+        name = error if isinstance(error, str) else name_of(own)
+        errors = np.ones((states, states + 1))
+        try:
+            _own_cost(own, name, errors, errors[:, None] * np.eye(states)[:, :, None])
+        except ConfigurationError:
+            raise
+        except Exception as reason:  # whatever its own code raises
+            text = " ".join(f"{type(reason).__name__}: {reason}".split())
+            raise ConfigurationError(
+                f"error = {name!r} is not allowed: it must take errors (n, N) and covariances "
+                f"(n, n, N), and return numbers >= 0 (N,) ({text})"
+            ) from reason
     return own
+
+
+def _own_cost(function: Cost, name: str, error: Array, covariance: Array) -> Array:
+    """What a function of one's own returns, checked; ``name`` is what an error calls it."""
+    values = np.asarray(function(error, covariance), dtype=np.float64)
+    if values.shape != error.shape[1:] or not np.all(values >= 0.0):
+        raise ConfigurationError(
+            f"error = {name!r} is not allowed: of errors {error.shape} it must "
+            f"return numbers >= 0 of shape {error.shape[1:]}, and returned "
+            f"{validation.display(values)} of shape {values.shape}"
+        )
+    return values
 
 
 @dataclass(frozen=True)
@@ -106,7 +131,7 @@ class Reward:
                 f"{_LARGEST:g} a step, not {weight * (weights @ open_loop):g}"
             )
         return cls(
-            error=_cost(error),
+            error=_cost(error, len(open_loop)),
             error_weight=weight,
             price=price,
             state_weights=weights[:, None],
@@ -138,22 +163,7 @@ class Reward:
         if self.error == "maximum":
             return np.asarray((self.state_weights * (error * error)).max(0))
         assert not isinstance(self.error, str)
-        try:
-            values = np.asarray(self.error(error, covariance), dtype=np.float64)
-        except TypeError as reason:
-            if reason.__traceback__ is None or reason.__traceback__.tb_next is not None:
-                raise  # from within the function
-            raise ConfigurationError(
-                f"error = {name_of(self.error)!r} is not allowed: it must take errors (n, N) and "
-                f"covariances (n, n, N), and return numbers: {reason}"
-            ) from None
-        if values.shape != error.shape[1:] or not np.all(values >= 0.0):
-            raise ConfigurationError(
-                f"error = {name_of(self.error)!r} is not allowed: of errors {error.shape} it must "
-                f"return numbers >= 0 of shape {error.shape[1:]}, and returned "
-                f"{validation.display(values)} of shape {values.shape}"
-            )
-        return values
+        return _own_cost(self.error, self.error_kind, error, covariance)
 
     def training_error(self, kind: str, error: Array, reference_error: Array) -> Array:
         """The error's term of the reward (…,) to train with, of errors (n, …): truth - estimate.

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Generic, Literal, Self, TypeVar, cast, get_arg
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fusion_gym import deprecation, linalg, validation
+from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import AS_ASSUMED, Nature
 
@@ -52,7 +52,6 @@ def covers(knower: Knowledge, known: Knowledge) -> bool:
     Raises:
         ConfigurationError: an unknown class.
     """
-    knower, known = deprecation.current("knower", knower), deprecation.current("known", known)
     for name, value in (("knower", knower), ("known", known)):
         validation.choice(name, value, KNOWLEDGE)
     return known == knower or known in _BELOW[knower]
@@ -94,7 +93,7 @@ class Signal:
         return covers(knower, self.knowledge) or (node and covers(knower, "own"))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "knowledge", deprecation.current("knowledge", self.knowledge))
+        validation.choice("knowledge", self.knowledge, KNOWLEDGE)
 
 
 # The signals of every system, and what they are where the system does not say otherwise.
@@ -143,7 +142,7 @@ class Block:
 
     ``knowledge`` is the least class that knows the block before anything is sent; ``node`` is what
     a sensor sees of it by itself: its own row of the first axis (``"own"``), all of it, for the
-    centre tells everyone (``"told"``), or nothing (``"hidden"``).
+    centre tells everyone (``"broadcast"``), or nothing (``"hidden"``).
     """
 
     name: str
@@ -156,8 +155,8 @@ class Block:
     constants: Mapping[str, ArrayLike] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("knowledge", "node"):
-            object.__setattr__(self, name, deprecation.current(name, getattr(self, name)))
+        validation.choice("knowledge", self.knowledge, KNOWLEDGE)
+        validation.choice("node", self.node, ("own", "broadcast", "hidden"))
 
     @functools.cached_property
     def shape(self) -> tuple[int, ...]:
@@ -216,7 +215,7 @@ def log_deviation(covariance: Array, reference: Array) -> Array:
     """
     possible = np.where(reference > 0.0, reference, np.inf)
     with np.errstate(divide="ignore"):
-        return 0.5 * np.log(linalg.diagonal(covariance) / possible[:, None])
+        return 0.5 * np.log(np.maximum(linalg.diagonal(covariance), 0.0) / possible[:, None])
 
 
 def numbered(count: int) -> tuple[str, ...]:

@@ -226,4 +226,11 @@ def make_bucket(options: CommonOptions, sensors: int) -> TokenBucket:
             "where all request; access='any' with sharing='turns' does not",
             stacklevel=2,
         )
+    if options.access in ("round_robin", "random") and bucket.favours_cheaper:
+        warnings.warn(
+            f"token_rate = {bucket.rate:g} is below token_cost, up to {bucket.cost.max():g}, with "
+            f"access={options.access!r}: where the tokens do not pay, the turn is lost, so that "
+            "dearer sensors are granted less often; access='any' with sharing='turns' is even",
+            stacklevel=2,
+        )
     return bucket

@@ -123,6 +123,15 @@ class TokenBucket:
         steps = Fraction(float(costs[0]) / self.rate).limit_denominator(1000)
         return steps.denominator % math.gcd(steps.numerator, len(self.cost)) != 0
 
+    @property
+    def favours_cheaper(self) -> bool:
+        """Whether a turn that goes by the step may be lost by dearer sensors more often.
+
+        At a rate of the largest cost and above, every turn is paid for in the end.
+        """
+        unequal = float(self.cost.min()) < float(self.cost.max())
+        return not self.unlimited and unequal and self.rate < float(self.cost.max())
+
     def start(self, num_envs: int) -> Array:
         """Tokens at the start of an episode, shape (num_envs,)."""
         return np.full(num_envs, self.capacity if self.unlimited else self.initial)

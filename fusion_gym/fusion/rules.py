@@ -176,14 +176,16 @@ class MatrixWeightedFusion(FusionRule):
         own = linalg.diagonal(own_covariances(joint))
         ridge = _RIDGE * (own[0] + own[1:])
         ridge[ridge < np.finfo(np.float64).tiny] = 1.0  # of what all know exactly
-        for i in range(count - 1):
-            for state in range(n):
-                spread[i, i, state, state] += ridge[i, state]
         size = (count - 1) * n
-        solved = linalg.solve(
-            spread.swapaxes(1, 2).reshape(size, size, runs), toward.reshape(size, n, runs)
-        )
-        weights[1:] = -linalg.transpose(solved.reshape(toward.shape))
+        spread = spread.swapaxes(1, 2).reshape(size, size, runs)
+        ridge, toward = ridge.reshape(size, runs), toward.reshape(size, n, runs)
+        solved = linalg.solve(linalg.add_diagonal(spread, ridge), toward)
+        (lanes,) = np.nonzero(np.isnan(solved).any((0, 1)))  # rounding has left it indefinite
+        if lanes.size:
+            definite = linalg.gram(linalg.root(spread[..., lanes]))
+            definite = linalg.add_diagonal(definite, ridge[:, lanes])
+            solved[..., lanes] = linalg.solve(definite, toward[..., lanes])
+        weights[1:] = -linalg.transpose(solved.reshape(count - 1, n, n, runs))
         weights[0] -= weights[1:].sum(0)
         return weights
 

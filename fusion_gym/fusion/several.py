@@ -33,7 +33,8 @@ class CovarianceIntersection(FusionRule):
     r"""Covariance intersection of all estimates at once (:func:`covariance_intersection_many`).
 
     Like its sequential form it bounds the actual covariance for every correlation of the errors.
-    Where ``active`` leaves one estimate alone it is taken as it is.
+    Where ``active`` leaves one estimate alone it is taken as it is. The smallest trace depends on
+    the units of the single states: a state in a smaller unit has larger numbers and counts more.
 
     Equation:
         $$

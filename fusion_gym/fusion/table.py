@@ -78,7 +78,10 @@ RULES = {
         _IN_TURN, "nothing", "Covariance intersection, two by two: a bound.", ordered=True
     ),
     "ci": FusionRow(
-        CovarianceIntersection, "nothing", "Covariance intersection of all: a bound.", cubic=True
+        CovarianceIntersection,
+        "nothing",
+        "Covariance intersection of all: a bound. Its weights depend on the states' units.",
+        cubic=True,
     ),
     "exact_ci": FusionRow(
         CovarianceIntersection, "tracked weights", "The same with exact weights.", cubic=True

@@ -8,7 +8,7 @@ from typing import Any, Protocol, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_gym import deprecation, linalg, validation
+from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.signals import MEMORY_SIGNALS, PLANNING_SIGNALS
@@ -52,7 +52,7 @@ def owner_of(policy: Policy) -> Owner | None:
     Raises:
         ConfigurationError: an attribute ``remember`` that is neither.
     """
-    result = deprecation.current("remember", getattr(policy, "remember", None))
+    result = getattr(policy, "remember", None)
     if result is None:
         return None
     validation.choice("remember", result, get_args(Owner))
@@ -62,8 +62,7 @@ def owner_of(policy: Policy) -> Owner | None:
 
 def refused_signals(policy: Policy, task: Task) -> dict[str, str]:
     """Return the signals outside a policy's declared knowledge, and why each is refused."""
-    declared = getattr(policy, "knowledge", None) or KNOWLEDGE[-1]  # without one it reads all
-    knower = deprecation.current("knowledge", declared)
+    knower = getattr(policy, "knowledge", None) or KNOWLEDGE[-1]  # without one it reads all
     least = {signal.name: signal for signal in task.system.signals}
     if not task.memory and covers(knower, "own"):
         knower = least_covering((knower, "own_memory"))  # beliefs of the new measurements alone

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -11,6 +12,8 @@ from numpy.typing import ArrayLike
 from fusion_gym import linalg, validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.nature import true_motion
+
+_CANCELLED = 1e-3  # of what is summed; what is left has lost three digits
 
 
 def covariance_factor(matrix: Array) -> Array:
@@ -25,7 +28,7 @@ class Plant:
 
     Shapes: ``transition`` A (n, n, 1), ``process_covariance`` W (n, n, 1), ``process_factor``
     (n, r, 1) with r the rank of W, ``initial_mean`` (n, 1), ``initial_covariance`` (n, n, 1),
-    ``initial_factor`` (n, r₀, 1).
+    ``initial_factor`` (n, n, 1).
     """
 
     transition: Array
@@ -80,19 +83,19 @@ class LinearPlant(Plant):
 
         Raises:
             ConfigurationError: a wrong shape, a non-finite entry, or a covariance that is not
-                symmetric positive semi-definite (``initial_covariance``: definite).
+                symmetric positive semi-definite.
         """
         matrix = validation.square("transition", transition)
         size = len(matrix)
         process = validation.covariance("process_covariance", process_covariance, size)
-        start = validation.covariance("initial_covariance", initial_covariance, size, definite=True)
+        start = validation.covariance("initial_covariance", initial_covariance, size)
         return cls(
             transition=matrix[..., None],
             process_covariance=process[..., None],
             process_factor=covariance_factor(process)[..., None],
             initial_mean=validation.array("initial_mean", initial_mean, (size,))[..., None],
             initial_covariance=start[..., None],
-            initial_factor=covariance_factor(start)[..., None],
+            initial_factor=linalg.root(start[..., None]),
         )
 
     def start(self, mean: Array, noise: Array) -> Array:
@@ -112,10 +115,23 @@ class LinearPlant(Plant):
     def predict(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Prior mean (n, N) and covariance A P Aᵀ + W (n, n, N) of the next state.
 
+        Where A P Aᵀ cancels, as it may where P is singular, it is (A F)(A F)ᵀ with a root F of P.
+
         Source: tobit_token_bucket, equations (21) and (29).
         """
         prior = linalg.congruence(self.transition, covariance) + self.process_covariance
+        most = (self._cancelling * linalg.diagonal(covariance)[..., None, :, :]).sum(-2)
+        cancelled = linalg.diagonal(prior) < most
+        if cancelled.any():
+            lanes = np.flatnonzero(cancelled.reshape(-1, cancelled.shape[-1]).any(0))
+            moved = linalg.matmul(self.transition, linalg.root(covariance[..., lanes]))
+            prior[..., lanes] = linalg.gram(moved) + self.process_covariance
         return linalg.matvec(self.transition, mean), prior
+
+    @functools.cached_property
+    def _cancelling(self) -> Array:
+        """C (n, n, 1): a variance of A P Aᵀ below C diag(P) has lost digits."""
+        return _CANCELLED * self.size * self.transition**2
 
     def open_loop(self, horizon: int) -> Array:
         """Mean over t = 1..horizon of the error variance without measurements, shape (n,)."""
@@ -136,13 +152,17 @@ class LinearPlant(Plant):
         moment = self.initial_covariance[..., 0] + square
         yield moment
         for _ in range(horizon):
-            moment = transition @ moment @ transition.T + process
+            root, moment = moment, transition @ moment @ transition.T + process
+            if (np.diagonal(moment) < 0.0).any():  # it has cancelled
+                root = transition @ covariance_factor(root)
+                moment = root @ root.T + process
             yield moment
 
 
 def typical_magnitude(plant: LinearPlant, horizon: int, random_start: bool) -> Array:
     """Root of the mean second moment of each state over t = 0..horizon, shape (n,)."""
-    return np.sqrt(plant.second_moments(horizon, random_start).mean(0))
+    magnitude = np.sqrt(plant.second_moments(horizon, random_start).mean(0))
+    return np.where(magnitude > 0.0, magnitude, 1.0)
 
 
 def largest_ratio(moments: Array, rows: Array) -> float:
@@ -171,6 +191,7 @@ def variance_loss(plant: LinearPlant, horizon: int, rows: Array, noise: Array) -
         keep = np.eye(plant.size) - gain @ rows
         left = ((keep @ prior) * keep).sum(-1) + ((gain @ noise) * gain).sum(-1)
         rounded = (np.abs(keep) @ np.sqrt(np.diagonal(prior))) ** 2
-        ratio = np.where(rounded > 0.0, rounded / np.maximum(left, 0.0), 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.where(rounded > 0.0, rounded / np.maximum(left, 0.0), 0.0)
         largest = float(np.maximum(largest, ratio.max()))
     return largest

@@ -19,7 +19,6 @@ from fusion_gym.core.system import (
     log_deviation,
     numbered,
 )
-from fusion_gym.systems.linear_plant import covariance_factor
 
 _RUNS = 1000  # that tell what happens without transmissions
 _SEED = 20_240_229  # of their noise
@@ -62,7 +61,7 @@ class NonlinearSystem(System[FilteredState]):
         initial_covariance: (n, n).
 
     Raises:
-        ConfigurationError: a wrong shape, or a covariance that is not positive definite.
+        ConfigurationError: a wrong shape, or a covariance that is not positive semi-definite.
     """
 
     signals = common_signals()
@@ -85,7 +84,7 @@ class NonlinearSystem(System[FilteredState]):
         self.process_channels = validation.integer("process_channels", process_channels, at_least=0)
         self.initial_mean = validation.array("initial_mean", initial_mean, (size,))
         self.initial_covariance = validation.covariance(
-            "initial_covariance", initial_covariance, size, definite=True
+            "initial_covariance", initial_covariance, size
         )
 
     @abstractmethod
@@ -169,8 +168,7 @@ class NonlinearSystem(System[FilteredState]):
         """Time 0: the state is drawn, and every first measurement is known, free of charge."""
         size, runs = len(self.state_names), noise.shape[-1]
         mean = np.repeat(self.initial_mean[:, None], runs, axis=1)
-        root = covariance_factor(self.initial_covariance)
-        truth = mean + root @ noise[:size]
+        truth = mean + linalg.root(self.initial_covariance[..., None])[..., 0] @ noise[:size]
         measurement = self._measured(truth, noise[size:])
         covariance = np.repeat(self.initial_covariance[..., None], runs, axis=-1)
         age = np.zeros((self.sensor_count, runs))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.systems.markov_jump.linear_minimum_variance import (
+    ROUNDING,
     AugmentedModel,
     Times,
     settled,
@@ -98,6 +99,9 @@ def mode_mixture(belief: Belief, maps: Array) -> tuple[Array, Array]:
     """Mean (p, N) and covariance (p, p, N) of maps · z, ``maps`` (M, p, s, 1), over all models."""
     means = linalg.matvec(maps, belief.mean)
     spreads = linalg.congruence(maps, belief.covariance)
+    deviation = np.sqrt(np.maximum(linalg.diagonal(belief.covariance), 0.0))
+    certain = linalg.diagonal(spreads) <= ROUNDING * linalg.matvec(np.abs(maps), deviation) ** 2
+    spreads[certain[:, :, None] | certain[:, None]] = 0.0
     if len(means) == 1:
         return means[0], spreads[0]
     mean = (belief.probability[:, None] * means).sum(0)

@@ -14,7 +14,11 @@ from numpy.typing import NDArray
 
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
-from fusion_gym.systems.markov_jump.linear_minimum_variance import LocalFilters, Times
+from fusion_gym.systems.markov_jump.linear_minimum_variance import (
+    ROUNDING,
+    LocalFilters,
+    Times,
+)
 
 
 class LagCovariances(NamedTuple):
@@ -34,12 +38,14 @@ class JointPrediction(NamedTuple):
 
     ``local`` E L⁺_i L⁺_jᵀ, ``crossed`` E d⁺_i L⁺_jᵀ and ``lag`` E d⁺_i d⁺_jᵀ, each
     (l, l, n, n, N), with L⁺ the nodes' errors and d⁺ their lags as they are before anything is
-    sent. The copy of a node has the error L⁺_i if it is sent, else L⁺_i + d⁺_i.
+    sent. The copy of a node has the error L⁺_i if it is sent, else L⁺_i + d⁺_i. A variance below
+    ``floor`` (l, n, N) is the rounding of a sum over modes and counts as zero.
     """
 
     local: Array
     crossed: Array
     lag: Array
+    floor: Array
 
     def joint(self, sent: NDArray[np.bool_]) -> Array:
         """Covariance of the copies' errors (l, l, n, n, N) if ``sent`` (l, N) is what is sent."""
@@ -48,6 +54,9 @@ class JointPrediction(NamedTuple):
         result = crossed + crossed.swapaxes(0, 1).swapaxes(2, 3)
         result += self.local
         result += (behind[:, None] * behind[None])[:, :, None, None] * self.lag
+        certain = np.einsum("iissN->isN", result) <= self.floor
+        if certain.any():
+            result[certain[:, None, :, None] | certain[None, :, None]] = 0.0
         return result
 
 
@@ -73,6 +82,7 @@ class LagRecursion:
     filters: LocalFilters
     states: int
     local: Array  # E L⁺_i L⁺_jᵀ, (l, l, n, n, T)
+    floor: Array  # the rounding of its variances, (l, n, T)
     gain: Array  # K, (l, n, T)
     filtered_cross: Array  # E ε_i L⁺_j, (l, l, n, T)
 
@@ -83,10 +93,12 @@ class LagRecursion:
         modes = size // states
         blocks = filters.covariance.reshape(count, count, modes, states, modes, states, steps)
         crosses = filters.filtered_cross.reshape(count, count, modes, states, steps)
+        own = np.abs(np.einsum("iimskst->imkst", blocks)).sum((1, 2))
         return cls(
             filters=filters,
             states=states,
             local=blocks.sum((2, 4)),
+            floor=ROUNDING * own,
             gain=filters.gain.reshape(count, modes, states, steps).sum(1),
             filtered_cross=crosses.sum(2),
         )
@@ -160,7 +172,8 @@ class LagRecursion:
             lag[i, j] = block + linalg.outer(gain[i], right)
             if i != j:
                 lag[j, i] = linalg.transpose(lag[i, j])
-        return JointPrediction(self.local.take(place, -1), crossed, lag)
+        local, floor = self.local.take(place, -1), self.floor.take(place, -1)
+        return JointPrediction(local, crossed, lag, floor)
 
 
 def _ordered(count: int) -> list[tuple[int, int]]:

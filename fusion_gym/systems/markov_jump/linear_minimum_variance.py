@@ -25,6 +25,8 @@ Times = NDArray[np.int64]
 
 _LONGEST = 2000  # steps after which tables that have not become periodic end anyway
 _SETTLED = 1e-13  # change over a period, in deviations of each state, below which they have
+_CANCELLED = 1e-6  # of two squares, what is left has lost six digits
+ROUNDING = 1e-14  # relative, of a sum over modes
 
 
 class AugmentedStep(NamedTuple):
@@ -127,8 +129,34 @@ class AugmentedModel:
     def scales(self, horizon: int) -> tuple[Array, Array]:
         """The mean variance (n,) over k = 1..horizon and the root mean square (n,) with k = 0."""
         means, squares = self.state_moments(horizon)
-        variance = np.asarray((squares - means * means)[1:].mean(0))
-        return variance, np.sqrt(squares.mean(0))
+        variances = squares - means * means
+        if (variances < _CANCELLED * squares).any():
+            variances = self._variances(horizon)
+        magnitude = np.sqrt(squares.mean(0))
+        return variances[1:].mean(0), np.where(magnitude > 0.0, magnitude, 1.0)
+
+    def _variances(self, last: int) -> Array:
+        """The state's variances (last + 1, n) as sums of squares, which cannot cancel."""
+        plant = self.plant
+        phi, gamma = np.moveaxis(plant.transition, -1, 0), np.moveaxis(plant.process_gain, -1, 0)
+        chain, pi = plant.mode_transition, plant.initial_probabilities
+        driven = gamma @ plant.noise_covariance @ gamma.swapaxes(1, 2)
+        means = np.tile(plant.initial_mean[:, 0], (plant.modes, 1))
+        spreads = np.tile(plant.initial_covariance[..., 0], (plant.modes, 1, 1))
+        result = []
+        for _ in range(last + 1):  # means (M, n) and covariances (M, n, n) given the mode
+            apart = means - pi @ means
+            result.append(pi @ (np.diagonal(spreads, 0, 1, 2) + apart**2))
+            pi, before = pi @ chain, pi
+            share = (chain * before[:, None] / np.where(pi > 0.0, pi, 1.0)).T
+            moved = np.einsum("mij,mj->mi", phi, means)
+            means = share @ moved
+            apart = moved - means[:, None]
+            spreads = phi @ spreads @ phi.swapaxes(1, 2) + driven
+            spreads = np.tensordot(share, spreads, 1) + np.einsum(
+                "mn,mni,mnj->mij", share, apart, apart
+            )
+        return np.array(result)
 
 
 def _diagonal_blocks(blocks: Array) -> Array:

@@ -85,8 +85,8 @@ class MarkovJumpPlant:
 
         Raises:
             ConfigurationError: a wrong shape, an entry that is not finite, probabilities that do
-                not add up to one, a covariance that is not positive semi-definite
-                (``initial_covariance``: definite), or a plant that is not mean-square stable.
+                not add up to one, a covariance that is not positive semi-definite,
+                or a plant that is not mean-square stable.
         """
         matrices = validation.array("transitions", transitions, (None, None, None))
         modes, size, _ = matrices.shape
@@ -97,7 +97,7 @@ class MarkovJumpPlant:
         if isinstance(process_covariance, (int, float, np.number)):
             values = validation.number("process_covariance", process_covariance) * np.eye(noises)
         noise = validation.covariance("process_covariance", values, noises)
-        start = validation.covariance("initial_covariance", initial_covariance, size, definite=True)
+        start = validation.covariance("initial_covariance", initial_covariance, size)
         plant = cls(
             transition=np.ascontiguousarray(matrices.transpose(1, 2, 0)),
             process_gain=np.ascontiguousarray(gains.transpose(1, 2, 0)),
@@ -109,7 +109,7 @@ class MarkovJumpPlant:
             ),
             initial_mean=validation.array("initial_mean", initial_mean, (size,))[..., None],
             initial_covariance=start[..., None],
-            initial_factor=covariance_factor(start)[..., None],
+            initial_factor=linalg.root(start[..., None]),
         )
         radius = plant.second_moment_radius()
         if radius >= 1.0 - 1e-9:

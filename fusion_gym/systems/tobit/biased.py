@@ -190,11 +190,9 @@ def _augmented(options: BiasedOscillatorOptions, aware: bool) -> tuple[LinearPla
     biases = gain.shape[1]
     process = validation.covariance("process_covariance", options.process_covariance, states)
     noise = validation.covariance("bias_noise_covariance", options.bias_noise_covariance, biases)
-    start = validation.covariance(
-        "initial_covariance", options.initial_covariance, states, definite=True
-    )
+    start = validation.covariance("initial_covariance", options.initial_covariance, states)
     bias_start = validation.covariance(
-        "bias_initial_covariance", options.bias_initial_covariance, biases, definite=True
+        "bias_initial_covariance", options.bias_initial_covariance, biases
     )
     inner = validation.array("bias_transition", options.bias_transition, (biases, biases))
     mean = validation.array("initial_mean", options.initial_mean, (states,))

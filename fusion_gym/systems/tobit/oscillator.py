@@ -172,7 +172,6 @@ def _plant(options: TobitOscillatorOptions) -> LinearPlant:
 
 def _centre(choice: TobitOscillatorOptions, sensors: CensoredSensors) -> Centre:
     centre = make_centre(choice.filter, _FILTERS, choice, sensors)
-    _bound_filter(choice, sensors)  # its numbers are checked whatever the filter
     for name, refused in (("silent", "hold"), ("event_error", True)):
         if choice.filter != "paper" and getattr(choice, name) == refused:
             raise ConfigurationError(

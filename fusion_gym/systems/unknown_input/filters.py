@@ -56,18 +56,21 @@ class ExactInputStateFilter:
     def growth(self, horizon: int) -> Array:
         """Factor (l,) by which a variance grows where the input hides a growing direction.
 
-        The largest of deliveries in each step and in every second, 4th, 16th and 64th one.
+        The largest of deliveries in each step and in every second, 4th, 16th and 64th one. Of a
+        state that is known at the start the unit is its largest variance of the first s steps.
         """
         periods, noise = np.array([1, 2, 4, 16, 64]), self.joint.sensors.covariance
         start = self.model.initial_covariance
         covariance = np.broadcast_to(start, (len(noise), *start.shape[:2], len(periods)))
-        largest = linalg.diagonal(covariance)
+        largest = unit = linalg.diagonal(covariance)
         for time in range(1, horizon + 1):
             predicted = self.model.predict_covariance(covariance)
             updated = self.update(covariance, noise)[1]
             covariance = np.where(time % periods == 0, updated, predicted)
             largest = np.fmax(largest, linalg.diagonal(covariance))
-        return np.asarray((largest / linalg.diagonal(start)).max((1, 2)))
+            if time <= len(start):
+                unit = np.where(linalg.diagonal(start) > 0.0, unit, largest)
+        return np.asarray((largest / np.where(unit > 0.0, unit, np.inf)).max((1, 2)))
 
     def update(self, posterior: Array, noise: Array) -> tuple[Array, Array]:
         """Gain (l, s, m, N) and covariance (l, s, s, N) from the posterior one instant earlier.

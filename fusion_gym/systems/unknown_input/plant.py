@@ -55,14 +55,13 @@ class UnknownInputPlant(Plant):
 
         Raises:
             ConfigurationError: a wrong shape, an entry that is not finite, a sampling period
-                not from 1 to 1000, more inputs than states, or a covariance that is not one
-                (``initial_covariance``: not definite).
+                not from 1 to 1000, more inputs than states, or a covariance that is not one.
         """
         small = validation.square("transition", transition)
         n = len(small)
         inputs = validation.array("input_matrix", input_matrix, (n, None))
         process = validation.covariance("process_covariance", process_covariance, n)
-        start = validation.covariance("initial_covariance", initial_covariance, n, definite=True)
+        start = validation.covariance("initial_covariance", initial_covariance, n)
         mean = validation.array("initial_mean", initial_mean, (n,))
         half = None
         if initial_half_width is not None:
@@ -83,7 +82,7 @@ class UnknownInputPlant(Plant):
             process_factor=covariance_factor(lifted_process)[..., None],
             initial_mean=mean[:, None],
             initial_covariance=start[..., None],
-            initial_factor=covariance_factor(start)[..., None],
+            initial_factor=linalg.root(start[..., None]),
             initial_half_width=None if half is None else half[:, None],
         )
 
@@ -149,5 +148,6 @@ class UnknownInputPlant(Plant):
             cross = cross + reach @ lags[k + 1]
             reach = a @ reach
             inputs = np.diagonal(lags[0]) + means[k] ** 2
-            result.append(np.concatenate((np.diagonal(spread) + mean**2, inputs)))
+            own = np.maximum(np.diagonal(spread), 0.0)  # it may cancel
+            result.append(np.concatenate((own + mean**2, inputs)))
         return np.array(result)
