@@ -4,10 +4,9 @@
         --sweep configs/biased_sweep.yaml \\
         --policy model:runs/biased_oscillator_ppo/best_model.zip --output runs/comparison
 
-An agent that sees the price of a token is asked at as many prices as ``--prices`` says: its whole
-front. All policies run on the same seeds. At each price its cost, error + price · tokens, is
-compared with that of the best baseline there; at its rate, its MSE with the baselines' lower
-envelope. Into the output folder go ``evaluation.json`` (every policy), ``comparison.json`` (the
+An agent that sees the price of a token runs at as many prices as ``--prices`` says. All policies
+run on the same seeds. The cost at a price is error + price · tokens; the best baseline at each
+price stands beside the agent. At its rate its MSE stands beside the baselines' lower envelope. Into the output folder go ``evaluation.json`` (every policy), ``comparison.json`` (the
 verdict) and ``pareto.png``.
 """
 

@@ -57,11 +57,11 @@ PHYSICAL: dict[tuple[str, str], Any] = {
         lambda e, c, s: (e * c, s["measurement"] - s["held"])
     ),
     ("error", "error_scale"): lambda e, c, s: (e * c, s["innovation"][:, 0]),
-    ("belief_difference", "open-loop deviations"): (
+    ("belief_difference", "nominal deviations"): (
         lambda e, c, s: (np.sinh(e) / 4.0 * c, s["belief_difference"])
     ),
     ("tokens", "capacity"): lambda e, c, s: (e * c, s["tokens"]),
-    ("transmission_value", "open loop"): (
+    ("transmission_value", "nominal error"): (
         lambda e, c, s: (np.sign(e[1:]) * (e[1:] / 2.0) ** 2 * c, s["transmission_value"])
     ),
 }
@@ -95,8 +95,8 @@ def check(batch: EpisodeBatch, env_id: str) -> set[tuple[str, str]]:
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_entries_give_back_what_was_measured(env_id: str) -> None:
     done = check(batch_of(env_id), env_id)
-    assert ("belief_difference", "open-loop deviations") in done
-    assert ("transmission_value", "open loop") in done
+    assert ("belief_difference", "nominal deviations") in done
+    assert ("transmission_value", "nominal error") in done
     blocks = batch_of(env_id).layout.blocks
     constants = {(block.name, word) for block in blocks for word in block.constants}
     assert constants & PHYSICAL.keys() <= done | {LAST[1:]}

@@ -165,7 +165,7 @@ def compare_with_envelope(
 class PriceComparison(NamedTuple):
     """A policy against the best baseline at one price of a token, over paired episodes.
 
-    ``difference`` is the policy's cost minus that of the baseline ``best``, whose mean is
+    ``difference`` is the policy's cost minus the cost of the baseline ``best``, in the mean
     ``cost``. Negative: the policy is better.
     """
 
