@@ -10,7 +10,7 @@ QUICK  := tests/laws/test_interfaces.py tests/test_bad_input.py tests/test_envir
 	tests/test_resume.py::test_a_resumed_training_is_the_uninterrupted_one \
 	tests/test_benchmark.py::test_from_tuning_to_report_and_zoo
 
-.PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films docs integrations \
+.PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films newcomer docs integrations \
 	integrations-tianshou integrations-rllib lines lint format bench clean
 
 help:  ## list the targets
@@ -102,6 +102,9 @@ integrations-tianshou: .venv-tianshou/.installed  ## Tianshou
 
 integrations-rllib: .venv-rllib/.installed  ## RLlib
 	.venv-rllib/bin/python -m pytest integrations/rllib
+
+newcomer: $(STAMP)  ## run the commands of docs/newcomer.md and write its tables, 6 minutes
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m benchmarks.newcomer --resume
 
 lines:  ## code lines without blanks, comments and docstrings
 	@$(PYTHON) tests/lines.py

@@ -6,8 +6,9 @@
 
 An agent that sees the price of a token runs at as many prices as ``--prices`` says. All policies
 run on the same seeds. The cost at a price is error + price · tokens; the best baseline at each
-price stands beside the agent. At its rate its MSE stands beside the baselines' lower envelope. Into the output folder go ``evaluation.json`` (every policy), ``comparison.json`` (the
-verdict) and ``pareto.png``.
+price stands beside the agent. At its rate its MSE stands beside the baselines' lower envelope.
+Into the output folder go ``evaluation.json`` (every policy), ``comparison.json`` (the verdict) and
+``pareto.png``.
 """
 
 from collections.abc import Mapping, Sequence

@@ -11,6 +11,7 @@ import pytest
 import yaml
 from command_runs import refusal, succeed
 
+from benchmarks.newcomer import replaced, run
 from fusion_gym.agents.compare import Compare
 from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.agents.training.config import Experiment
@@ -36,7 +37,7 @@ def test_the_lines_of_the_page_lead_to_a_front(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (text,) = (block for language, block in BLOCKS if language == "yaml")
+    text, _ = (block for language, block in BLOCKS if language == "yaml")
     first, *_ = text.splitlines()
     Path(first.removeprefix("# ")).write_text(text)
     installing, *commands = command_lines()
@@ -47,11 +48,11 @@ def test_the_lines_of_the_page_lead_to_a_front(
         ended = succeed(name, [*words, *LESS[name]])
         if name == "evaluate":
             assert "kitchen" in ended.out
-    assert (tmp_path / "runs/comparison/pareto.png").stat().st_size > 20_000
-    points = json.loads((tmp_path / "runs/comparison/comparison.json").read_text())["points"]
+    assert (tmp_path / "runs/rooms/comparison/pareto.png").stat().st_size > 20_000
+    points = json.loads((tmp_path / "runs/rooms/comparison/comparison.json").read_text())["points"]
     prices = [float(point["agent"].partition("price=")[2]) for point in points]
     # The plant of the file belongs to the training, wherever the file has gone.
-    content = yaml.safe_load((tmp_path / "runs/front/config.yaml").read_text())["environment"]
+    content = yaml.safe_load((tmp_path / "runs/rooms/front/config.yaml").read_text())["environment"]
     options = content["options"]
     assert options.pop("reward_scale") > 0.0
     low, high = options.pop("price_range")
@@ -61,7 +62,7 @@ def test_the_lines_of_the_page_lead_to_a_front(
         "memory": True, "cost_weight": "random", "horizon": 8, **yaml.safe_load(text)
     }  # fmt: skip
     Path("rooms.yaml").write_text(text.replace("0.05", "0.04"))
-    same = ["--config", "linear_fusion_front", "--output", "runs/front", "--set", "horizon=8"]
+    same = ["--config", "linear_fusion_front", "--output", "runs/rooms/front", "--set", "horizon=8"]
     error = refusal("train", [*same, "system=rooms.yaml", "--resume", "--timesteps", "4096"])
     assert "environment" in error
     assert "transition" in error
@@ -88,3 +89,18 @@ def test_prices_are_for_agents_that_see_one() -> None:
         requests_at("always", 3).policies_of(task)
     with pytest.raises(ConfigurationError, match=r"prices = 3 .* no price_range"):
         requests_at("model:a.zip", 3).policies_of(make_task("fusion_gym/LinearFusion-v2"))
+
+
+def test_tables_go_between_their_marks() -> None:
+    text = "a\n<!-- results: x -->\nold\n<!-- end -->\n<!-- results: y -->\n<!-- end -->\n"
+    once = replaced(text, "x", "| new |")
+    assert once == replaced(once, "x", "| new |")
+    assert "old" not in once
+    assert once.endswith("<!-- results: y -->\n<!-- end -->\n")
+
+
+def test_a_command_that_has_ended_is_not_run_again(tmp_path: Path) -> None:
+    first = run("python -c 'print(1)'", tmp_path)
+    assert run("python -c 'print(1)'", tmp_path) == first
+    with pytest.raises(RuntimeError, match="ended with 3"):
+        run("python -c 'raise SystemExit(3)'", tmp_path)

@@ -1,0 +1,127 @@
+"""Run the commands of docs/newcomer.md on its plants, and write their tables into the page.
+
+    python -m benchmarks.newcomer [--resume]
+
+Each YAML block of the page is a plant. The page's commands name the first; for the others that
+name is replaced, also in folders. A command that has ended is not run again with ``--resume``.
+"""
+
+import argparse
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from fusion_gym import __version__
+from fusion_gym.docstrings import table
+
+PAGE = Path(__file__).parent.parent / "docs" / "newcomer.md"
+FENCE = re.compile(r"^```(\w+)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A command of the page: seconds of the wall and of the processor."""
+
+    command: str
+    seconds: float
+    processor: float
+
+
+def main() -> None:
+    """Run what is missing, then write tables and figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--resume", action="store_true", help="keep the commands that have ended")
+    parser.add_argument("--folder", type=Path, default=Path("runs/newcomer"))
+    arguments = parser.parse_args()
+    if not arguments.resume:
+        shutil.rmtree(arguments.folder, ignore_errors=True)
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    text = PAGE.read_text(encoding="utf-8")
+    plants = [block for language, block in FENCE.findall(text) if language == "yaml"]
+    names = [re.match(r"# (\w+)\.yaml\n", block)[1] for block in plants]  # type: ignore[index]
+    shell = "".join(block for language, block in FENCE.findall(text) if language == "bash")
+    lines = [line for line in shell.replace("\\\n", " ").splitlines() if line[:10] == "fusion-gym"]
+    runs: list[list[Run]] = []
+    for name, plant in zip(names, plants, strict=True):
+        (arguments.folder / f"{name}.yaml").write_text(plant, encoding="utf-8")
+        own = [re.sub(rf"\b{names[0]}\b", name, line) for line in lines]
+        runs.append([run(line, arguments.folder) for line in own])
+        comparison = arguments.folder / "runs" / name / "comparison"
+        text = replaced(text, name, points_table(comparison / "comparison.json"))
+        shutil.copy(comparison / "pareto.png", PAGE.with_name(f"newcomer_{name}.png"))
+    PAGE.write_text(replaced(text, "seconds", seconds_table(names, runs)), encoding="utf-8")
+
+
+def run(line: str, folder: Path) -> Run:
+    """Run a command in the folder, or read what an earlier run took.
+
+    Raises:
+        RuntimeError: it failed; the message ends with what it said.
+    """
+    words = shlex.split(line)
+    stored = folder / f"{'_'.join(re.findall(r'[a-z]+', line))[:120]}.json"
+    if not stored.exists():
+        print(line, flush=True)
+        environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        began, before = time.monotonic(), os.times()
+        ended = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True)
+        if ended.returncode:
+            raise RuntimeError(f"{line} ended with {ended.returncode}: {ended.stderr[-1000:]}")
+        after = os.times()
+        processor = after.children_user - before.children_user
+        result = Run(words[1], time.monotonic() - began, processor)
+        stored.write_text(json.dumps(asdict(result)))
+    return Run(**json.loads(stored.read_text()))
+
+
+def points_table(path: Path) -> str:
+    """The agent beside the best rule at each price."""
+    rows = []
+    for point in json.loads(path.read_text())["points"]:
+        comparison: dict[str, Any] = point["at_price"]
+        cost, difference = comparison["cost"], comparison["difference"]
+        ends = (f"{difference[end] / cost:+.1%}" for end in ("low", "high"))
+        rows.append(
+            (
+                f"{comparison['price']:.3g}",
+                f"{point['rate']:.3f}",
+                f"{point['mse']:.3g}",
+                f"`{comparison['best']}`",
+                f"{difference['mean'] / cost:+.1%} [{', '.join(ends)}]",
+            )
+        )
+    heads = (
+        "price",
+        "agent's rate",
+        "its MSE",
+        "best rule",
+        "agent's cost over the rule's",
+    )
+    return table(heads, rows) + f"\n\nMeasured in fusion-gym {__version__}."
+
+
+def seconds_table(names: list[str], runs: list[list[Run]]) -> str:
+    """Seconds of each command, of the wall and of the processor."""
+    rows = [
+        (f"`{item.command}`, {name}", f"{item.seconds:.0f}", f"{item.processor:.0f}")
+        for name, items in zip(names, runs, strict=True)
+        for item in items
+    ]
+    return table(("command", "seconds", "of the processor"), rows)
+
+
+def replaced(text: str, name: str, content: str) -> str:
+    """Return the page with new content between the marks of this name."""
+    pattern = re.compile(rf"(<!-- results: {name} -->\n).*?(<!-- end -->)", re.DOTALL)
+    return pattern.sub(lambda mark: f"{mark[1]}\n{content}\n\n{mark[2]}", text)
+
+
+if __name__ == "__main__":
+    main()
