@@ -7,6 +7,9 @@ The settings are the registered environments with their defaults, and the Tobit 
 run the same episodes. An agent's share is 0 at the return of the best simple rule, which looks at
 nothing but the clock or a coin, and 1 at that of the best rule of the environment's sweep. A
 training and the rules of a setting are pieces, stored one by one: ``--resume`` keeps them.
+
+In the biased oscillator the error runs away in about one episode of a thousand: a share there has a
+standard error of about .3, and of .75 with 300 episodes.
 """
 
 import argparse
@@ -40,6 +43,7 @@ from fusion_gym.validation import choice
 Returns = dict[str, float]
 RATES = 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7
 SIMPLE = ["always", "never", "round_robin", *(f"random:rate={rate}" for rate in RATES)]
+WAYS = "likeliest", "drawn"
 VALUE = {"belief_features": ["value"]}
 # The trainings of a setting: what the observation shows beside the defaults, and the seed.
 TRAININGS: dict[str, tuple[dict[str, Any], int]] = {
@@ -79,18 +83,22 @@ SETTINGS = {
 
 @dataclass(frozen=True)
 class Row:
-    """A setting: processor seconds, the best rules' returns, and the share of each training."""
+    """A setting: processor seconds, the best rules' returns, and the shares of each training.
+
+    The first share is that of an agent that takes its likeliest actions, the second of one that
+    draws them.
+    """
 
     setting: str
     seconds: float
     simple: tuple[str, float]
     best: tuple[str, float]
-    shares: dict[str, float]
+    shares: dict[str, tuple[float, float]]
 
     def shown(self) -> list[str]:
         """Return the cells of the table."""
         ends = (f"{rule} ({value:.4g})" for rule, value in (self.simple, self.best))
-        shares = (f"{share:.2f}" for share in self.shares.values())
+        shares = (f"{likeliest:.2f} · {drawn:.2f}" for likeliest, drawn in self.shares.values())
         return [self.setting, *ends, *shares, f"{self.seconds:.0f}"]
 
 
@@ -99,7 +107,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("settings", nargs="*", metavar="SETTING", help="all by default")
     parser.add_argument("--output", type=Path, default=Path("runs/plain_ppo"))
-    parser.add_argument("--episodes", type=int, default=300)
+    parser.add_argument("--episodes", type=int, default=2000)
     parser.add_argument("--timesteps", type=int, default=300_000)
     parser.add_argument("--gamma", type=float, default=0.95)
     parser.add_argument("--n-steps", type=int, default=32)
@@ -107,7 +115,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     heads = "setting", "best simple rule", "best rule", *TRAININGS, "CPU s"
-    table = Table(*heads, title="0: the return of the best simple rule, 1: that of the best rule")
+    table = Table(*heads, title="shares; likeliest · drawn actions")
     with report_errors():
         for name in arguments.settings or SETTINGS:
             choice("setting", name, SETTINGS)
@@ -127,7 +135,10 @@ def judge(name: str, arguments: argparse.Namespace) -> Row:
     for title, (shown, seed) in TRAININGS.items():
         run = partial(train, setting, shown, seed, **asked)
         agent, more = piece(folder / f"{title}.json", arguments.resume, run, asked)
-        shares[title] = (agent["ppo"] - rules[simple]) / (rules[best] - rules[simple])
+        likeliest, drawn = (
+            (agent[way] - rules[simple]) / (rules[best] - rules[simple]) for way in WAYS
+        )
+        shares[title] = likeliest, drawn
         seconds += more
     return Row(name, seconds, (simple, rules[simple]), (best, rules[best]), shares)
 
@@ -156,12 +167,15 @@ def train(
     setting: Setting, shown: dict[str, Any], seed: int, *, episodes: int, timesteps: int,
     gamma: float, n_steps: int,
 ) -> Returns:  # fmt: skip
-    """Return the mean return of a training's agent, which takes its most likely actions."""
+    """Return the mean return of a training's agent, for each way to choose its actions."""
     env = make_sb3_vec_env(setting.environment, num_envs=64, seed=seed, **setting.options | shown)
     scaled = VecNormalize(env, norm_obs=False, norm_reward=True, gamma=gamma)
     model = PPO("MlpPolicy", scaled, n_steps=n_steps, gamma=gamma, seed=seed, device="cpu")
     model.learn(timesteps)
-    return {"ppo": mean_return(env.task, ModelPolicy(model, env.task), episodes)}
+    return {
+        way: mean_return(env.task, ModelPolicy(model, env.task, way == "likeliest"), episodes)
+        for way in WAYS
+    }
 
 
 def mean_return(task: Task, policy: Policy, episodes: int) -> float:
