@@ -109,7 +109,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("runs/plain_ppo"))
     parser.add_argument("--episodes", type=int, default=2000)
     parser.add_argument("--timesteps", type=int, default=300_000)
-    parser.add_argument("--gamma", type=float, default=0.95)
+    parser.add_argument("--gamma", type=float, default=0.9)
     parser.add_argument("--n-steps", type=int, default=32)
     parser.add_argument("--resume", action="store_true", help="go on with what is there")
     arguments = parser.parse_args()
