@@ -12,7 +12,7 @@ from fusion_gym.core.memory import Owner
 from fusion_gym.core.runs import Branch
 from fusion_gym.core.task import Task
 from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_system
-from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.envs.sb3 import FusionSB3VecEnv, make_sb3_vec_env
 from fusion_gym.validation import ConfigurationError
 
 OSCILLATOR = "fusion_gym/TobitOscillator-v1"
@@ -244,3 +244,28 @@ def test_looking_at_alternatives_changes_nothing(local: bool) -> None:
                     left["terminal_observation"].tolist() == right["terminal_observation"].tolist()
                 )
                 assert left["episode"]["r"] == right["episode"]["r"]
+
+
+@pytest.mark.parametrize("kind", ["mismatch", "excess"])
+def test_rewards_without_what_no_policy_changes(kind: str) -> None:
+    """Requests of nobody: rewards of the training differ, returns in infos are the task's."""
+    usual = make_sb3_vec_env(OSCILLATOR, 4, seed=0, horizon=5, filter="tobit")
+    other = make_sb3_vec_env(OSCILLATOR, 4, seed=0, training_error=kind, horizon=5, filter="tobit")
+    total = np.zeros(4)
+    for env in (usual, other):
+        env.reset()
+    for _ in range(5):
+        nobody = np.zeros((4, 3), dtype=np.int8)
+        seen, rewards, _, infos = usual.step(nobody)
+        again, changed, _, others = other.step(nobody)
+        np.testing.assert_array_equal(seen, again)
+        assert not np.allclose(rewards, changed)
+        total += rewards
+    for run in range(4):
+        assert infos[run]["episode"]["r"] == others[run]["episode"]["r"]
+        assert others[run]["episode"]["r"] == pytest.approx(total[run], rel=1e-5)
+
+
+def test_another_training_error_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="training_error = 'trace' is not allowed"):
+        make_sb3_vec_env(OSCILLATOR, 4, training_error="trace")
