@@ -12,6 +12,7 @@ from typing import Annotated
 import tyro
 from rich.markdown import Markdown
 
+from fusion_gym.envs.registration import ENVIRONMENTS
 from fusion_gym.validation import nearest, refusal
 
 from .command_line import Command
@@ -24,7 +25,7 @@ class Info(Command):
     """Show the page of an environment, rule, filter, signal, agent or config."""
 
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
-    """A name from fusion-gym list; an environment may go without fusion_gym/ and -v1."""
+    """A name from fusion-gym list; an environment may go without fusion_gym/ and its version."""
 
     def run(self) -> None:
         """Print the page of every entry of this name.
@@ -33,8 +34,8 @@ class Info(Command):
             ConfigurationError: an unknown name.
         """
         entries = catalogue()
-        alias = f"fusion_gym/{self.name}-v1"
-        name = alias if alias in entries["environments"] else self.name
+        short = {id_.removeprefix("fusion_gym/").rpartition("-v")[0]: id_ for id_ in ENVIRONMENTS}
+        name = short.get(self.name, self.name)
         names = [entry for named in entries.values() for entry in named]
         if name not in names:
             hint = f"; did you mean {nearest(name, names)!r}?" if nearest(name, names) else ""

@@ -81,7 +81,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("plants", nargs="*", metavar="PLANT", help="all by default")
     parser.add_argument("--output", type=Path, default=Path("runs/plants"))
-    parser.add_argument("--episodes", type=int, default=400)
+    parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--timesteps", type=int, help="in the place of the config's")
     parser.add_argument("--resume", action="store_true", help="go on with what is there")
     arguments = parser.parse_args()

@@ -55,8 +55,9 @@ def test_committed_sweep_and_comparison_name_policies_that_exist() -> None:
     ):
         sweep = load_checked(Sweep, CONFIGS / f"{name}_sweep.yaml")
         task = fusion_gym.make_task(env_id)
-        assert len(sweep.policies) == len(set(sweep.policies)) > 50
-        for policy in sweep.policies:
+        policies = sweep.policies(task.reward.price)
+        assert len(policies) == len(set(policies)) > 50
+        for policy in policies:
             make_policy(policy, task)
     for file in CONFIGS.glob("*_reproduce.yaml"):
         comparison = load_checked(SweepSettings, file)

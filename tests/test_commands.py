@@ -105,7 +105,7 @@ def test_a_training_needs_no_config(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", words.split())
     experiment = command_line.read_command(Train).experiment()
     assert experiment.environment.options == {"horizon": 9}
-    assert (experiment.algorithm.name, experiment.output) == ("ppo", "runs/linearfusion_v1_ppo")
+    assert (experiment.algorithm.name, experiment.output) == ("ppo", "runs/linearfusion_v2_ppo")
     assert (experiment.training.timesteps, experiment.training.seed) == (64, 3)
     for more in ([], ["--env", "fusion_gym/LinearFusion-v2", "--config", "tobit_oscillator_ppo"]):
         assert "give one of them" in call("train", more).err
