@@ -104,3 +104,16 @@ def test_a_command_that_has_ended_is_not_run_again(tmp_path: Path) -> None:
     assert run("python -c 'print(1)'", tmp_path) == first
     with pytest.raises(RuntimeError, match="ended with 3"):
         run("python -c 'raise SystemExit(3)'", tmp_path)
+
+
+def test_many_sensors_train_shorter() -> None:
+    experiment = load_checked(Experiment, "linear_fusion_front")
+    lengths = [
+        experiment.resolved({"reward_scale": 1.0, "price_range": None}, sensors).training.timesteps
+        for sensors in (2, 4, 12)
+    ]
+    assert lengths == [800_000, 800_000, 266_667]
+    given = experiment.changed(None, timesteps=1000)
+    assert given.resolved(given.environment.options | {"reward_scale": 1.0}, 12).training == (
+        given.training
+    )

@@ -37,7 +37,8 @@ class TrainingConfig(Strict):
     ``target_rate`` trains to an average rate of transmissions per sensor and step: the price of a
     token starts at the environment's ``cost_weight`` and is adapted. ``price_exponent`` is for a
     price that is drawn: episodes count by (middle of the range / price)^exponent, in training and
-    in validation, so that an agent does not neglect the low prices.
+    in validation, so that an agent does not neglect the low prices. With more sensors than
+    ``many_sensors``, ``timesteps`` fall in proportion, for a step of theirs takes longer.
 
     ``error`` is what is trained on (validations are of the true error): ``excess`` and ``mismatch``
     take off what no policy can change, by an estimate that takes in every measurement with the
@@ -51,6 +52,7 @@ class TrainingConfig(Strict):
     threads: Annotated[int, pydantic.Field(gt=0, le=1024)] = 1
     target_rate: float | None = pydantic.Field(default=None, gt=0, le=1)
     price_exponent: Share = 0.0
+    many_sensors: Positive | None = None
     error: Literal["squared", "excess", "mismatch"] = "squared"
     error_filter: str | None = None
 
@@ -78,9 +80,12 @@ class Experiment(Strict):
             mode="json", exclude={"output": True, "training": {"timesteps": True, "threads": True}}
         )
 
-    def resolved(self, settings: Mapping[str, Any]) -> Experiment:
-        """Return the experiment with the numbers that its environment's ``"auto"`` stood for."""
-        options = self.environment.options
+    def resolved(self, settings: Mapping[str, Any], sensors: int) -> Experiment:
+        """Return the experiment with the numbers that ``"auto"`` and ``many_sensors`` stand for.
+
+        ``settings`` are those of the environment's task, which has so many ``sensors``.
+        """
+        options, training = self.environment.options, self.training
         numbers = {
             name: settings[name]
             for name in ("reward_scale", "price_range")
@@ -88,7 +93,10 @@ class Experiment(Strict):
         }
         given = {name: value for name, value in options.items() if name not in numbers}
         environment = self.environment.model_copy(update={"options": given | numbers})
-        return self.model_copy(update={"environment": environment})
+        share = min((training.many_sensors or sensors) / sensors, 1.0)
+        length = {"timesteps": round(training.timesteps * share), "many_sensors": None}
+        training = training.model_copy(update=length)
+        return self.model_copy(update={"environment": environment, "training": training})
 
     def changed(
         self, output: str | Path | None, options: Mapping[str, Any] | None = None, **training: Any
@@ -102,4 +110,6 @@ class Experiment(Strict):
         environment = plain["environment"]
         environment["options"] |= open_options(environment["id"], options or {})
         plain["training"] |= {key: value for key, value in training.items() if value is not None}
+        if training.get("timesteps") is not None:
+            plain["training"]["many_sensors"] = None
         return parse(Experiment, plain, "command line")

@@ -128,7 +128,7 @@ def train(
     if resume and not holds_training(folder):
         raise ConfigurationError(f"output = {str(folder)!r} holds no training: nothing to resume")
     model, env, scored = check_run(experiment)
-    experiment = experiment.resolved(env.task.settings)
+    experiment = experiment.resolved(env.task.settings, env.task.sensors)
     earlier(experiment, folder, resume)  # refuses before anything is made
     torch.set_num_threads(experiment.training.threads)
     with alone_in(folder, "output"):
