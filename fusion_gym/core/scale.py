@@ -4,6 +4,7 @@ Both are found by seeded simulations of the plant as assumed, whatever its filte
 """
 
 import json
+import math
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -21,6 +22,7 @@ from fusion_gym.errors import ConfigurationError, display
 
 Build = Callable[[Any], Scenario]
 _RUNS, _STEPS, _SEED = 32, 200, 20_261_124
+_WORK = 200  # sensors · states² up to which a sweep has all its rules and runs
 # A pace that comes up at a step may be computed a rounding below it: 49 · (1/49) < 1.
 _ROUNDING = 1e-9
 # Of the packets that the tokens sustain, at the lowest and at the highest price; packets of a
@@ -82,7 +84,7 @@ def nominal_error(task: Task) -> Array:
     rate, sensors = nominal_rate(task.bucket, task.access), task.sensors
     if rate == 0.0:
         return task.open_loop[:, 0]
-    batch = _batch(task, 1)
+    batch = _batch(task, _RUNS, 1)
     total = np.zeros(len(task.open_loop))
     due = np.repeat(np.arange(sensors)[:, None] / sensors + _ROUNDING, _RUNS, axis=1)
     for _ in range(batch.task.horizon):
@@ -124,21 +126,25 @@ def _nominal(task: Task) -> tuple[Array, float]:
 def _sweep(task: Task) -> tuple[Array, Array]:
     """Tokens and error a step (rules,) of value of information, on the same noise.
 
-    Of rising thresholds, each with at most 1, 2, 4, … sensors a step.
+    Of rising thresholds, each with at most 1, 2, 4, … sensors a step; fewer of all on a plant whose
+    steps take long.
     """
+    share = _WORK / (task.sensors * len(task.open_loop) ** 2)
+    runs = int(np.clip(_RUNS * share, 4, _RUNS))
+    ratio, count = (2, 21) if runs > 4 else (4, 9)
     usual = task.error_scale * float((task.relative_weights[:, 0] * nominal_error(task)).sum())
-    levels = usual / float(task.bucket.cost.mean()) * np.geomspace(3e-3, 3e2, 21)
-    counts = 2 ** np.arange(task.sensors.bit_length())
-    least = np.tile(np.repeat(levels, _RUNS), len(counts)) * task.bucket.cost
-    most = np.repeat(counts, len(levels) * _RUNS)
-    batch = _batch(task, len(levels) * len(counts))
+    levels = usual / float(task.bucket.cost.mean()) * np.geomspace(3e-3, 3e2, count)
+    counts = ratio ** np.arange(1 + int(math.log(task.sensors, ratio)))
+    least = np.tile(np.repeat(levels, runs), len(counts)) * task.bucket.cost
+    most = np.repeat(counts, len(levels) * runs)
+    batch = _batch(task, runs, len(levels) * len(counts))
     total = np.zeros((2, len(most)))
     for _ in range(batch.task.horizon):
         value = task.error_scale * batch.beliefs().value()
         rank = np.argsort(np.argsort(-value, axis=0), axis=0)
         outcome = batch.step((value >= least) & (rank < most))
         total += outcome.cost, -outcome.reward_error
-    spent, error = total.reshape(2, -1, _RUNS).mean(-1) / batch.task.horizon
+    spent, error = total.reshape(2, -1, runs).mean(-1) / batch.task.horizon
     return spent, error
 
 
@@ -159,10 +165,10 @@ def _above(left: int, middle: int, right: int, spent: Array, error: Array) -> bo
     return bool(rise >= (error[right] - error[left]) * (spent[middle] - spent[left]))
 
 
-def _batch(task: Task, copies: int) -> EpisodeBatch:
+def _batch(task: Task, runs: int, copies: int) -> EpisodeBatch:
     """A batch of as many copies of the simulation's runs."""
-    batch = EpisodeBatch(replace(task, horizon=min(task.horizon, _STEPS)), _RUNS * copies)
-    seeds = np.tile(np.arange(_SEED, _SEED + _RUNS), copies)
+    batch = EpisodeBatch(replace(task, horizon=min(task.horizon, _STEPS)), runs * copies)
+    seeds = np.tile(np.arange(_SEED, _SEED + runs), copies)
     batch.seed(np.arange(len(seeds)), seeds.tolist())
     batch.reset()
     return batch
