@@ -12,7 +12,7 @@ from typing import Annotated
 import tyro
 from rich.markdown import Markdown
 
-from fusion_gym.envs.registration import ENVIRONMENTS
+from fusion_gym.envs.registration import present_id
 from fusion_gym.validation import nearest, refusal
 
 from .command_line import Command
@@ -34,8 +34,7 @@ class Info(Command):
             ConfigurationError: an unknown name.
         """
         entries = catalogue()
-        short = {id_.removeprefix("fusion_gym/").rpartition("-v")[0]: id_ for id_ in ENVIRONMENTS}
-        name = short.get(self.name, self.name)
+        name = present_id(self.name)
         names = [entry for named in entries.values() for entry in named]
         if name not in names:
             hint = f"; did you mean {nearest(name, names)!r}?" if nearest(name, names) else ""

@@ -119,7 +119,7 @@ def seconds_table(names: list[str], runs: list[list[Run]]) -> str:
 
 def replaced(text: str, name: str, content: str) -> str:
     """Return the page with new content between the marks of this name."""
-    pattern = re.compile(rf"(<!-- results: {name} -->\n).*?(<!-- end -->)", re.DOTALL)
+    pattern = re.compile(rf"(<!-- table: {name} -->\n).*?(<!-- end -->)", re.DOTALL)
     return pattern.sub(lambda mark: f"{mark[1]}\n{content}\n\n{mark[2]}", text)
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from fusion_gym import ConfigurationError, make_task
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.envs.registration import present_id
 
 Array = NDArray[np.float64]
 Options = dict[str, Any]
@@ -335,7 +336,7 @@ def draw(family: str, number: int, horizon: int) -> Drawn:
     random = np.random.default_rng([list(FAMILIES).index(family), number])
     drawn = FAMILIES[family](random, horizon)
     options = drawn.options | {"tokens": "unlimited"}
-    return Drawn(f"fusion_gym/{drawn.env_id}-v1", options, drawn.known)
+    return Drawn(present_id(drawn.env_id), options, drawn.known)
 
 
 def request(random: np.random.Generator, step: int, sensors: int, runs: int) -> NDArray[np.bool_]:

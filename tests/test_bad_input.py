@@ -10,6 +10,7 @@ from gymnasium.error import ResetNeeded
 from rules import make_rule
 
 from fusion_gym import ConfigurationError, make_sb3_vec_env, make_task
+from fusion_gym.envs.registration import present_id
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
 
@@ -208,7 +209,7 @@ ELSEWHERE: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
 @pytest.mark.parametrize(("name", "options", "parts"), ELSEWHERE, ids=lambda value: str(value)[:60])
 def test_options_elsewhere(name: str, options: dict[str, Any], parts: tuple[str, ...]) -> None:
     message = refused(
-        lambda: make_task(f"fusion_gym/{name}-v1", **options),
+        lambda: make_task(present_id(name), **options),
         ConfigurationError,
         (next(iter(options)), *parts),
     )
@@ -310,7 +311,7 @@ CENTRE, MARKOV = {"information": "centre"}, "MarkovJumpTracking"
 def test_policies_elsewhere(
     name: str, options: dict[str, Any], spec: str, parts: tuple[str, ...]
 ) -> None:
-    task = make_task(f"fusion_gym/{name}-v1", **options)
+    task = make_task(present_id(name), **options)
     message = refused(lambda: make_policy(spec, task), ConfigurationError, parts)
     assert "\n" not in message
 

@@ -19,6 +19,7 @@ from fusion_gym.agents import __main__ as everything
 from fusion_gym.agents.command_line import Command
 from fusion_gym.agents.experiments.config import SweepCurve
 from fusion_gym.agents.output.ending import report_errors
+from fusion_gym.core.reward import Price
 from fusion_gym.policies.settings import parse_value
 from fusion_gym.validation import ConfigurationError
 
@@ -174,4 +175,4 @@ def test_what_is_no_literal_stays_text(text: str) -> None:
 
 def test_braces_of_a_swept_policy_are_its_own() -> None:
     curve = SweepCurve(label="a", policy="p:a={value},b={0}{other}", values=(1, 2.5))
-    assert curve.policies == ["p:a=1,b={0}{other}", "p:a=2.5,b={0}{other}"]
+    assert curve.policies(Price.create(0.5)) == ["p:a=1,b={0}{other}", "p:a=2.5,b={0}{other}"]

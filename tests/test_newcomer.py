@@ -92,11 +92,11 @@ def test_prices_are_for_agents_that_see_one() -> None:
 
 
 def test_tables_go_between_their_marks() -> None:
-    text = "a\n<!-- results: x -->\nold\n<!-- end -->\n<!-- results: y -->\n<!-- end -->\n"
+    text = "a\n<!-- table: x -->\nold\n<!-- end -->\n<!-- table: y -->\n<!-- end -->\n"
     once = replaced(text, "x", "| new |")
     assert once == replaced(once, "x", "| new |")
     assert "old" not in once
-    assert once.endswith("<!-- results: y -->\n<!-- end -->\n")
+    assert once.endswith("<!-- table: y -->\n<!-- end -->\n")
 
 
 def test_a_command_that_has_ended_is_not_run_again(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from fusion_gym.core.memory import Memory
 from fusion_gym.core.options import CommonOptions, Scenario
 from fusion_gym.core.system import CAPABILITIES, Block, Signal, System
 from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import present_id
 from fusion_gym.systems.nonlinear import NonlinearSystem
 from fusion_gym.validation import ConfigurationError
 
@@ -28,7 +29,7 @@ OFFERED: list[tuple[str, dict[str, Any], set[str]]] = [
 
 
 def system_of(name: str, options: dict[str, Any]) -> System[Any]:
-    return fusion_gym.make_task(f"fusion_gym/{name}-v1", **options).system
+    return fusion_gym.make_task(present_id(name), **options).system
 
 
 @pytest.mark.parametrize(("name", "options", "expected"), OFFERED)

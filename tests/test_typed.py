@@ -80,7 +80,7 @@ def test_the_specification_lists_every_option(env_id: str) -> None:
         place = lines.index(f"{name}: {options[name].type} = {short(getattr(kind(), name))}")
         assert lines[place + 1] == options[name].meaning
     assert options["access"].type == "'any' | 'single' | 'round_robin' | 'random'"
-    assert options["price_range"].type == "ArrayLike | None"
+    assert options["price_range"].type == "ArrayLike | 'auto' | None"
     for ending in ("Env", "VectorEnv"):  # what an editor shows of the class, and help
         parameters = inspect.signature(getattr(registered, class_name(env_id) + ending)).parameters
         for name in own:

@@ -14,7 +14,7 @@ def made_up(rate: float, mse: Any) -> EpisodeResults:
     mse = np.asarray(mse, dtype=np.float64)
     zero = np.zeros_like(mse)
     return EpisodeResults(
-        mse=mse, bound_trace=zero, nees=zero, rate=np.full((len(mse), 2), rate),
+        mse=mse, error_cost=mse, bound_trace=zero, nees=zero, rate=np.full((len(mse), 2), rate),
         requests=np.full((len(mse), 2), rate), tokens=zero, denied=zero, returns=zero,
         diverged=zero, squared_error=np.zeros((3, 2)),
     )  # fmt: skip

@@ -122,6 +122,11 @@ def id_of(name: str) -> str | None:
     return classes.get(name)
 
 
+def present_id(name: str) -> str:
+    """Return the present id of an environment's name or earlier id, or else the name."""
+    return {class_name(env_id): env_id for env_id in ENVIRONMENTS}.get(class_name(name), name)
+
+
 def base_of(env_id: str) -> tuple[str, dict[str, Any]]:
     """Return the environment of this suite behind an id, and the options of its registration.
 
@@ -138,10 +143,8 @@ def base_of(env_id: str) -> tuple[str, dict[str, Any]]:
     module, colon, name = env_id.rpartition(":")
     if colon:
         imported("env", env_id, module)
-    if name not in gymnasium.registry:
-        for newer in ENVIRONMENTS:
-            if _VERSION.sub(r"\1", newer) == _VERSION.sub(r"\1", name) != name:
-                raise validation.refusal("environment", name, f"{newer!r}, its present version")
+    if name not in gymnasium.registry and (present := present_id(name)) != name:
+        raise validation.refusal("environment", name, f"{present!r}, its present version")
     if name in ENVIRONMENTS or name not in gymnasium.registry:
         validation.keys("environment", [name], ENVIRONMENTS)
         return name, {}

@@ -135,7 +135,12 @@ class Blueprint:
         if "format" not in card_entry:
             return _inferred(data)
         validation.integer("format", card_entry["format"], at_least=FORMAT, at_most=FORMAT)
-        known = {"format", *ModelView.__dataclass_fields__, *cls.__dataclass_fields__}
+        known = {
+            "format",
+            "reward_scale",
+            *ModelView.__dataclass_fields__,
+            *cls.__dataclass_fields__,
+        }
         validation.keys("entry of the card", card_entry, known)
         if not isinstance(card_entry.get("network"), dict):
             raise ConfigurationError("network is not allowed: it must be a table of sizes")
@@ -158,6 +163,7 @@ def model_card(algorithm: str, model: BaseAlgorithm, task: Task, local: bool) ->
     }
     if task.nominal_error is not None:
         entries["nominal_error"] = task.nominal_error.tolist()
+        entries["reward_scale"] = task.settings["reward_scale"]
     policy: Any = model.policy
     if type(policy) is not POLICIES.get(algorithm) or set(model.policy_kwargs) - _HARMLESS:
         return entries

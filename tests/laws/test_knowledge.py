@@ -15,6 +15,7 @@ from fusion_gym.core.options import Broadcast
 from fusion_gym.core.runs import Runs
 from fusion_gym.core.system import SignalError, Signals, covers
 from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import present_id
 from fusion_gym.envs.views import SensorView
 from fusion_gym.fusion.intersection import covariance_intersection
 from fusion_gym.validation import ConfigurationError
@@ -240,7 +241,7 @@ EXACT: list[tuple[str, dict[str, Any]]] = [
 @pytest.mark.parametrize(("name", "options"), EXACT)
 def test_innovations_have_the_variance_that_is_claimed(name: str, options: dict[str, Any]) -> None:
     """Under random requests: the mean square of each channel that is sampled at a step is 1."""
-    task = fusion_gym.make_task(f"fusion_gym/{name}-v1", **options)
+    task = fusion_gym.make_task(present_id(name), **options)
     batch, squares = EpisodeBatch.seeded(task, 8000, 0), []
     for request in requests(task, 8000, 12, rate=0.3):
         signals = read(batch)

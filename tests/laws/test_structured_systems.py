@@ -15,6 +15,7 @@ from structured_systems import FAMILIES, Drawn, Survey, draw, draw_linear, reque
 import fusion_gym
 from fusion_gym import ConfigurationError, make_task
 from fusion_gym.core.batch import EpisodeBatch
+from fusion_gym.envs.registration import present_id
 from fusion_gym.errors import DivergenceError
 from fusion_gym.systems.linear_plant import LinearPlant
 from fusion_gym.systems.markov_jump.linear_minimum_variance import AugmentedModel
@@ -55,7 +56,7 @@ def exactly_filtered(number: int, horizon: int) -> tuple[Drawn, bool]:
     kind = number % 3
     if kind == 0:
         drawn = draw_linear(np.random.default_rng([9, number]), horizon, exact=True)
-        return Drawn(f"fusion_gym/{drawn.env_id}-v1", drawn.options, drawn.known), False
+        return Drawn(present_id(drawn.env_id), drawn.options, drawn.known), False
     drawn = draw(("TobitOscillator", "BiasedOscillator")[kind - 1], number, horizon)
     name = ("tobit", "paper")[kind - 1] if number % 2 else "kalman"
     own = ("fusion", "stochastic_weight", "bias_aware", "silent")
@@ -198,7 +199,7 @@ def test_a_growth_that_the_unknown_input_hides_is_refused() -> None:
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_step_names_run_step_and_quantity(family: str) -> None:
-    task = make_task(f"fusion_gym/{family}-v1", horizon=5)
+    task = make_task(present_id(family), horizon=5)
     batch = EpisodeBatch.seeded(task, 3, seed=0)
     nobody = np.zeros((task.sensors, 3), dtype=np.bool_)
     batch.step(nobody)
