@@ -83,7 +83,7 @@ class Experiment(Strict):
     def resolved(self, settings: Mapping[str, Any], sensors: int) -> Experiment:
         """Return the experiment with the numbers that ``"auto"`` and ``many_sensors`` stand for.
 
-        ``settings`` are those of the environment's task, which has so many ``sensors``.
+        ``settings`` belong to the environment's task, which has so many ``sensors``.
         """
         options, training = self.environment.options, self.training
         numbers = {
