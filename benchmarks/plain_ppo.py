@@ -33,8 +33,8 @@ from fusion_gym.agents.output.ending import report_errors
 from fusion_gym.agents.output.files import write
 from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.core.task import Task
+from fusion_gym.envs.privileged import make_sb3_vec_env
 from fusion_gym.envs.registration import make_task
-from fusion_gym.envs.sb3 import make_sb3_vec_env
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.model import ModelPolicy

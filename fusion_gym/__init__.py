@@ -16,7 +16,8 @@ from fusion_gym.version import __version__
 if TYPE_CHECKING:
     from fusion_gym import evaluation, zoo
     from fusion_gym.envs.parallel import FusionParallelEnv, parallel_env
-    from fusion_gym.envs.sb3 import FusionSB3VecEnv, make_sb3_vec_env
+    from fusion_gym.envs.privileged import make_sb3_vec_env
+    from fusion_gym.envs.sb3 import FusionSB3VecEnv
     from fusion_gym.envs.single import FusionEnv
     from fusion_gym.envs.vector import FusionVectorEnv
 
@@ -43,7 +44,7 @@ _INTERFACES = {
     "FusionEnv": "single",
     "FusionVectorEnv": "vector",
     "FusionSB3VecEnv": "sb3",
-    "make_sb3_vec_env": "sb3",
+    "make_sb3_vec_env": "privileged",
     "FusionParallelEnv": "parallel",
     "parallel_env": "parallel",
 }

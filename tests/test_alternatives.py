@@ -11,8 +11,12 @@ from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.memory import Owner
 from fusion_gym.core.runs import Branch
 from fusion_gym.core.task import Task
-from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_system
-from fusion_gym.envs.sb3 import FusionSB3VecEnv, make_sb3_vec_env
+from fusion_gym.envs.privileged import (
+    PrivilegedVecEnv,
+    make_sb3_vec_env,
+    reference_system,
+)
+from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.validation import ConfigurationError
 
 OSCILLATOR = "fusion_gym/TobitOscillator-v1"

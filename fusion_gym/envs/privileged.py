@@ -1,4 +1,4 @@
-"""The vector environment of a training that knows what no policy may know.
+"""Vector environments for training, also with what no policy may know.
 
 Only credit and rewards are made of it, in training: what a policy sees is what it sees in use.
 """
@@ -150,3 +150,44 @@ def reference_system(
         settings["memory_filter"] = memory_filter
     task = make_task(env_id, **settings)
     return task.memory_system or task.system
+
+
+def make_sb3_vec_env(
+    env_id: str,
+    num_envs: int,
+    *,
+    seed: int | None = None,
+    stagger: bool = False,
+    local: bool = False,
+    training_error: str = "squared",
+    **options: Any,
+) -> FusionSB3VecEnv:
+    """Return a native SB3 ``VecEnv`` of a registered environment.
+
+    Args:
+        env_id: the id of the environment.
+        num_envs: runs side by side.
+        seed: seed of run 0, for the next reset; run i gets ``seed + i``.
+        stagger: spread the lengths of the first episodes.
+        local: one row for each sensor of each run.
+        training_error: error's term of the rewards. ``"mismatch"`` and ``"excess"`` take off the
+            part of the error that no policy changes
+            (:meth:`~fusion_gym.core.reward.Reward.training_error`). Returns in infos stay the
+            task's.
+        options: options of ``gym.make``.
+
+    Raises:
+        ConfigurationError: an unknown id or option, or a value that is not allowed.
+    """
+    task = make_task(env_id, **options)
+    if training_error == "squared":
+        env = FusionSB3VecEnv(task, num_envs, stagger=stagger, local=local)
+    else:
+        validation.choice("training_error", training_error, TRAINING_ERRORS)
+        reference = reference_system(env_id, options)
+        env = PrivilegedVecEnv(
+            task, num_envs, error=training_error, reference=reference, stagger=stagger, local=local
+        )
+    if seed is not None:
+        env.seed(seed)
+    return env

@@ -12,10 +12,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from fusion_gym import validation
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.reward import TRAINING_ERRORS
 from fusion_gym.core.runs import Outcome
 from fusion_gym.core.task import Task
-from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.vector import refuse_vector_reward
 from fusion_gym.envs.views import make_view
 
@@ -256,46 +254,3 @@ class FusionSB3VecEnv(VecEnv):
         from stable_baselines3.common.monitor import Monitor
 
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]
-
-
-def make_sb3_vec_env(
-    env_id: str,
-    num_envs: int,
-    *,
-    seed: int | None = None,
-    stagger: bool = False,
-    local: bool = False,
-    training_error: str = "squared",
-    **options: Any,
-) -> FusionSB3VecEnv:
-    """Return a native SB3 ``VecEnv`` of a registered environment.
-
-    Args:
-        env_id: the id of the environment.
-        num_envs: runs side by side.
-        seed: seed of run 0, for the next reset; run i gets ``seed + i``.
-        stagger: spread the lengths of the first episodes.
-        local: one row for each sensor of each run.
-        training_error: error's term of the rewards. ``"mismatch"`` and ``"excess"`` take off the
-            part of the error that no policy changes
-            (:meth:`~fusion_gym.core.reward.Reward.training_error`). Returns in infos stay the
-            task's.
-        options: options of ``gym.make``.
-
-    Raises:
-        ConfigurationError: an unknown id or option, or a value that is not allowed.
-    """
-    task = make_task(env_id, **options)
-    if training_error == "squared":
-        env = FusionSB3VecEnv(task, num_envs, stagger=stagger, local=local)
-    else:
-        from fusion_gym.envs import privileged  # which imports this module
-
-        validation.choice("training_error", training_error, TRAINING_ERRORS)
-        reference = privileged.reference_system(env_id, options)
-        env = privileged.PrivilegedVecEnv(
-            task, num_envs, error=training_error, reference=reference, stagger=stagger, local=local
-        )
-    if seed is not None:
-        env.seed(seed)
-    return env
