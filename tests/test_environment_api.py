@@ -56,7 +56,7 @@ def test_extreme_entries_are_clipped_to_their_bounds() -> None:
 def test_a_interface_without_its_package_says_what_to_install(
     package: str, interface: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module = {"make_sb3_vec_env": "sb3", "parallel_env": "parallel"}[interface]
+    module = {"make_sb3_vec_env": "privileged", "parallel_env": "parallel"}[interface]
     monkeypatch.delitem(sys.modules, f"fusion_gym.envs.{module}", raising=False)
     for name in [name for name in sys.modules if name.partition(".")[0] == package]:
         monkeypatch.delitem(sys.modules, name)

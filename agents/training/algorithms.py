@@ -85,7 +85,7 @@ class CounterfactualConfig(PPOConfig):
     """PPO with counterfactual credit (:mod:`.counterfactual`).
 
     ``alternatives`` of a decision are ``all`` actions, or the requests with one sensor's flipped at
-    a time; by default all where a scheduler has at most 16. Without ``path_credit`` what the view
+    a time; by default all where a scheduler has at most 8. Without ``path_credit`` what the view
     of one step has missed teaches the critic alone.
     """
 

@@ -13,7 +13,7 @@ from fusion_gym.envs.views import SensorView
 from fusion_gym.validation import ConfigurationError
 
 Kind = Literal["all", "flips"]
-MOST_ALTERNATIVES = 16  # sets of requests that are all stepped unless told otherwise
+MOST_ALTERNATIVES = 8  # sets of requests that are all stepped unless told otherwise
 MOST_SENSORS = 10  # whose sets of requests are all stepped where that is asked for
 Chosen = NDArray[np.int64]  # choices (runs, D)
 
