@@ -2,8 +2,8 @@
 
     python -m benchmarks.newcomer [--resume]
 
-Each YAML block of the page is a plant. The page's commands name the first; for the others that
-name is replaced, also in folders. A command that has ended is not run again with ``--resume``.
+Each YAML block of the page is a plant, whose name is the folder of its comparison, too. A command
+that has ended is not run again with ``--resume``.
 """
 
 import argparse
@@ -48,15 +48,14 @@ def main() -> None:
     names = [re.match(r"# (\w+)\.yaml\n", block)[1] for block in plants]  # type: ignore[index]
     shell = "".join(block for language, block in FENCE.findall(text) if language == "bash")
     lines = [line for line in shell.replace("\\\n", " ").splitlines() if line[:10] == "fusion-gym"]
-    runs: list[list[Run]] = []
     for name, plant in zip(names, plants, strict=True):
         (arguments.folder / f"{name}.yaml").write_text(plant, encoding="utf-8")
-        own = [re.sub(rf"\b{names[0]}\b", name, line) for line in lines]
-        runs.append([run(line, arguments.folder) for line in own])
+    runs = [run(line, arguments.folder) for line in lines]
+    for name in names:
         comparison = arguments.folder / "runs" / name / "comparison"
         text = replaced(text, name, points_table(comparison / "comparison.json"))
         shutil.copy(comparison / "pareto.png", PAGE.with_name(f"newcomer_{name}.png"))
-    PAGE.write_text(replaced(text, "seconds", seconds_table(names, runs)), encoding="utf-8")
+    PAGE.write_text(replaced(text, "seconds", seconds_table(runs)), encoding="utf-8")
 
 
 def run(line: str, folder: Path) -> Run:
@@ -107,13 +106,9 @@ def points_table(path: Path) -> str:
     return table(heads, rows) + f"\n\nMeasured in fusion-gym {__version__}."
 
 
-def seconds_table(names: list[str], runs: list[list[Run]]) -> str:
+def seconds_table(runs: list[Run]) -> str:
     """Seconds of each command, of the wall and of the processor."""
-    rows = [
-        (f"`{item.command}`, {name}", f"{item.seconds:.0f}", f"{item.processor:.0f}")
-        for name, items in zip(names, runs, strict=True)
-        for item in items
-    ]
+    rows = [(f"`{item.command}`", f"{item.seconds:.0f}", f"{item.processor:.0f}") for item in runs]
     return table(("command", "seconds", "of the processor"), rows)
 
 

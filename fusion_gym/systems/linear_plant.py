@@ -115,11 +115,13 @@ class LinearPlant(Plant):
     def predict(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Prior mean (n, N) and covariance A P Aᵀ + W (n, n, N) of the next state.
 
-        Where A P Aᵀ cancels, as it may where P is singular, it is (A F)(A F)ᵀ with a root F of P.
+        Where A P Aᵀ cancels, as it may after a known start, it is (A F)(A F)ᵀ with a root F of P.
 
         Source: tobit_token_bucket, equations (21) and (29).
         """
         prior = linalg.congruence(self.transition, covariance) + self.process_covariance
+        if not self._known_start:
+            return linalg.matvec(self.transition, mean), prior
         most = (self._cancelling * linalg.diagonal(covariance)[..., None, :, :]).sum(-2)
         cancelled = linalg.diagonal(prior) < most
         if cancelled.any():
@@ -127,6 +129,11 @@ class LinearPlant(Plant):
             moved = linalg.matmul(self.transition, linalg.root(covariance[..., lanes]))
             prior[..., lanes] = linalg.gram(moved) + self.process_covariance
         return linalg.matvec(self.transition, mean), prior
+
+    @functools.cached_property
+    def _known_start(self) -> bool:
+        """Whether the start is known in some direction."""
+        return bool(np.linalg.matrix_rank(self.initial_covariance[..., 0]) < self.size)
 
     @functools.cached_property
     def _cancelling(self) -> Array:
