@@ -20,8 +20,8 @@ from fusion_gym.validation import ConfigurationError, display, refusal
 def one_batch(envs: VecEnv, **options: Any) -> FusionSB3VecEnv:
     """A batch with as many runs, the same environment and the same seeds; ``envs`` are closed.
 
-    ``options`` are those of :func:`~fusion_gym.envs.privileged.make_sb3_vec_env`; what the environments
-    were made with comes before them. Without options the batch's episodes are those of ``envs``,
+    ``options`` belong to :func:`~fusion_gym.envs.privileged.make_sb3_vec_env`; what the
+    environments were made with comes before them. Without options the batch's episodes are those of ``envs``,
     bit by bit. Monitors write no files any more, their infos are the batch's own.
 
     Raises:
