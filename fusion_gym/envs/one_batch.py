@@ -21,8 +21,8 @@ def one_batch(envs: VecEnv, **options: Any) -> FusionSB3VecEnv:
     """A batch with as many runs, the same environment and the same seeds; ``envs`` are closed.
 
     ``options`` belong to :func:`~fusion_gym.envs.privileged.make_sb3_vec_env`; what the
-    environments were made with comes before them. Without options the batch's episodes are those of ``envs``,
-    bit by bit. Monitors write no files any more, their infos are the batch's own.
+    environments were made with comes before them. Without options the batch's episodes are bitwise
+    the episodes of ``envs``. Monitors write no files any more, their infos are the batch's own.
 
     Raises:
         ConfigurationError: environments of another kind or made differently, with a window, or in
