@@ -104,7 +104,7 @@ integrations-rllib: .venv-rllib/.installed  ## RLlib
 	.venv-rllib/bin/python -m pytest integrations/rllib
 
 newcomer: $(STAMP)  ## run the commands of docs/newcomer.md and write its tables, 6 minutes
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m benchmarks.newcomer --resume
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m benchmarks.newcomer
 
 lines:  ## code lines without blanks, comments and docstrings
 	@$(PYTHON) tests/lines.py

@@ -3,7 +3,7 @@
     python -m benchmarks.newcomer [--resume]
 
 Each YAML block of the page is a plant, whose name is the folder of its comparison, too. A command
-that has ended is not run again with ``--resume``.
+that has ended is not run again with ``--resume``, and a training that was cut off goes on.
 """
 
 import argparse
@@ -68,6 +68,8 @@ def run(line: str, folder: Path) -> Run:
     stored = folder / f"{'_'.join(re.findall(r'[a-z]+', line))[:120]}.json"
     if not stored.exists():
         print(line, flush=True)
+        if words[1] == "train" and (folder / words[-1] / "config.yaml").exists():
+            words.append("--resume")  # of a training that was cut off
         environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         began, before = time.monotonic(), os.times()
         ended = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True)
