@@ -25,7 +25,7 @@ from fusion_gym.agents.output import tables
 from fusion_gym.agents.output.ending import report_errors
 from fusion_gym.agents.training.run import holds_training
 from fusion_gym.arrays import Array
-from fusion_gym.core.scale import sustained_rate
+from fusion_gym.core.scale import sustained_tokens
 from fusion_gym.envs.registration import make_task
 from fusion_gym.validation import choice
 
@@ -102,8 +102,7 @@ def judge(name: str, arguments: argparse.Namespace) -> Row:
         stored.write_text(json.dumps(run_commands(PLANTS[name], folder, arguments)))
     points = json.loads((folder / "comparison" / "comparison.json").read_text())["points"]
     policies = json.loads((folder / "comparison" / "evaluation.json").read_text())["policies"]
-    task = make_task(ENV, **PLANTS[name])
-    sustained = sustained_rate(task.bucket, task.access) * float(task.bucket.cost.sum())
+    sustained = sustained_tokens(make_task(ENV, **PLANTS[name]))
     shares = [policies[point["agent"]]["tokens"]["mean"] / sustained for point in points]
     costs = [
         point["at_price"]["difference"]["mean"] / point["at_price"]["cost"] for point in points

@@ -11,7 +11,7 @@ import numpy as np
 
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.scale import sustained_rate
+from fusion_gym.core.scale import sustained_tokens
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults
 
@@ -82,7 +82,7 @@ def warn_of_unused_tokens(task: Task, results: EpisodeResults) -> None:
     Warns:
         UserWarning: it does; names its share of what the bucket sustains.
     """
-    sustained = sustained_rate(task.bucket, task.access) * float(task.bucket.cost.sum())
+    sustained = sustained_tokens(task)
     share = float(results.tokens.mean()) / sustained if sustained else 1.0
     if share < 0.5 and not task.bucket.unlimited:
         warnings.warn(

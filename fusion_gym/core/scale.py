@@ -75,6 +75,11 @@ def sustained_rate(bucket: TokenBucket, access: str) -> float:
     return most if bucket.unlimited else min(most, bucket.rate / float(bucket.cost.sum()))
 
 
+def sustained_tokens(task: Task) -> float:
+    """Return the tokens a step that the network lets all sensors spend for long."""
+    return sustained_rate(task.bucket, task.access) * float(task.bucket.cost.sum())
+
+
 def nominal_error(task: Task) -> Array:
     """Return each state's mean squared error (n,) where sensors request at an even pace.
 
@@ -109,7 +114,7 @@ def price_range(task: Task) -> tuple[float, float]:
         raise ConfigurationError(
             "price_range = 'auto' is not allowed here: transmissions do not lower the error"
         )
-    sustained = sustained_rate(task.bucket, task.access) * float(task.bucket.cost.sum())
+    sustained = sustained_tokens(task)
     least = _PACKETS * float(task.bucket.cost.sum()) / task.horizon
     shares = sustained * _MOST, max(sustained * _LEAST, least)
     middle = np.sqrt(spent[1:] * np.maximum(spent[:-1], 0.25 * spent[1]))
