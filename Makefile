@@ -10,7 +10,7 @@ QUICK  := tests/laws/test_interfaces.py tests/test_bad_input.py tests/test_envir
 	tests/test_resume.py::test_a_resumed_training_is_the_uninterrupted_one \
 	tests/test_benchmark.py::test_from_tuning_to_report_and_zoo
 
-.PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films newcomer docs integrations \
+.PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films benchmark papers zoo newcomer docs integrations \
 	integrations-tianshou integrations-rllib lines lint format bench clean
 
 help:  ## list the targets
@@ -25,7 +25,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable '.[agents,test]'
 	touch $@
 
-demo: $(STAMP)  ## train two fronts, compare them with the strongest rules, draw the figures
+demo: $(STAMP)  ## train two agents and compare them with rules under the same budget: runs/demo/
 	$(BIN)/fusion-gym demo
 
 test: $(STAMP)  ## the tests, without the slow ones
@@ -102,6 +102,15 @@ integrations-tianshou: .venv-tianshou/.installed  ## Tianshou
 
 integrations-rllib: .venv-rllib/.installed  ## RLlib
 	.venv-rllib/bin/python -m pytest integrations/rllib
+
+benchmark: $(STAMP)  ## rules and agents of every class: results/
+	$(BIN)/python -m agents.benchmark --resume
+
+papers: $(STAMP)  ## the five papers' figures, tables and claims: docs/reproduction/
+	$(BIN)/python -m agents.papers all --resume
+
+zoo: $(STAMP)  ## the benchmark's best agents: fusion_gym/zoo/
+	$(BIN)/python -m agents.zoo
 
 newcomer: $(STAMP)  ## run the commands of docs/newcomer.md and write its tables, 6 minutes
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m benchmarks.newcomer

@@ -17,19 +17,19 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from fusion_gym.agents.compare import run_all
-from fusion_gym.agents.output import tables
-from fusion_gym.agents.output.files import write
-from fusion_gym.agents.output.progress import progress_bar, quietly
-from fusion_gym.agents.training.checked import load_checked
-from fusion_gym.agents.training.config import Experiment
+from fusion_gym.commands.compare import run_all
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.intervals import mean_interval
+from fusion_gym.output import tables
+from fusion_gym.output.files import write
+from fusion_gym.output.progress import progress_bar, quietly
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.solvers import lagrangian_bound
 from fusion_gym.solvers.task import source_problems
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.config import Experiment
 
 TUNING_SEED = 600_000_000
 # Every family with the values that are tried; {0} is what varies.

@@ -27,18 +27,18 @@ from rich.table import Table
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
-from fusion_gym.agents.experiments.config import Sweep
-from fusion_gym.agents.output import tables
-from fusion_gym.agents.output.ending import report_errors
-from fusion_gym.agents.output.files import write
-from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.core.task import Task
 from fusion_gym.envs.privileged import make_sb3_vec_env
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.output import tables
+from fusion_gym.output.ending import report_errors
+from fusion_gym.output.files import write
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.model import ModelPolicy
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.sweeps import Sweep
 from fusion_gym.validation import choice
 
 Returns = dict[str, float]

@@ -21,12 +21,12 @@ import numpy as np
 import yaml
 from rich.table import Table
 
-from fusion_gym.agents.output import tables
-from fusion_gym.agents.output.ending import report_errors
-from fusion_gym.agents.training.run import holds_training
 from fusion_gym.arrays import Array
 from fusion_gym.core.scale import sustained_tokens
 from fusion_gym.envs.registration import make_task
+from fusion_gym.output import tables
+from fusion_gym.output.ending import report_errors
+from fusion_gym.training.run import holds_training
 from fusion_gym.validation import choice
 
 DRAWN = 3
@@ -129,7 +129,7 @@ def run_commands(options: dict[str, Any], folder: Path, arguments: argparse.Name
     compare += ["--episodes", str(arguments.episodes), "--output", str(folder / "comparison")]
     before = os.times()
     for words in (train, compare):
-        line = [sys.executable, "-m", "fusion_gym.agents", *words]
+        line = [sys.executable, "-m", "fusion_gym.commands", *words]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         ended = subprocess.run(line, env=environment, capture_output=True, text=True)
         if ended.returncode:

@@ -16,11 +16,11 @@ from typing import Any
 import yaml
 
 import fusion_gym
-from fusion_gym.agents.experiments.tables import write_rows
-from fusion_gym.agents.output.progress import progress_bar, quietly, remark, writing
+from agents.benchmark.tables import write_rows
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.metrics import mean_interval
+from fusion_gym.output.progress import progress_bar, quietly, remark, writing
 from fusion_gym.policies.registry import make_policy
 
 CONFIG = Path(__file__).parent.parent / "configs" / "benchmark.yaml"

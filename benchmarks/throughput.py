@@ -22,9 +22,9 @@ from rich.table import Table
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 import fusion_gym
-from fusion_gym.agents.output import tables
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.memory import Owner
+from fusion_gym.output import tables
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
 
 ENV = "fusion_gym/TobitOscillator-v1"

@@ -12,10 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from hostile_commands import Try
+from hostile_commands import Try, load
 from hostile_folder import contents
-
-from fusion_gym.agents import __main__ as everything
 
 NOBODY = 65534
 
@@ -42,13 +40,13 @@ def call(command: str, words: list[str], seconds: float = 60.0, limit: int | Non
     out, err, trace, status = io.StringIO(), io.StringIO(), "", 0
     longest = resource.getrlimit(resource.RLIMIT_FSIZE)
     before = sys.argv, signal.signal(signal.SIGALRM, late)
-    sys.argv = ["fusion-gym", command, *words]
+    sys.argv = ["program", *words]
     signal.setitimer(signal.ITIMER_REAL, seconds)
     if limit is not None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, longest[1]))
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            everything.main(everything.COMMANDS | everything.MAINTENANCE)
+            load(command).main()
     except SystemExit as end:
         status = end.code if isinstance(end.code, int) else 1
         if isinstance(end.code, str):

@@ -27,7 +27,7 @@ def own_table(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make the intervals of a verdict in no time."""
-    monkeypatch.setattr("fusion_gym.agents.experiments.verdict.RESAMPLES", 20)
+    monkeypatch.setattr("agents.benchmark.verdict.RESAMPLES", 20)
 
 
 @pytest.fixture

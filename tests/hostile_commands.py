@@ -10,9 +10,30 @@ from typing import Any, NamedTuple
 
 from hostile_folder import BROKEN, ENV
 
-from fusion_gym.agents.__main__ import load
-from fusion_gym.agents.command_line import Command
-from fusion_gym.agents.input.options import OutputFile, OutputFolder
+from agents.benchmark.bound import Bound
+from agents.benchmark.command import Benchmark
+from agents.papers.reproduce import Reproduce
+from agents.papers.table import Table
+from agents.zoo.zoo import Zoo
+from fusion_gym.commands import __main__ as fusion_gym_commands
+from fusion_gym.commands.command_line import Command
+from fusion_gym.commands.options import OutputFile, OutputFolder
+
+RESEARCH: dict[str, type[Command]] = {
+    "benchmark": Benchmark,
+    "bound": Bound,
+    "papers": Reproduce,
+    "table": Table,
+    "zoo": Zoo,
+}
+EVERY = (*fusion_gym_commands.COMMANDS, *RESEARCH)
+
+
+def load(name: str) -> type[Command]:
+    """Return the class of a command of fusion-gym, or of the research made with it."""
+    kind: type[Command] = RESEARCH.get(name) or fusion_gym_commands.load(name)
+    return kind
+
 
 LONG = "n" * 300
 JSON = [name for name in BROKEN if name not in ("date", "tag")]  # which a JSON reader knows not
@@ -20,10 +41,6 @@ JSON = [name for name in BROKEN if name not in ("date", "tag")]  # which a JSON 
 # What a command needs beside the option that is tried. None of these tries may get so far.
 BASES: dict[str, dict[str, list[str]]] = {
     "evaluate": {
-        "env": [ENV], "set": ["horizon=4"], "policies": ["always"], "episodes": ["2"],
-        "json": ["made.json"],
-    },
-    "mismatch": {
         "env": [ENV], "set": ["horizon=4"], "policies": ["always"], "episodes": ["2"],
         "json": ["made.json"],
     },
@@ -38,7 +55,7 @@ BASES: dict[str, dict[str, list[str]]] = {
     "list": {"kinds": ["rules"]},
     "info": {"name": ["whittle"]},
     "table": {"config": ["rows.yaml"], "episodes": ["2"]},
-    "reproduce": {
+    "papers": {
         "papers": ["markov_jump"], "figure": ["5"], "output": ["made"], "work": ["made_too"],
         "episodes": ["2"],
     },
@@ -81,7 +98,7 @@ FILES = ["folder", "text/made.json", "locked/made.json", f"{LONG}.json", "loop",
 UNREADABLE = ["absent.yaml", "absent", "folder", "locked/file.yaml", "text/below.yaml", LONG,
               "loop.yaml"]  # fmt: skip
 # Words without a name before them.
-POSITIONAL = {("reproduce", "papers"), ("export", "model"), ("list", "kinds"), ("info", "name")}
+POSITIONAL = {("papers", "papers"), ("export", "model"), ("list", "kinds"), ("info", "name")}
 # Numbers among the hostile ones that an option may have after all.
 ALLOWED = {("seed", "0"), ("seeds", "0"), ("seed", "9" * 30)}
 

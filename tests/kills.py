@@ -18,8 +18,8 @@ from pathlib import Path
 
 from small_runs import arguments, meaning
 
-from fusion_gym.agents.__main__ import load
-from fusion_gym.agents.experiments import verdict
+from agents.benchmark import verdict
+from fusion_gym.commands.__main__ import load
 
 # Steps of a training, and trials of a study or trainings of a class.
 SIZES = {"train": (16_384, 1), "tune": (4096, 8), "benchmark": (4096, 2)}

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fusion_gym.agents.experiments.training import write_verdict
+from agents.benchmark.training import write_verdict
 
 ENV = "fusion_gym/RemoteEstimation-v1"
 SETTING = "remote_estimation"

@@ -11,27 +11,25 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import yaml
-from command_runs import call, succeed
+from command_runs import call, refusal, succeed
 from stable_baselines3 import PPO
 from training_configs import ENV, read_records, small_config
 
 import fusion_gym
-from fusion_gym.agents import demo
-from fusion_gym.agents.experiments.config import Setting, Suite, Sweep, SweepSettings
-from fusion_gym.agents.experiments.envelopes import EnvelopeStore
-from fusion_gym.agents.experiments.workers import Pool
-from fusion_gym.agents.training import run as train
-from fusion_gym.agents.training.algorithms import TABLE
-from fusion_gym.agents.training.checked import load_checked
-from fusion_gym.agents.training.config import Experiment
-from fusion_gym.agents.training.constraint import rate_score
+from agents.benchmark.config import Suite
+from fusion_gym.commands import demo
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.metrics import METRICS
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.training import run as train
+from fusion_gym.training.algorithms import TABLE
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.config import Experiment
+from fusion_gym.training.constraint import rate_score
+from fusion_gym.training.sweeps import Sweep, SweepSettings
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
@@ -148,7 +146,7 @@ def test_the_best_model_under_a_target_keeps_its_rate() -> None:
 )
 def test_an_interrupted_training_loses_nothing(tmp_path: Path, number: signal.Signals) -> None:
     config = small_config(tmp_path, training={"timesteps": 10_000_000, "num_envs": 8})
-    command = [sys.executable, "-m", "fusion_gym.agents", "train", "--config", str(config)]
+    command = [sys.executable, "-m", "fusion_gym.commands", "train", "--config", str(config)]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     folder = tmp_path / "run"
     deadline = time.monotonic() + 120
@@ -194,61 +192,16 @@ def test_evaluation_writes_the_promised_json(tmp_path: Path) -> None:
     assert difference["mean"] == pytest.approx(random["mse"]["mean"] - always["mse"]["mean"])
 
 
-def test_demo_from_training_to_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def thinned(self: EnvelopeStore, setting: Setting) -> dict[str, Any]:
-        """With fewer rules, for speed."""
-        content = whole(self, setting)
-        for of in content["classes"].values():
-            of["vertices"] = of["vertices"][::30]
-        return content
-
-    whole = EnvelopeStore.read
-    monkeypatch.setattr(EnvelopeStore, "read", thinned)
-    learner = demo.learners_of(tmp_path, 2, 4096)[1]
-    monkeypatch.setattr(demo, "learners_of", lambda *_: [learner])
-    monkeypatch.setattr(demo, "TEAM", Pool(1))
+def test_demo_from_training_to_figures(tmp_path: Path) -> None:
     words = ["--output", str(tmp_path), "--episodes", "2", "--timesteps", "4096"]
-    assert demo.TITLES[learner.name] in succeed("demo", words).out
-    folder, remembering = tmp_path / learner.name, learner.classes["with"]
-    for figure in ("front.png", "episode_agent.png", "episode_rule.png"):
-        assert (folder / figure).stat().st_size > 20_000
-    assert json.loads((folder / "agent" / "summary.json").read_text())["finished"]
-    report = json.loads((folder / "front.json").read_text())
-    prices = [point["price"] for point in report["points"]]
-    assert prices == pytest.approx(np.geomspace(0.003, 0.3, 7))
-    assert list(report["classes"]) == ["local_estimate", "local_estimate_memory"]
-    agent = f"model:{folder / 'agent' / 'best_model.zip'},price={prices[3]}"
-    task = fusion_gym.make_task(ENV, **report["options"], memory=True)
-    results, point = run_episodes(task, make_policy(agent, task), 2, 0), report["points"][3]
-    assert point["rate"] == pytest.approx(float(results.rate.mean()))
-    assert point["mse"]["mean"] == pytest.approx(float(results.mse.mean()))
-    # The line through the rules, once more.
-    rules = []
-    for vertex in learner.envelope("with")["vertices"]:
-        task = fusion_gym.make_task(ENV, **report["options"], **vertex["options"])
-        brought = run_episodes(task, make_policy(vertex["policy"], task), 2, 0)
-        rules.append((float(brought.rate.mean()), float(brought.mse.mean())))
-    below = np.interp(point["rate"], *np.array(sorted(rules)).T)
-    beside = point["rules"][remembering]
-    assert beside["mse"] == pytest.approx(below)
-    assert beside["difference"]["mean"] == pytest.approx(results.mse.mean() / below - 1.0)
-    # The same command again has nothing left to test; another model has all of its prices.
-    assert learner.calls() == []
-    with (folder / "agent" / "best_model.zip").open("ab") as model:
-        model.write(b"another")
-    assert len(learner.calls()) == 7
-
-
-def test_the_demo_trains_in_the_setting_of_its_rules(tmp_path: Path) -> None:
-    """What differs from the environment of the rules with memory is the price, which is drawn."""
-    for learner in demo.learners_of(tmp_path, 1, None):
-        plain, remembering = (learner.envelope(which) for which in learner.classes)
-        assert (plain["memory"], remembering["memory"]) == (False, True)
-        assert plain["mode"] == remembering["mode"]
-        environment = learner.experiment.environment
-        assert (environment.id, environment.local) == (ENV, plain["mode"] == "local")
-        price = {"cost_weight": "random", "price_range": learner.setting.price_range}
-        rules = learner.setting.environment.options | remembering["options"]
-        assert json.dumps(environment.options, sort_keys=True) == json.dumps(
-            rules | price, sort_keys=True
-        )
+    printed = succeed("demo", words).out
+    for name in demo.CONFIGS:
+        folder = tmp_path / name
+        assert (folder / "comparison" / "pareto.png").stat().st_size > 20_000
+        assert json.loads((folder / "agent" / "summary.json").read_text())["finished"]
+        points = json.loads((folder / "comparison" / "comparison.json").read_text())["points"]
+        assert len(points) == 7
+        for point in points:
+            assert f"{point['at_price']['cost']:.4f}" in printed
+    assert "--resume" in refusal("demo", words)
+    succeed("demo", [*words, "--resume"])

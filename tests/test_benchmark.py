@@ -19,21 +19,21 @@ from small_suite import ENV, SMALL, small_suite
 from training_configs import small_config
 
 import fusion_gym
-from fusion_gym.agents import tune
-from fusion_gym.agents.experiments import training as jobs
-from fusion_gym.agents.experiments.classes import classes_of, trained_classes
-from fusion_gym.agents.experiments.config import load_suite
-from fusion_gym.agents.experiments.envelopes import envelope_task, read_envelopes, searches_of
-from fusion_gym.agents.experiments.figures import report_text
-from fusion_gym.agents.experiments.report import SettingResults, read_results
-from fusion_gym.agents.experiments.tables import read_rows, write_rows
-from fusion_gym.agents.experiments.workers import Folders
-from fusion_gym.agents.output.markup import code, page_of
-from fusion_gym.agents.training.checked import load_checked
-from fusion_gym.agents.training.config import Experiment
+from agents.benchmark import training as jobs
+from agents.benchmark.classes import classes_of, trained_classes
+from agents.benchmark.config import load_suite
+from agents.benchmark.envelopes import envelope_task, read_envelopes, searches_of
+from agents.benchmark.figures import report_text
+from agents.benchmark.markup import code, page_of
+from agents.benchmark.report import SettingResults, read_results
+from agents.benchmark.tables import read_rows, write_rows
+from agents.workers import Folders
+from fusion_gym.commands import tune
 from fusion_gym.core.system import covers
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.config import Experiment
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
@@ -121,7 +121,7 @@ def test_the_committed_suite_fits_its_environments(monkeypatch: pytest.MonkeyPat
         tasks[name] = tasks.get(name) or envelope_task(setting, options)
         return tasks[name]
 
-    monkeypatch.setattr("fusion_gym.agents.experiments.envelopes.envelope_task", task_of)
+    monkeypatch.setattr("agents.benchmark.envelopes.envelope_task", task_of)
     suite = load_suite(ROOT / "configs" / "benchmark.yaml")
     assert load_suite(ROOT / "configs" / "benchmark.yaml", quick=True).settings == suite.settings
     for setting in suite.settings:
@@ -320,7 +320,7 @@ def test_tuning_goes_on_with_its_study(tmp_path: Path) -> None:
 
     succeed("tune", words(folder, 1))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fusion_gym.agents.training.monitor.Progress.finish", killed)
+        patch.setattr("fusion_gym.training.monitor.Progress.finish", killed)
         assert "Killed" in call("tune", words(folder, 3)).trace
     for trials in (2, 3, 3):
         succeed("tune", words(folder, trials))

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fusion_gym.agents.output import cache
-from fusion_gym.agents.output.cache import Cache, code_of
+from agents import cache
+from agents.cache import Cache, code_of
 from fusion_gym.validation import ConfigurationError
 
 INPUTS = {"episodes": 3, "settings": {"m": [0.5]}}
@@ -87,7 +87,7 @@ def test_a_result_that_cannot_be_written_is_an_error(
         Cache(tmp_path).call(evaluate, INPUTS, 2.0)
 
 
-START = "import sys; from pathlib import Path; from fusion_gym.agents.output.cache import Cache\n"
+START = "import sys; from pathlib import Path; from agents.cache import Cache\n"
 
 
 def test_two_processes_at_once(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from small_suite import small_suite
 
-from fusion_gym.agents.experiments.workers import Pool
+from agents.workers import Pool
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -54,7 +54,7 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.P
 def benchmark(suite: Path, folder: Path, *words: str) -> list[str]:
     places = ["--results", str(folder / "results"), "--work", str(folder / "work")]
     given = ["--parts", "agents", "--config", str(suite), *places, *words]
-    return [sys.executable, "-m", "fusion_gym.agents", "benchmark", *given]
+    return [sys.executable, "-m", "fusion_gym.commands", "benchmark", *given]
 
 
 def find(folder: Path) -> dict[str, str]:

@@ -12,15 +12,14 @@ from pathlib import Path
 
 import pytest
 from command_runs import call, flaw, refusal
-from hostile_commands import BASES, Try, line, options, tries
+from hostile_commands import BASES, EVERY, Try, line, options, tries
 from hostile_folder import ROOT, contents, scratch
 
-from fusion_gym.agents import __main__ as everything
-from fusion_gym.agents.command_line import Command
-from fusion_gym.agents.experiments.config import SweepCurve
-from fusion_gym.agents.output.ending import report_errors
+from fusion_gym.commands.command_line import Command
 from fusion_gym.core.reward import Price
+from fusion_gym.output.ending import report_errors
 from fusion_gym.policies.settings import parse_value
+from fusion_gym.training.sweeps import SweepCurve
 from fusion_gym.validation import ConfigurationError
 
 PER_OPTION = 2  # of the tries that run each time
@@ -48,7 +47,7 @@ def selected() -> list[Try]:
 
 
 def test_every_option_of_every_command_is_tried() -> None:
-    assert BASES.keys() == everything.COMMANDS.keys() | everything.MAINTENANCE.keys()
+    assert BASES.keys() == set(EVERY)
     tried = {(item.command, item.option) for item in tries()}
     for name in BASES:
         for option, kind in options(name).items():
@@ -150,22 +149,10 @@ def run(command: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_output_that_nobody_reads_or_takes() -> None:
-    gone = run("python -m fusion_gym.agents | true; echo ${PIPESTATUS[0]}")
+    gone = run("python -m fusion_gym.commands | true; echo ${PIPESTATUS[0]}")
     assert (gone.stdout, gone.stderr) == ("141\n", "")
-    full = run("python -m fusion_gym.agents > /dev/full; echo $?")
+    full = run("python -m fusion_gym.commands > /dev/full; echo $?")
     assert (full.stdout, full.stderr) == ("1\n", "error: No space left on device\n")
-
-
-def test_a_fresh_demo_removes_nothing_but_a_demo(here: Path) -> None:
-    """Neither what is not its own, nor anything when it is refused."""
-    for name in ("scheduler", "local"):
-        (here / name / "agent").mkdir(parents=True)
-        (here / name / "agent" / "config.yaml").touch()
-    (here / "local" / "agent" / "config.yaml").rename(here / "local" / "notes")
-    error = refusal("demo", ["--fresh", "--output", "."])
-    assert "fresh = True is not allowed: 'local' holds no results of a demo" in error
-    assert (here / "local" / "notes").exists()
-    assert (here / "scheduler" / "agent" / "config.yaml").exists()
 
 
 @pytest.mark.parametrize("text", ["{[]: 1}", "(" * 5000, "9" * 5000 + "x", "\0"])

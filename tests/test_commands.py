@@ -9,38 +9,37 @@ from pathlib import Path
 import pytest
 import tyro
 from command_runs import call
+from hostile_commands import EVERY, load
 
 import fusion_gym
-from fusion_gym.agents import __main__ as everything
-from fusion_gym.agents import command_line
-from fusion_gym.agents.benchmark import Benchmark
-from fusion_gym.agents.train import Train
-from fusion_gym.agents.training.algorithms import TABLE
-from fusion_gym.agents.training.catalogue import catalogue
-from fusion_gym.agents.training.checked import config_path, load_checked, parse
-from fusion_gym.agents.training.config import Experiment
+from agents.benchmark.command import Benchmark
+from fusion_gym.commands import __main__ as everything
+from fusion_gym.commands import command_line
+from fusion_gym.commands.train import Train
 from fusion_gym.policies.card import ALGORITHMS
+from fusion_gym.training.algorithms import TABLE
+from fusion_gym.training.catalogue import catalogue
+from fusion_gym.training.checked import config_path, load_checked, parse
+from fusion_gym.training.config import Experiment
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
 
 
-@pytest.mark.parametrize("name", [*everything.COMMANDS, *everything.MAINTENANCE])
+@pytest.mark.parametrize("name", EVERY)
 def test_help_shows_every_option(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["program", "--help"])
     with pytest.raises(SystemExit) as caught:
-        everything.load(name).main()
+        load(name).main()
     assert caught.value.code == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    program = "fusion-gym"
-    if name in everything.MAINTENANCE:
-        program = "python -m fusion_gym.agents.maintenance"
-    assert text.startswith(f"usage: {program} {name} ")
-    assert f" {program} {name} " in text[10:], "no example"
+    program = command_line.program_of(load(name))
+    assert text.startswith(f"usage: {program} ")
+    assert f" {program} " in text[10:], "no example"
     assert "{None}" not in text
-    kind = everything.load(name)
+    kind = load(name)
     options = {field.name: field for field in dataclasses.fields(kind)}
     for own, option in (("options", "set"), ("of", "class")):
         if own in options:
@@ -64,22 +63,20 @@ def test_lists_flags_and_negative_numbers_are_read(monkeypatch: pytest.MonkeyPat
 
 
 def test_all_commands_under_one_name() -> None:
-    def run(*words: str, package: str = "fusion_gym.agents") -> subprocess.CompletedProcess[str]:
-        line = [sys.executable, "-m", package, *words]
+    def run(*words: str) -> subprocess.CompletedProcess[str]:
+        line = [sys.executable, "-m", "fusion_gym.commands", *words]
         return subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
 
     assert run("--version").stdout == f"{fusion_gym.__version__}\n"
     listed = run().stdout
     assert all(f"\n  {name} " in listed for name in everything.COMMANDS)
-    assert "\n  bound " not in listed
-    assert "\n  bound " in run(package="fusion_gym.agents.maintenance").stdout
     unknown = run("trian")
     assert unknown.returncode == 2
     assert "did you mean 'train'?" in unknown.stderr
     assert len(unknown.stderr.splitlines()) == 1
-    absent = run("benchmark", "--parts", "report", "--results", "absent")
+    absent = run("info", "absent")
     assert absent.returncode == 1
-    assert absent.stderr.startswith("error: results = 'absent'")
+    assert absent.stderr.startswith("error: name = 'absent'")
 
 
 def test_list_and_info_show_every_entry() -> None:

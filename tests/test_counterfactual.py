@@ -9,16 +9,16 @@ import torch
 from training_configs import ENV, small_config
 
 import fusion_gym
-from fusion_gym.agents.training import run
-from fusion_gym.agents.training.algorithms import TABLE
-from fusion_gym.agents.training.checked import load_checked
-from fusion_gym.agents.training.config import Experiment
-from fusion_gym.agents.training.counterfactual import CounterfactualPPO, RolloutBatch, _Step
-from fusion_gym.agents.training.decisions import Decisions
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.training import run
+from fusion_gym.training.algorithms import TABLE
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.config import Experiment
+from fusion_gym.training.counterfactual import CounterfactualPPO, RolloutBatch, _Step
+from fusion_gym.training.decisions import Decisions
 from fusion_gym.validation import ConfigurationError
 
 RUNS = 5

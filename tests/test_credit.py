@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import fusion_gym
-from fusion_gym.agents.training.counterfactual import CounterfactualPPO, RolloutBatch
 from fusion_gym.envs.privileged import PrivilegedVecEnv
+from fusion_gym.training.counterfactual import CounterfactualPPO, RolloutBatch
 
 ENV = "fusion_gym/TobitOscillator-v1"
 

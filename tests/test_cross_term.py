@@ -1,18 +1,12 @@
 """Error, floor, mismatch and cross term: what they are, the command, a training's warning."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from command_runs import succeed
 from training_configs import small_config
 
-from fusion_gym.agents.training.checked import load_checked
-from fusion_gym.agents.training.config import Experiment
-from fusion_gym.agents.training.models import make_env
-from fusion_gym.agents.training.run import train
 from fusion_gym.core.system import System
 from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_system
 from fusion_gym.envs.registration import make_task
@@ -21,6 +15,10 @@ from fusion_gym.evaluation.cross_term import CrossTerm, cross_terms, usual_polic
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.evaluation.intervals import Interval
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.config import Experiment
+from fusion_gym.training.models import make_env
+from fusion_gym.training.run import train
 
 OSCILLATOR, INPUT = "fusion_gym/TobitOscillator-v1", "fusion_gym/UnknownInput-v1"
 ORDINARY = {"filter": "tobit", "random_start": True, "token_rate": 2, "horizon": 30}
@@ -114,35 +112,6 @@ def test_the_worst_is_one_that_is_reported_from_zero() -> None:
     result = {"wide": part(-1.0, 3.0), "broadcast": part(-0.2, -0.1), "less": part(0.01, 0.02)}
     assert worst(result)[0] == "broadcast"
     assert worst({"near": part(-0.2, 0.1), "far": part(-0.2, 0.4)})[0] == "far"
-
-
-# --- the command ----------------------------------------------------------------------------------
-
-
-def test_the_command_writes_what_it_prints(tmp_path: Path) -> None:
-    file = tmp_path / "cross.json"
-    words = ["--env", OSCILLATOR, "--set", *(f"{key}={value}" for key, value in PAPER.items())]
-    words += ["--filter", "paper", "--policies", "always", "never", "--episodes", "40"]
-    ended = succeed("mismatch", [*words, "--json", str(file)])
-    report = json.loads(file.read_text())
-    assert (report["filter"], report["episodes"], report["compatible"]) == ("paper", 40, False)
-    share = report["policies"]["always"]["share"]
-    assert f"{share['mean']:+.2%} [{share['low']:+.2%}, {share['high']:+.2%}]" in ended.out
-    assert report["policies"].keys() == {"always", "never"}
-    assert "error: excess" in " ".join(ended.out.split())
-
-
-def test_the_command_takes_a_trainings_environment_and_filter(tmp_path: Path) -> None:
-    training = {"timesteps": 64, "num_envs": 2, "error": "mismatch", "error_filter": "adf"}
-    config = small_config(tmp_path, training=training)
-    file = tmp_path / "cross.json"
-    words = ["--config", str(config), "--set", "horizon=5", "--episodes", "4", "--json", str(file)]
-    succeed("mismatch", words)
-    report = json.loads(file.read_text())
-    assert (report["filter"], report["horizon"]) == ("adf", 5)
-    assert len(report["policies"]) == 5
-    succeed("mismatch", [*words, "--filter", "tobit"])
-    assert json.loads(file.read_text())["filter"] == "tobit"
 
 
 # --- trainings ------------------------------------------------------------------------------------

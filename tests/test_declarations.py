@@ -5,7 +5,6 @@ from typing import Any
 
 import pytest
 
-from fusion_gym.agents.training.algorithms import TABLE
 from fusion_gym.docstrings import read
 from fusion_gym.envs.pages import task_of
 from fusion_gym.evaluation.metrics import METRICS
@@ -16,6 +15,7 @@ from fusion_gym.policies.registry import (
     policy_names,
     policy_parameters,
 )
+from fusion_gym.training.algorithms import TABLE
 from website import parts
 
 DECLARED = [(kind, part) for kind in parts.KIND_NAMES for part in parts.parts(kind)]

@@ -9,14 +9,14 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from training_configs import ENV, SMALL, read_records, small_config
 
-from fusion_gym.agents.training.algorithms import TABLE
-from fusion_gym.agents.training.checked import load_checked
-from fusion_gym.agents.training.config import Experiment
-from fusion_gym.agents.training.diagnosis import by_price, prices_of
-from fusion_gym.agents.training.run import train
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.training.algorithms import TABLE
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.config import Experiment
+from fusion_gym.training.diagnosis import by_price, prices_of
+from fusion_gym.training.run import train
 
 FRONT = {"filter": "tobit", "horizon": 20, "cost_weight": "random", "price_range": [0.01, 0.32]}
 COUNTERFACTUAL = {"n_steps": 8, "batch_size": 32, "n_epochs": 1}

@@ -11,15 +11,10 @@ import pytest
 from page_blocks import blocks_of, imported
 
 import fusion_gym
-from fusion_gym.agents.experiments.config import load_suite
-from fusion_gym.agents.experiments.figures import report_text
-from fusion_gym.agents.experiments.report import (
-    envelopes_text,
-    read_results,
-    robustness_text,
-    update_pages,
-)
-from fusion_gym.agents.experiments.verdict import read_cases
+from agents.benchmark.config import load_suite
+from agents.benchmark.figures import report_text
+from agents.benchmark.report import envelopes_text, read_results, robustness_text, update_pages
+from agents.benchmark.verdict import read_cases
 from fusion_gym.envs import pages
 from fusion_gym.envs.option_text import options_in
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
@@ -74,7 +69,7 @@ def test_the_evaluation_command_runs(tmp_path: Path) -> None:
         if words[:2] == ["fusion-gym", "evaluate"]
     )
     words[words.index("--json") + 1] = str(tmp_path / "evaluation.json")
-    line = [sys.executable, "-m", "fusion_gym.agents", *words[1:]]
+    line = [sys.executable, "-m", "fusion_gym.commands", *words[1:]]
     subprocess.run(line, cwd=ROOT, check=True, capture_output=True)
     assert (tmp_path / "evaluation.json").exists()
 

@@ -10,17 +10,11 @@ from command_runs import refusal, succeed
 from small_suite import ENV, SMALL, small_suite
 
 import fusion_gym
-from fusion_gym.agents.experiments.classes import Class, classes_of
-from fusion_gym.agents.experiments.config import Choices, Family, Range, Tuning, load_suite
-from fusion_gym.agents.experiments.envelopes import merge_curves, read_envelopes, write_envelopes
-from fusion_gym.agents.experiments.tables import read_rows, write_rows
-from fusion_gym.agents.experiments.tuning import (
-    TuningTrial,
-    first_values,
-    near_hull,
-    policy_text,
-    search_family,
-)
+from agents.benchmark.classes import Class, classes_of
+from agents.benchmark.config import Choices, Family, Range, Tuning, load_suite
+from agents.benchmark.envelopes import merge_curves, read_envelopes, write_envelopes
+from agents.benchmark.tables import read_rows, write_rows
+from agents.benchmark.tuning import TuningTrial, first_values, near_hull, policy_text, search_family
 from fusion_gym.core.system import covers
 from fusion_gym.evaluation.beside import run_beside
 from fusion_gym.evaluation.envelope import EnvelopePoint, lower_hull

@@ -19,7 +19,7 @@ from small_models import ENV, MODELS
 
 import fusion_gym
 from fusion_gym import zoo
-from fusion_gym.agents.export import Export, export, spec
+from fusion_gym.commands.export import Export, export, spec
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import run_episodes

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import fusion_gym
-from fusion_gym.agents.output.files import read_json, remove_partials, replacing, write, write_text
+from fusion_gym.output.files import read_json, remove_partials, replacing, write, write_text
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 

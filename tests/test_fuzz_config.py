@@ -12,10 +12,10 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from fusion_gym import ConfigurationError
-from fusion_gym.agents.training.algorithms import TABLE
-from fusion_gym.agents.training.checked import load_checked, parse
-from fusion_gym.agents.training.config import Experiment
-from fusion_gym.agents.training.run import check_run
+from fusion_gym.training.algorithms import TABLE
+from fusion_gym.training.checked import load_checked, parse
+from fusion_gym.training.config import Experiment
+from fusion_gym.training.run import check_run
 
 Content = dict[str, Any]
 _UNKNOWN = ("nobody_knows_this",)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import fusion_gym
+from fusion_gym.commands.__main__ import COMMANDS
 from fusion_gym.envs import registered
 from fusion_gym.envs.pages import _MARKED
 from fusion_gym.envs.registration import ENVIRONMENTS, class_name
@@ -43,7 +44,7 @@ def public_names(tree: ast.Module) -> Iterator[str]:
 
 def named_by_environments() -> set[str]:
     """Policies, commands, and the signals and entries of all environments."""
-    names = {*fusion_gym.policy_names(), *(p.stem for p in (ROOT / "agents").glob("*.py"))}
+    names = {*fusion_gym.policy_names(), *COMMANDS}
     for task in map(fusion_gym.make_task, ENVIRONMENTS):
         names |= {s.name for s in task.system.signals} | {b.name for b in task.system.observation}
     return names

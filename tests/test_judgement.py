@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from small_suite import small_suite
 
-from fusion_gym.agents.experiments import envelopes
-from fusion_gym.agents.experiments.classes import classes_of
-from fusion_gym.agents.experiments.config import load_suite
-from fusion_gym.agents.experiments.report import robustness_rows
-from fusion_gym.agents.output.cache import Cache
-from fusion_gym.agents.papers.numbers import below
-from fusion_gym.agents.papers.round_robin_tobit_runs import always_below
+from agents.benchmark import envelopes
+from agents.benchmark.classes import classes_of
+from agents.benchmark.config import load_suite
+from agents.benchmark.report import robustness_rows
+from agents.cache import Cache
+from agents.papers.numbers import below
+from agents.papers.round_robin_tobit_runs import always_below
 from fusion_gym.evaluation.envelope import best_mse
 
 NOISE = np.array([-3.0, 1.0, -2.0, 3.5])

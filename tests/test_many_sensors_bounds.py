@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import fusion_gym
-from fusion_gym.agents.training.decisions import Decisions
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.envs.privileged import PrivilegedVecEnv
@@ -16,6 +15,7 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.solvers import solve_ages, solve_task
 from fusion_gym.solvers.task import source_problems
 from fusion_gym.solvers.tokens import TokenLevels
+from fusion_gym.training.decisions import Decisions
 from fusion_gym.validation import ConfigurationError
 
 MANY = 200

@@ -12,9 +12,9 @@ import pytest
 from numpy.typing import NDArray
 from reference_markov_jump import options, random_model
 
+from agents.papers.markov_jump import trigger
+from agents.papers.walk import walk
 from fusion_gym import linalg
-from fusion_gym.agents.papers.markov_jump import trigger
-from fusion_gym.agents.papers.walk import walk
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.policies.base import Policy

@@ -26,8 +26,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 import fusion_gym
-from fusion_gym.agents import compare, evaluate
-from fusion_gym.agents.maintenance import table
+from agents.papers import table
+from fusion_gym.commands import compare, evaluate
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.policies import archive

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from fusion_gym.agents.training.checked import parse
-from fusion_gym.agents.training.config import Experiment
-from fusion_gym.agents.training.models import make_model
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.training.checked import parse
+from fusion_gym.training.config import Experiment
+from fusion_gym.training.models import make_model
 from fusion_gym.validation import ConfigurationError
 
 ENV = "fusion_gym/CorrelatedTracking-v1"

@@ -12,10 +12,10 @@ import yaml
 from command_runs import refusal, succeed
 
 from benchmarks.newcomer import replaced, run
-from fusion_gym.agents.compare import Compare
-from fusion_gym.agents.training.checked import load_checked
-from fusion_gym.agents.training.config import Experiment
+from fusion_gym.commands.compare import Compare
 from fusion_gym.envs.registration import make_task
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.config import Experiment
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent

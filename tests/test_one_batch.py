@@ -13,9 +13,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import fusion_gym
-from fusion_gym.agents.training.checked import load_checked
-from fusion_gym.agents.training.config import Experiment
 from fusion_gym.envs.one_batch import one_batch
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.config import Experiment
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent

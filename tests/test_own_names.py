@@ -15,11 +15,11 @@ from rules import make_rule
 from stable_baselines3.common.env_util import make_vec_env
 
 import fusion_gym
-from fusion_gym.agents.training.config import EnvironmentConfig
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.one_batch import one_batch
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.training.config import EnvironmentConfig
 from fusion_gym.validation import ConfigurationError
 
 TOBIT = "fusion_gym/TobitOscillator-v1"
@@ -194,7 +194,7 @@ def test_what_cannot_be_had_is_reported_in_one_line(own: Path, make: Any, messag
 
 def command(folder: Path, *words: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "fusion_gym.agents", *words],
+        [sys.executable, "-m", "fusion_gym.commands", *words],
         cwd=folder,
         env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "HOME": ".", "OMP_NUM_THREADS": "1"},
         capture_output=True,

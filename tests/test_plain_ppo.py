@@ -7,9 +7,9 @@ import pytest
 
 from benchmarks import plain_ppo
 from benchmarks.plain_ppo import SETTINGS, TRAININGS, Setting, judge
-from fusion_gym.agents.experiments.config import Sweep
-from fusion_gym.agents.training.checked import load_checked
 from fusion_gym.envs.registration import ENVIRONMENTS
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.sweeps import Sweep
 
 
 def test_every_environment_is_there() -> None:

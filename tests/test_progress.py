@@ -10,20 +10,18 @@ from typing import Any
 
 import pytest
 from command_runs import call
-from hostile_commands import BASES, line
+from hostile_commands import BASES, EVERY, line, load
 
-from fusion_gym.agents import __main__ as everything
-from fusion_gym.agents import command_line, evaluate
-from fusion_gym.agents.command_line import Long
-from fusion_gym.agents.output import progress
-from fusion_gym.agents.output.progress import progress_bar
+from fusion_gym.commands import command_line, evaluate
+from fusion_gym.commands.command_line import Long
+from fusion_gym.output import progress
+from fusion_gym.output.progress import progress_bar
 
 EVALUATE = [
     *("--env", "fusion_gym/TobitOscillator-v1", "--set", "horizon=20"),
     *("--policies", "always", "never", "--episodes", "3"),
 ]
-EVERY = [*everything.COMMANDS, *everything.MAINTENANCE]
-LONG = [name for name in EVERY if issubclass(everything.load(name), Long)]
+LONG = [name for name in EVERY if issubclass(load(name), Long)]
 
 
 class Clock:
@@ -77,14 +75,14 @@ def test_where_nobody_watches_a_line_is_printed_now_and_then(
 
 
 def test_every_long_command_can_be_quiet() -> None:
-    assert set(EVERY) - set(LONG) <= {"export", "reproduce", "list", "info"}
+    assert set(EVERY) - set(LONG) <= {"export", "papers", "list", "info"}
 
 
 @pytest.mark.parametrize("name", LONG)
 def test_the_command_that_goes_on_is_one(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is read as the command that was interrupted, to be resumed where it can be."""
     words = [*line(name, BASES[name]), "--quiet"]
-    kind = everything.load(name)
+    kind = load(name)
     monkeypatch.setattr(sys, "argv", [f"agents/{name}.py", *words])
     command = command_line.read_command(kind)
     program = command_line.program_of(kind)

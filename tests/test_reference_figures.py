@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from reference_tobit import Example, Run, simulate
 
 import fusion_gym
-from fusion_gym.agents.papers.tobit_token_bucket_runs import History, record_history
+from agents.papers.tobit_token_bucket_runs import History, record_history
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes

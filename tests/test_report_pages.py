@@ -6,9 +6,9 @@ from typing import Any
 from command_runs import call
 from small_results import small_results
 
-from fusion_gym.agents.experiments.report import read_results, robustness_text, update_pages
-from fusion_gym.agents.experiments.tables import read_rows, write_rows
-from fusion_gym.agents.experiments.verdict import read_cases, write_cases
+from agents.benchmark.report import read_results, robustness_text, update_pages
+from agents.benchmark.tables import read_rows, write_rows
+from agents.benchmark.verdict import read_cases, write_cases
 
 PAGE = """# A page
 

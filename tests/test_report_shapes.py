@@ -15,14 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_results import CLASSES, ENV, SETTING, small_model, small_results
 
-from fusion_gym.agents.compare import Point, price_table, rate_table
-from fusion_gym.agents.experiments.tables import read_rows, write_rows
-from fusion_gym.agents.output import pareto_figure
-from fusion_gym.agents.output.palette import AGENTS, RULES
-from fusion_gym.agents.output.pareto_figure import Differences, Limits, Panel, Series
+from agents.benchmark import pareto_figure
+from agents.benchmark.pareto_figure import Differences, Limits, Panel, Series
+from agents.benchmark.tables import read_rows, write_rows
+from fusion_gym.commands.compare import Point, price_table, rate_table
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import compare_at_price, compare_with_envelope
 from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.output.palette import AGENTS, RULES
 from fusion_gym.policies.registry import make_policy
 
 ABSENT = "ABSENT"
@@ -138,7 +138,7 @@ def test_the_zoo_takes_a_choice_and_removes_what_is_not_in_it(
     assert {path.name for path in folder.iterdir()} == left | {"notes.json"}
     for wrong, message in ((["--classes", "sensor"], "sensors"), (["--envs", "x"], "envs = 'x'")):
         assert message in refusal("zoo", [*words, *wrong])
-    monkeypatch.setattr("fusion_gym.agents.maintenance.zoo.MOST", 200)
+    monkeypatch.setattr("agents.zoo.zoo.MOST", 200)
     assert "all together must have at most 200; name fewer" in refusal("zoo", words)
     assert {path.name for path in folder.iterdir()} == left | {"notes.json"}
 

@@ -13,9 +13,9 @@ import pytest
 from command_runs import Ended, call
 from hostile_folder import contents
 
-from fusion_gym.agents.output import cache
-from fusion_gym.agents.papers import page, paper
-from fusion_gym.agents.papers.numbers import Number
+from agents import cache
+from agents.papers import page, paper
+from agents.papers.numbers import Number
 from fusion_gym.validation import ConfigurationError
 
 USUAL = 30
@@ -73,7 +73,7 @@ def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calls:
         (texts / path.name).write_text(path.read_text())
     for name in ("one", "two"):
         (texts / f"{name}.md").write_text(TEMPLATE)
-        module = types.ModuleType(f"fusion_gym.agents.papers.{name}")
+        module = types.ModuleType(f"agents.papers.{name}")
         module.PAPER = a_paper(name, result)  # type: ignore[attr-defined]
         monkeypatch.setitem(sys.modules, module.__name__, module)
     for module in (paper, page):
@@ -85,7 +85,7 @@ def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calls:
 
 def reproduce(*words: str) -> Ended:
     """One process, for the papers are in this one alone."""
-    ended = call("reproduce", [*words, "--workers", "1", "--output", "pages", "--work", "work"])
+    ended = call("papers", [*words, "--workers", "1", "--output", "pages", "--work", "work"])
     assert ended.status == 0, (ended.err, ended.trace)
     return ended
 
@@ -153,12 +153,12 @@ def test_a_piece_that_fails_leaves_the_others(
     def fail(episodes: int, seed: int, settings: paper.Settings) -> paper.Data:
         raise ConfigurationError("threshold = 3 is not allowed")
 
-    module = sys.modules["fusion_gym.agents.papers.one"]
+    module = sys.modules["agents.papers.one"]
     first, second = module.PAPER.pieces
     bad = module.PAPER._replace(pieces=[first, second._replace(simulate=fail)])
     with monkeypatch.context() as patch:
         patch.setattr(module, "PAPER", bad)
-        ended = call("reproduce", ["one", "--workers", "1", "--output", "pages", "--work", "work"])
+        ended = call("papers", ["one", "--workers", "1", "--output", "pages", "--work", "work"])
         assert ended.status != 0
         assert "threshold = 3 is not allowed" in ended.err
     assert not Path("pages").exists() or pages() == {}
@@ -206,7 +206,7 @@ def test_pages_are_the_same_bytes_and_hold_no_path(calls: Calls, tmp_path: Path)
     folders = [tmp_path / "a", tmp_path / "deeper" / "b"]
     for folder in folders:
         words = ["--output", str(folder / "pages"), "--work", str(folder / "work")]
-        assert call("reproduce", ["all", "--workers", "1", *words]).status == 0
+        assert call("papers", ["all", "--workers", "1", *words]).status == 0
     first, second = (contents(folder / "pages") for folder in folders)
     assert first == second
     assert {Path(name).suffix for name in first} == {"", ".md", ".json", ".png", ".svg"}
@@ -267,7 +267,7 @@ def test_a_figure_simulates_its_piece_with_its_parameters(calls: Calls) -> None:
 def test_one_clear_error_before_anything_runs(
     calls: Calls, words: list[str], text: list[str]
 ) -> None:
-    ended = call("reproduce", words)
+    ended = call("papers", words)
     assert ended.status != 0
     assert ended.trace == ""
     (line,) = ended.err.splitlines()

@@ -14,10 +14,10 @@ import pytest
 from command_runs import call
 from matplotlib.text import Text
 
-from fusion_gym.agents.output import palette
-from fusion_gym.agents.papers.page import draw_figure, render_page
-from fusion_gym.agents.papers.paper import NAMES, Data, Paper, load_paper
-from fusion_gym.agents.reproduce import reproduce_figure
+from agents.papers.page import draw_figure, render_page
+from agents.papers.paper import NAMES, Data, Paper, load_paper
+from agents.papers.reproduce import reproduce_figure
+from fusion_gym.output import palette
 from fusion_gym.policies.settings import parse_settings
 
 PAGES = Path(__file__).parents[1] / "docs" / "reproduction"
@@ -131,7 +131,7 @@ def test_a_figure_has_parameters(
 ) -> None:
     texts = [f"{key}={value}" for key, value in changes.items()]
     words = [name, "--figure", figure, "--episodes", "2", "--set", *texts, "--workers", "1"]
-    ended = call("reproduce", [*words, "--output", str(tmp_path), "--work", str(tmp_path)])
+    ended = call("papers", [*words, "--output", str(tmp_path), "--work", str(tmp_path)])
     assert ended.status == 0, ended.err
     assert {path.suffix for path in tmp_path.rglob("*_*.*")} >= {".png", ".svg"}
     drawing = reproduce_figure(name, figure, 2, **parse_settings("option", texts))

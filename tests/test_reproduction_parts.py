@@ -8,17 +8,17 @@ from numpy.typing import NDArray
 from scipy import stats
 
 import fusion_gym
-from fusion_gym.agents.papers import round_robin_tobit_runs as biased
-from fusion_gym.agents.papers import tobit_token_bucket_runs as runs
-from fusion_gym.agents.papers import unknown_input
-from fusion_gym.agents.papers.adaptive_innovation_runs import _largest, _whitened
-from fusion_gym.agents.papers.markov_jump import example, period_of, run_markov_jump, trigger
-from fusion_gym.agents.papers.markov_jump_covariances import covariances
-from fusion_gym.agents.papers.numbers import cite, percent, verdict
-from fusion_gym.agents.papers.paper import NAMES
-from fusion_gym.agents.papers.round_robin_tobit_theorems import Censoring, MatrixBound, matrix_below
-from fusion_gym.agents.papers.unknown_input_recursion import gains, models
-from fusion_gym.agents.papers.walk import SomeSensors
+from agents.papers import round_robin_tobit_runs as biased
+from agents.papers import tobit_token_bucket_runs as runs
+from agents.papers import unknown_input
+from agents.papers.adaptive_innovation_runs import _largest, _whitened
+from agents.papers.markov_jump import example, period_of, run_markov_jump, trigger
+from agents.papers.markov_jump_covariances import covariances
+from agents.papers.numbers import cite, percent, verdict
+from agents.papers.paper import NAMES
+from agents.papers.round_robin_tobit_theorems import Censoring, MatrixBound, matrix_below
+from agents.papers.unknown_input_recursion import gains, models
+from agents.papers.walk import SomeSensors
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation import run_episodes
 from fusion_gym.evaluation.intervals import Interval

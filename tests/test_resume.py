@@ -12,10 +12,10 @@ import yaml
 from small_runs import meaning
 from training_configs import ENV, read_records, small_config
 
-from fusion_gym.agents.training import run
-from fusion_gym.agents.training.checked import load_checked
-from fusion_gym.agents.training.config import Experiment
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.training import run
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.config import Experiment
 from fusion_gym.validation import ConfigurationError
 
 ROOT = Path(__file__).parent.parent
@@ -134,9 +134,7 @@ def test_the_best_model_outlives_a_kill_between_its_validation_and_the_checkpoin
     experiment = experiment_of(tmp_path / "a", "ppo", timesteps=512)
     folder = Path(experiment.output)
     with monkeypatch.context() as patch:
-        patch.setattr(
-            "fusion_gym.agents.training.monitor.Progress._write_records", die_with_records(2)
-        )
+        patch.setattr("fusion_gym.training.monitor.Progress._write_records", die_with_records(2))
         with pytest.raises(Killed):
             run.train(experiment, quiet=True)
     assert (folder / "best_model.zip").exists()

@@ -11,18 +11,18 @@ import yaml
 from command_runs import refusal, succeed
 from small_suite import SMALL, small_suite
 
-from fusion_gym.agents.experiments import verdict
-from fusion_gym.agents.experiments.classes import classes_of
-from fusion_gym.agents.experiments.config import Case, load_suite, world
-from fusion_gym.agents.experiments.envelopes import EnvelopeStore, run_test
-from fusion_gym.agents.experiments.robustness import RobustTrial, error_change, usual_class
-from fusion_gym.agents.experiments.training import experiment_of
-from fusion_gym.agents.experiments.workers import Folders
-from fusion_gym.agents.training.run import train
+from agents.benchmark import verdict
+from agents.benchmark.classes import classes_of
+from agents.benchmark.config import Case, load_suite, world
+from agents.benchmark.envelopes import EnvelopeStore, run_test
+from agents.benchmark.robustness import RobustTrial, error_change, usual_class
+from agents.benchmark.training import experiment_of
+from agents.workers import Folders
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.envelope import best_mse
 from fusion_gym.evaluation.episodes import run_episodes
 from fusion_gym.policies.registry import make_policy
+from fusion_gym.training.run import train
 from fusion_gym.validation import ConfigurationError
 
 CASES = [

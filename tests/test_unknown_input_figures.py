@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusion_gym.agents.papers.unknown_input import record_run
+from agents.papers.unknown_input import record_run
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.envs.registration import make_task
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rliable import library, metrics
 
-from fusion_gym.agents.experiments.verdict import AgentFront, interval, judge
+from agents.benchmark.verdict import AgentFront, interval, judge
 from fusion_gym.evaluation.episodes import EpisodeResults
 
 

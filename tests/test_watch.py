@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import fusion_gym
-from fusion_gym.agents import watch as command
-from fusion_gym.agents.output.films import save_film
+from fusion_gym.commands import watch as command
 from fusion_gym.evaluation.watching import watch
+from fusion_gym.output.films import save_film
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError
 

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 # A parent that waits for its worker, which says its number and would work for a minute.
 PARENT = """
 import subprocess, sys
-worker = "import os, sys, time; from fusion_gym.agents.experiments.workers import end_with; "
+worker = "import os, sys, time; from agents.workers import end_with; "
 worker += "end_with(os.getppid()); print(os.getpid(), flush=True); time.sleep(60)"
 subprocess.run([sys.executable, "-c", worker])
 """
@@ -54,7 +54,7 @@ def test_workers_of_a_killed_benchmark_train_no_longer(tmp_path: Path) -> None:
     config = small_suite(tmp_path, timesteps=50_000_000, classes=["sensors"], training_seeds=2)
     work = tmp_path / "work"
     words = ["--config", str(config), "--results", str(tmp_path / "results"), "--work", str(work)]
-    command = [sys.executable, "-m", "fusion_gym.agents", "benchmark", *words, "--workers", "2"]
+    command = [sys.executable, "-m", "fusion_gym.commands", "benchmark", *words, "--workers", "2"]
     run = subprocess.Popen(
         command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
     )

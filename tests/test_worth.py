@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from test_verdict import made_up
 
-from fusion_gym.agents.experiments import verdict
-from fusion_gym.agents.experiments.classes import Class, classes_of, trained_classes
-from fusion_gym.agents.experiments.config import load_suite
-from fusion_gym.agents.experiments.verdict import ClassTests, at_rates, middles, worths
+from agents.benchmark import verdict
+from agents.benchmark.classes import Class, classes_of, trained_classes
+from agents.benchmark.config import load_suite
+from agents.benchmark.verdict import ClassTests, at_rates, middles, worths
 from fusion_gym.core.system import covers
 
 NOISE = np.random.default_rng(0).uniform(0.5, 1.5, 300)

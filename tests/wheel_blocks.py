@@ -29,7 +29,6 @@ from wheel_smoke import copy
 ROOT = Path(__file__).parent.parent
 LIMIT = 60.0  # seconds for a block; what takes longer belongs into the list
 PATIENCE = 600.0  # seconds until it is ended
-MAINTENANCE = "python -m fusion_gym.agents.maintenance"
 
 
 @dataclass(frozen=True)
@@ -47,27 +46,23 @@ class Listed:
 LISTED = (
     Listed("make ", "works in a clone: its targets are looked for in the Makefile"),
     Listed("python -m pytest", "works in a clone"),
+    Listed("python -m agents.", "works in a clone"),
     Listed("python -m fusion_gym.envs.pages", "works in a clone, on pages that are being written"),
     Listed("pip install ", "downloads: its extras are looked for in the wheel"),
     Listed("fusion-gym train --config tobit_oscillator_front", "minutes; wheel_smoke.py trains it"),
     Listed("fusion-gym train ", "minutes", "--timesteps 1024"),
     Listed("fusion-gym compare ", "minutes, for more than a hundred policies"),
     Listed("fusion-gym evaluate --env fusion_gym/RemoteEstimation-v1", "minutes", "--episodes 4"),
-    Listed(f"{MAINTENANCE} table ", "minutes, for policies that search for their schedules"),
-    Listed(f"{MAINTENANCE} mismatch ", "half a minute", "--episodes 20"),
     Listed("fusion-gym watch ", "half a minute, for a film of all of an episode", "--steps 10"),
-    Listed(f"{MAINTENANCE} bound ", "minutes", "--set horizon=20 --episodes 8 --accuracy 0.3"),
-    Listed("fusion-gym benchmark", "hours, and a cluster that is not here"),
-    Listed("fusion-gym reproduce ", "half an hour"),
     Listed("fusion-gym tune ", "hours, and a database that is not here"),
     Listed("tensorboard ", "serves until it is interrupted"),
 )
 READ = """
 import contextlib, io, json, os, sys
-from fusion_gym.agents.__main__ import load
-from fusion_gym.agents.command_line import read_command
-from fusion_gym.agents.input.options import check_options
-from fusion_gym.agents.training.checked import config_path
+from fusion_gym.commands.__main__ import load
+from fusion_gym.commands.command_line import read_command
+from fusion_gym.commands.options import check_options
+from fusion_gym.training.checked import config_path
 from fusion_gym.validation import read_text
 for place, folder, (program, name, *words) in json.loads(sys.stdin.read()):
     os.chdir(folder)
@@ -146,9 +141,8 @@ class Pages:
                 text = self._wrong_words(words, environment)
                 if text is not None:
                     return text
-                if words[0] == "fusion-gym" or line.startswith(MAINTENANCE):
-                    own = words if words[0] == "fusion-gym" else words[2:]
-                    self.unread.append((block.place, str(folder), own))
+                if words[0] == "fusion-gym":
+                    self.unread.append((block.place, str(folder), words))
         script = "\n".join(["set -euo pipefail", *lines])
         return _wrong(["bash", "-c", script], environment, folder) if lines else None
 

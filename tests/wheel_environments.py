@@ -107,7 +107,7 @@ class Wheel:
     def extra_of(self, module: str) -> str | None:
         """The extra that installs a module: empty for the wheel alone, none if no extra does."""
         for extra in ("", "agents", *self.extras):
-            if extra == "test" or (module.startswith("fusion_gym.agents") and not extra):
+            if extra == "test" or (module.startswith("fusion_gym.commands") and not extra):
                 continue
             try:
                 result = self.environment(frozenset(filter(None, [extra])))

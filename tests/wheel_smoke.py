@@ -23,8 +23,6 @@ import venv
 import zipfile
 from pathlib import Path
 
-from small_suite import small_suite
-
 ROOT = Path(__file__).parent.parent
 CONSTRAINTS = str(ROOT / "constraints.txt")
 HIDDEN = {".ci", ".gitignore"}  # of the repository alone
@@ -46,20 +44,19 @@ assert len(fusion_gym.zoo.names()) > 10
 """
 HELP = """
 import contextlib, io, sys
-from fusion_gym.agents.__main__ import COMMANDS, MAINTENANCE, main
-for commands in COMMANDS, MAINTENANCE:
-    for name in commands:
-        sys.argv = ["fusion-gym", name, "--help"]
-        said = io.StringIO()
-        with contextlib.suppress(SystemExit), contextlib.redirect_stdout(said):
-            main(commands)
-        assert f" {name} [-h] " in said.getvalue().splitlines()[0], said.getvalue()
+from fusion_gym.commands.__main__ import COMMANDS, main
+for name in COMMANDS:
+    sys.argv = ["fusion-gym", name, "--help"]
+    said = io.StringIO()
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(said):
+        main()
+    assert f" {name} [-h] " in said.getvalue().splitlines()[0], said.getvalue()
 """
 WITHOUT_EXTRA = """
 import sys
 sys.modules["tyro"] = None
 sys.argv = ["fusion-gym", "evaluate"]
-from fusion_gym.agents.__main__ import main
+from fusion_gym.commands.__main__ import main
 main()
 """
 
@@ -132,18 +129,7 @@ def use(programs: Path, folder: Path) -> None:
     assert json.loads((folder / "training" / "summary.json").read_text())["finished"]
     quick = ("--episodes", "2", "--timesteps", "8192")
     call(program, "demo", *quick, "--output", "demo", cwd=folder)
-    assert (folder / "demo" / "scheduler" / "front.png").exists()
-    maintenance = (python, "-m", "fusion_gym.agents.maintenance")
-    table = call(*maintenance, "table", "--episodes", "2", "--markdown", cwd=folder).stdout
-    assert table.startswith("| setting |"), table
-    small_suite(folder, training_seeds=1, classes=["sensors"])
-    suite = ("--config", "suite.yaml", "--results", "results", "--work", "work", "--workers", "1")
-    call(program, "benchmark", *suite, cwd=folder)
-    again = call(program, "benchmark", *suite, cwd=folder, status=1).stderr
-    assert "--resume" in again.splitlines()[-1], again
-    assert "`fusion-gym benchmark`" in (folder / "results" / "README.md").read_text()
-    call(*maintenance, "zoo", "--work", "work", "--zoo", "zoo", cwd=folder)
-    assert (folder / "zoo" / "small_sensors.zip").exists()
+    assert (folder / "demo" / "linear_fusion" / "comparison" / "pareto.png").exists()
 
 
 def main() -> None:

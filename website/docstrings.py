@@ -11,7 +11,7 @@ def markdown(text: str) -> str:
 
     def name(match: re.Match[str]) -> str:
         full = match["name"]
-        if not full.startswith("fusion_gym.") or full.startswith("fusion_gym.agents"):
+        if not full.startswith("fusion_gym.") or full.startswith("fusion_gym.commands"):
             return f"`{full}`"
         return f"[`{full.rpartition('.')[2]}`][{full}]"
 

@@ -5,8 +5,8 @@ import io
 
 from matplotlib.figure import Figure
 
-from fusion_gym.agents.output import palette  # the name by which the tutorials import it
-from fusion_gym.agents.output.palette import plt
+from fusion_gym.output import palette  # the name by which the tutorials import it
+from fusion_gym.output.palette import plt
 
 STYLE = {"svg.fonttype": "path", "figure.constrained_layout.use": True, "text.parse_math": True}
 plt.rcParams.update(palette.LARGE | STYLE)

@@ -12,16 +12,33 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 import fusion_gym
+from agents.papers.adaptive_innovation_runs import (
+    ELLIPSES,
+    SENSORS,
+    STEPS,
+    Ask,
+    ErrorRecord,
+    Lane,
+    steps,
+    top,
+)
+from agents.papers.drawing import legend, set_ticks, stack
+from agents.papers.numbers import Number, grid
+from agents.papers.paper import (
+    Data,
+    Paper,
+    PaperFigure,
+    Parameter,
+    Piece,
+    Settings,
+    numbers_within,
+    policy_of,
+)
 from fusion_gym.arrays import Array
 from fusion_gym.core.system import Signals
+from fusion_gym.output import palette
 from fusion_gym.policies.rules.adaptive_innovation import AdaptiveInnovation
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
-
-from ..output import palette
-from .adaptive_innovation_runs import ELLIPSES, SENSORS, STEPS, Ask, ErrorRecord, Lane, steps, top
-from .drawing import legend, set_ticks, stack
-from .numbers import Number, grid
-from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_of
 
 STATES = ("position", "velocity", "acceleration")
 UNITS = ("m", "m/s", "m/s²")

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fusion_gym
+from agents.papers.paper import Settings
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
@@ -16,8 +17,6 @@ from fusion_gym.core.runs import Outcome
 from fusion_gym.core.system import Signals
 from fusion_gym.systems.correlated.environment import CorrelatedTrackingOptions
 from fusion_gym.systems.correlated.system import CorrelatedTrackingState, CorrelatedTrackingSystem
-
-from .paper import Settings
 
 STEPS = 600
 SENSORS = ("sensor 1", "sensor 2", "sensor 3")

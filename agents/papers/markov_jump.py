@@ -12,16 +12,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fusion_gym
+from agents.papers.drawing import legend_of, stack
+from agents.papers.markov_jump_covariances import covariances
+from agents.papers.numbers import Number, below, grid
+from agents.papers.paper import (
+    Data,
+    Paper,
+    PaperFigure,
+    Parameter,
+    Piece,
+    Settings,
+    numbers_within,
+    policy_list,
+)
+from agents.papers.walk import walk
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
+from fusion_gym.output.palette import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    SENSORS,
+    SKY,
+    TRUTH,
+    VERMILLION,
+)
 from fusion_gym.systems.markov_jump.environment import MarkovJumpTrackingOptions
-
-from ..output.palette import BLACK, BLUE, GREEN, ORANGE, PURPLE, SENSORS, SKY, TRUTH, VERMILLION
-from .drawing import legend_of, stack
-from .markov_jump_covariances import covariances
-from .numbers import Number, below, grid
-from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_list
-from .walk import walk
 
 STATES = ("position", "velocity")
 UNITS = ("m", "m/s")

@@ -9,10 +9,10 @@ import jinja2
 import matplotlib.pyplot as plt
 from PIL import Image
 
-from ..output import palette
-from ..output.files import read_json, replacing, write, write_text
-from .numbers import below, cite, estimate, number_text, percent, verdict
-from .paper import NAMES, Data, Paper, PaperFigure
+from agents.papers.numbers import below, cite, estimate, number_text, percent, verdict
+from agents.papers.paper import NAMES, Data, Paper, PaperFigure
+from fusion_gym.output import palette
+from fusion_gym.output.files import read_json, replacing, write, write_text
 
 OVERVIEW = "README.md"
 TEMPLATES = Path(__file__).parent

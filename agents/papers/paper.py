@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import fusion_gym
+from agents.cache import Cache
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.validation import ConfigurationError, choice, keys, number, refusal
-
-from ..output.cache import Cache
 
 NAMES = (
     "tobit_token_bucket",
@@ -147,7 +146,7 @@ def load_paper(name: str) -> Paper:
     Raises:
         ConfigurationError: there is no such paper.
     """
-    module = importlib.import_module(f".{choice('paper', name, NAMES)}", __package__)
+    module = importlib.import_module(f"agents.papers.{choice('paper', name, NAMES)}")
     paper: Paper = module.PAPER
     return paper
 

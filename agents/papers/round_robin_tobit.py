@@ -12,19 +12,27 @@ from typing import Any
 import numpy as np
 
 import fusion_gym
+from agents.papers import round_robin_tobit_runs as runs
+from agents.papers import round_robin_tobit_theorems as theorems
+from agents.papers.drawing import legend, stack
+from agents.papers.numbers import Number
+from agents.papers.paper import (
+    Data,
+    Paper,
+    PaperFigure,
+    Parameter,
+    Piece,
+    Settings,
+    numbers_within,
+    policy_of,
+)
+from agents.papers.walk import SomeSensors
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import record_episode
 from fusion_gym.evaluation.intervals import Interval, mean_interval
+from fusion_gym.output import palette
 from fusion_gym.policies.registry import make_policy
-
-from ..output import palette
-from . import round_robin_tobit_runs as runs
-from . import round_robin_tobit_theorems as theorems
-from .drawing import legend, stack
-from .numbers import Number
-from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, numbers_within, policy_of
-from .walk import SomeSensors
 
 # Tables II and III of the paper: ARMSE1, ARMSE2, ARMSE3 by interval and by variance.
 TABLE_II = {

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import fusion_gym
+from agents.papers.numbers import Number, Verdict
+from agents.papers.walk import walk, walk_in_parts
 from fusion_gym import gaussian
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
@@ -15,9 +17,6 @@ from fusion_gym.systems.tobit.centre import FederatedCentre
 from fusion_gym.systems.tobit.filters import Expectation
 from fusion_gym.systems.tobit.system import CensoredSystem
 from fusion_gym.systems.tobit.tobit_filter import TobitKalmanFilter
-
-from .numbers import Number, Verdict
-from .walk import walk, walk_in_parts
 
 OSCILLATOR = "fusion_gym/BiasedOscillator-v1"
 TRACKING = "fusion_gym/BiasedTracking-v1"

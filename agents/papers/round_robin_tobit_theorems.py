@@ -8,18 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fusion_gym
+from agents.papers import round_robin_tobit_runs as measures
+from agents.papers.numbers import Number
+from agents.papers.paper import Data, Settings
+from agents.papers.round_robin_tobit_runs import (
+    FREE,
+    OSCILLATOR,
+    TRACKING,
+    PrintedTobitFilter,
+    censored,
+)
+from agents.papers.walk import SomeSensors, walk_in_parts
 from fusion_gym import gaussian, linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy
 from fusion_gym.systems.tobit.tobit_filter import expect_censored
-
-from . import round_robin_tobit_runs as measures
-from .numbers import Number
-from .paper import Data, Settings
-from .round_robin_tobit_runs import FREE, OSCILLATOR, TRACKING, PrintedTobitFilter, censored
-from .walk import SomeSensors, walk_in_parts
 
 PLACES = (-7.0, -5.0, -4.0, 0.0, 4.5, 5.0, 6.0)  # true x1 at which Lemma 1 is tried
 _DRAWS = 200  # measurements an episode, at each of them

@@ -10,18 +10,17 @@ from typing import Any
 import numpy as np
 from matplotlib.patches import Patch
 
+from agents.papers import tobit_token_bucket_runs as runs
+from agents.papers.drawing import legend_of, stack
+from agents.papers.numbers import below, grid
+from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
+from agents.papers.tobit_token_bucket_runs import SENSORS, TRIGGER, History, record_history, scheme
+from agents.papers.walk import SomeSensors
 from fusion_gym.arrays import Array
 from fusion_gym.evaluation import run_episodes
+from fusion_gym.output.palette import FUSED, INK, MEASURED, TRUTH
+from fusion_gym.output.palette import SENSORS as COLOURS
 from fusion_gym.policies.registry import make_policy
-
-from ..output.palette import FUSED, INK, MEASURED, TRUTH
-from ..output.palette import SENSORS as COLOURS
-from . import tobit_token_bucket_runs as runs
-from .drawing import legend_of, stack
-from .numbers import below, grid
-from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
-from .tobit_token_bucket_runs import SENSORS, TRIGGER, History, record_history, scheme
-from .walk import SomeSensors
 
 _NODES = range(SENSORS)
 _NODE_NAMES = tuple(f"node {m + 1}" for m in _NODES)

@@ -6,14 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fusion_gym
+from agents.papers.walk import walk
 from fusion_gym import linalg
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
 from fusion_gym.policies.base import Policy
 from fusion_gym.policies.rules.dynamic_event import DynamicEvent
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
-
-from .walk import walk
 
 TRIGGER = "dynamic_event"
 SENSORS = 3

@@ -11,20 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fusion_gym
+from agents.papers import unknown_input_recursion as recursion
+from agents.papers.drawing import legend, set_ticks
+from agents.papers.numbers import below, estimate, grid
+from agents.papers.paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
+from agents.papers.unknown_input_recursion import EXACT_CUTOFF
+from agents.papers.walk import walk
 from fusion_gym.arrays import Array
 from fusion_gym.core.task import Task
+from fusion_gym.output import palette
 from fusion_gym.policies.rules.adaptive_threshold import AdaptiveThreshold
 from fusion_gym.systems.unknown_input.environment import UnknownInputOptions
 from fusion_gym.systems.unknown_input.nodes import TableNodes
 from fusion_gym.systems.unknown_input.system import UnknownInputSystem
-
-from ..output import palette
-from . import unknown_input_recursion as recursion
-from .drawing import legend, set_ticks
-from .numbers import below, estimate, grid
-from .paper import Data, Paper, PaperFigure, Parameter, Piece, Settings, policy_of
-from .unknown_input_recursion import EXACT_CUTOFF
-from .walk import walk
 
 PRINTED, CARTS = "paper", "two_carts"
 EXAMPLES = (PRINTED, CARTS)

@@ -63,7 +63,7 @@ TABLES = {
     "fusion": f"{__name__}:fusion_table",
     "policies": "fusion_gym.policies.registry:policy_table",
     "metrics": "fusion_gym.evaluation.metrics:metric_table",
-    "algorithms": "fusion_gym.agents.training.algorithms:algorithm_table",
+    "algorithms": "fusion_gym.training.algorithms:algorithm_table",
 }
 _MARKED = re.compile(rf"(<!-- ({'|'.join(TABLES)}): (.*?) -->\n).*?(<!-- end -->)", re.DOTALL)
 

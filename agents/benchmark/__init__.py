@@ -1,0 +1,1 @@
+"""The benchmark: rules and agents of every class, at equal price."""

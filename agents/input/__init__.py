@@ -1,1 +1,0 @@
-"""What a user hands in: options and files, checked before anything runs."""

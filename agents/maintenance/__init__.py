@@ -1,1 +1,0 @@
-"""Commands of the maintainers: what makes tables and models of the documentation."""

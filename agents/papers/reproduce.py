@@ -1,0 +1,163 @@
+"""Reproduce the simulation sections of the five papers: figures, tables and claims.
+
+    python -m agents.papers tobit_token_bucket
+    python -m agents.papers all --resume
+    python -m agents.papers markov_jump --figure 5 --set m=0.7 --episodes 200
+
+Into the output folder go a page a paper (``PAPER.md``), its figures (PNG and SVG), its numbers
+(``PAPER.json``), and ``README.md`` with every claim's verdict. With ``--figure`` one figure alone
+is simulated and drawn, under other parameters of the paper or options of its environment.
+Simulations are kept in the work folder as they are finished; ``--resume`` skips those, if they
+were made from the same inputs by the same code.
+"""
+
+import itertools
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from agents.cache import Cache
+from agents.papers.page import draw_figure, write_figure, write_overview, write_page
+from agents.papers.paper import (
+    NAMES,
+    NOTHING,
+    Data,
+    Paper,
+    Piece,
+    PieceJob,
+    Settings,
+    load_paper,
+    load_papers,
+)
+from agents.workers import Call, Pool, side_by_side
+from fusion_gym.commands.command_line import Command, SetOptions
+from fusion_gym.commands.options import OutputFolder, Seed, Whole
+from fusion_gym.output.ending import ended_like_by_ctrl_c
+from fusion_gym.output.folders import alone_in
+from fusion_gym.policies.settings import parse_settings
+from fusion_gym.validation import ConfigurationError, integer
+
+
+@dataclass(frozen=True)
+class Reproduce(Command):
+    """Reproduce the simulation sections of the five papers."""
+
+    program = "python -m agents.papers"
+
+    papers: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar=f"{{{','.join(NAMES)},all}}")
+    ]
+    """Papers by name, or all."""
+    figure: str | None = None
+    """One figure of one paper, by its number or name, instead of pages."""
+    options: SetOptions = ()
+    """Parameters of the figure, or options of the paper's environment."""
+    episodes: Annotated[int | None, Whole(2, 100_000_000)] = None
+    """Episodes of every simulation, instead of its own number."""
+    seed: Seed = 0
+    """Seed of the first episode."""
+    resume: bool = False
+    """Keep simulations that are finished."""
+    output: Annotated[Path | None, OutputFolder()] = None
+    """Folder for pages, figures and numbers: docs/reproduction, or runs/figures for a figure."""
+    work: Annotated[Path, OutputFolder()] = Path("runs/reproduction")
+    """Folder for simulations."""
+    workers: Annotated[int, Whole(1, 512)] = 2
+    """Processes side by side."""
+
+    def run(self) -> None:
+        """Simulate what is not there, then write every page, or the figure.
+
+        Raises:
+            ConfigurationError: no paper, an unknown name, or a parameter that is not allowed.
+        """
+        papers = load_papers(self.papers)
+        changes = parse_settings("option", itertools.chain(*self.options))
+        if self.figure is not None:
+            if len(papers) != 1:
+                raise ConfigurationError(
+                    f"papers = {self.papers!r} is not allowed with figure = {self.figure!r}: "
+                    "it must be a single paper"
+                )
+            self._reproduce_figure(papers[0], self.figure, changes)
+        elif changes:
+            raise ConfigurationError(
+                f"set = {next(iter(changes))!r} is not allowed without --figure: the pages' claims "
+                "are about the papers' own parameters"
+            )
+        else:
+            self._reproduce_pages(papers, self.output or Path("docs/reproduction"))
+
+    def _reproduce_pages(self, papers: list[Paper], output: Path) -> None:
+        with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
+            print(f"simulations go into {self.work}, pages into {output}", file=sys.stderr)
+            jobs = {
+                (paper.name, piece.name): self._job(piece, paper.settings({}))
+                for paper in papers
+                for piece in paper.pieces
+            }
+            results = dict(zip(jobs, self._simulate(list(jobs.values())), strict=True))
+            for paper in papers:
+                names = [piece.name for piece in paper.pieces]
+                data = {name: results[paper.name, name] for name in names}
+                counts = {name: jobs[paper.name, name].counts for name in names}
+                write_page(paper, data, counts, output)
+                print(f"{paper.name}: {output / paper.name}.md")
+            write_overview(output)
+
+    def _reproduce_figure(self, paper: Paper, name: str, changes: dict[str, Any]) -> None:
+        name, figure = paper.figure(name)
+        settings = paper.settings(changes, figure.without)
+        path = (self.output or Path("runs/figures")) / paper.name / name
+        with ended_like_by_ctrl_c(), alone_in(self.work, "work"):
+            job = self._job(paper.piece(figure.piece), settings, figure.restriction)
+            write_figure(figure, self._simulate([job])[0], path)
+        print(f"{paper.name}: {path}.png")
+
+    def _job(self, piece: Piece, settings: Data, restriction: Settings = NOTHING) -> PieceJob:
+        return PieceJob(piece, self.episodes or piece.usual, self.seed, settings, dict(restriction))
+
+    def _simulate(self, jobs: Sequence[PieceJob]) -> list[Data]:
+        """Return the data of all jobs, from the work folder or simulated now."""
+        cache = Cache(self.work)
+        if not self.resume:
+            for job in jobs:
+                cache.drop(*job.key)
+        absent = [job for job in jobs if not cache.holds(*job.key)]
+        work = [Call(job.weight, job.simulate, (cache,)) for job in absent]
+        side_by_side(work, Pool(self.workers), "reproducing")
+        return [cache.read(*job.key) for job in jobs]
+
+    def interrupted(self) -> str:
+        """Finished simulations are kept."""
+        words = [word for word in sys.argv[1:] if word != "--resume"]
+        command = f"{self.program} {shlex.join([*words, '--resume'])}"
+        return f"interrupted; go on with: {command}"
+
+
+def reproduce_figure(
+    paper: str, figure: str, episodes: int | None = None, seed: int = 0, **changes: Any
+) -> Any:
+    """Return a figure of a paper as a matplotlib Figure, simulated under changed parameters.
+
+    Args:
+        paper: The paper's name.
+        figure: The figure's number or name.
+        episodes: Episodes of the simulation, instead of the paper's own number.
+        seed: Seed of the first episode.
+        changes: Parameters of the paper, or options of its environment.
+
+    Raises:
+        ConfigurationError: an unknown name, or a value that is not allowed.
+    """
+    item = load_paper(paper)
+    drawing = item.figure(figure)[1]
+    settings, piece = item.settings(changes, drawing.without), item.piece(drawing.piece)
+    count = integer("episodes", piece.usual if episodes is None else episodes, at_least=2)
+    first = integer("seed", seed, at_least=0)
+    return draw_figure(drawing, piece.simulate(count, first, settings, **drawing.restriction))

@@ -1,0 +1,1 @@
+"""The configs: one YAML for each environment and experiment."""

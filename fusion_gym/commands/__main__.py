@@ -1,0 +1,61 @@
+"""All commands under one name: ``fusion-gym COMMAND``."""
+
+import ast
+import importlib
+import sys
+from pathlib import Path
+from typing import Any
+
+from fusion_gym.commands import missing_extra
+from fusion_gym.output.ending import report_errors
+from fusion_gym.validation import ConfigurationError, choice
+from fusion_gym.version import __version__
+
+COMMANDS = ("compare", "demo", "evaluate", "export", "info", "list", "train", "tune", "watch")
+
+
+def usage() -> str:
+    """Return every command with the first sentence of its module."""
+    lines = ["usage: fusion-gym COMMAND [OPTIONS]", ""]
+    for name in COMMANDS:
+        text = Path(__file__).with_name(f"{name}.py").read_text("utf-8")
+        lines.append(f"  {name:<10} {(ast.get_docstring(ast.parse(text)) or '').splitlines()[0]}")
+    return "\n".join([*lines, "", "fusion-gym COMMAND --help shows the options of a command."])
+
+
+def main() -> None:
+    """Run the command line of ``fusion-gym``, which needs the packages of the extra ``agents``.
+
+    Raises:
+        SystemExit: as :func:`report_errors`; an unknown command (2).
+    """
+    name = sys.argv[1] if sys.argv[1:] else "--help"
+    with report_errors():
+        if name in ("-h", "--help", "--version"):
+            print(__version__ if name == "--version" else usage())
+            return
+        command = load(name)
+        del sys.argv[1]
+        command.main()
+
+
+def load(name: str) -> Any:
+    """Return the class of a command.
+
+    Raises:
+        SystemExit: no such command (2), or a package that it needs is not installed (1).
+    """
+    try:
+        module = importlib.import_module(f"fusion_gym.commands.{choice('command', name, COMMANDS)}")
+        return getattr(module, name.capitalize())
+    except ConfigurationError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except ModuleNotFoundError as error:
+        if missing_extra(error) is None:
+            raise
+        sys.exit(missing_extra(error))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,187 @@
+"""How every command reads its options, reports an error and ends."""
+
+import contextlib
+import inspect
+import io
+import itertools
+import os
+import re
+import shlex
+import sys
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, fields, replace
+from typing import Annotated, Any, ClassVar, TypeVar, get_args
+
+import tyro
+
+from fusion_gym.commands.options import check_options
+from fusion_gym.docstrings import plain_marks
+from fusion_gym.importing import trust_files
+from fusion_gym.output.ending import flush, report_errors
+from fusion_gym.output.progress import quietly
+from fusion_gym.validation import CONTROL, ConfigurationError
+
+Words = tuple[tuple[str, ...], ...]  # of an option that may be given several times
+SetOptions = Annotated[
+    Words, tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE …")
+]
+PolicyNames = Annotated[
+    Words, tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME[:key=value,…] …")
+]
+_Kind = TypeVar("_Kind", bound="Command")
+
+
+def program_of(kind: type["Command"]) -> str:
+    """Return the words that run a command."""
+    return kind.program or f"fusion-gym {kind.__name__.lower()}"
+
+
+@dataclass(frozen=True)
+class Command(ABC):
+    """A command: its fields are its options, its docstring and theirs are its help."""
+
+    program: ClassVar[str] = ""  # the words that run it, where it is none of fusion-gym
+
+    @classmethod
+    def main(cls) -> None:
+        """Read the command, check its options and do it.
+
+        Raises:
+            SystemExit: as :func:`report_errors`; status 130 after an interrupt.
+        """
+        command: Command | None = None
+        if os.getcwd() not in sys.path:  # an installed script lacks the user's own modules
+            sys.path.append(os.getcwd())
+        with report_errors(lambda: command.interrupted() if command else "interrupted"):
+            command = read_command(cls)
+            with (
+                trust_files(getattr(command, "trust", False)),
+                quietly(isinstance(command, Long) and command.quiet),
+            ):
+                check_options(command)
+                command.run()
+
+    @abstractmethod
+    def run(self) -> None:
+        """Do the work.
+
+        Raises:
+            ConfigurationError: anything that is not allowed.
+            KeyboardInterrupt: the work was interrupted.
+        """
+
+    def interrupted(self) -> str:
+        """What to say after an interrupt."""
+        return "interrupted"
+
+
+@dataclass(frozen=True)
+class Long(Command):
+    """A command that may take long: it shows where it is, and says how to go on."""
+
+    quiet: bool = field(default=False, kw_only=True)
+    """Show neither progress nor remarks: results and errors alone."""
+    trust: bool = field(default=False, kw_only=True)
+    """Run code of files: what they name as module:name, and what model:PATH holds besides data."""
+
+    keeps: ClassVar[bool] = True  # what is finished, before all of it is
+
+    def interrupted(self) -> str:
+        """The command line that goes on, where something is kept."""
+        if not self.keeps:
+            return "interrupted: nothing is kept"
+        return f"interrupted; go on with: {self.again()}"
+
+    def again(self, without: tuple[str, ...] = ()) -> str:
+        """The words of the command line but ``without``, with ``--resume`` where it has that."""
+        more = ["--resume"] if "resume" in {item.name for item in fields(self)} else []
+        words = [word for word in sys.argv[1:] if word not in (*more, *without)]
+        return f"{program_of(type(self))} {shlex.join([*words, *more])}"
+
+
+@dataclass(frozen=True)
+class EnvironmentOptions:
+    """The options of a command about one environment."""
+
+    env: str | None = field(default=None, kw_only=True)
+    """Id of a registered environment."""
+    config: str | None = field(default=None, kw_only=True)
+    """Take environment and options from a training's YAML, or from a shipped config by its name."""
+    options: SetOptions = field(default=(), kw_only=True)
+    """Options of gym.make for the environment; they go before all others."""
+
+
+_REGISTRY = tyro.constructors.ConstructorRegistry()
+
+
+@_REGISTRY.primitive_rule
+def _optional(
+    info: tyro.constructors.PrimitiveTypeInfo,
+) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+    """Read and show ``X | None`` as X: an option that is left out is None."""
+    parts = get_args(info.type)
+    if len(parts) != 2 or parts[1] is not type(None):
+        return None
+    spec = _REGISTRY.get_primitive_spec(
+        tyro.constructors.PrimitiveTypeInfo.make(parts[0], info.markers)
+    )
+    assert isinstance(spec, tyro.constructors.PrimitiveConstructorSpec)
+    return replace(spec, is_instance=lambda value: value is None or spec.is_instance(value))
+
+
+def read_command(kind: type[_Kind]) -> _Kind:
+    """The command with the options of the command line.
+
+    Raises:
+        SystemExit: help was asked for (status 0), or an option is not understood (2, after one
+            line that says which).
+        ConfigurationError: a word is empty, or no text.
+    """
+    _check_words()
+    output = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(output):
+            return tyro.cli(
+                kind,
+                prog=program_of(kind),
+                description=plain_marks(inspect.getmodule(kind).__doc__ or ""),
+                registry=_REGISTRY,
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    except SystemExit as end:
+        if end.code:
+            print(f"error: {_essence(output.getvalue())}", file=sys.stderr)
+        flush()
+        raise
+
+
+def _check_words() -> None:
+    """Every word is text that can be written into a file, and not empty.
+
+    An empty word is a variable of the shell that is not set; as a path it would be this folder.
+
+    Raises:
+        ConfigurationError: one is not.
+    """
+    option = "the command line"
+    for word in sys.argv[1:]:
+        named = word.startswith("--")
+        option = word.strip("-").partition("=")[0] if named else option
+        if not word or (named and word.endswith("=")):
+            raise ConfigurationError(f"{option} = '' is not allowed: it must not be empty")
+        if re.search(CONTROL, word):  # bytes that were no text among them
+            allowed = "UTF-8 without control characters"
+            raise ConfigurationError(f"{option} = {word!r} is not allowed: it must be {allowed}")
+
+
+def _essence(message: str) -> str:
+    """What tyro says below its title and above the next rule, as one line."""
+    lines = [re.sub(r"\x1b\[[\d;]*m", "", line).strip("│ ") for line in message.splitlines()[1:]]
+    body = itertools.dropwhile(_is_rule, lines)
+    return " ".join(itertools.takewhile(lambda line: not _is_rule(line), body)).removeprefix(
+        "Error parsing "
+    )
+
+
+def _is_rule(line: str) -> bool:
+    return not line.strip("─-╰╯ ")

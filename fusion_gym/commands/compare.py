@@ -1,0 +1,237 @@
+"""Compare one policy with swept baselines: at its price, and at its rate.
+
+    fusion-gym compare --config configs/biased_oscillator_ppo.yaml \\
+        --sweep configs/biased_sweep.yaml \\
+        --policy model:runs/biased_oscillator_ppo/best_model.zip --output runs/comparison
+
+An agent that sees the price of a token runs at as many prices as ``--prices`` says. All policies
+run on the same seeds. The cost at a price is error + price · tokens; the best baseline at each
+price stands beside the agent. At its rate its MSE stands beside the baselines' lower envelope.
+Into the output folder go ``evaluation.json`` (every policy), ``comparison.json`` (the verdict) and
+``pareto.png``.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from rich.table import Table
+
+from fusion_gym.commands.command_line import Long
+from fusion_gym.commands.evaluate import evaluation_report
+from fusion_gym.commands.options import Episodes, OutputFolder, Seed, Whole
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation.envelope import (
+    FAR_APART,
+    BaselineComparison,
+    PriceComparison,
+    compare_at_price,
+    compare_with_envelope,
+    lower_envelope,
+)
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.output import figures, tables
+from fusion_gym.output.files import write
+from fusion_gym.output.progress import progress_bar, writing
+from fusion_gym.policies.registry import make_policy, policy_names
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.config import Experiment
+from fusion_gym.training.diagnosis import warn_of_unused_tokens
+from fusion_gym.training.sweeps import Sweep
+from fusion_gym.validation import refusal
+
+
+@dataclass(frozen=True)
+class Compare(Long):
+    """Compare one policy with swept baselines: at its price, and at its rate."""
+
+    config: str
+    """A training's YAML, or the name of a shipped one: its environment."""
+    sweep: str
+    """The baselines' YAML, or the name of a shipped one."""
+    policy: str
+    """The policy, for example model:PATH."""
+    output: Annotated[Path, OutputFolder()]
+    """Folder for the results."""
+    episodes: Episodes = 1000
+    """Episodes of each policy."""
+    seed: Seed = 0
+    """Seed of the first episode."""
+    prices: Annotated[int | None, Whole(2, 1000)] = None
+    """Ask an agent that sees the price at as many, over the config's price_range."""
+
+    keeps = False
+
+    def run(self) -> None:
+        """Run all policies on the same seeds; write, print and draw the comparison."""
+        world, sweep = (
+            load_checked(Experiment, self.config).environment,
+            load_checked(Sweep, self.sweep, "sweep"),
+        )
+        task = make_task(world.id, **world.options)
+        requested = self.policies_of(task)
+        for policy in requested:
+            make_policy(policy, task)
+        writing(("evaluation, comparison and figure", self.output))
+        rules = sweep.policies(task.reward.price)
+        baselines = run_all(task, rules, self.episodes, self.seed, "baselines")
+        compare(world.id, task, sweep, baselines, requested, self.seed, self.output)
+
+    def policies_of(self, task: Task) -> dict[str, float]:
+        """The policy, or the policy at each of the prices, with the price of a token.
+
+        A price that is drawn stands for the middle of its range.
+
+        Raises:
+            ConfigurationError: prices, but none that is drawn, or a policy that is no agent.
+        """
+        if self.prices is None:
+            return {self.policy: float(task.reward.price.draw(np.array([0.5]))[0])}
+        span = task.reward.price.span
+        if span is None:
+            raise refusal(
+                "prices", self.prices, "left out where the config has no price_range, as here"
+            )
+        if self.policy.partition(":")[0] not in policy_names("agent"):
+            raise refusal(
+                "prices", self.prices, f"left out with policy = {self.policy!r}, which is no agent"
+            )
+        low, high = (repr(float(end)) for end in span)  # to the last digit: it knows no others
+        inner = [f"{price:.4g}" for price in np.geomspace(*span, self.prices)[1:-1]]
+        return {f"{self.policy},price={price}": float(price) for price in (low, *inner, high)}
+
+
+def run_all(
+    task: Task, policies: list[str], episodes: int, seed: int, description: str
+) -> dict[str, EpisodeResults]:
+    """Run every policy on the same seeds, with a bar of progress."""
+    built = {name: make_policy(name, task) for name in policies}
+    total = len(policies) * episodes * task.horizon
+    with progress_bar(total, description) as bar:
+        result = {}
+        for name, policy in built.items():
+            bar.say(name)
+            result[name] = run_episodes(task, policy, episodes, seed, bar.update)
+        return result
+
+
+def compare(
+    env_id: str, task: Task, sweep: Sweep, baselines: dict[str, EpisodeResults],
+    agents: Mapping[str, float], seed: int, folder: Path,
+) -> None:  # fmt: skip
+    """Run the agent, or the agent at each of its prices, on the baselines' episodes.
+
+    Writes, prints and draws the comparison.
+
+    Raises:
+        ConfigurationError: the agent transmits less than every baseline.
+    """
+    episodes = next(iter(baselines.values())).episodes
+    learned = run_all(task, list(agents), episodes, seed, "agent")
+    points = [
+        Point(
+            name,
+            float(item.rate.mean()),
+            float(item.mse.mean()),
+            compare_at_price(item, baselines, agents[name]),
+            compare_with_envelope(item, baselines),
+        )
+        for name, item in learned.items()
+    ]
+    envelope = lower_envelope(baselines)
+    report = evaluation_report(env_id, task, episodes, seed, baselines | learned)
+    write(folder / "evaluation.json", report)
+    write(folder / "comparison.json", {"points": [point.plain() for point in points]})
+    best = (point.at_price.best for point in points)
+    visible = dict.fromkeys([*sweep.points, *best, *(point.name for point in envelope), *learned])
+    console = tables.console()
+    console.print(
+        tables.evaluation_table(
+            f"{env_id}: single policies, the best of all {len(baselines)} baselines, and the agent",
+            {name: report["policies"][name] for name in visible},
+            report["quantiles"],
+            {},
+        )
+    )
+    console.print(price_table(points, baselines))
+    console.print(rate_table(points))
+    warn_of_unused_tokens(task, next(iter(learned.values())))
+    lines = [
+        figures.FigureLine(curve.label, [baselines[name] for name in rules])
+        for curve in sweep.curves
+        if (rules := curve.policies(task.reward.price))
+    ]
+    single = {name: baselines[name] for name in sweep.points}
+    agent = figures.FigureLine(_label(list(agents)), list(learned.values()))
+    figures.pareto(folder / "pareto.png", env_id, lines, single, agent, envelope)
+
+
+@dataclass(frozen=True)
+class Point:
+    """The agent at one price: its rate per sensor and step, its MSE, and both comparisons."""
+
+    agent: str
+    rate: float
+    mse: float
+    at_price: PriceComparison
+    at_rate: BaselineComparison
+
+    def plain(self) -> dict[str, Any]:
+        """Return the point as JSON has it."""
+        result = asdict(self)
+        for name in ("at_price", "at_rate"):
+            comparison = getattr(self, name)
+            result[name] = comparison._asdict() | {"difference": comparison.difference._asdict()}
+        return result
+
+
+def _label(agents: Sequence[str]) -> str:
+    if len(agents) > 1:
+        return f"the agent, at {len(agents)} prices"
+    return "the agent" if agents[0].startswith("model:") else agents[0]
+
+
+def price_table(points: Sequence[Point], baselines: Mapping[str, EpisodeResults]) -> Table:
+    """The agent against the best baseline at each of its prices."""
+    rows = []
+    for point in points:
+        price, best, cost, difference = point.at_price
+        row = (
+            best,
+            f"{price:.4g}",
+            f"{baselines[best].rate.mean():.4f}",
+            f"{point.rate:.4f}",
+            f"{cost:.4f}",
+            tables.difference(difference),
+            f"{point.at_price.relative:+.1%}" if cost else "–",
+        )
+        rows.append(row)
+    heads = "price", "its rate", "agent's rate", "its cost", "difference [95 %]", "relative"
+    title = "at equal price: cost = error + price · tokens, a step; negative: the agent is better"
+    return tables.table_tables(title, ("best baseline", *heads), rows)
+
+
+def rate_table(points: Sequence[Point]) -> Table:
+    """The agent against the envelope, at its own rate at each of its prices."""
+    rows = []
+    for point in points:
+        comparison = point.at_rate
+        share = comparison.difference.mean / (comparison.envelope or np.nan)
+        row = (
+            "\n".join(comparison.between),
+            f"{point.rate:.4f}",
+            f"{point.mse:.4f}",
+            f"{comparison.envelope:.4f}" + (" *" if comparison.far_apart else ""),
+            tables.difference(comparison.difference),
+            # Whoever always transmits over a perfect channel has no error to compare with.
+            "–" if np.isnan(share) else f"{share:+.1%}",
+        )
+        rows.append(row)
+    heads = "rate", "agent's MSE", "envelope's MSE", "difference [95 %]", "relative"
+    title = "at equal rate: the baselines' lower envelope at the agent's own rate"
+    far = any(point.at_rate.far_apart for point in points)
+    note = f"* between baselines whose rates differ by more than {FAR_APART:g} times"
+    return tables.table_tables(title, ("envelope between", *heads), rows, note if far else None)

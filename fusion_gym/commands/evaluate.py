@@ -1,0 +1,209 @@
+"""Evaluate policies on paired episodes.
+
+    fusion-gym evaluate --env fusion_gym/TobitOscillator-v1 --set filter=tobit \\
+        --policies always dynamic_event innovation_threshold:threshold=1 --reference always
+
+Every policy runs on the same seeds, so that the same noise meets every policy. The JSON is
+written after each policy; with ``--resume`` the policies that it already holds are not run again.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, Any
+
+import pydantic
+
+from fusion_gym.commands.command_line import EnvironmentOptions, Long, PolicyNames
+from fusion_gym.commands.options import Episodes, OutputFile, Seed
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.evaluation.intervals import Interval, mean_interval
+from fusion_gym.evaluation.metrics import METRICS, paired_difference, robust_summary, summarise
+from fusion_gym.output import tables
+from fusion_gym.output.files import read_json, write
+from fusion_gym.output.progress import progress_bar, remark, writing
+from fusion_gym.policies.base import Policy
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.training.checked import checked
+from fusion_gym.training.environment import environment_of
+from fusion_gym.validation import ConfigurationError, refusal
+
+_DRAWN = 100  # episodes by which drawn actions are compared with the likeliest
+
+
+class Quantiles(pydantic.BaseModel):
+    """Quantiles of the episodes' error."""
+
+    median: float
+
+
+# A policy in the JSON of an evaluation: an interval for a metric, or a list.
+_Row = Annotated[list[float], pydantic.Field(min_length=1)]
+_FIELDS: dict[str, Any] = {
+    name: (_Row if metric.axis else Interval, ...) for name, metric in METRICS.items()
+}
+EVALUATED = pydantic.create_model("EVALUATED", **_FIELDS)
+
+
+class Evaluation(pydantic.BaseModel):
+    """The JSON of an evaluation."""
+
+    policies: dict[str, EVALUATED]  # type: ignore[valid-type]
+    quantiles: dict[str, Quantiles]
+
+    @pydantic.model_validator(mode="after")
+    def _paired(self) -> "Evaluation":
+        if missing := sorted(self.policies.keys() - self.quantiles.keys()):
+            raise ValueError(f"quantiles of {missing} are missing")
+        return self
+
+
+@dataclass(frozen=True)
+class Evaluate(EnvironmentOptions, Long):
+    """Evaluate policies on paired episodes."""
+
+    policies: PolicyNames
+    """Rules and references by name, zoo:NAME, or model:PATH."""
+    episodes: Episodes = 1000
+    """Episodes of each policy."""
+    seed: Seed = 0
+    """Seed of the first episode."""
+    reference: str | None = None
+    """One of the policies: print paired differences to it."""
+    json: Annotated[Path | None, OutputFile(".json")] = None
+    """Write the results to this file."""
+    resume: bool = False
+    """Keep what the JSON already holds."""
+
+    def run(self) -> None:
+        """Evaluate and print the tables."""
+        evaluate(self)
+
+    def interrupted(self) -> str:
+        """Finished policies are in the JSON; a reference needs the episodes of all."""
+        if self.json is None:
+            return "interrupted: nothing is kept (--json FILE keeps finished policies)"
+        if self.reference is not None:
+            return f"interrupted: finished policies are in {self.json}; --reference begins anew"
+        return super().interrupted()
+
+
+def evaluate(command: Evaluate) -> dict[str, Any]:
+    """Run the evaluation that the command line asks for and return what the JSON holds.
+
+    Raises:
+        ConfigurationError: anything that is not allowed, before the first episode.
+    """
+    env_id, options, _ = environment_of(command.env, command.config, command.options)
+    task = make_task(env_id, **options)
+    names = list(dict.fromkeys(chain(*command.policies)))
+    if not names:
+        raise ConfigurationError("policies = [] is not allowed: give --policies NAME …")
+    if command.reference is not None and command.reference not in names:
+        raise refusal("reference", command.reference, f"one of the policies {names}")
+    if command.resume and command.reference:
+        raise ConfigurationError(
+            f"resume = True is not allowed with reference = {command.reference!r}: paired "
+            "differences need the episodes of every policy, and the JSON holds only their means"
+        )
+    policies = {name: make_policy(name, task) for name in names}
+    report = evaluation_report(env_id, task, command.episodes, command.seed, {})
+    done = finished(command.json, report) if command.resume else {"policies": {}}
+    results: dict[str, EpisodeResults] = {}
+    steps = command.episodes * task.horizon
+    if command.json is None:
+        remark("nothing is written (--json FILE keeps the results)")
+    else:
+        writing(("the results of each policy", command.json))
+    earlier = steps * len(done["policies"].keys() & policies.keys())
+    with progress_bar(len(names) * steps, "evaluating", earlier) as bar:
+        for name, policy in policies.items():
+            if name in done["policies"]:
+                report["policies"][name] = done["policies"][name]
+                report["quantiles"][name] = done["quantiles"][name]
+                continue
+            bar.say(name)
+            results[name] = run_episodes(task, policy, command.episodes, command.seed, bar.update)
+            report["policies"][name] = summarise(results[name])
+            report["quantiles"][name] = robust_summary(results[name])
+            write(command.json, report)
+            warn_of_draws(name, task, policy, results[name], command.seed)
+    differences = {
+        name: paired_difference(result, results[command.reference])
+        for name, result in results.items()
+        if command.reference and name != command.reference
+    }
+    if command.reference:
+        report["reference"] = {
+            "name": command.reference,
+            "differences": {name: difference._asdict() for name, difference in differences.items()},
+        }
+    write(command.json, report)
+    title = f"{env_id}: {command.episodes} episodes of {task.horizon} steps, seed {command.seed}"
+    console = tables.console()
+    console.print(
+        tables.evaluation_table(title, report["policies"], report["quantiles"], differences)
+    )
+    console.print(tables.state_table(task.system.state_names, report["policies"]))
+    return report
+
+
+def warn_of_draws(
+    name: str, task: Task, policy: Policy, results: EpisodeResults, seed: int
+) -> None:
+    """Say it where an agent whose likeliest actions were taken does otherwise by drawn ones."""
+    if not getattr(policy, "deterministic", False):
+        return
+    drawn = make_policy(f"{name},deterministic=false", task)
+    episodes = min(results.episodes, _DRAWN)
+    difference = mean_interval(
+        run_episodes(task, drawn, episodes, seed).returns - results.returns[:episodes]
+    )
+    if difference.low > 0.0 or difference.high < 0.0:
+        remark(
+            f"{name} takes its likeliest actions; drawn actions change the return by "
+            f"{difference.mean:+.3g} [{difference.low:+.3g}, {difference.high:+.3g}] in {episodes} "
+            f"episodes: {name},deterministic=false evaluates them"
+        )
+
+
+def evaluation_report(
+    env_id: str, task: Task, episodes: int, seed: int, results: Mapping[str, EpisodeResults]
+) -> dict[str, Any]:
+    """Return what the JSON of an evaluation holds."""
+    return {
+        "env": env_id,
+        "episodes": episodes,
+        "seed": seed,
+        "horizon": task.horizon,
+        "settings": task.settings,
+        "states": list(task.system.state_names),
+        "policies": {name: summarise(result) for name, result in results.items()},
+        "quantiles": {name: robust_summary(result) for name, result in results.items()},
+    }
+
+
+def finished(path: Path | None, report: dict[str, Any]) -> dict[str, Any]:
+    """What an earlier run of the same evaluation has written.
+
+    Raises:
+        ConfigurationError: no file is named, or it holds no evaluation, or another one.
+    """
+    if path is None:
+        raise ConfigurationError("resume = True is not allowed without json: there is no file")
+    if not path.exists():
+        return {"policies": {}}
+    earlier = read_json(path, "json")
+    plain = json.loads(json.dumps(report))
+    for key in ("env", "episodes", "seed", "horizon", "settings"):
+        if earlier.get(key) != plain[key]:
+            raise ConfigurationError(
+                f"json {str(path)!r} holds another evaluation: its {key} is {earlier.get(key)!r}, "
+                f"asked for is {plain[key]!r}"
+            )
+    checked(Evaluation, earlier, f"json = {str(path)!r}")
+    return earlier

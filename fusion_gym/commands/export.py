@@ -1,0 +1,122 @@
+"""Export a saved agent as an ONNX file, for sensors and schedulers that run without this library.
+
+    fusion-gym export zoo:tobit_oscillator_sensors_memory,price=0.02 --onnx scheduler.onnx
+
+The file has everything from the observation to the request, and says what the observation is. It is
+checked against the agent on 10,000 observations of whole episodes, and not kept if it differs.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from fusion_gym import zoo
+from fusion_gym.commands.command_line import Command, EnvironmentOptions
+from fusion_gym.commands.options import OutputFile
+from fusion_gym.envs.registration import make_task
+from fusion_gym.importing import require
+from fusion_gym.output.files import replacing
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.settings import parse_settings
+from fusion_gym.training.environment import environment_of
+from fusion_gym.validation import ConfigurationError, refusal
+
+_KINDS = ("zoo", "model")
+
+
+@dataclass(frozen=True)
+class Export(EnvironmentOptions, Command):
+    """Export a saved agent as an ONNX file, by default for the environment of its training."""
+
+    model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
+    """An agent: zoo:NAME, model:PATH or the path of a .zip, with ,price=PRICE for one price."""
+    onnx: Annotated[Path, OutputFile(".onnx")]
+    """The file to write."""
+    trust: bool = False
+    """Run code of files: what they name as module:name, and what model:PATH holds besides data."""
+
+    def run(self) -> None:
+        """Write the file, check it and say what it is."""
+        for line in export(self):
+            print(line)
+
+    def interrupted(self) -> str:
+        """A file that is not checked is not kept."""
+        return f"interrupted: no new file in {self.onnx}"
+
+
+def export(command: Export) -> list[str]:
+    """Write the file and return what there is to say of it, in lines.
+
+    Raises:
+        ConfigurationError: anything that is not allowed, or a graph that decides otherwise than the
+            agent; then no file is written.
+    """
+    kind, _, rest = spec(command.model).partition(":")
+    env_id, options = _environment(command, kind, rest.partition(",")[0])
+    require("onnx", "onnx", "onnx", "onnxruntime")
+    # Here, for it needs torch, which takes seconds to load.
+    from fusion_gym.evaluation.onnx_export import export_onnx
+
+    task = make_task(env_id, **options)
+    agent = make_policy(f"{kind}:{rest}", task)
+    try:
+        with replacing(command.onnx) as unfinished:
+            model = export_onnx(agent, task, unfinished, env_id, command.model)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"model = {command.model!r} is not exported: {error}") from None
+    text = ", ".join(f"{name} {_shape(shape)}" for name, shape in model.inputs.items())
+    answers = ", ".join(f"{name} {_shape(shape)}" for name, shape in model.outputs.items())
+    result = model.agreement
+    return [
+        f"{command.model} is in {command.onnx}: {model.size:,} bytes",
+        f"from {text}",
+        f"to {answers}",
+        f"as the agent on {result.observations:,} observations of {result.episodes:,} episodes of "
+        f"{env_id}: all decisions agree, numbers differ by {result.difference:.2g} at most",
+        f"one decision on one thread here: {1e6 * model.latency.median:.1f} µs in the median, 99 % "
+        f"below {1e6 * model.latency.most:.1f} µs",
+    ]
+
+
+def spec(text: str) -> str:
+    """The agent as policies are named: ``model:`` stands before a bare path.
+
+    Raises:
+        ConfigurationError: a policy that is no saved agent.
+    """
+    kind, colon, _ = text.partition(":")
+    if colon and kind in _KINDS:
+        return text
+    if text.partition(",")[0].endswith(".zip"):
+        return f"model:{text}"
+    raise refusal("model", text, "zoo:NAME, model:PATH or the path of a .zip")
+
+
+def _environment(command: Export, kind: str, name: str) -> tuple[str, dict[str, Any]]:
+    """Id and options: those given, else those that the agent was trained in.
+
+    Raises:
+        ConfigurationError: neither is known.
+    """
+    config = command.config
+    if command.env is None and config is None:
+        if kind == "zoo":
+            trained = zoo.card(name)["training"]["environment"]
+            own = parse_settings("option", [word for words in command.options for word in words])
+            return trained["id"], trained["options"] | own
+        beside = Path(name).parent / "config.yaml"
+        if not beside.is_file():
+            raise ConfigurationError(
+                f"env = None is not allowed with model = {command.model!r}, beside which lies no "
+                "config.yaml of its training: give --env ID or --config FILE"
+            )
+        config = str(beside)
+    env_id, options, _ = environment_of(command.env, config, command.options)
+    return env_id, options
+
+
+def _shape(shape: tuple[str | int, ...]) -> str:
+    return f"({', '.join(map(str, shape))})"

@@ -1,0 +1,88 @@
+"""Watch one or two policies through an episode, in a window or as a film.
+
+    fusion-gym watch --env fusion_gym/TobitOscillator-v1 --policy dynamic_event \\
+        --against innovation_threshold:threshold=1 --save episode.gif
+
+Both meet the same noise, side by side and with the same axes: states and fused estimates with two
+claimed deviations, requests with their answers, tokens.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from fusion_gym.commands.command_line import EnvironmentOptions, Long
+from fusion_gym.commands.options import OutputFile, Seed, Whole
+from fusion_gym.core.task import Task
+from fusion_gym.envs.drawing import Frame, Window
+from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation.watching import watch
+from fusion_gym.importing import require
+from fusion_gym.output.films import ENDINGS, save_film
+from fusion_gym.output.progress import progress_bar, writing
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.training.environment import environment_of
+from fusion_gym.validation import ConfigurationError
+
+
+@dataclass(frozen=True)
+class Watch(EnvironmentOptions, Long):
+    """Watch one or two policies through an episode."""
+
+    policy: Annotated[str, tyro.conf.arg(metavar="NAME[:key=value,…]")]
+    """A rule or reference by name, zoo:NAME, model:PATH or module:Class."""
+    against: Annotated[str | None, tyro.conf.arg(metavar="NAME[:key=value,…]")] = None
+    """Another policy beside it, on the same noise."""
+    save: Annotated[Path | None, OutputFile(*ENDINGS)] = None
+    """Write a film, .gif or .mp4, instead of showing a window."""
+    seed: Seed = 0
+    """Seed of the episode."""
+    steps: Annotated[int | None, Whole(1)] = None
+    """Steps, instead of the whole episode."""
+    fps: Annotated[int, Whole(1, 50)] = 10
+    """Steps a second."""
+
+    def run(self) -> None:
+        """Show or save the episode.
+
+        Raises:
+            ConfigurationError: anything that is not allowed, before the first step.
+        """
+        if self.save is not None:
+            require("save", "render", "imageio", "imageio_ffmpeg")
+        env_id, options, _ = environment_of(self.env, self.config, self.options)
+        task = make_task(env_id, **options)
+        names = [self.policy] if self.against is None else [self.policy, self.against]
+        if len(set(names)) < len(names):
+            raise ConfigurationError(
+                f"against = {self.against!r} is not allowed: it is the policy itself"
+            )
+        policies = {name: make_policy(name, task) for name in names}
+        frames = watch(task, policies, self.seed, self.steps)
+        if self.save is None:
+            self._show(frames, " against ".join(names))
+        else:
+            writing(("the film", self.save))
+            save_film(self._counted(frames, task), self.save, self.fps)
+            print(f"film in {self.save}")
+
+    def interrupted(self) -> str:
+        """A film that is not finished is not kept."""
+        return "interrupted" if self.save is None else f"interrupted: no film in {self.save}"
+
+    def _counted(self, frames: Iterator[Frame], task: Task) -> Iterator[Frame]:
+        with progress_bar((self.steps or task.horizon) + 1, "filming") as bar:
+            for frame in frames:
+                yield frame
+                bar.update()
+
+    def _show(self, frames: Iterator[Frame], title: str) -> None:
+        window = Window(title, self.fps)
+        try:
+            for frame in frames:
+                window.show(frame)
+        finally:
+            window.close()

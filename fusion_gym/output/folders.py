@@ -1,0 +1,88 @@
+"""Folders of results: one process at a time, and the inputs that a result was made from."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from fusion_gym.output.files import remove_partials
+from fusion_gym.validation import ConfigurationError
+
+
+@contextmanager
+def alone_in(folder: Path, name: str) -> Iterator[None]:
+    """The folder, made if it is not there, for this process alone; ``name`` is its option.
+
+    The lock is the operating system's and ends with the process, however that ends. What killed
+    processes left half-written is removed.
+
+    Raises:
+        ConfigurationError: another process works in the folder, or it cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(folder / ".lock")
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ConfigurationError(
+            f"{name} = {str(folder)!r} is in use by another process: wait for its end, or give "
+            f"another --{name}"
+        ) from None
+    except OSError as error:
+        raise ConfigurationError(
+            f"{name} = {str(folder)!r} cannot be written: {error.strerror or error}"
+        ) from None
+    try:
+        remove_partials(folder)
+        yield
+    finally:
+        lock.release()
+
+
+def fingerprint(inputs: Mapping[str, Any]) -> str:
+    """A hash of plain inputs, the same in every process."""
+    plain = json.dumps(inputs, sort_keys=True, default=list)
+    return hashlib.sha256(plain.encode()).hexdigest()[:16]
+
+
+def check_inputs(arguments: Mapping[str, Any], earlier: Any, label: str) -> None:
+    """Whether what is there was made from the inputs that are given now.
+
+    ``earlier`` are the inputs kept with it, and ``label`` says what it is, for the error.
+
+    Raises:
+        ConfigurationError: it was not; names the first input that differs, with both values.
+    """
+    now = _flat(json.loads(json.dumps(arguments, default=list)))
+    then = _flat(earlier) if isinstance(earlier, Mapping) else {}
+    if not then:
+        raise ConfigurationError(f"{label} does not say what it was made from")
+    for key in dict.fromkeys([*now, *then]):
+        if now.get(key, _ABSENT) != then.get(key, _ABSENT):
+            raise ConfigurationError(
+                f"{key} = {now.get(key, _ABSENT)!r} differs from that of {label}: "
+                f"{then.get(key, _ABSENT)!r}"
+            )
+
+
+class _Absent:
+    def __repr__(self) -> str:
+        return "nothing"
+
+
+_ABSENT = _Absent()
+
+
+def _flat(values: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Nested values by their dotted names."""
+    result: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            result |= _flat(value, f"{above}{key}.")
+        else:
+            result[f"{above}{key}"] = value
+    return result

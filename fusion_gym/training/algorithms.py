@@ -1,0 +1,206 @@
+"""Every algorithm is one row of a table: its class, its settings, what it asks for.
+
+Settings carry the names that Stable-Baselines3 and sb3-contrib give them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import pydantic
+import torch
+from sb3_contrib import MaskablePPO, RecurrentPPO
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import LinearSchedule
+
+from fusion_gym.docstrings import table
+from fusion_gym.training.checked import Positive, Rate, Several, Share, Strict, Weight
+from fusion_gym.training.counterfactual import (
+    Counterfactual,
+    CounterfactualMaskablePPO,
+    CounterfactualPPO,
+)
+from fusion_gym.training.decisions import Kind
+from fusion_gym.validation import choice
+
+# Share of the steps in which the untrained policy lets every sensor request; by default one half.
+# Where that is far more than the tokens pay for, asking for less changes nothing (another sensor's
+# request is granted instead), and a training can stay there for long.
+InitialRate = Annotated[float | None, pydantic.Field(gt=0, lt=1)]
+
+
+class NetworkConfig(Strict):
+    """The agent's networks."""
+
+    hidden: tuple[Positive, ...] = (64, 64)
+    activation: Literal["tanh", "relu"] = "tanh"
+
+
+class AlgorithmConfig(Strict):
+    """What every algorithm has; ``learning_rate_end`` makes the rate fall linearly to it."""
+
+    name: str
+    learning_rate: Rate = 1e-3
+    learning_rate_end: Rate | None = None
+    gamma: Share = 0.97
+    network: NetworkConfig = NetworkConfig()
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of the algorithm's class."""
+        value = self.model_dump(exclude={"name", "learning_rate_end", "network"})
+        if self.learning_rate_end is not None:
+            value["learning_rate"] = LinearSchedule(self.learning_rate, self.learning_rate_end, 1.0)
+        activation = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[self.network.activation]
+        shape = {"net_arch": list(self.network.hidden), "activation_fn": activation}
+        return value | {"policy_kwargs": shape}
+
+
+class A2CConfig(AlgorithmConfig):
+    """A2C, and what PPO has in common with it."""
+
+    gae_lambda: Share = 0.9
+    ent_coef: Weight = 0.0
+    vf_coef: Weight = 0.5
+    max_grad_norm: Rate = 0.5
+    initial_rate: InitialRate = None
+    n_steps: Positive = 8
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of the algorithm's class; the initial rate is set on the finished model."""
+        result = super().arguments()
+        del result["initial_rate"]
+        return result
+
+
+class PPOConfig(A2CConfig):
+    """PPO, also the one that cannot choose what the tokens do not allow (``maskable_ppo``)."""
+
+    n_steps: Positive = 64
+    batch_size: Several = 4096
+    n_epochs: Positive = 4
+    clip_range: Rate = 0.2
+
+
+class CounterfactualConfig(PPOConfig):
+    """PPO with counterfactual credit (:mod:`.counterfactual`).
+
+    ``alternatives`` of a decision are ``all`` actions, or the requests with one sensor's flipped at
+    a time; by default all where a scheduler has at most 8. Without ``path_credit`` what the view
+    of one step has missed teaches the critic alone.
+    """
+
+    learning_rate: Rate = 2e-3
+    learning_rate_end: Rate | None = 1e-5
+    ent_coef: Weight = 0.003
+    initial_rate: InitialRate = 0.1
+    n_steps: Positive = 32
+    batch_size: Several = 1024
+    n_epochs: Positive = 8
+    alternatives: Kind | None = None
+    path_credit: bool = True
+
+
+class RecurrentPPOConfig(PPOConfig):
+    """PPO with a memory, for modes that hide the sensors' signals."""
+
+    memory: Positive = 64
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of the algorithm's class; the memory is the size of its policy's LSTM."""
+        result = super().arguments()
+        result["policy_kwargs"]["lstm_hidden_size"] = result.pop("memory")
+        return result
+
+
+class DQNConfig(AlgorithmConfig):
+    """DQN."""
+
+    buffer_size: Positive = 500_000
+    batch_size: Positive = 1024
+    learning_starts: Positive = 20_000
+    train_freq: Positive = 4
+    gradient_steps: Positive = 4
+    target_update_interval: Positive = 10_000
+    exploration_fraction: Share = 0.2
+    exploration_final_eps: Share = 0.02
+    max_grad_norm: Rate = 10.0
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """A row: class, settings, meaning, source, kind of policy, whether Discrete actions only.
+
+    RecurrentPPO accepts MultiBinary actions and then fails on them while it trains.
+    """
+
+    model: type[BaseAlgorithm]
+    config: type[AlgorithmConfig]
+    meaning: str
+    source: str
+    policy: str = "MlpPolicy"
+    discrete_only: bool = False
+
+    @property
+    def privileged(self) -> bool:
+        """Whether it learns from what no policy may know."""
+        return issubclass(self.model, Counterfactual)
+
+
+_CREDIT = "this library ([Learning](learning.md))"
+TABLE = {
+    "a2c": Algorithm(
+        A2C, A2CConfig, "advantage actor-critic", "V. Mnih et al., ICML 2016 (arXiv 1602.01783)"
+    ),
+    "counterfactual_maskable_ppo": Algorithm(
+        CounterfactualMaskablePPO, CounterfactualConfig,
+        "PPO with counterfactual credit and the mask of `maskable_ppo`", _CREDIT,
+    ),
+    "counterfactual_ppo": Algorithm(
+        CounterfactualPPO, CounterfactualConfig, "PPO with counterfactual credit", _CREDIT
+    ),
+    "dqn": Algorithm(
+        DQN, DQNConfig, "deep Q-learning", "V. Mnih et al., arXiv 1312.5602", discrete_only=True
+    ),
+    "maskable_ppo": Algorithm(
+        MaskablePPO, PPOConfig, "PPO that cannot choose what the tokens do not allow",
+        "S. Huang and S. Ontañón, arXiv 2006.14171",
+    ),
+    "ppo": Algorithm(
+        PPO, PPOConfig, "proximal policy optimisation", "J. Schulman et al., arXiv 1707.06347"
+    ),
+    "recurrent_ppo": Algorithm(
+        RecurrentPPO, RecurrentPPOConfig, "PPO with an LSTM, for tasks that hide signals",
+        "J. Schulman et al., arXiv 1707.06347", "MlpLstmPolicy", discrete_only=True,
+    ),
+}  # fmt: skip
+
+
+def algorithm_table(_: str) -> str:
+    """Return the algorithms as a Markdown table."""
+    rows = (
+        (f"`{name}`", row.meaning, "`Discrete`" if row.discrete_only else "all", row.source)
+        for name, row in TABLE.items()
+    )
+    return table(("algorithm", "meaning", "actions", "source"), rows)
+
+
+def settings(content: Any) -> AlgorithmConfig:
+    """The settings of an algorithm, as the class that the table has for its name.
+
+    Raises:
+        ValueError: no settings, an unknown name or setting, or a value that is not allowed.
+    """
+    if isinstance(content, AlgorithmConfig):
+        return content
+    if not isinstance(content, Mapping):
+        raise ValueError("it must be a name and settings")
+    name = choice("name", content.get("name"), TABLE)
+    return TABLE[name].config.model_validate(content)
+
+
+AnyAlgorithm = Annotated[
+    pydantic.SerializeAsAny[AlgorithmConfig], pydantic.BeforeValidator(settings)
+]

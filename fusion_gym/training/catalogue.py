@@ -1,0 +1,126 @@
+"""What the suite has, by kind and name, with the declaration of each."""
+
+import inspect
+import itertools
+import re
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+from fusion_gym import zoo
+from fusion_gym.core.system import MEANING
+from fusion_gym.docstrings import plain_marks, read, table
+from fusion_gym.envs.option_text import short
+from fusion_gym.envs.pages import page
+from fusion_gym.envs.registration import ENVIRONMENTS, make_task, options_of
+from fusion_gym.evaluation.metrics import METRICS
+from fusion_gym.fusion.table import RULES
+from fusion_gym.policies.registry import policy_maker, policy_names
+from fusion_gym.training.algorithms import TABLE, Algorithm
+from fusion_gym.training.checked import SHIPPED
+
+
+class Entry(NamedTuple):
+    """One line on what it is, and a function that returns its page in Markdown."""
+
+    meaning: str
+    page: Callable[[], str]
+
+
+def catalogue() -> dict[str, dict[str, Entry]]:
+    """Return the entries of every kind by name, with what the user has registered."""
+    return {
+        "environments": {
+            env_id: Entry(read(options_of(env_id)).summary, partial(_environment, env_id))
+            for env_id in ENVIRONMENTS
+        },
+        "rules": {name: _declared(policy_maker(name)) for name in policy_names("rule")},
+        "references": {name: _declared(policy_maker(name)) for name in policy_names("reference")},
+        "filters": _filters(),
+        "fusion": {name: _declared(type(row.make()), row.meaning) for name, row in RULES.items()},
+        "signals": _signals(),
+        "metrics": {
+            name: Entry(row.meaning, partial(str, row.meaning)) for name, row in METRICS.items()
+        },
+        "algorithms": {
+            name: Entry(row.meaning, partial(_settings, row)) for name, row in TABLE.items()
+        },
+        "zoo": {name: _agent(name) for name in zoo.names()},
+        "configs": {
+            path.stem: _config(path.read_text(encoding="utf-8"))
+            for path in sorted(SHIPPED.glob("*.yaml"))
+        },
+    }
+
+
+def _declared(owner: Any, meaning: str = "") -> Entry:
+    """Return what a docstring declares."""
+    return Entry(
+        plain_marks(meaning or read(owner).summary), lambda: _code(inspect.getdoc(owner) or "")
+    )
+
+
+def _environment(env_id: str) -> str:
+    signals = make_task(env_id).system.signals
+    rows = [(f"`{s.name}`", s.axes, s.knowledge, s.meaning) for s in signals]
+    head = ("signal", "axes", "known to", "meaning")
+    return f"{page(env_id)}\n## Signals\n{table(head, rows)}\n"
+
+
+def _filters() -> dict[str, Entry]:
+    """Return the filters of all environments; a name may stand for several classes."""
+    owners: dict[str, dict[type, list[str]]] = {}
+    for env_id in ENVIRONMENTS:
+        for name, owner in options_of(env_id).filters.items():
+            owners.setdefault(name or owner.__name__, {}).setdefault(owner, []).append(env_id)
+    return {
+        name: Entry(_declared(next(iter(places))).meaning, partial(_classes, places))
+        for name, places in owners.items()
+    }
+
+
+def _classes(places: Mapping[type, list[str]]) -> str:
+    """Return the declarations of classes, each below the environments that have it."""
+    return "\n".join(
+        f"{', '.join(where)}:\n\n{_declared(owner).page()}" for owner, where in places.items()
+    )
+
+
+def _signals() -> dict[str, Entry]:
+    """Return the signals of all environments, each with the environments that have it."""
+    rows: dict[str, list[tuple[str, ...]]] = {}
+    for env_id in ENVIRONMENTS:
+        for signal in make_task(env_id).system.signals:
+            row = (env_id, signal.axes, MEANING[signal.knowledge], signal.meaning)
+            rows.setdefault(signal.name, []).append(row)
+    head = ("environment", "axes", "known to", "meaning")
+    return {name: Entry(where[0][-1], partial(table, head, where)) for name, where in rows.items()}
+
+
+def _settings(row: Algorithm) -> str:
+    """Return the settings of an algorithm with their defaults."""
+    fields = row.config.model_fields.items()
+    rows = [(f"`{name}`", short(field.default)) for name, field in fields if name != "name"]
+    return f"{row.meaning}; {row.source}\n\n{table(('setting', 'default'), rows)}\n"
+
+
+def _agent(name: str) -> Entry:
+    card = zoo.card(name)
+    options = " ".join(f"{key}={value}" for key, value in card["options"].items())
+    prices = zip(card["test"]["prices"], card["test"]["points"], strict=True)
+    rows = [
+        (f"{p:.3g}", f"{e['mse']['mean']:.4g}", f"{e['tokens']['mean']:.3g}") for p, e in prices
+    ]
+    where, head = f"{card['env']} {options}", ("price of a token", "MSE", "tokens per step")
+    return Entry(where, lambda: f"{where}\n\n{table(head, rows)}\n")
+
+
+def _config(text: str) -> Entry:
+    """Return a config with the sentence of its first comment."""
+    lines = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
+    comment = " ".join(line.strip("# ") for line in lines)
+    return Entry(re.split(r"(?<=[.])\s", comment)[0], partial(_code, text, "yaml"))
+
+
+def _code(text: str, language: str = "text") -> str:
+    return f"```{language}\n{text.rstrip()}\n```\n"

@@ -1,0 +1,104 @@
+"""Checked YAML: every key is known, and every value is allowed, before anything runs."""
+
+import os
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import pydantic
+
+from fusion_gym import validation
+from fusion_gym.errors import display
+from fusion_gym.validation import ConfigurationError
+from fusion_gym.yaml_text import parsed
+
+SHIPPED = Path(str(files("fusion_gym.configs")))
+
+Model = TypeVar("Model", bound=pydantic.BaseModel)
+Shape = TypeVar("Shape")
+Positive = Annotated[int, pydantic.Field(gt=0, le=10**12)]
+Several = Annotated[int, pydantic.Field(gt=1, le=10**12)]
+Weight = Annotated[float, pydantic.Field(ge=0)]
+Rate = Annotated[float, pydantic.Field(gt=0)]
+Share = Annotated[float, pydantic.Field(ge=0, le=1)]
+
+
+class Strict(pydantic.BaseModel):
+    """No unknown keys, no conversions, finite numbers, and nothing changes afterwards."""
+
+    model_config = pydantic.ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False
+    )
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _tuples(cls, content: Any) -> Any:
+        """YAML knows lists alone."""
+        if not isinstance(content, Mapping):
+            return content
+        return {
+            key: tuple(value) if isinstance(value, list) else value
+            for key, value in content.items()
+        }
+
+
+def config_path(name: str | Path, option: str = "config") -> Path:
+    """The file of that path, or the shipped config of that name (``tobit_oscillator_ppo``).
+
+    Raises:
+        ConfigurationError: a bare name that is neither; the message lists the shipped configs.
+    """
+    path = Path(name)
+    if os.path.isfile(path) or path.suffix or path.name != str(name):
+        return path
+    shipped = sorted(file.stem for file in SHIPPED.glob("*.yaml"))
+    return SHIPPED / f"{validation.choice(option, str(name), shipped)}.yaml"
+
+
+def load_checked(kind: type[Model], name: str | Path, option: str = "config") -> Model:
+    """The config of a path or shipped name, checked; ``option`` is where the user named it.
+
+    Raises:
+        ConfigurationError: unreadable, an unknown key, or a value that is not allowed; names the
+            file and the first such field.
+    """
+    return parse(kind, read_yaml(name, option), str(name), option)
+
+
+def read_yaml(name: str | Path, option: str = "config") -> Any:
+    """What the config of a path or shipped name holds.
+
+    Raises:
+        ConfigurationError: no such file, or no YAML.
+    """
+    text = validation.read_text(option, config_path(name, option), str(name))
+    return parsed(text, f"{option} {str(name)!r}")
+
+
+def parse(kind: type[Model], content: Any, source: str, option: str = "config") -> Model:
+    """The content as a checked model.
+
+    Raises:
+        ConfigurationError: an unknown key or a value that is not allowed; names ``source`` and
+            the first such field.
+    """
+    return checked(kind, content, f"{option} {source!r}")
+
+
+def checked(shape: type[Shape], content: Any, source: str) -> Shape:
+    """The content as what ``shape`` says.
+
+    Raises:
+        ConfigurationError: an unknown key, or a value that is not allowed; names ``source`` and the
+            first such field.
+    """
+    try:
+        return pydantic.TypeAdapter(shape).validate_python(content)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"]) or "the whole file"
+        text = "" if first["type"] == "missing" else f" = {display(first['input'])}"
+        raise ConfigurationError(
+            f"{source}: {place}{text} is not allowed: {first['msg']}"
+        ) from None

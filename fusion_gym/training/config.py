@@ -1,0 +1,114 @@
+"""A training as typed YAML."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pydantic
+
+from fusion_gym.envs.registration import open_options
+from fusion_gym.training.algorithms import AnyAlgorithm
+from fusion_gym.training.checked import Positive, Share, Strict, parse
+
+
+class EnvironmentConfig(Strict):
+    """A registered environment and the options of ``gym.make`` that differ from its defaults.
+
+    ``local`` trains one policy that every sensor runs by itself, on what it sees by itself. A file
+    of options that ``options`` name as ``system`` is read here: what it says belongs to the config.
+    """
+
+    id: str
+    options: dict[str, Any] = pydantic.Field(default_factory=dict)
+    local: bool = False
+
+    @pydantic.field_validator("options")
+    @classmethod
+    def _opened(cls, options: dict[str, Any], info: pydantic.ValidationInfo) -> dict[str, Any]:
+        return open_options(info.data["id"], options) if "id" in info.data else options
+
+
+class TrainingConfig(Strict):
+    """How long, with how many runs side by side, from which seed, on how many threads.
+
+    ``target_rate`` trains to an average rate of transmissions per sensor and step: the price of a
+    token starts at the environment's ``cost_weight`` and is adapted. ``price_exponent`` is for a
+    price that is drawn: episodes count by (middle of the range / price)^exponent, in training and
+    in validation, so that an agent does not neglect the low prices. With more sensors than
+    ``many_sensors``, ``timesteps`` fall in proportion, for a step of theirs takes longer.
+
+    ``error`` is what is trained on (validations are of the true error): ``excess`` and ``mismatch``
+    take off what no policy can change, by an estimate that takes in every measurement with the
+    filter ``error_filter``, by default that of a memory. The mismatch has the least noise, and is
+    right where that estimate is the conditional mean.
+    """
+
+    timesteps: Positive
+    num_envs: Positive = 256
+    seed: int = pydantic.Field(default=0, ge=0, lt=2**32)
+    threads: Annotated[int, pydantic.Field(gt=0, le=1024)] = 1
+    target_rate: float | None = pydantic.Field(default=None, gt=0, le=1)
+    price_exponent: Share = 0.0
+    many_sensors: Positive | None = None
+    error: Literal["squared", "excess", "mismatch"] = "squared"
+    error_filter: str | None = None
+
+
+class ValidationConfig(Strict):
+    """Evaluation during training, on seeds that neither training nor a test uses."""
+
+    every: Positive = 500_000
+    episodes: Positive = 256
+    seed: int = pydantic.Field(default=500_000_000, ge=0)
+
+
+class Experiment(Strict):
+    """One training: environment, algorithm, length, validation, and where results go."""
+
+    environment: EnvironmentConfig
+    algorithm: AnyAlgorithm
+    training: TrainingConfig
+    validation: ValidationConfig = ValidationConfig()
+    output: str = pydantic.Field(min_length=1, pattern=r"^[^\n\t]+$")
+
+    def inputs(self) -> dict[str, Any]:
+        """What the results depend on; a training can be made longer, moved, or given threads."""
+        return self.model_dump(
+            mode="json", exclude={"output": True, "training": {"timesteps": True, "threads": True}}
+        )
+
+    def resolved(self, settings: Mapping[str, Any], sensors: int) -> Experiment:
+        """Return the experiment with the numbers that ``"auto"`` and ``many_sensors`` stand for.
+
+        ``settings`` belong to the environment's task, which has so many ``sensors``.
+        """
+        options, training = self.environment.options, self.training
+        numbers = {
+            name: settings[name]
+            for name in ("reward_scale", "price_range")
+            if options.get(name, "auto") == "auto" and settings[name] is not None
+        }
+        given = {name: value for name, value in options.items() if name not in numbers}
+        environment = self.environment.model_copy(update={"options": given | numbers})
+        share = min((training.many_sensors or sensors) / sensors, 1.0)
+        length = {"timesteps": round(training.timesteps * share), "many_sensors": None}
+        training = training.model_copy(update=length)
+        return self.model_copy(update={"environment": environment, "training": training})
+
+    def changed(
+        self, output: str | Path | None, options: Mapping[str, Any] | None = None, **training: Any
+    ) -> Experiment:
+        """The experiment with another output, options, training where given, checked again.
+
+        Raises:
+            ConfigurationError: a value that is not allowed.
+        """
+        plain = self.model_dump() | ({} if output is None else {"output": str(output)})
+        environment = plain["environment"]
+        environment["options"] |= open_options(environment["id"], options or {})
+        plain["training"] |= {key: value for key, value in training.items() if value is not None}
+        if training.get("timesteps") is not None:
+            plain["training"]["many_sensors"] = None
+        return parse(Experiment, plain, "command line")

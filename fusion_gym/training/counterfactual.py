@@ -1,0 +1,315 @@
+"""PPO with counterfactual credit: the simulator steps what might have been done instead.
+
+The advantage of a request is read off from the alternatives of the decision, stepped on the same
+noise, instead of from the return that followed, in which it drowns. Only the training knows them:
+the policy sees what it will see in use, and what is saved is an ordinary model of PPO.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sb3_contrib import MaskablePPO
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.utils import explained_variance
+from stable_baselines3.common.vec_env import VecEnv
+
+from fusion_gym.arrays import Array
+from fusion_gym.envs.privileged import PrivilegedVecEnv
+from fusion_gym.training.decisions import Chosen, Decisions, Kind
+from fusion_gym.validation import ConfigurationError
+
+_CLOSED = -1e8  # the logit of a choice that is masked
+
+
+class RolloutBatch(NamedTuple):
+    """What one stretch of T steps taught, B = T · runs.
+
+    ``observations`` (B, entries), ``masks`` (B, choices) or ``None``, and where sensors decide by
+    themselves (B, sensors, …), ``choices`` (B, D), ``old`` log-probabilities and ``advantages``
+    (B, D, C), ``surplus`` δ, ``returns`` G and ``values`` (B,).
+    """
+
+    observations: torch.Tensor
+    masks: torch.Tensor | None
+    choices: torch.Tensor
+    old: torch.Tensor
+    advantages: torch.Tensor
+    surplus: torch.Tensor
+    returns: torch.Tensor
+    values: torch.Tensor
+
+
+class Counterfactual(OnPolicyAlgorithm):
+    """What PPO and MaskablePPO have in common here; it stands before the one that it changes.
+
+    Source of the surrogate, its clipping and the λ-returns: Schulman et al. 2015, 2017. For the
+    action b taken and each alternative a of a decision, on the same noise, Q_a = r_a + γ V(o'_a),
+    V̄ = Σ π_a Q_a, A_a = Q_a - V̄; one factor at a time, V̄ is their mean. Along the path
+    G = V̄ + δ, δ = γ λ (G' - V(o'_b)), zero at the end of an episode and of the rollout: G is the
+    critic's target, δ what the view of one step has missed. Both are divided by the spread
+    √(mean Σ π_a A_a²).
+
+    Where sensors decide by themselves, V of a run is the sum of what the critic says of their
+    rows (value decomposition: Sunehag et al. 2018), so that nobody has to guess what the others
+    see, and δ is weighed with each sensor's own ratio.
+
+    Without ``path_credit`` δ teaches the critic alone: it holds the noise of all that a run's
+    reward is of, which with many sensors is far more than one decision can move.
+    """
+
+    n_epochs: int
+    batch_size: Any
+    clip_range: Any
+    _decisions: Decisions
+
+    def __init__(
+        self, *args: Any, alternatives: Kind | None = None, path_credit: bool = True, **kwargs: Any
+    ) -> None:
+        self.alternatives, self.path_credit = alternatives, path_credit
+        super().__init__(*args, **kwargs)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if self.env is not None:
+            self._decisions = Decisions(_privileged(self.env), self.alternatives)
+        self._rollout: RolloutBatch | None = None
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_decisions", "_rollout"]
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+        use_masking: bool = True,
+    ) -> bool:
+        """Step all runs and the alternatives of their decisions; false if a callback ends it."""
+        privileged, decisions = _privileged(env), self._decisions
+        first = slice(None, None, privileged.view.rows_per_run)  # of a run's rows
+        self.policy.set_training_mode(False)
+        callback.on_rollout_start()
+        steps: list[_Step] = []
+        while len(steps) < n_rollout_steps:
+            assert self._last_obs is not None
+            observation = decisions.by_run(torch.as_tensor(self._last_obs))
+            masks = self._masks(privileged)
+            with torch.no_grad():
+                old = decisions.log_probabilities(self._logits(observation, masks))
+                noise = -torch.log(-torch.log(torch.rand(old.shape)))
+            choice = (old + noise).argmax(-1).numpy()
+            (after, rewards, dones, infos), branched = privileged.step_alternatives(
+                decisions.actions(choice), decisions.alternatives(choice)
+            )
+            self.num_timesteps += env.num_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+            self._update_info_buffer(infos, dones)
+            follows = np.array(after)
+            for row in np.flatnonzero(dones):
+                follows[row] = infos[row]["terminal_observation"]
+            goes_on = ~_terminated(dones, infos)[first]
+            beyond = goes_on * self._beyond(branched.observation)
+            value = goes_on * self._value(decisions.by_run(follows))
+            taken = rewards[first] + self.gamma * value
+            values = decisions.arranged(choice, taken, branched.reward + self.gamma * beyond)
+            steps.append(_Step(observation, masks, choice, old, values, value, dones[first]))
+            self._last_obs = after  # type: ignore[assignment]
+            self._last_episode_starts = dones
+        self._rollout = self._credited(steps)
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def _credited(self, steps: list[_Step]) -> RolloutBatch:
+        """Advantages and returns of a rollout, undivided."""
+        values = [self._value(step.observation.numpy()) for step in steps]
+        advantages, surplus, returns = [], [], []
+        ahead = np.zeros(len(steps[0].dones))
+        for place in range(len(steps) - 1, -1, -1):
+            step = steps[place]
+            mean = (np.exp(step.old.numpy()) * step.values).sum(-1)
+            left = np.zeros_like(ahead)
+            if place + 1 < len(steps):
+                left = self.gamma * self.gae_lambda * (ahead - step.follows)
+                left[step.dones] = 0.0
+            ahead = mean.mean(-1) + left
+            advantages.append(step.values - mean[..., None])
+            surplus.append(left)
+            returns.append(ahead)
+
+        def joined(parts: list[Any]) -> torch.Tensor:
+            return torch.as_tensor(np.concatenate(parts[::-1]), dtype=torch.float32)
+
+        masks = [step.masks for step in steps if step.masks is not None]
+        return RolloutBatch(
+            torch.cat([step.observation for step in steps]),
+            torch.cat(masks) if masks else None,
+            torch.as_tensor(np.concatenate([step.choices for step in steps])),
+            torch.cat([step.old for step in steps]),
+            joined(advantages),
+            joined(surplus),
+            joined(returns),
+            torch.as_tensor(np.concatenate(values), dtype=torch.float32),
+        )
+
+    def train(self) -> None:
+        """Improve policy and critic on the last rollout."""
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        rollout = self._rollout
+        assert rollout is not None
+        clip = float(self.clip_range(self._current_progress_remaining))
+        weight = rollout.old.exp()
+        spread = float((weight * rollout.advantages**2).sum(-1).mean().sqrt()) + 1e-8
+        entries: dict[str, list[float]] = {}
+        size = max(self.batch_size // _privileged(self.env).view.rows_per_run, 1)
+        for _ in range(self.n_epochs):
+            order = np.random.permutation(len(rollout.returns))  # noqa: NPY002
+            for first in range(0, len(order), size):
+                batch = torch.as_tensor(order[first : first + size])
+                loss, parts = self._loss(rollout, batch, spread, clip)
+                self.policy.optimizer.zero_grad()
+                loss.backward()
+                torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+                self.policy.optimizer.step()
+                for name, part in parts.items():
+                    entries.setdefault(name, []).append(part.item())
+            self._n_updates += 1
+        surplus = float(rollout.surplus.square().mean())
+        entries |= {
+            "advantage_spread": [spread],
+            "surplus_share": [surplus / (surplus + spread**2)],
+            "explained_variance": [
+                float(explained_variance(rollout.values.numpy(), rollout.returns.numpy()))
+            ],
+        }
+        for name, entry in entries.items():
+            self.logger.record(f"train/{name}", float(np.mean(entry)))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _loss(
+        self, rollout: RolloutBatch, batch: torch.Tensor, spread: float, clip: float
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        observation = rollout.observations[batch]
+        masks = None if rollout.masks is None else rollout.masks[batch]
+        new = self._decisions.log_probabilities(self._logits(observation, masks))
+        old = rollout.old[batch]
+        weight, change = old.exp(), new - old
+        ratio = change.exp()
+        credit = rollout.advantages[batch] / spread
+        gain = torch.minimum(ratio * credit, ratio.clamp(1.0 - clip, 1.0 + clip) * credit)
+        selection = rollout.choices[batch][..., None]
+        taken = change.gather(-1, selection)
+        whole = (taken if self._decisions.local else taken.sum((-1, -2), keepdim=True)).exp()
+        surplus = rollout.surplus[batch][:, None, None] / spread
+        late = torch.minimum(whole * surplus, whole.clamp(1.0 - clip, 1.0 + clip) * surplus)
+        policy = -(weight * gain).sum((-1, -2)).mean()
+        if self.path_credit:
+            policy = policy - late.sum((-1, -2)).mean()
+        entropy = -(new.exp() * new).sum((-1, -2)).mean()
+        value = (self._critic(observation) - rollout.returns[batch]).square().mean()
+        loss = policy - self.ent_coef * entropy + self.vf_coef * value
+        with torch.no_grad():
+            parts = {
+                "policy_gradient_loss": policy,
+                "value_loss": value,
+                "entropy_loss": -entropy / (new.shape[1] if self._decisions.local else 1),
+                "approx_kl": ((whole - 1.0) - whole.log()).mean(),
+                "clip_fraction": ((whole - 1.0).abs() > clip).float().mean(),
+            }
+        return loss, parts
+
+    def _logits(self, observation: torch.Tensor, masks: torch.Tensor | None) -> torch.Tensor:
+        """Of the choices of ``Discrete``, of the requests of ``MultiBinary``."""
+        policy: Any = self.policy
+        rows = policy.pi_features_extractor(observation.reshape(-1, observation.shape[-1]))
+        logits: torch.Tensor = policy.action_net(policy.mlp_extractor.forward_actor(rows))
+        logits = logits.reshape(*observation.shape[:-1], -1)
+        if masks is not None and self._decisions.binary:  # two a sensor, silence and a request
+            pairs = logits.reshape(len(logits), -1, 2)
+            logits, masks = pairs[..., 1] - pairs[..., 0], masks.reshape(pairs.shape)[..., 1]
+        return logits if masks is None else logits.masked_fill(~masks, _CLOSED)
+
+    def _critic(self, observation: torch.Tensor) -> torch.Tensor:
+        policy: Any = self.policy
+        rows = policy.vf_features_extractor(observation.reshape(-1, observation.shape[-1]))
+        values: torch.Tensor = policy.value_net(policy.mlp_extractor.forward_critic(rows))
+        values = values.reshape(observation.shape[:-1])
+        return values.sum(-1) if self._decisions.local else values
+
+    def _value(self, observation: NDArray[np.float32]) -> Array:
+        """V of runs whose decisions are made on observations (…, entries) or, where sensors decide
+        by themselves, (…, sensors, entries)."""
+        with torch.no_grad():
+            return self._critic(torch.as_tensor(observation)).numpy().astype(np.float64)
+
+    def _beyond(self, observation: NDArray[np.float32]) -> Array:
+        """V of what the alternatives led to, (A, runs), from observations (A, runs, entries)."""
+        if not self._decisions.local:
+            return self._value(observation)
+        # One by one: that many rows of that many sensors would not fit into the cache.
+        return np.stack([self._value(self._decisions.visible_rows(item)) for item in observation])
+
+    def _masks(self, env: PrivilegedVecEnv) -> torch.Tensor | None:
+        """Open choices of the runs' decisions, for an algorithm that knows them."""
+        return None
+
+
+class CounterfactualPPO(Counterfactual, PPO):
+    """PPO with counterfactual credit; what it saves are models of PPO."""
+
+
+class CounterfactualMaskablePPO(Counterfactual, MaskablePPO):
+    """MaskablePPO with counterfactual credit; what it saves are models of MaskablePPO."""
+
+    def _masks(self, env: PrivilegedVecEnv) -> torch.Tensor | None:
+        return self._decisions.by_run(torch.as_tensor(env.action_masks()))
+
+
+class _Step(NamedTuple):
+    """One step of all runs, on the way to a :class:`RolloutBatch`.
+
+    ``values`` (runs, D, C) are the values Q of all choices, ``follows`` (runs,) that of the state
+    reached; ``dones`` (runs,) bool.
+    """
+
+    observation: torch.Tensor
+    masks: torch.Tensor | None
+    choices: Chosen
+    old: torch.Tensor
+    values: Array
+    follows: Array
+    dones: NDArray[np.bool_]
+
+
+def _terminated(dones: NDArray[np.bool_], infos: list[dict[str, Any]]) -> NDArray[np.bool_]:
+    """The rows whose episode has ended for good, after which nothing has a value."""
+    result = dones.copy()
+    for row in np.flatnonzero(dones):
+        result[row] = not infos[row]["TimeLimit.truncated"]
+    return result
+
+
+def _privileged(env: Any) -> PrivilegedVecEnv:
+    """The training's own environment.
+
+    Raises:
+        ConfigurationError: another one, which cannot step alternatives.
+    """
+    result = env.unwrapped
+    if not isinstance(result, PrivilegedVecEnv):
+        raise ConfigurationError(
+            f"env = {type(result).__name__} is not allowed with counterfactual credit: it must be "
+            "a PrivilegedVecEnv, which steps alternatives"
+        )
+    return result

@@ -1,0 +1,34 @@
+"""The environment that a command is about, from ``--env``, ``--set`` and ``--config``."""
+
+from __future__ import annotations
+
+from itertools import chain
+from typing import TYPE_CHECKING, Any
+
+from fusion_gym.policies.settings import parse_settings
+from fusion_gym.validation import ConfigurationError
+
+if TYPE_CHECKING:
+    from fusion_gym.training.config import Experiment
+
+
+def environment_of(
+    env: str | None, config: str | None, settings: tuple[tuple[str, ...], ...]
+) -> tuple[str, dict[str, Any], Experiment | None]:
+    """Id, options and training: what ``settings`` say goes before the training's own options.
+
+    Raises:
+        ConfigurationError: neither an id nor a config, or a config that is not allowed.
+    """
+    options = parse_settings("option", list(chain(*settings)))
+    if config is None:
+        if env is None:
+            raise ConfigurationError("env = None is not allowed: give --env ID or --config FILE")
+        return env, options, None
+    # Here, for it needs Stable-Baselines3, which takes seconds to load.
+    from fusion_gym.training.checked import load_checked
+    from fusion_gym.training.config import Experiment
+
+    experiment = load_checked(Experiment, config)
+    environment = experiment.environment
+    return env or environment.id, dict(environment.options) | options, experiment

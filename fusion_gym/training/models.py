@@ -1,0 +1,160 @@
+"""New models of a config's algorithm, and with which policy they begin."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Discrete, MultiBinary
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from fusion_gym.arrays import Array
+from fusion_gym.core.system import System
+from fusion_gym.core.task import Task
+from fusion_gym.envs.privileged import PrivilegedVecEnv, reference_system
+from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.envs.views import SensorView
+from fusion_gym.evaluation.cross_term import cross_terms, usual_policies, worst
+from fusion_gym.output.progress import remark
+from fusion_gym.policies.model import tag_model
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.training.algorithms import TABLE
+from fusion_gym.training.config import EnvironmentConfig, Experiment
+from fusion_gym.validation import ConfigurationError, refusal
+
+# Of the warning of a cross term:
+_EPISODES = 150  # of each of two policies: a second or two in the slowest environment
+_SEED = 700_000_000  # far from the seeds of trainings, validations, tuning and tests
+_LEVEL = 0.99  # of the intervals together: one of a hundred settings is warned of for nothing
+
+
+def make_env(experiment: Experiment, task: Task) -> FusionSB3VecEnv:
+    """The environment to train in.
+
+    Raises:
+        ConfigurationError: actions that the algorithm does not know.
+    """
+    name, local = experiment.algorithm.name, experiment.environment.local
+    many = not local and task.action != "discrete" and task.access != "single"
+    if TABLE[name].discrete_only and many:
+        raise ConfigurationError(
+            f"action = {task.action!r} is not allowed with algorithm {name!r}: set the "
+            "environment's option action: discrete"
+        )
+    training, where = experiment.training, experiment.environment
+    runs: dict[str, Any] = {
+        "num_envs": training.num_envs,
+        "stagger": True,
+        "local": local,
+        "price_exponent": training.price_exponent,
+    }
+    reference = None
+    if training.error != "squared":
+        reference = _reference(task, where, training.error_filter)
+    elif training.error_filter is not None:
+        raise refusal("error_filter", training.error_filter, "none with error: squared")
+    if reference is None and not TABLE[name].privileged:
+        return FusionSB3VecEnv(task, **runs)
+    return PrivilegedVecEnv(task, error=training.error, reference=reference, **runs)
+
+
+def _reference(task: Task, where: EnvironmentConfig, error_filter: str | None) -> System[Any]:
+    """What takes in every measurement: the task's own memory where that has the same filter.
+
+    Raises:
+        ConfigurationError: the environment has no such filter.
+    """
+    if task.memory_system is not None and error_filter in (
+        None,
+        where.options.get("memory_filter"),
+    ):
+        return task.memory_system
+    try:
+        return reference_system(where.id, where.options, error_filter)
+    except ConfigurationError as error:
+        if error_filter is None:
+            raise
+        raise ConfigurationError(
+            f"error_filter = {error_filter!r} is not allowed: {error}"
+        ) from None
+
+
+def make_model(experiment: Experiment, env: FusionSB3VecEnv) -> BaseAlgorithm:
+    """A new model of the config's algorithm.
+
+    Raises:
+        ConfigurationError: settings that the algorithm's class refuses, or an ``initial_rate``
+            that the action space does not allow.
+    """
+    settings = experiment.algorithm
+    row = TABLE[settings.name]
+    try:
+        model = row.model(
+            row.policy, env, seed=experiment.training.seed, device="cpu", **settings.arguments()
+        )
+    except (AssertionError, ValueError) as error:  # what Stable-Baselines3 checks by itself
+        reason = " ".join(str(error).split())
+        raise ConfigurationError(
+            f"algorithm = {settings.name!r} is not allowed with these settings: {reason}"
+        ) from None
+    rate = getattr(settings, "initial_rate", None)
+    if rate is not None:
+        _begin_at(model, env, rate)
+    tag_model(model, env.task, local=experiment.environment.local)
+    return model
+
+
+def initial_logits(env: FusionSB3VecEnv, rate: float) -> Array:
+    """Logits of the choices with which every sensor requests in a share ``rate`` of the steps.
+
+    Shape (sensors,) for ``MultiBinary``, else one a number of ``Discrete``.
+
+    Raises:
+        ConfigurationError: one sensor a step, and the sensors' rates exceed 1 together.
+    """
+    odds, space, sensors = np.log(rate / (1.0 - rate)), env.action_space, env.task.sensors
+    if isinstance(space, MultiBinary):
+        return np.full(sensors, odds)
+    assert isinstance(space, Discrete)
+    if isinstance(env.view, SensorView):
+        return np.array([0.0, odds])
+    if env.task.access == "single":
+        if sensors * rate >= 1.0:
+            raise ConfigurationError(
+                f"initial_rate = {rate} is not allowed: it must be < 1/{sensors}, for one of "
+                f"{sensors} sensors transmits in a step"
+            )
+        return np.log([1.0 - sensors * rate, *[rate] * sensors])
+    bits = np.arange(2**sensors)[:, None] >> np.arange(sensors) & 1
+    return np.asarray(bits.sum(1) * odds)
+
+
+def _begin_at(model: BaseAlgorithm, env: FusionSB3VecEnv, rate: float) -> None:
+    """Shift the last layer's offsets so that the untrained policy requests at this rate."""
+    logits = initial_logits(env, rate)
+    head = model.policy.action_net
+    assert isinstance(head, torch.nn.Linear)
+    if head.out_features == 2 * logits.size:  # two choices a sensor, as MaskablePPO has them
+        logits = np.stack((np.zeros_like(logits), logits), axis=1).ravel()
+    with torch.no_grad():
+        head.bias.add_(torch.as_tensor(logits, dtype=head.bias.dtype))
+
+
+def warn_of_cross_term(experiment: Experiment, env: FusionSB3VecEnv) -> None:
+    """Print the cross term, with its interval, if that says that it is not zero.
+
+    Two policies are measured: random requests at the rate at which the training begins, or to
+    which it goes, and the one of the greatest value that the environment knows.
+    """
+    task, reference = env.task, env.batch.reference
+    assert reference is not None  # the environment of such a training has one
+    begins = getattr(experiment.algorithm, "initial_rate", None)
+    rate = experiment.training.target_rate or begins or 0.5
+    usual = usual_policies(task, (rate,))
+    policies = {name: make_policy(name, task) for name in (usual[0], usual[-1])}
+    name, terms = worst(cross_terms(task, reference, policies, _EPISODES, _SEED, _LEVEL))
+    if not terms.compatible:
+        remark(
+            f"warning: training.error = 'mismatch' leaves out a cross term of {terms.text} of the "
+            f"error under {name} ({_EPISODES} episodes); error: excess has none, and the command "
+            "mismatch measures it under other policies and filters"
+        )

@@ -1,0 +1,225 @@
+"""What watches a training: interrupts, validation, checkpoints, the split of the wall time."""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+from fusion_gym.arrays import Array
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
+from fusion_gym.output.files import replacing, write_text
+from fusion_gym.output.progress import Bar
+from fusion_gym.policies.card import ModelView
+from fusion_gym.policies.model import ModelPolicy
+from fusion_gym.training import checkpoint
+from fusion_gym.training.callback import Callback
+from fusion_gym.training.checkpoint import Journal
+from fusion_gym.training.config import Experiment
+from fusion_gym.training.constraint import rate_score
+from fusion_gym.training.diagnosis import by_price, prices_of
+
+
+class Interrupt:
+    """Turns Ctrl-C and SIGTERM into a flag while it is entered; a second Ctrl-C gets through.
+
+    In a thread, as a cluster's workers have, signals belong to somebody else: nothing happens.
+    """
+
+    def __init__(self) -> None:
+        self.raised = False
+
+    def __enter__(self) -> Interrupt:
+        mine = threading.current_thread() is threading.main_thread()
+        self._before = {
+            number: signal.signal(number, self._raise)
+            for number in ((signal.SIGINT, signal.SIGTERM) if mine else ())
+        }
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _raise(self, number: int, _: FrameType | None) -> None:
+        self.raised = True
+        signal.signal(number, self._before[signal.Signals(number)])
+
+
+class Stop(Exception):
+    """Ends a training between two rollouts, where the steps counted are the steps trained on."""
+
+
+class Progress(Callback):
+    """Validation, best model, checkpoints, the progress bar and the split of the wall time."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        folder: Path,
+        task: Task,
+        interrupt: Interrupt,
+        bar: Bar,
+        journal: Journal,
+        watch: Callable[[dict[str, Any]], bool] | None = None,
+    ) -> None:
+        super().__init__()
+        self.watch, self.stopped = watch, False
+        self.experiment, self.folder, self.task = experiment, folder, task
+        self.interrupt, self.bar, self.journal = interrupt, bar, journal
+        self.target = experiment.training.target_rate
+        scores = (rate_score(record, self.target) for record in journal.records)
+        self.best = max(scores, default=(-np.inf, -np.inf))
+        self._mark = _now()
+        self._env_mark = 0.0
+        self._next = 0
+        self._due = False  # a checkpoint, as soon as the model has learned from the rollout
+        self._write_records()
+        if journal.best is not None:
+            self._write_best(journal.best)
+        for record in journal.records:
+            self._show(record)
+
+    def _on_training_start(self) -> None:
+        self._plan()
+        self._mark = _now()
+
+    def _on_rollout_start(self) -> None:
+        self._measure("update")
+        if self.interrupt.raised or self.stopped:
+            raise Stop
+        if self._due:
+            self._due = False
+            self.save()
+            self._measure("validation")
+        self._env_mark = self.environment.seconds
+
+    def _on_rollout_end(self) -> None:
+        environment = self.environment.seconds - self._env_mark
+        self._measure("policy")
+        self.journal.seconds["policy"] -= environment
+        self.journal.seconds["environment"] += environment
+        self.bar.reach(self.num_timesteps)
+        # The last validation is that of the finished model.
+        if self._next <= self.num_timesteps < self.experiment.training.timesteps:
+            self._plan()
+            self._due = True
+            self.validate()
+            self._measure("validation")
+
+    def _on_training_end(self) -> None:
+        self._measure("update")
+
+    def _measure(self, activity: str) -> None:
+        """Add the time since the last call to an activity's."""
+        now = _now()
+        self.journal.seconds[activity] += now[0] - self._mark[0]
+        if activity != "validation":
+            self.journal.cpu_seconds += now[1] - self._mark[1]
+        self._mark = now
+
+    def _plan(self) -> None:
+        """The next validation is at the next multiple of the steps between two."""
+        every = self.experiment.validation.every
+        self._next = (self.num_timesteps // every + 1) * every
+
+    def finish(self) -> None:
+        """Validate the finished model, if that was not done before."""
+        records = self.journal.records
+        if not records or records[-1]["timesteps"] < self.num_timesteps:
+            self._mark = _now()
+            self.validate()
+            self._measure("validation")
+
+    def validate(self) -> None:
+        """Run the validation episodes, log them, and keep the model if it is the best so far."""
+        results = self._run()
+        record: dict[str, Any] = {
+            "timesteps": self.num_timesteps,
+            "return": float((results.returns * self._weights()).mean()),
+            "mse": float(results.mse.mean()),
+            "rate": float(results.rate.mean()),
+        }
+        parts = by_price(self.task, self.prices, results)
+        if parts:
+            record["prices"] = parts
+        if rate_score(record, self.target) > self.best:
+            self.best = rate_score(record, self.target)
+            file = io.BytesIO()
+            self.model.save(file)
+            self.journal.best = file.getvalue()
+            self._write_best(self.journal.best)
+        self.journal.records.append(record)
+        self._write_records()
+        for key in ("return", "mse", "rate"):
+            self.logger.record(f"validation/{key}", record[key])
+        self.logger.record("validation/cpu_seconds", self.journal.cpu_seconds)
+        for part in parts:
+            where = f"price_{part['low']:.3g}-{part['high']:.3g}"
+            for key in ("mse", "rate"):
+                self.logger.record(f"validation/{key}_{where}", part[key])
+        self.logger.dump(self.num_timesteps)
+        self._show(record)
+
+    def run_cheapest(self) -> EpisodeResults:
+        """Return the validation episodes of the model at its lowest price."""
+        span = self.task.reward.price.span
+        return self._run(None if span is None else span[0])
+
+    def _run(self, price: float | None = None) -> EpisodeResults:
+        settings, local = self.experiment.validation, self.experiment.environment.local
+        policy = ModelPolicy(self.model, self.task, price=price, trained=ModelView(local=local))
+        return run_episodes(self.task, policy, settings.episodes, settings.seed)
+
+    def _show(self, record: dict[str, Any]) -> None:
+        """A validation to the bar, and to whoever watches and may end the training."""
+        self.bar.say(log_line(record))
+        if self.watch is not None:
+            self.stopped = self.watch(record)
+
+    def _write_best(self, content: bytes) -> None:
+        with replacing(self.folder / "best_model.zip") as partial:
+            partial.write_bytes(content)
+
+    def _write_records(self) -> None:
+        lines = [json.dumps(record) + "\n" for record in self.journal.records]
+        write_text(self.folder / "validation.jsonl", "".join(lines))
+
+    @functools.cached_property
+    def prices(self) -> Array:
+        """Of a token in each validation episode."""
+        settings = self.experiment.validation
+        return prices_of(self.task, settings.episodes, settings.seed)
+
+    def _weights(self) -> Array:
+        """What each validation episode's return counts, by its price."""
+        exponent = self.experiment.training.price_exponent
+        if exponent == 0.0:
+            return np.ones(1)
+        return self.task.reward.price.scale(self.prices, exponent)
+
+    def save(self) -> None:
+        """Write the checkpoint."""
+        checkpoint.save_checkpoint(
+            self.folder / "latest.zip", self.model, self.environment, self.journal
+        )
+
+
+def log_line(record: dict[str, Any]) -> str:
+    """A validation in a few words."""
+    return f"MSE {record['mse']:.4f}, rate {record['rate']:.3f}"
+
+
+def _now() -> tuple[float, float]:
+    """Seconds of the wall, and of this process on all its processors."""
+    return time.perf_counter(), time.process_time()

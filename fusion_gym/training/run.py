@@ -1,0 +1,222 @@
+"""One training from config to summary; it can be ended at any moment and gone on with."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.logger import configure
+
+from fusion_gym.core.reward import Price
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import make_task
+from fusion_gym.envs.sb3 import FusionSB3VecEnv
+from fusion_gym.importing import trust_files
+from fusion_gym.output.files import replacing, write, write_text
+from fusion_gym.output.folders import alone_in, check_inputs, fingerprint
+from fusion_gym.output.progress import progress_bar, writing
+from fusion_gym.training.checked import load_checked
+from fusion_gym.training.checkpoint import Journal, read_journal, restore
+from fusion_gym.training.config import Experiment
+from fusion_gym.training.constraint import TargetRate, rate_score
+from fusion_gym.training.diagnosis import Traffic, warn_of_unused_tokens
+from fusion_gym.training.models import make_env, make_model, warn_of_cross_term
+from fusion_gym.training.monitor import Interrupt, Progress, Stop
+from fusion_gym.validation import ConfigurationError
+
+# Training seeds lie far from the validation's and from the small numbers that tests use.
+TRAINING_SEEDS = 1_000_000_000
+
+
+class Diverged(ConfigurationError):
+    """The weights of a training are no numbers any more."""
+
+
+def holds_training(folder: Path) -> bool:
+    """Whether a training was begun in the folder."""
+    return any((folder / name).exists() for name in ("config.yaml", "latest.zip"))
+
+
+def earlier(experiment: Experiment, folder: Path, resume: bool) -> Journal | None:
+    """The journal of the training to go on with; none where it is begun.
+
+    Raises:
+        ConfigurationError: the folder holds a training and ``resume`` is false, there is nothing
+            to resume, the training there had another config, or its checkpoint is damaged.
+    """
+    where, checkpoint = f"the training in {str(folder)!r}", folder / "latest.zip"
+    if not resume:
+        if holds_training(folder):
+            raise ConfigurationError(
+                f"output = {str(folder)!r} holds a training already: go on with --resume, or give "
+                "another --output"
+            )
+        return None
+    if checkpoint.exists():
+        journal = read_journal(checkpoint)
+        check_inputs(experiment.inputs(), journal.inputs, where)
+        return journal
+    if (folder / "final_model.zip").exists():
+        raise ConfigurationError(
+            f"output = {str(folder)!r} holds a finished training without its checkpoint, "
+            "latest.zip: nothing to resume"
+        )
+    with trust_files():  # a checkpoint there would hold code, too
+        begun = load_checked(Experiment, folder / "config.yaml")
+    check_inputs(experiment.inputs(), begun.inputs(), where)
+    return None
+
+
+def validation_task(experiment: Experiment, task: Task) -> Task:
+    """The task that validation runs on: with a target rate its tokens are free of charge.
+
+    Raises:
+        ConfigurationError: a target rate, but a price that is drawn or zero.
+    """
+    if experiment.training.target_rate is None:
+        return task
+    price = task.reward.price
+    if price.span is not None or not price.fixed:
+        raise ConfigurationError(
+            f"target_rate = {experiment.training.target_rate} is not allowed with cost_weight = "
+            f"{experiment.environment.options.get('cost_weight')!r} and price_range = "
+            f"{price.span}: it starts from a fixed cost_weight > 0 without a price_range"
+        )
+    return dataclasses.replace(
+        task, reward=dataclasses.replace(task.reward, price=Price.create(0.0))
+    )
+
+
+def check_run(experiment: Experiment) -> tuple[BaseAlgorithm, FusionSB3VecEnv, Task]:
+    """A new model, what it trains in, and the task that it is validated on; nothing is written.
+
+    Raises:
+        ConfigurationError: a config or environment that does not fit.
+    """
+    task = make_task(experiment.environment.id, **experiment.environment.options)
+    scored = validation_task(experiment, task)
+    env = make_env(experiment, task)
+    return make_model(experiment, env), env, scored
+
+
+def train(
+    experiment: Experiment,
+    *,
+    resume: bool = False,
+    quiet: bool = False,
+    watch: Callable[[dict[str, Any]], bool] | None = None,
+) -> dict[str, Any]:
+    """Run the training and return its summary; ``quiet`` shows neither bar nor summary.
+
+    ``watch`` is handed each validation's record, those of earlier stretches first, and may end the
+    training by returning true.
+
+    The summary has ``timesteps``, ``finished``, ``steps_per_second``, ``seconds`` by activity (of
+    all stretches together), the best validation, and a hash of the inputs.
+
+    Raises:
+        ConfigurationError: a config, environment or folder that does not fit; a config that is not
+            allowed leaves no folder.
+    """
+    folder = Path(experiment.output)
+    if resume and not holds_training(folder):
+        raise ConfigurationError(f"output = {str(folder)!r} holds no training: nothing to resume")
+    model, env, scored = check_run(experiment)
+    experiment = experiment.resolved(env.task.settings, env.task.sensors)
+    earlier(experiment, folder, resume)  # refuses before anything is made
+    torch.set_num_threads(experiment.training.threads)
+    with alone_in(folder, "output"):
+        journal = earlier(experiment, folder, resume)
+        if journal is None:
+            journal = Journal(experiment.inputs())
+            env.seed(TRAINING_SEEDS + 10_000_019 * experiment.training.seed)
+            if experiment.training.error == "mismatch" and not quiet:
+                warn_of_cross_term(experiment, env)
+        else:
+            model = restore(folder / "latest.zip", type(model), env)
+        if not quiet:
+            writing(("checkpoints, models and validations", folder))
+        plain = experiment.model_dump(mode="json")
+        write_text(folder / "config.yaml", yaml.safe_dump(plain, sort_keys=False))
+        return _learn(experiment, folder, model, env, scored, journal, quiet, watch)
+
+
+def _learn(
+    experiment: Experiment, folder: Path, model: BaseAlgorithm, env: FusionSB3VecEnv, scored: Task,
+    journal: Journal, quiet: bool, watch: Callable[[dict[str, Any]], bool] | None,
+) -> dict[str, Any]:  # fmt: skip
+    """Train what remains, write the results and return the summary."""
+    model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
+    total, begun, began = experiment.training.timesteps, model.num_timesteps, time.perf_counter()
+    with (
+        Interrupt() as interrupt,
+        progress_bar(total, f"training {experiment.algorithm.name}", begun, quiet) as bar,
+    ):
+        progress = Progress(experiment, folder, scored, interrupt, bar, journal, watch)
+        progress.init_callback(model)
+        callbacks: list[BaseCallback] = [Traffic(), progress]
+        if experiment.training.target_rate is not None:
+            price = env.task.reward.price.fixed
+            assert price is not None  # validation_task refuses a drawn price
+            callbacks.append(TargetRate(experiment.training.target_rate, price))
+        if begun < total:
+            try:
+                model.learn(total - begun, CallbackList(callbacks), reset_num_timesteps=False)
+            except Stop:
+                pass
+            except ValueError:  # what torch's distributions make of weights that are not finite
+                if all(bool(part.isfinite().all()) for part in model.policy.parameters()):
+                    raise
+                raise Diverged(
+                    f"output = {str(folder)!r}: the training diverged after {model.num_timesteps} "
+                    "steps, its weights are not finite; lower learning_rate or max_grad_norm"
+                ) from None
+        progress.num_timesteps = model.num_timesteps
+        finished = model.num_timesteps >= total
+        if finished:
+            progress.finish()
+            if not quiet and experiment.training.target_rate is None:
+                warn_of_unused_tokens(scored, progress.run_cheapest())
+        progress.save()
+        if finished:
+            with replacing(folder / "final_model.zip") as partial:
+                model.save(partial)
+    best = max(
+        journal.records, key=lambda record: rate_score(record, progress.target), default=None
+    )
+    summary = {
+        "timesteps": model.num_timesteps,
+        "finished": finished,
+        "steps_per_second": round(model.num_timesteps / (sum(journal.seconds.values()) or 1.0)),
+        "seconds": {key: round(value, 2) for key, value in journal.seconds.items()},
+        "best_validation": best and {key: best[key] for key in best if key != "prices"},
+        "inputs": fingerprint(journal.inputs),
+    }
+    write(folder / "summary.json", summary)
+    if not quiet:
+        print(describe(summary, folder, time.perf_counter() - began))
+    return summary
+
+
+def describe(summary: dict[str, Any], folder: Path, elapsed: float) -> str:
+    """What a reader wants to know of a training, in a few lines."""
+    lines = [
+        f"{'finished' if summary['finished'] else 'interrupted'} after {summary['timesteps']:,} "
+        f"steps at {summary['steps_per_second']:,} steps/s; this stretch: {elapsed:.0f} s"
+    ]
+    total = sum(summary["seconds"].values())
+    if total > 0.0:
+        parts = (f"{key} {value / total:.0%}" for key, value in summary["seconds"].items())
+        lines.append("wall time: " + ", ".join(parts))
+    best = summary["best_validation"]
+    if best:
+        lines.append(
+            f"best validation at {best['timesteps']:,} steps: return {best['return']:.3f}, "
+            f"MSE {best['mse']:.4f}, rate {best['rate']:.4f}"
+        )
+    return "\n".join([*lines, f"results in {folder}"])

@@ -1,0 +1,64 @@
+"""Sweeps of rules and rows of a comparison as typed YAML."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pydantic
+
+from fusion_gym.core.reward import Price
+from fusion_gym.training.checked import Strict
+
+
+class SweepCurve(Strict):
+    """A baseline swept over one parameter: ``policy`` holds ``{value}`` in its place.
+
+    Or ``{price}``: the values are then multiples of the task's price, or of the middle of its
+    range.
+    """
+
+    label: str
+    policy: str
+    values: tuple[float | int, ...] = pydantic.Field(min_length=1)
+
+    def policies(self, price: Price) -> list[str]:
+        """One policy text a value."""
+        name = "{price}" if "{price}" in self.policy else "{value}"
+        middle = float(price.draw(np.array([0.5]))[0]) if name == "{price}" else 1.0
+        return [self.policy.replace(name, f"{middle * value:g}") for value in self.values]
+
+    @pydantic.field_validator("policy")
+    @classmethod
+    def _has_place(cls, policy: str) -> str:
+        if ("{value}" in policy) == ("{price}" in policy):
+            raise ValueError("must hold {value} or {price} where the swept parameter stands")
+        return policy
+
+
+class Sweep(Strict):
+    """Baselines over their thresholds, and the single policies that stand beside them."""
+
+    curves: tuple[SweepCurve, ...]
+    points: tuple[str, ...] = ()
+
+    def policies(self, price: Price) -> list[str]:
+        """Every policy text of the sweep, each once, in order."""
+        texts = [text for curve in self.curves for text in curve.policies(price)]
+        return list(dict.fromkeys([*self.points, *texts]))
+
+
+class ComparisonRow(Strict):
+    """One policy in one setting of the comparison's environment, or of another."""
+
+    label: str
+    policy: str
+    environment: str | None = None
+    options: dict[str, Any] = pydantic.Field(default_factory=dict)
+
+
+class SweepSettings(Strict):
+    """Settings and policies of one environment, row by row."""
+
+    environment: str
+    rows: tuple[ComparisonRow, ...] = pydantic.Field(min_length=1)
