@@ -156,7 +156,7 @@ def add(name: str, report: dict[str, Any], model: bytes, folder: Path) -> None:
         "mode": mode,
         "knows": KNOWS[mode, bool(options.get("memory", False))],
         "training": training | {"output": f"runs/{name}"},
-        "command": f"python -m agents.zoo --envs {report['setting']} --classes "
+        "command": f"python -m agents.benchmark --envs {report['setting']} --classes "
         f"{report['class']}, training seed {report['training_seed']}",
         "test": {
             "episodes": report["episodes"],
