@@ -4,8 +4,7 @@
 
 One thread (``make bench`` sets it), float64. All rows are measured in one run, in turns, and each
 figure is the median of its turns; the ratios are to a plain loop with FilterPy and to SB3's
-DummyVecEnv, and in a second table what memory costs. The absolute figures belong to the machine,
-the ratios to the code.
+DummyVecEnv. The absolute figures belong to the machine, the ratios to the code.
 """
 
 import argparse
@@ -18,12 +17,9 @@ import filterpy.kalman
 import gymnasium
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 import fusion_gym
-from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.memory import Owner
 from fusion_gym.output import tables
 from fusion_gym.systems.tobit.oscillator import TobitOscillatorOptions
 
@@ -91,37 +87,18 @@ def _sb3(env: VecEnv) -> Workload:
     return _timed(lambda: env.step(actions[next(count) % 16]), env.num_envs)
 
 
-# An environment's options in the comparison of what memory costs.
-REMEMBERED: dict[str, dict[str, Any]] = {
-    "TobitOscillator": {"filter": "tobit"},
-    "BiasedOscillator": {"access": "any"},
-    "BiasedTracking": {"access": "any"},
-    "CorrelatedTracking": {},
-    "UnknownInput": {},
-    "MarkovJumpTracking": {},
-    "MarkovJumpTracking, imm": {"filter": "imm"},
-    "RemoteEstimation": {"sensors": 3},
-}
-RATE = 0.3  # of requests there, a sensor and step
-
-
-def remembering(env_id: str, options: dict[str, Any], how: str, num_envs: int = 1024) -> Workload:
-    """The core's loop without memory, or with ``memory_system``, ``values`` or ``own`` values."""
-    changed = {"memory": how != "without", "horizon": 250}
-    task = fusion_gym.make_task(env_id, **(options | changed))
-    owner: Owner = "own" if how == "own" else "scheduler"
-    batch = EpisodeBatch.seeded(task, num_envs, 0, owner)
-    draw = np.random.default_rng(0)
-    required = draw.random((16, task.sensors, num_envs)) < RATE
-    count = iter(range(10**12))
-
-    def step() -> None:
-        if how in ("values", "own"):
-            batch.beliefs().value()
-        if batch.step(required[next(count) % 16]).ended.any():
-            batch.reset()
-
-    return _timed(step, num_envs)
+# Other environments by gym.make_vec.
+OTHERS: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("CorrelatedTracking", {}),
+    ("CorrelatedTracking", {"fusion": "ci"}),
+    ("MarkovJumpTracking", {}),
+    ("UnknownInput", {}),
+    ("UnknownInput", {"filter": "predict"}),
+    ("UnknownInput", {"filter": "paper"}),
+    ("BiasedOscillator", {}),
+    ("BiasedOscillator", {"filter": "adf"}),
+    ("BiasedTracking", {}),
+)
 
 
 def filterpy_loop() -> Workload:
@@ -156,7 +133,6 @@ def main() -> None:
     seconds = parser.parse_args().seconds
     paper: dict[str, Any] = {}
     tobit: dict[str, Any] = {"filter": "tobit"}
-    adf: dict[str, Any] = {"filter": "adf"}
     rows: dict[str, Workload] = {
         "plain loop with FilterPy's Kalman filter": filterpy_loop(),
         "gym.make, paper's filter": single(paper),
@@ -166,22 +142,10 @@ def main() -> None:
         "native SB3 VecEnv, 1,024, Tobit filter": native_sb3(tobit, 1024),
         "gym.make_vec, 1,024, paper's filter": vector(paper, 1024),
         "gym.make_vec, 1,024, Tobit filter": vector(tobit, 1024),
-        "CorrelatedTracking, 1,024": vector({}, 1024, "fusion_gym/CorrelatedTracking-v1"),
-        "CorrelatedTracking, 1,024, ci": vector(
-            {"fusion": "ci"}, 1024, "fusion_gym/CorrelatedTracking-v1"
-        ),
-        "MarkovJumpTracking, 1,024": vector({}, 1024, "fusion_gym/MarkovJumpTracking-v1"),
-        "UnknownInput, 1,024": vector({}, 1024, "fusion_gym/UnknownInput-v1"),
-        "UnknownInput, 1,024, exact filter": vector(
-            {"filter": "predict"}, 1024, "fusion_gym/UnknownInput-v1"
-        ),
-        "UnknownInput, 1,024, paper's filter": vector(
-            {"filter": "paper"}, 1024, "fusion_gym/UnknownInput-v1"
-        ),
-        "BiasedOscillator, 1,024": vector({}, 1024, "fusion_gym/BiasedOscillator-v1"),
-        "BiasedOscillator, 1,024, adf": vector(adf, 1024, "fusion_gym/BiasedOscillator-v1"),
-        "BiasedTracking, 1,024": vector({}, 1024, "fusion_gym/BiasedTracking-v1"),
     }
+    for name, options in OTHERS:
+        label = ", ".join((name, "1,024", *map(str, options.values())))
+        rows[label] = vector(options, 1024, f"fusion_gym/{name}-v1")
     figures = measured(rows, seconds)
     medians = {name: statistics.median(figure) for name, figure in figures.items()}
     names = list(rows)
@@ -199,7 +163,6 @@ def main() -> None:
             f"{median / medians[names[3]]:.2f}",
         )
     Console(width=130).print(table)
-    Console(width=130).print(memory_table(seconds))
 
 
 def measured(rows: dict[str, Workload], seconds: float) -> dict[str, list[float]]:
@@ -211,28 +174,6 @@ def measured(rows: dict[str, Workload], seconds: float) -> dict[str, list[float]
         for name, workload in rows.items():
             figures[name].append(workload(seconds))
     return figures
-
-
-def memory_table(seconds: float) -> Table:
-    """What memory costs: the core's loop with it over without, the median of a turn's ratios."""
-    ways = {
-        "memory_system": "shadow alone",
-        "values": "and values",
-        "own": "every sensor's own values",
-    }
-    title = f"core's loop, 1,024 runs, requests at rate {RATE}: with memory over without"
-    table = tables.table_tables(title, ("environment", "steps/s without", *ways.values()))
-    for name, options in REMEMBERED.items():
-        env_id = f"fusion_gym/{name.partition(',')[0]}-v1"
-        rows = {how: remembering(env_id, options, how) for how in ("without", *ways)}
-        result = measured(rows, seconds)
-        ratios = [
-            statistics.median(a / b for a, b in zip(result[how], result["without"], strict=True))
-            for how in ways
-        ]
-        without = statistics.median(result["without"])
-        table.add_row(name, f"{without:,.0f}", *(f"{ratio:.2f}" for ratio in ratios))
-    return table
 
 
 if __name__ == "__main__":

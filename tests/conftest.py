@@ -25,12 +25,6 @@ def own_table(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make the intervals of a verdict in no time."""
-    monkeypatch.setattr("agents.benchmark.verdict.RESAMPLES", 20)
-
-
-@pytest.fixture
 def unsearched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make policies without the search for their schedule, which takes minutes."""
 

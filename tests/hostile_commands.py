@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 from hostile_folder import BROKEN, ENV
 
-from agents.benchmark.bound import Bound
 from agents.benchmark.command import Benchmark
 from agents.papers.reproduce import Reproduce
 from agents.papers.table import Table
@@ -21,7 +20,6 @@ from fusion_gym.commands.options import OutputFile, OutputFolder
 
 RESEARCH: dict[str, type[Command]] = {
     "benchmark": Benchmark,
-    "bound": Bound,
     "papers": Reproduce,
     "table": Table,
     "zoo": Zoo,
@@ -44,10 +42,6 @@ BASES: dict[str, dict[str, list[str]]] = {
         "env": [ENV], "set": ["horizon=4"], "policies": ["always"], "episodes": ["2"],
         "json": ["made.json"],
     },
-    "bound": {
-        "env": [ENV], "set": ["horizon=4"], "rates": ["0.1"], "episodes": ["2"],
-        "json": ["made.json"],
-    },
     "compare": {
         "config": ["training.yaml"], "sweep": ["sweep.yaml"], "policy": ["always"],
         "output": ["made"], "episodes": ["2"],
@@ -60,14 +54,17 @@ BASES: dict[str, dict[str, list[str]]] = {
         "episodes": ["2"],
     },
     "watch": {"env": [ENV], "set": ["horizon=4"], "policy": ["always"], "save": ["made.gif"]},
-    "export": {"model": ["zoo:remote_estimation_sensors"], "onnx": ["made.onnx"]},
-    "zoo": {"results": ["results"], "work": ["work"], "zoo": ["made"]},
+    "export": {"model": ["zoo:remote_estimation_scheduler"], "onnx": ["made.onnx"]},
+    "zoo": {"work": ["made"], "zoo": ["made_too"], "workers": ["1"]},
     "demo": {"output": ["made"], "episodes": ["2"], "timesteps": ["32"]},
     "train": {"config": ["training.yaml"], "output": ["made"]},
-    "tune": {"config": ["training.yaml"], "output": ["made"], "trials": ["1"]},
+    "search": {
+        "env": [ENV], "set": ["horizon=4"], "output": ["made"], "class": ["scheduler"],
+        "prices": ["2"], "generations": ["1"],
+    },
     "benchmark": {
-        "config": ["suite.yaml"], "results": ["made"], "work": ["made_too"], "workers": ["1"],
-        "parts": ["robustness"], "classes": ["sensors"],
+        "results": ["made"], "work": ["made_too"], "workers": ["1"], "policy": ["always"],
+        "class": ["scheduler"], "settings": ["remote_estimation"],
     },
 }  # fmt: skip
 
@@ -76,7 +73,7 @@ POLICIES = [
     "nothing", "nothing:a=1", "always:a=1", "random:rate=x", "random:rate=nan", "random:rate=2",
     "random:rate", "random:rate=.5,rate=.5", "periodic:period=0", "periodic:period=1e9999",
     "model:", "model:absent.zip", "model:text", "model:folder", "model:latin", "zoo:", "zoo:nobody",
-    "zoo:remote_estimation_sensors,price=-1", "innovation_threshold:threshold={[]:1}",
+    "zoo:remote_estimation_scheduler,price=-1", "innovation_threshold:threshold={[]:1}",
     "innovation_threshold:threshold=" + "(" * 300, "whittle:price=-1", ":", "=",
     "lookahead:steps=0", "value_of_information:steps=1000000000", "periodic:period=" + "9" * 30,
     "rollout:samples=1000000000,base=never", "lookahead:steps=1000000000", "os:abort",
@@ -120,8 +117,9 @@ def options(name: str) -> dict[str, Any]:
     kind: type[Command] = load(name)
     hints = typing.get_type_hints(kind, include_extras=True)
     result = {field.name: hints[field.name] for field in dataclasses.fields(kind)}
-    if "options" in result:
-        result["set"] = result.pop("options")
+    for field, option in (("options", "set"), ("of", "class")):
+        if field in result:
+            result[option] = result.pop(field)
     return result
 
 
@@ -163,14 +161,12 @@ def tries() -> Iterator[Try]:
         yield Try(command, "", "stray", [*line(command, base), "stray"])
     evaluate = BASES["evaluate"]
     for name in JSON:
-        results = {"parts": ["report"], "results": [f"bad_results/{name}"]}
-        words = line("benchmark", BASES["benchmark"] | results)
-        yield Try("benchmark", "results", f"bad_results/{name}", words)
         words = line("evaluate", evaluate | {"json": [f"{name}.json"]})
         yield Try("evaluate", "json", f"{name}.json", [*words, "--resume"])
     yield Try("evaluate", "resume", "json", [*line("evaluate", evaluate)[:-2], "--resume"])
     yield Try("evaluate", "reference", "never", [*line("evaluate", evaluate), "--reference=never"])
-    yield Try("train", "resume", "made", [*line("train", BASES["train"]), "--resume"])
+    for name in ("search", "train"):
+        yield Try(name, "resume", "made", [*line(name, BASES[name]), "--resume"])
 
 
 def line(command: str, arguments: dict[str, list[str]]) -> list[str]:

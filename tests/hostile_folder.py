@@ -1,13 +1,12 @@
 """A folder in which commands are tried: small configs and results, and much that is neither."""
 
 import os
-import shutil
 from pathlib import Path
 
 import yaml
-from small_results import ENV, SETTING, small_model, small_results
 
 ROOT = Path(__file__).parent.parent
+ENV = "fusion_gym/TobitOscillator-v1"
 
 TRAINING = {
     "environment": {"id": ENV, "options": {"horizon": 4}},
@@ -21,27 +20,6 @@ SWEEP = {
     "curves": [{"label": "a", "policy": "periodic:period={value}", "values": [2, 3]}],
 }
 ROWS = {"environment": ENV, "rows": [{"label": "a", "policy": "always"}]}
-SUITE = {
-    "episodes": 2,
-    "training_seeds": 1,
-    "timesteps": 32,
-    "num_envs": 2,
-    "prices": 2,
-    "classes": ["sensors"],
-    "tuning": {"trials": 2, "prices": 2, "episodes": 2, "seeds": 2},
-    "algorithm": TRAINING["algorithm"],
-    "families": [],
-    "settings": [
-        {
-            "name": "one",
-            "title": "one",
-            "environment": TRAINING["environment"],
-            "price_range": [0.1, 1.0],
-            "drawn": {"true_process_noise": [0.5, 2.0]},
-        }
-    ],
-}
-# Files that are no config and no result, by name.
 BROKEN: dict[str, bytes] = {
     "empty": b"",
     "text": b"this is no structure: at: all\n\t- x",
@@ -75,18 +53,12 @@ BROKEN: dict[str, bytes] = {
 
 def scratch(folder: Path) -> None:
     """A folder with what the tries need, where everybody may write."""
-    configs = {"training": TRAINING, "sweep": SWEEP, "rows": ROWS, "suite": SUITE}
+    configs = {"training": TRAINING, "sweep": SWEEP, "rows": ROWS}
     for name, content in configs.items():
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(content))
-    whole = small_results(folder / "results", classes=["sensors"], seeds=1)
     for name, raw in BROKEN.items():
         for suffix in ("", ".yaml", ".json"):
             (folder / f"{name}{suffix}").write_bytes(raw)
-        broken = folder / "bad_results" / name / SETTING
-        shutil.copytree(whole, broken)
-        (broken / "verdict.csv").write_bytes(raw)
-        (broken / "runs.csv").write_bytes(raw)
-    small_model(folder / "work" / SETTING / "sensors_0" / "best_model.zip")
     (folder / "folder").mkdir()
     (folder / "folder" / "file").write_text("kept")
     (folder / "locked").mkdir()

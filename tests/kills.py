@@ -1,6 +1,6 @@
 """Kill a command at random moments, go on with it, and compare with an undisturbed run.
 
-    python tests/kills.py {train,tune,benchmark} [--kills 15] [--seed 0]
+    python tests/kills.py {train} [--kills 15] [--seed 0]
 
 Every attempt is a fork of this process, which has imported everything: kills fall into the
 command's own work. The end must be that of the undisturbed run, bit by bit.
@@ -18,11 +18,9 @@ from pathlib import Path
 
 from small_runs import arguments, meaning
 
-from agents.benchmark import verdict
 from fusion_gym.commands.__main__ import load
 
-# Steps of a training, and trials of a study or trainings of a class.
-SIZES = {"train": (16_384, 1), "tune": (4096, 8), "benchmark": (4096, 2)}
+SIZES = {"train": 16_384}  # steps of a training
 
 
 def attempt(command: str, words: list[str], log: Path, seconds: float | None) -> str:
@@ -60,7 +58,7 @@ def begun(command: str, folder: Path) -> bool:
     """Whether the command needs --resume to go on."""
     if command == "train":
         return (folder / "run" / "config.yaml").exists()
-    return command == "benchmark"
+    return False
 
 
 def main() -> None:
@@ -69,15 +67,14 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=15)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    steps, repetitions = SIZES[args.command]
+    steps = SIZES[args.command]
     load(args.command)
     moments = random.Random(args.seed)
-    verdict.RESAMPLES = 20
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
         log = root / "log"
         (root / "whole").mkdir()
-        words = arguments(args.command, root / "whole", 0, steps, repetitions)
+        words = arguments(args.command, root / "whole", 0, steps)
         began = time.perf_counter()
         attempt(args.command, words, log, None)
         lasts = time.perf_counter() - began
@@ -86,7 +83,7 @@ def main() -> None:
             rounds += 1
             folder = root / f"round_{rounds}"
             folder.mkdir()
-            words = arguments(args.command, folder, 0, steps, repetitions)
+            words = arguments(args.command, folder, 0, steps)
             ended = "killed"
             while ended == "killed":
                 again = ["--resume"] if begun(args.command, folder) else []

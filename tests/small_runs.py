@@ -6,11 +6,10 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-import optuna
 import torch
-import yaml
-from small_suite import ENV, small_suite
 from training_configs import small_config
+
+ENV = "fusion_gym/TobitOscillator-v1"
 
 
 def arguments(
@@ -18,23 +17,14 @@ def arguments(
     folder: Path,
     seed: int = 0,
     steps: int = 256,
-    repetitions: int = 1,
-    classes: list[str] | None = None,
 ) -> list[str]:
     """Return the words of a short run into the folder; the seed makes another run."""
     if command == "evaluate":
         options = ["--env", ENV, "--set", "horizon=5", "--policies", "always", "never"]
         return [*options, "--episodes", "3", "--seed", str(seed), "--json", f"{folder}/result.json"]
-    if command == "benchmark":
-        changes = {"training_seeds": repetitions, "timesteps": steps, "seed": seed}
-        config = small_suite(folder, classes=classes, **changes)
-        places = ["--results", str(folder / "results"), "--work", str(folder / "work")]
-        return ["--config", str(config), *places, "--workers", "1", "--parts", "agents"]
     training = {"timesteps": steps, "num_envs": 8, "seed": seed}
     every = {"every": min(1024, steps // 2), "episodes": 2}
     words = ["--config", str(small_config(folder, training=training, validation=every))]
-    if command == "tune":
-        words += ["--trials", str(repetitions), "--output", str(folder / "study")]
     return words
 
 
@@ -54,12 +44,6 @@ def _content(path: Path, folder: str) -> Any:
             with zipfile.ZipFile(path) as archive:
                 weights = torch.load(io.BytesIO(archive.read("policy.pth")))
             return {name: weight.tolist() for name, weight in weights.items()}
-        case "study.db", _:
-            study = optuna.load_study(study_name="tune", storage=f"sqlite:///{path}")
-            ended = [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
-            return [(t.state.name, t.params, t.value, t.intermediate_values) for t in ended]
-        case "best.yaml", _:
-            return yaml.safe_load(path.read_text())["algorithm"]
         case _, ".csv":
             return path.read_text()
         case _, ".json" | ".jsonl":

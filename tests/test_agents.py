@@ -1,7 +1,6 @@
 """The scripts, used as a user does: configs, evaluation, training with interrupts, the demo."""
 
 import json
-import math
 import os
 import shlex
 import signal
@@ -14,11 +13,9 @@ from typing import Any
 import pytest
 import yaml
 from command_runs import call, refusal, succeed
-from stable_baselines3 import PPO
 from training_configs import ENV, read_records, small_config
 
 import fusion_gym
-from agents.benchmark.config import Suite
 from fusion_gym.commands import demo
 from fusion_gym.core.batch import EpisodeBatch
 from fusion_gym.evaluation.episodes import run_episodes
@@ -28,7 +25,6 @@ from fusion_gym.training import run as train
 from fusion_gym.training.algorithms import TABLE
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.config import Experiment
-from fusion_gym.training.constraint import rate_score
 from fusion_gym.training.sweeps import Sweep, SweepSettings
 from fusion_gym.validation import ConfigurationError
 
@@ -75,7 +71,7 @@ UNREADABLE = {
 }
 
 
-@pytest.mark.parametrize("kind", [Experiment, Suite, Sweep, SweepSettings])
+@pytest.mark.parametrize("kind", [Experiment, Sweep, SweepSettings])
 @pytest.mark.parametrize("name", UNREADABLE)
 def test_a_config_that_cannot_be_read(tmp_path: Path, name: str, kind: Any) -> None:
     path, (content, message) = tmp_path / "unreadable.yaml", UNREADABLE[name]
@@ -91,26 +87,6 @@ def test_numbers_with_an_exponent_are_numbers(tmp_path: Path) -> None:
     path = small_config(tmp_path)
     path.write_text(path.read_text().replace("name: ppo", "name: ppo\n  learning_rate: 1e-3"))
     assert load_checked(Experiment, path).algorithm.learning_rate == 0.001
-
-
-def test_training_to_a_target_rate_moves_the_price(tmp_path: Path) -> None:
-    """A target far above what the agent sends makes tokens cheaper, one far below dearer."""
-    prices = {}
-    for target in (0.001, 1.0):
-        experiment = load_checked(
-            Experiment,
-            small_config(
-                tmp_path,
-                training={"timesteps": 2048, "num_envs": 8, "target_rate": target},
-                output=str(tmp_path / f"run{target}"),
-            ),
-        )
-        train.train(experiment)
-        model = PPO.load(tmp_path / f"run{target}" / "final_model.zip")
-        prices[target] = model.token_price
-    assert prices[1.0] < 0.01 < prices[0.001]
-    # 16 rollouts of 128 steps; each raises the logarithm by at most 0.05.
-    assert prices[0.001] == pytest.approx(0.01 * math.exp(16 * 0.05), rel=1e-6)
 
 
 def test_validation_counts_episodes_by_their_price(tmp_path: Path) -> None:
@@ -129,16 +105,6 @@ def test_validation_counts_episodes_by_their_price(tmp_path: Path) -> None:
     results = run_episodes(task, best, 4, 500_000_000)
     assert record["return"] == pytest.approx(float((results.returns * 0.1 / price).mean()))
     assert record["return"] != pytest.approx(float(results.returns.mean()), rel=0.01)
-
-
-def test_the_best_model_under_a_target_keeps_its_rate() -> None:
-    records = [
-        {"return": -1.0, "rate": 0.5},
-        {"return": -3.0, "rate": 0.1},
-        {"return": -2.0, "rate": 0.102},
-    ]
-    assert max(records, key=lambda r: rate_score(r, 0.1)) == records[2]
-    assert max(records, key=lambda r: rate_score(r, None)) == records[0]
 
 
 @pytest.mark.parametrize(

@@ -114,12 +114,13 @@ def test_another_process_reads_every_folder_of_this_one(tmp_path: Path) -> None:
 @pytest.fixture
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], str]:
     """The hash of a module with this text, beside ``rules/b.py`` with the other."""
-    (tmp_path / "rules").mkdir()
+    package = tmp_path / "fusion_gym"
+    (package / "rules").mkdir(parents=True)
     monkeypatch.setattr(cache, "_ROOT", tmp_path)
 
     def hash_of(text: str, other: str) -> str:
-        (tmp_path / "a.py").write_text(text)
-        (tmp_path / "rules/b.py").write_text(other)
+        (package / "a.py").write_text(text)
+        (package / "rules/b.py").write_text(other)
         code_of.cache_clear()
         cache.read_module.cache_clear()
         return code_of("fusion_gym.a")

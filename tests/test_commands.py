@@ -53,13 +53,13 @@ def test_help_shows_every_option(
             assert f"--{option.replace('_', '-')} " in listed, option
 
 
-def test_lists_flags_and_negative_numbers_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    words = "--envs a b --seeds -3 --quick --classes local_none --work deep/er --resume"
+def test_lists_and_flags_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = "--settings a b --quick --class local --policy always --work deep/er"
     monkeypatch.setattr(sys, "argv", ["program", *words.split()])
     command = command_line.read_command(Benchmark)
-    assert (command.envs, command.classes, command.seeds) == (("a", "b"), ("local_none",), -3)
-    assert (command.quick, command.resume, command.work) == (True, True, Path("deep/er"))
-    assert (command.config, command.results, command.workers) == ("benchmark", None, 2)
+    assert (command.settings, command.of, command.policy) == (("a", "b"), "local", "always")
+    assert (command.quick, command.work) == (True, Path("deep/er"))
+    assert (command.results, command.workers) == (None, 2)
 
 
 def test_all_commands_under_one_name() -> None:
@@ -116,9 +116,9 @@ def test_configs_go_by_path_or_by_shipped_name(
     path = ROOT / "configs" / "tobit_oscillator_ppo.yaml"
     monkeypatch.chdir(tmp_path)
     assert load_checked(Experiment, "tobit_oscillator_ppo") == load_checked(Experiment, path)
-    Path("benchmark").mkdir()
-    shipped = (ROOT / "configs" / "benchmark.yaml").read_text()
-    assert config_path("benchmark").read_text() == shipped
+    Path("many_sensors").mkdir()
+    shipped = (ROOT / "configs" / "many_sensors.yaml").read_text()
+    assert config_path("many_sensors").read_text() == shipped
     Path("own").write_text("a: 1")
     assert config_path("own") == Path("own")
     with pytest.raises(ConfigurationError, match="did you mean 'tobit_oscillator_ppo'"):

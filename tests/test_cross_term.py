@@ -76,7 +76,8 @@ def test_where_the_filter_is_approximate_the_cross_term_is_reported(
 
 def test_where_the_filter_is_good_none_is_reported_under_any_policy() -> None:
     task = make_task(OSCILLATOR, **ORDINARY)
-    result = measured(OSCILLATOR, ORDINARY, usual_policies(task), episodes=150)
+    policies = [*usual_policies(task, 0.03), *usual_policies(task, 0.3), "always"]
+    result = measured(OSCILLATOR, ORDINARY, policies, episodes=150)
     assert all(part.compatible for part in result.values())
     assert result["random:rate=0.03"].rate < result["random:rate=0.3"].rate < 0.3
     exact = measured("fusion_gym/RemoteEstimation-v1", {"horizon": 20}, ["always"])["always"]

@@ -10,7 +10,6 @@ from command_runs import call, succeed
 from hostile_folder import contents
 from small_runs import arguments, meaning
 
-pytestmark = pytest.mark.usefixtures("few_resamples")
 DAMAGES: dict[str, Callable[[bytes, bytes], bytes]] = {
     "cut short": lambda content, other: content[: len(content) * 2 // 3],
     "empty": lambda content, other: b"",
@@ -25,8 +24,6 @@ DAMAGES: dict[str, Callable[[bytes, bytes], bytes]] = {
 # The files without which a command cannot go on.
 READ: dict[str, tuple[str, ...]] = {
     "train": ("run/latest.zip",),
-    "tune": ("study/study.db",),
-    "benchmark": ("results/small/classes.csv", "results/small/vertices.csv"),
     "evaluate": ("result.json",),
 }
 # Those that it writes anew.
@@ -35,8 +32,6 @@ WRITTEN = {
         *("run/config.yaml", "run/best_model.zip", "run/final_model.zip"),
         *("run/validation.jsonl", "run/summary.json"),
     ),
-    "tune": ("study/best.yaml", "study/trial_0/latest.zip", "study/trial_0/config.yaml"),
-    "benchmark": ("results/small/verdict.csv", "work/small/sensors_0/latest.zip", "work/pieces"),
     "evaluate": (),
 }
 
@@ -49,7 +44,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, int], Path]
     def find(command: str, seed: int) -> Path:
         if (command, seed) not in jobs:
             jobs[command, seed] = folder = tmp_path_factory.mktemp(command)
-            succeed(command, arguments(command, folder, seed, classes=["sensors"]))
+            succeed(command, arguments(command, folder, seed))
         return jobs[command, seed]
 
     return find
@@ -61,7 +56,7 @@ def cases() -> Iterator[Any]:
     for command, read in READ.items():
         for file in (*read, *WRITTEN[command]):
             for kind in kinds:
-                quick = kind == kinds[turn % len(kinds)] and "vertices" not in file
+                quick = kind == kinds[turn % len(kinds)]
                 marks = () if quick else (pytest.mark.slow,)
                 yield pytest.param(command, file, kind, marks=marks, id=f"{command}-{file}-{kind}")
             turn += 1
@@ -74,17 +69,11 @@ def test_a_damaged_file_is_reported_or_mended(
     folder = tmp_path / "run"
     shutil.copytree(runs(command, 0), folder)
     other = runs(command, 1) / file if kind == "another run's" else folder / file
-    words = arguments(command, folder, classes=["sensors"])
+    words = arguments(command, folder)
     damaged = folder / file
-    if damaged.is_dir():  # all pieces in it
-        for piece in damaged.rglob("output.pkl"):
-            piece.write_bytes(DAMAGES[kind](piece.read_bytes(), b"another run's"))
-        succeed(command, [*words, "--resume"])
-        assert meaning(folder) == meaning(runs(command, 0))
-        return
     damaged.write_bytes(DAMAGES[kind](damaged.read_bytes(), other.read_bytes()))
     before = files(folder)
-    ended = call(command, words if command == "tune" else [*words, "--resume"])
+    ended = call(command, [*words, "--resume"])
     assert ended.trace == ""
     if ended.status == 0:
         assert file not in READ[command] or kind == "a changed byte", "it went unnoticed"

@@ -11,10 +11,9 @@ import pytest
 from page_blocks import blocks_of, imported
 
 import fusion_gym
-from agents.benchmark.config import load_suite
-from agents.benchmark.figures import report_text
-from agents.benchmark.report import envelopes_text, read_results, robustness_text, update_pages
-from agents.benchmark.verdict import read_cases
+from agents.benchmark.report import headline_text
+from agents.benchmark.settings import load_suite
+from agents.benchmark.tables import ClassRow, read_rows
 from fusion_gym.envs import pages
 from fusion_gym.envs.option_text import options_in
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
@@ -31,7 +30,7 @@ def importable(code: str) -> bool:
     return all(importlib.util.find_spec(package) is not None for package in packages)
 
 
-TITLES = {setting.name: setting.title for setting in load_suite("benchmark").settings}
+TITLES = {setting.name: setting.title for setting in load_suite().settings}
 JOURNEYS = [path.read_text() for path in (ROOT / "tests" / "journeys").glob("*.py")]
 BLOCKS = {
     path.name: blocks_of(path.relative_to(ROOT), path.read_text())
@@ -101,19 +100,9 @@ def test_files_and_names_of_the_library_that_the_texts_name_exist() -> None:
     assert not [name for name in names if pydoc.locate(name) is None]
 
 
-def test_the_committed_pages_say_what_the_results_say() -> None:
-    results = ROOT / "results"
-    settings, cases = read_results(results), read_cases(results, list(TITLES))
-    for folder, text in {
-        ".": report_text(settings),
-        "envelopes": envelopes_text(results),
-        "robustness": robustness_text(cases, TITLES),
-    }.items():
-        assert (results / folder / "README.md").read_text() == text, folder
-    assert {report["setting"] for report in cases} == set(TITLES)
-    for path in (ROOT / "README.md", *DOCS):
-        text = path.read_text()
-        assert update_pages(text, settings, results, TITLES) == text, path.name
+def test_the_readme_says_what_the_results_say() -> None:
+    titles = {setting.name: setting.title for setting in load_suite().settings}
+    assert headline_text(titles, read_rows(ROOT / "results", ClassRow)) in README
 
 
 def doc_of(env_id: str) -> str:

@@ -159,7 +159,7 @@ def command(model: str, path: Path, *options: str, **value: Any) -> list[str]:
     return export(Export(model, path, options=(options,) if options else (), **value))
 
 
-AGENTS = ["remote_estimation_local_none", "biased_oscillator_sensors_memory"]
+AGENTS = ["remote_estimation_local", "biased_oscillator_scheduler"]
 
 
 @pytest.mark.parametrize("name", AGENTS)
@@ -202,7 +202,7 @@ def test_agents_of_the_zoo_are_exported_with_what_they_see(name: str, tmp_path: 
 @pytest.mark.usefixtures("few")
 def test_a_node_in_an_environment_does_what_run_episodes_does(tmp_path: Path) -> None:
     """Through PettingZoo, one row at a time, by names from the file: the same share of requests."""
-    name, price = "tobit_oscillator_local_estimate_memory", 0.02
+    name, price = "tobit_oscillator_local", 0.2
     path = tmp_path / "sensor.onnx"
     command(f"zoo:{name},price={price}", path)
     session = onnxruntime.InferenceSession(str(path))
@@ -233,7 +233,7 @@ def test_a_node_in_an_environment_does_what_run_episodes_does(tmp_path: Path) ->
 
 @pytest.mark.usefixtures("few")
 def test_one_price_is_inside_the_file(tmp_path: Path) -> None:
-    name = "zoo:tobit_oscillator_sensors"
+    name = "zoo:tobit_oscillator_scheduler"
     command(name, tmp_path / "all.onnx")
     command(f"{name},price=0.03", tmp_path / "one.onnx")
     every, row = (onnxruntime.InferenceSession(str(tmp_path / f"{n}.onnx")) for n in ("all", "one"))
@@ -276,9 +276,9 @@ def test_a_training_of_ones_own_says_its_environment(tmp_path: Path) -> None:
 REFUSED = [
     ("always", {}, "it must be zoo:NAME, model:PATH or the path of a .zip"),
     ("zoo:nobody", {}, "zoo = 'nobody'"),
-    ("zoo:tobit_oscillator_sensors,deterministic=false", {}, "deterministic = False"),
-    ("zoo:tobit_oscillator_sensors,price=9", {}, "price"),
-    ("zoo:tobit_oscillator_sensors", {"env": "fusion_gym/CorrelatedTracking-v1"}, "layout"),
+    ("zoo:tobit_oscillator_scheduler,deterministic=false", {}, "deterministic = False"),
+    ("zoo:tobit_oscillator_scheduler,price=9", {}, "price"),
+    ("zoo:tobit_oscillator_scheduler", {"env": "fusion_gym/CorrelatedTracking-v1"}, "layout"),
 ]
 
 
@@ -306,7 +306,7 @@ def test_a_file_that_decides_otherwise_is_not_kept(
     with pytest.raises(
         ConfigurationError, match=r"is not exported: [\d,]+ of .* are decided otherwise"
     ):
-        command("zoo:tobit_oscillator_centre,price=0.01", path)
+        command("zoo:tobit_oscillator_centre,price=0.1", path)
     assert path.read_text() == "kept"
     assert len(list(tmp_path.iterdir())) == 2
 

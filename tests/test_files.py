@@ -85,7 +85,7 @@ def test_text_is_written_as_utf_8(tmp_path: Path) -> None:
 def test_a_file_of_the_zoo_is_the_one_that_its_card_describes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    name = "biased_oscillator_local_packets_memory"
+    name = "biased_oscillator_local"
     for suffix in ("zip", "json"):
         source = Path(fusion_gym.zoo.__file__).with_name(f"{name}.{suffix}")
         shutil.copyfile(source, tmp_path / source.name)

@@ -10,7 +10,6 @@ from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import TokenBucket
 from fusion_gym.envs.privileged import PrivilegedVecEnv
 from fusion_gym.evaluation.episodes import run_episodes
-from fusion_gym.policies.hindsight import find_schedules
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.solvers import solve_ages, solve_task
 from fusion_gym.solvers.task import source_problems
@@ -61,10 +60,6 @@ REFUSED: dict[str, tuple[Any, str]] = {
         r"sensors = 41.*'lookahead'.*at most 40.*'value_of_information'",
     ),
     "discrete": (lambda: linear(17, action="discrete"), r"'discrete'.*17 sensors.*at most 16"),
-    "hindsight": (
-        lambda: find_schedules(linear(13), 0.1, 4, 1, 0),
-        r"sensors = 13 .*hindsight.*at most 12.*2\^13",
-    ),
     "periodic_optimum": (
         lambda: make_policy("periodic_optimum:packets=3,period=2", linear(MANY)),
         r"200 sensors.*at most 200000",

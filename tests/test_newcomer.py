@@ -85,7 +85,7 @@ def test_prices_are_for_agents_that_see_one() -> None:
     }  # fmt: skip
     narrow = front(price_range=[0.0123456789, 0.2])
     assert min(requests_at("zoo:x", 2).policies_of(narrow)) == "zoo:x,price=0.0123456789"
-    with pytest.raises(ConfigurationError, match=r"prices = 3 .* no agent"):
+    with pytest.raises(ConfigurationError, match=r"prices = 3 .* takes no price"):
         requests_at("always", 3).policies_of(task)
     with pytest.raises(ConfigurationError, match=r"prices = 3 .* no price_range"):
         requests_at("model:a.zip", 3).policies_of(make_task("fusion_gym/LinearFusion-v2"))

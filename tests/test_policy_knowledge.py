@@ -93,6 +93,13 @@ POLICIES: dict[str, list[str]] = {
     "optimal": ["", "criterion=average"],
     "periodic": ["", "period=3,staggered=false"],
     "periodic_optimum": ["packets=2,period=2"],
+    "priced_threshold": [
+        "threshold=0.03,token_exponent=0.5,price_exponent=0",
+        "threshold=0.03,price_exponent=0,own=true,age_exponent=-0.5",
+        "score=innovation,threshold=0.5,price_exponent=0",
+        "score=innovation,threshold=0.2,price_exponent=0,margin=1.5",
+        "score=variance,threshold=0.01,price_exponent=0,mixture=0.5",
+    ],
     "rollout": ["samples=2,steps=1,base=innovation_threshold:threshold=0.5"],
     "round_robin": ["", "period=2"],
     "send_on_delta": ["", "threshold=0.4"],

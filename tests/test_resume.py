@@ -59,7 +59,6 @@ def end_at(monkeypatch: pytest.MonkeyPatch, step: int, how: str) -> None:
 CASES = [
     pytest.param("ppo", "fixed", {}, marks=pytest.mark.slow),
     pytest.param("ppo", "drawn", {}, marks=pytest.mark.slow),
-    ("ppo", "fixed", {"target_rate": 0.2}),
     ("a2c", "fixed", {}),
     ("dqn", "fixed", {}),
     ("maskable_ppo", "drawn", {}),
@@ -94,7 +93,7 @@ def test_a_resumed_training_is_the_uninterrupted_one(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["train", "tune", "benchmark"])
+@pytest.mark.parametrize("command", ["train", "benchmark"])
 def test_kills_at_random_moments_lose_nothing(command: str) -> None:
     line = [sys.executable, "tests/kills.py", command, "--kills", "3"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -115,7 +114,6 @@ def test_threads_timesteps_and_output_may_change_and_nothing_else(tmp_path: Path
         ("training", "seed", 1),
         ("training", "num_envs", 4),
         ("training", "price_exponent", 0.5),
-        ("training", "target_rate", 0.3),
         ("validation", "episodes", 5),
         ("algorithm", "gamma", 0.5),
         ("environment", "options", {"horizon": 30}),
@@ -179,7 +177,7 @@ def test_two_trainings_in_one_folder_are_refused(
     experiment = experiment_of(tmp_path / "a", "ppo", timesteps=256)
     tried: list[str] = []
 
-    def watch(_: Any) -> bool:
+    def log_line(_: Any) -> str:
         for resume, message in (
             (False, "holds a training already"),
             (True, "is in use by another"),
@@ -187,9 +185,10 @@ def test_two_trainings_in_one_folder_are_refused(
             with pytest.raises(ConfigurationError, match=message) as caught:
                 run.train(experiment, quiet=True, resume=resume)
             tried.append(str(caught.value))
-        return False
+        return ""
 
-    run.train(experiment, quiet=True, watch=watch)
+    monkeypatch.setattr("fusion_gym.training.monitor.log_line", log_line)
+    run.train(experiment, quiet=True)
     assert len(tried) == 2
 
 
@@ -209,13 +208,6 @@ def test_two_trainings_in_one_folder_are_refused(
                 "algorithm": {"name": "ppo", "initial_rate": 0.9},
             },
             "initial_rate = 0.9",
-        ),
-        (
-            {
-                "environment": {"id": ENV, "options": PRICED},
-                "training": SHORT | {"target_rate": 0.1},
-            },
-            "target_rate = 0.1 is not allowed",
         ),
         (
             {

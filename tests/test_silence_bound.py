@@ -1,14 +1,11 @@
 """The lower bound of every policy's error: against exact optima, policies and itself."""
 
-import json
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from command_runs import refusal, succeed
 from scipy import stats
 from scipy.optimize import brentq
 
@@ -20,6 +17,7 @@ from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.policies.registry import make_policy
 from fusion_gym.solvers.silence import (
     SilenceProblem,
+    cost_bound,
     silence_bound,
     silence_model,
     simulate,
@@ -279,17 +277,12 @@ def test_where_it_applies_silence_is_prediction(env: str, options: dict[str, Any
     assert system.fused(state)[0] == pytest.approx(matrix @ before, rel=1e-9, abs=1e-12)
 
 
-# --- the command ----------------------------------------------------------------------------------
-
-
-def test_the_command_writes_what_it_prints(tmp_path: Path) -> None:
-    file = tmp_path / "bound.json"
-    words = ["--env", "fusion_gym/TobitOscillator-v1", "--set", "filter=tobit", "horizon=5"]
-    words += ["--episodes", "8", "--filters", "tobit", "adf", "--json", str(file)]
-    ended = succeed("bound", [*words, "--rates", "0.1", "--accuracy", "0.1"])
-    report = json.loads(file.read_text())
-    assert report["everything_delivered"].keys() == {"tobit", "adf"}
-    row = report["bounds"][0]
-    assert report["floor"] < row["bound"]
-    assert f"{row['bound']:.5g}" in ended.out
-    refusal("bound", ["--env", "fusion_gym/UnknownInput-v1", "--rates", "0.1"])
+def test_no_rule_costs_less_than_the_bound_at_its_price() -> None:
+    options = {"filter": "tobit", "random_start": True, "token_rate": 2.0, "memory": True}
+    task = make_task("fusion_gym/TobitOscillator-v1", horizon=40, **options)
+    for price in (0.05, 0.5):
+        bound = cost_bound(task, price)
+        assert bound.lower < bound.upper < 1.05 * bound.lower
+        rule = make_policy(f"value_of_information:price={price / 4},at_most=1", task)
+        results = run_episodes(task, rule, 200, 0)
+        assert float((results.error_cost + price * results.tokens).mean()) > bound.lower

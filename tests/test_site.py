@@ -32,15 +32,15 @@ def test_environment_pages_get_their_tables() -> None:
 def test_links_lead_to_what_there_is() -> None:
     text = (
         "[a](step.md) [b](../results/README.md#overview) [c](../fusion_gym/linalg.py) "
-        "[d](../nowhere.md) [e](https://example.org) ![f](../results/overview.png) "
-        "[g](../results/robustness)"
+        "[d](../nowhere.md) [e](https://example.org) ![f](../results/tobit_oscillator.png) "
+        "[g](../tests/laws)"
     )
     changed = places.with_links(text, "docs/use.md", "use.md")
     assert changed == (
         "[a](step.md) [b](results/report.md#overview) "
         f"[c]({places.REPOSITORY}/blob/main/fusion_gym/linalg.py) [d](../nowhere.md) "
-        "[e](https://example.org) ![f](results/overview.png) "
-        f"[g]({places.REPOSITORY}/tree/main/results/robustness)"
+        "[e](https://example.org) ![f](results/tobit_oscillator.png) "
+        f"[g]({places.REPOSITORY}/tree/main/tests/laws)"
     )
     assert places.with_links("[a](biased.md)", "docs/use.md", "x/y.md") == "[a](../biased.md)"
 

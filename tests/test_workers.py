@@ -5,11 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
-
-import pytest
-from small_suite import small_suite
 
 ROOT = Path(__file__).parent.parent
 # A parent that waits for its worker, which says its number and would work for a minute.
@@ -47,23 +43,3 @@ def test_a_worker_ends_soon_after_its_parent_was_killed() -> None:
         end_of(parent)
     finally:
         kill_all(parent)
-
-
-@pytest.mark.slow
-def test_workers_of_a_killed_benchmark_train_no_longer(tmp_path: Path) -> None:
-    config = small_suite(tmp_path, timesteps=50_000_000, classes=["sensors"], training_seeds=2)
-    work = tmp_path / "work"
-    words = ["--config", str(config), "--results", str(tmp_path / "results"), "--work", str(work)]
-    command = [sys.executable, "-m", "fusion_gym.commands", "benchmark", *words, "--workers", "2"]
-    run = subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
-    )
-    try:
-        deadline = time.monotonic() + 300
-        while len(list(work.glob("small/*/config.yaml"))) < 2:
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
-        run.kill()
-        end_of(run)
-    finally:
-        kill_all(run)

@@ -54,7 +54,7 @@ LISTED = (
     Listed("fusion-gym compare ", "minutes, for more than a hundred policies"),
     Listed("fusion-gym evaluate --env fusion_gym/RemoteEstimation-v1", "minutes", "--episodes 4"),
     Listed("fusion-gym watch ", "half a minute, for a film of all of an episode", "--steps 10"),
-    Listed("fusion-gym tune ", "hours, and a database that is not here"),
+    Listed("fusion-gym search ", "minutes", "--generations 1"),
     Listed("tensorboard ", "serves until it is interrupted"),
 )
 READ = """

@@ -23,6 +23,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 OWN = "fusion-gym"
+# Packages that need the extra "agents".
+OF_AGENTS = ("fusion_gym.commands", "fusion_gym.output", "fusion_gym.training")
 _ALONE = threading.Lock()
 _SCRIPT = """#!{python}
 import sys
@@ -107,7 +109,7 @@ class Wheel:
     def extra_of(self, module: str) -> str | None:
         """The extra that installs a module: empty for the wheel alone, none if no extra does."""
         for extra in ("", "agents", *self.extras):
-            if extra == "test" or (module.startswith("fusion_gym.commands") and not extra):
+            if extra == "test" or (module.startswith(OF_AGENTS) and not extra):
                 continue
             try:
                 result = self.environment(frozenset(filter(None, [extra])))

@@ -118,7 +118,7 @@ def use(programs: Path, folder: Path) -> None:
     call(python, "-c", HELP, cwd=folder)
     call(
         program, "evaluate", "--config", "tobit_oscillator_ppo", "--set", "belief_features=true",
-        "--episodes", "5", "--policies", "always", "zoo:tobit_oscillator_sensors",
+        "--episodes", "5", "--policies", "always", "zoo:tobit_oscillator_scheduler",
         "--json", "evaluation.json", cwd=folder,
     )  # fmt: skip
     assert len(json.loads((folder / "evaluation.json").read_text())["policies"]) == 2

@@ -11,7 +11,6 @@ REPOSITORY = "https://github.com/fusion-gym/fusion-gym"
 # Texts outside docs/ that the site has as pages. The README's place is taken by the start page.
 PAGES = {
     "results/README.md": "results/report.md",
-    "results/envelopes/README.md": "results/envelopes.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
 }

@@ -1,4 +1,4 @@
-"""The commands: train, evaluate, compare, tune, benchmark and more."""
+"""The commands: search, train, evaluate, compare and more."""
 
 
 def missing_extra(error: BaseException) -> str | None:

@@ -11,7 +11,7 @@ from fusion_gym.output.ending import report_errors
 from fusion_gym.validation import ConfigurationError, choice
 from fusion_gym.version import __version__
 
-COMMANDS = ("compare", "demo", "evaluate", "export", "info", "list", "train", "tune", "watch")
+COMMANDS = ("compare", "demo", "evaluate", "export", "info", "list", "search", "train", "watch")
 
 
 def usage() -> str:

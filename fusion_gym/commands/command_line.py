@@ -92,10 +92,10 @@ class Long(Command):
             return "interrupted: nothing is kept"
         return f"interrupted; go on with: {self.again()}"
 
-    def again(self, without: tuple[str, ...] = ()) -> str:
-        """The words of the command line but ``without``, with ``--resume`` where it has that."""
+    def again(self) -> str:
+        """The words of the command line, with ``--resume`` where it has that."""
         more = ["--resume"] if "resume" in {item.name for item in fields(self)} else []
-        words = [word for word in sys.argv[1:] if word not in (*more, *without)]
+        words = [word for word in sys.argv[1:] if word not in more]
         return f"{program_of(type(self))} {shlex.join([*words, *more])}"
 
 

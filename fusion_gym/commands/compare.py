@@ -4,9 +4,10 @@
         --sweep configs/biased_sweep.yaml \\
         --policy model:runs/biased_oscillator_ppo/best_model.zip --output runs/comparison
 
-An agent that sees the price of a token runs at as many prices as ``--prices`` says. All policies
-run on the same seeds. The cost at a price is error + price · tokens; the best baseline at each
-price stands beside the agent. At its rate its MSE stands beside the baselines' lower envelope.
+An agent that sees the price of a token, or a rule with a parameter ``price``, runs at as many
+prices as ``--prices`` says. All policies run on the same seeds. The cost at a price is error +
+price · tokens; the best baseline at each price stands beside the agent. At its rate its MSE stands
+beside the baselines' lower envelope.
 Into the output folder go ``evaluation.json`` (every policy), ``comparison.json`` (the verdict) and
 ``pareto.png``.
 """
@@ -36,7 +37,7 @@ from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.output import figures, tables
 from fusion_gym.output.files import write
 from fusion_gym.output.progress import progress_bar, writing
-from fusion_gym.policies.registry import make_policy, policy_names
+from fusion_gym.policies.registry import make_policy, policy_names, policy_parameters
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.config import Experiment
 from fusion_gym.training.diagnosis import warn_of_unused_tokens
@@ -61,7 +62,7 @@ class Compare(Long):
     seed: Seed = 0
     """Seed of the first episode."""
     prices: Annotated[int | None, Whole(2, 1000)] = None
-    """Ask an agent that sees the price at as many, over the config's price_range."""
+    """Ask a policy with a parameter price at as many, over the config's price_range."""
 
     keeps = False
 
@@ -86,7 +87,7 @@ class Compare(Long):
         A price that is drawn stands for the middle of its range.
 
         Raises:
-            ConfigurationError: prices, but none that is drawn, or a policy that is no agent.
+            ConfigurationError: prices, but none that is drawn, or a policy that takes no price.
         """
         if self.prices is None:
             return {self.policy: float(task.reward.price.draw(np.array([0.5]))[0])}
@@ -95,13 +96,16 @@ class Compare(Long):
             raise refusal(
                 "prices", self.prices, "left out where the config has no price_range, as here"
             )
-        if self.policy.partition(":")[0] not in policy_names("agent"):
-            raise refusal(
-                "prices", self.prices, f"left out with policy = {self.policy!r}, which is no agent"
-            )
+        name, _, text = self.policy.partition(":")
+        if name not in policy_names() or "price" not in policy_parameters(name):
+            reason = f"left out with policy = {self.policy!r}, which takes no price"
+            raise refusal("prices", self.prices, reason)
         low, high = (repr(float(end)) for end in span)  # to the last digit: it knows no others
         inner = [f"{price:.4g}" for price in np.geomspace(*span, self.prices)[1:-1]]
-        return {f"{self.policy},price={price}": float(price) for price in (low, *inner, high)}
+        # Text may follow that belongs to a base; the first text of an agent is its file or name.
+        form = "{0}:{1},price={2}" if name in policy_names("agent") else "{0}:price={2},{1}"
+        prices = (low, *inner, high)
+        return {form.format(name, text, p).rstrip(","): float(p) for p in prices}
 
 
 def run_all(

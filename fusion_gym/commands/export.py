@@ -1,6 +1,6 @@
 """Export a saved agent as an ONNX file, for sensors and schedulers that run without this library.
 
-    fusion-gym export zoo:tobit_oscillator_sensors_memory,price=0.02 --onnx scheduler.onnx
+    fusion-gym export zoo:tobit_oscillator_scheduler,price=0.2 --onnx scheduler.onnx
 
 The file has everything from the observation to the request, and says what the observation is. It is
 checked against the agent on 10,000 observations of whole episodes, and not kept if it differs.

@@ -55,15 +55,6 @@ class Between(Mark):
         number(option, value, above=self.above, at_most=self.at_most)
 
 
-class InputFolder(Mark):
-    """A folder that is there."""
-
-    def check(self, option: str, value: Any) -> None:
-        """Try to list it."""
-        path = Path(value)
-        _try_out(option, path, "a folder that can be read", lambda: list(path.iterdir()))
-
-
 class OutputFolder(Mark):
     """A folder that can be written, or made."""
 

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Annotated
 
 from fusion_gym.commands.command_line import Long, SetOptions
-from fusion_gym.commands.options import Between, OutputFolder, Steps, TrainingSeed, writable_folder
+from fusion_gym.commands.options import OutputFolder, Steps, TrainingSeed, writable_folder
 from fusion_gym.policies.settings import parse_settings
 from fusion_gym.training.checked import load_checked, parse
 from fusion_gym.training.config import Experiment
@@ -50,8 +50,6 @@ class Train(Long):
     """Steps of all runs together, instead of the config's, or of a million with --env."""
     seed: TrainingSeed = None
     """Seed of the training, instead of the config's."""
-    target_rate: Annotated[float | None, Between(0, 1)] = None
-    """Average transmissions per sensor and step to train to."""
     output: Annotated[str | None, OutputFolder()] = None
     """Folder for the results, instead of the config's."""
     resume: bool = False
@@ -68,7 +66,6 @@ class Train(Long):
             parse_settings("option", list(chain(*self.options))),
             timesteps=self.timesteps,
             seed=self.seed,
-            target_rate=self.target_rate,
         )
 
     def _base_experiment(self) -> Experiment:

@@ -109,18 +109,29 @@ def price_range(task: Task) -> tuple[float, float]:
     Raises:
         ConfigurationError: no transmission lowers the error.
     """
-    spent, error = _envelope(*_sweep(task))
+    sustained = sustained_tokens(task)
+    least = _PACKETS * float(task.bucket.cost.sum()) / task.horizon
+    shares = np.array([sustained * _MOST, max(sustained * _LEAST, least)])
+    low, high = prices_at(*_sweep(task), shares).tolist()
+    return _rounded(low), _rounded(max(high, 2.0 * low))
+
+
+def prices_at(spent: Array, error: Array, tokens: Array) -> Array:
+    """Return the prices at which the best of some policies spends these tokens.
+
+    ``spent`` and ``error`` (policies,) are per step; prices are slopes of their lower envelope.
+
+    Raises:
+        ConfigurationError: no policy that transmits has a lower error.
+    """
+    spent, error = _envelope(spent, error)
     if len(spent) < 3:
         raise ConfigurationError(
             "price_range = 'auto' is not allowed here: transmissions do not lower the error"
         )
-    sustained = sustained_tokens(task)
-    least = _PACKETS * float(task.bucket.cost.sum()) / task.horizon
-    shares = sustained * _MOST, max(sustained * _LEAST, least)
     middle = np.sqrt(spent[1:] * np.maximum(spent[:-1], 0.25 * spent[1]))
     slopes = np.log(np.diff(-error) / np.diff(spent))
-    low, high = np.exp(np.interp(np.log(shares), np.log(middle), slopes)).tolist()
-    return _rounded(low), _rounded(max(high, 2.0 * low))
+    return np.exp(np.interp(np.log(tokens), np.log(middle), slopes))
 
 
 def _nominal(task: Task) -> tuple[Array, float]:

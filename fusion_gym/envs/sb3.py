@@ -194,19 +194,6 @@ class FusionSB3VecEnv(VecEnv):
     def _observe(self) -> NDArray[np.float32]:
         return self.view.rows(self.batch.observe())
 
-    def set_price(self, price: float) -> None:
-        """From now on every token costs ``price``, for training to a budget.
-
-        Raises:
-            ConfigurationError: a negative price, or a task that shows a price of its own.
-        """
-        if self.task.reward.price.span is not None:
-            raise validation.ConfigurationError(
-                f"price_range = {list(self.task.reward.price.span)} is not allowed here: it must "
-                "be none, for the price is adapted in training and not shown"
-            )
-        self.batch.price[:] = validation.number("price", price, at_least=0.0)
-
     def action_masks(self) -> NDArray[np.bool_]:
         """Open choices (N, choices) for sb3-contrib's MaskablePPO.
 

@@ -2,21 +2,17 @@
 
 from fusion_gym.evaluation.envelope import EnvelopePoint, compare_with_envelope, lower_envelope
 from fusion_gym.evaluation.episodes import EpisodeResults, Trajectory, record_episode, run_episodes
-from fusion_gym.evaluation.hindsight import run_hindsight
 from fusion_gym.evaluation.intervals import Interval, mean_interval
 from fusion_gym.evaluation.metrics import paired_difference, robust_summary, summarise
 from fusion_gym.evaluation.watching import watch
-from fusion_gym.policies.hindsight import Schedules, find_schedules
 from fusion_gym.policies.registry import make_policy
 
 __all__ = [
     "EnvelopePoint",
     "EpisodeResults",
     "Interval",
-    "Schedules",
     "Trajectory",
     "compare_with_envelope",
-    "find_schedules",
     "lower_envelope",
     "make_policy",
     "mean_interval",
@@ -24,7 +20,6 @@ __all__ = [
     "record_episode",
     "robust_summary",
     "run_episodes",
-    "run_hindsight",
     "summarise",
     "watch",
 ]

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from fusion_gym import validation
 from fusion_gym.arrays import Array, take_runs
 from fusion_gym.core.batch import EpisodeBatch
-from fusion_gym.core.beliefs import Beliefs, Estimate
+from fusion_gym.core.beliefs import Beliefs, Estimate, Owner
 from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
-from fusion_gym.policies.base import Policy, owner_of, refused_signals
+from fusion_gym.policies.base import Policy, Requests, owner_of, refused_signals
 from fusion_gym.validation import ConfigurationError
 
 Runs = NDArray[np.int64]
@@ -24,11 +24,18 @@ class Brief(NamedTuple):
     """What a policy's E episodes brought, each averaged over its steps.
 
     ``rate`` (E,) of transmissions, the mean over sensors · ``mse`` (E,), as in
-    :class:`~fusion_gym.evaluation.episodes.EpisodeResults`.
+    :class:`~fusion_gym.evaluation.episodes.EpisodeResults`, and so are ``error_cost`` (E,) and
+    ``tokens`` (E,).
     """
 
     rate: Array
     mse: Array
+    error_cost: Array
+    tokens: Array
+
+    def cost(self, price: float | Array) -> Array:
+        """Return error + price · tokens (E,), at one price of a token or each episode's (E,)."""
+        return self.error_cost + price * self.tokens
 
 
 def run_beside(task: Task, policies: Sequence[Policy], episodes: int, seed: int) -> list[Brief]:
@@ -51,24 +58,56 @@ def run_beside(task: Task, policies: Sequence[Policy], episodes: int, seed: int)
             "beside each other: there must be some, and all must look at the same owner's"
         )
     runs = len(policies) * episodes
-    batch = EpisodeBatch(task, runs, owners.pop())
-    batch.seed(np.arange(runs), [seed + run % episodes for run in range(runs)])
-    batch.reset()
     for policy in policies:
         policy.reset(episodes, seed)
     parts = np.arange(runs).reshape(len(policies), episodes)
     refused = [refused_signals(policy, task) for policy in policies]
-    mse, rate = np.zeros(runs), np.zeros(runs)
-    for _ in range(task.horizon):
-        signals = _Whole(batch.signals())
+
+    def requests(signals: Signals) -> Requests:
+        whole = _Whole(signals)
         request = [
-            policy(signals.part(part).limit(withheld))
+            policy(whole.part(part).limit(withheld))
             for policy, part, withheld in zip(policies, parts, refused, strict=True)
         ]
-        outcome = batch.step(np.concatenate(request, axis=-1))
-        mse += outcome.squared_error.sum(0)
-        rate += outcome.granted.mean(0)
-    return [Brief(rate[part] / task.horizon, mse[part] / task.horizon) for part in parts]
+        return np.concatenate(request, axis=-1)
+
+    batch = _batch(task, owners.pop(), seed + np.arange(runs) % episodes)
+    brief = _run(batch, requests)
+    return [Brief(*(values[part] for values in brief)) for part in parts]
+
+
+def run_priced(task: Task, policy: Policy, seeds: Runs, prices: Array) -> Brief:
+    """One policy in the episodes of N seeds side by side, each at its own price of a token (N,).
+
+    Its signals and the reward hold that price, whatever the task's is.
+
+    Raises:
+        LookupError: the policy looks at a signal that the task withholds.
+    """
+    batch = _batch(task, owner_of(policy), seeds)
+    batch.price = np.array(prices, dtype=np.float64)
+    policy.reset(len(seeds), int(seeds[0]))
+    refused = refused_signals(policy, task)
+    return _run(batch, lambda signals: policy(signals.limit(refused)))
+
+
+def _batch(task: Task, owner: Owner | None, seeds: Runs) -> EpisodeBatch:
+    batch = EpisodeBatch(task, len(seeds), owner)
+    batch.seed(np.arange(len(seeds)), seeds.tolist())
+    batch.reset()
+    return batch
+
+
+def _run(batch: EpisodeBatch, requests: Callable[[Signals], Requests]) -> Brief:
+    """The first episode of all runs of a batch."""
+    sums, horizon = np.zeros((4, batch.num_envs)), batch.task.horizon
+    for _ in range(horizon):
+        outcome = batch.step(requests(batch.signals()))
+        squared_error = outcome.squared_error.sum(0)
+        step = (outcome.granted.mean(0), squared_error, -outcome.reward_error, outcome.cost)
+        for total, values in zip(sums, step, strict=True):
+            total += values
+    return Brief(*(sums / horizon))
 
 
 class _Whole:

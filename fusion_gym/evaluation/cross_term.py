@@ -10,7 +10,7 @@ is not, and a policy that is trained on the mismatch is drawn aside by it.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,8 +23,6 @@ from fusion_gym.core.task import Task
 from fusion_gym.evaluation.episodes import BATCH
 from fusion_gym.evaluation.intervals import LEVEL, Interval, mean_interval
 from fusion_gym.policies.base import Policy, owner_of, refused_signals
-
-RATES = (0.03, 0.1, 0.3)  # of random requests, over the range in which agents transmit
 
 
 class CrossTerm(NamedTuple):
@@ -58,14 +56,12 @@ def cross_terms(
     episodes: int,
     seed: int,
     level: float = LEVEL,
-    progress: Callable[[int], Any] | None = None,
 ) -> dict[str, CrossTerm]:
     """The cross term under each policy, in episodes with the seeds ``seed``, ``seed + 1``, …
 
     ``reference`` is the system, on the same noise, whose filter takes in every measurement
     (:func:`~fusion_gym.envs.privileged.reference_system`). All intervals hold together with the
     probability ``level`` (Bonferroni): where some exclude zero, it is not for their number.
-    ``progress`` is called with the number of environment steps made since its last call.
 
     Raises:
         ConfigurationError: fewer than two episodes, which have no interval, or a negative seed.
@@ -77,9 +73,7 @@ def cross_terms(
     result = {}
     for name, policy in policies.items():
         sizes = [(first, min(BATCH, episodes - first)) for first in range(0, episodes, BATCH)]
-        parts = [
-            _run(task, reference, policy, many, seed + first, progress) for first, many in sizes
-        ]
+        parts = [_run(task, reference, policy, many, seed + first) for first, many in sizes]
         result[name] = _summary(np.concatenate(parts, axis=-1), each)
     return result
 
@@ -89,27 +83,26 @@ def worst(terms: Mapping[str, CrossTerm]) -> tuple[str, CrossTerm]:
     return max(terms.items(), key=lambda item: (not item[1].compatible, abs(item[1].share.mean)))
 
 
-def usual_policies(task: Task, rates: Sequence[float] = RATES) -> list[str]:
-    """Policies of different rates that every environment knows, as texts for ``make_policy``.
+def usual_policies(task: Task, rate: float) -> list[str]:
+    """Two different policies that every environment knows, as texts for ``make_policy``.
 
-    Random requests, which choose by nothing; every request, which spends all tokens; and, where a
-    policy may look at new measurements, the value of a transmission against the price of a token
-    (the middle of a range), which is what an agent comes to look like.
+    Random requests at a rate, which choose by nothing. And the value of a transmission against the
+    price of a token (the middle of a range), which is what an agent comes to look like; where a
+    policy may not look at new measurements, every request.
     """
-    names = [*(f"random:rate={rate:.4g}" for rate in rates), "always"]
-    if task.information == "sensors":
-        price = task.reward.price
-        middle = price.fixed
-        if middle is None:
-            assert price.span is not None  # Price.create refuses a drawn price without one
-            middle = math.sqrt(price.span[0] * price.span[1])
-        names.append(f"value_of_information:price={middle:.4g}")
-    return names
+    random = f"random:rate={rate:.4g}"
+    if task.information != "sensors":
+        return [random, "always"]
+    price = task.reward.price
+    middle = price.fixed
+    if middle is None:
+        assert price.span is not None  # Price.create refuses a drawn price without one
+        middle = math.sqrt(price.span[0] * price.span[1])
+    return [random, f"value_of_information:price={middle:.4g}"]
 
 
 def _run(
     task: Task, system: System[Any], policy: Policy, episodes: int, seed: int,
-    progress: Callable[[int], Any] | None,
 ) -> Array:  # fmt: skip
     """Rate, error, floor and mismatch (4, E) of episodes, each a mean over steps."""
     batch = EpisodeBatch(task, episodes, owner_of(policy), system)
@@ -123,8 +116,6 @@ def _run(
         least = batch.reference_error
         squared = [error * error for error in (outcome.error, least, outcome.error - least)]
         sums += np.stack((outcome.granted.mean(0), *(weights @ part for part in squared)))
-        if progress is not None:
-            progress(episodes)
     return sums / task.horizon
 
 

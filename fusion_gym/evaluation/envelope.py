@@ -83,38 +83,6 @@ def mixture(hull: Sequence[EnvelopePoint], rate: float) -> dict[str, float] | No
     return {left.name: 1.0 - share, right.name: share}
 
 
-def height(hull: Sequence[EnvelopePoint], rate: float) -> float | None:
-    """The envelope's error at a rate, ``None`` left of it."""
-    shares = mixture(hull, rate)
-    if shares is None:
-        return None
-    errors = {point.name: point.mse for point in hull}
-    return sum(share * errors[name] for name, share in shares.items())
-
-
-def envelope_mse(results: Mapping[str, EpisodeResults], rate: float) -> Array | None:
-    """Each episode's MSE (E,) on the lower envelope at a rate, ``None`` left of it."""
-    return mixed_mse(results, lower_envelope(results), rate)
-
-
-def best_mse(results: Mapping[str, EpisodeResults], rate: float) -> Array | None:
-    """Each episode's MSE (E,) at a rate on the line through all these policies, by their rate.
-
-    For policies that were chosen as an envelope on other episodes: all of them count, also those
-    that lie above the line between their neighbours here, for leaving them out would be a choice
-    on the episodes that measure. ``None`` left of the first.
-    """
-    return mixed_mse(results, points_of(results), rate)
-
-
-def mixed_mse(
-    results: Mapping[str, EpisodeResults], points: Sequence[EnvelopePoint], rate: float
-) -> Array | None:
-    """Each episode's MSE (E,) at a rate on the line through these points, ``None`` left of it."""
-    shares = mixture(points, rate)
-    return None if shares is None else _mixed(results, shares)
-
-
 def _mixed(results: Mapping[str, EpisodeResults], shares: Mapping[str, float]) -> Array:
     return np.asarray(sum(share * results[name].mse for name, share in shares.items()))
 

@@ -1,6 +1,6 @@
 """What the error is where everything is always taken in."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fusion_gym.core.task import Task
@@ -17,30 +17,24 @@ def everything_delivered(
     filters: Sequence[str] = (),
     episodes: int = 1000,
     seed: int = 0,
-    progress: Callable[[int], Any] | None = None,
 ) -> dict[str, Interval]:
     """The MSE of a centre that gets every measurement, by filter, with its 95 % interval.
 
     The environment's tokens and access are opened; ``filters`` are values of its option
     ``filter``, by default the setting's own. The best of them is what no rule is likely to
     undercut with these filters. It is no bound: these filters may be approximations, and with
-    one, less may be more. ``progress`` is called with the number of environment steps made since
-    its last call.
+    one, less may be more.
 
     Raises:
         ConfigurationError: a value that is not allowed.
     """
     return {
-        name: mean_interval(
-            run_episodes(task, make_policy("always", task), episodes, seed, progress).mse
-        )
-        for name, task in everything_delivered_tasks(env_id, options, filters).items()
+        name: mean_interval(run_episodes(task, make_policy("always", task), episodes, seed).mse)
+        for name, task in _tasks(env_id, options, filters).items()
     }
 
 
-def everything_delivered_tasks(
-    env_id: str, options: Mapping[str, Any], filters: Sequence[str] = ()
-) -> dict[str, Task]:
+def _tasks(env_id: str, options: Mapping[str, Any], filters: Sequence[str] = ()) -> dict[str, Task]:
     """The environment with tokens and access opened, by filter.
 
     Raises:

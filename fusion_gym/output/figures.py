@@ -1,4 +1,4 @@
-"""Figures: the Pareto front, and one episode in the manner of the token-bucket paper."""
+"""Figures: the Pareto front."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from fusion_gym.evaluation.envelope import EnvelopePoint
-from fusion_gym.evaluation.episodes import EpisodeResults, Trajectory
+from fusion_gym.evaluation.episodes import EpisodeResults
 from fusion_gym.evaluation.intervals import mean_interval
 from fusion_gym.output.files import replacing
 from fusion_gym.output.palette import AGENT, INK
@@ -84,52 +84,6 @@ def _draw(
         rate[order], mean, yerr=spread, label=label, color=colour, marker=marker,
         ms=size, lw=1.1, elinewidth=0.8, capsize=1.5, zorder=3 if size > 5 else 2,
     )  # fmt: skip
-
-
-def episode(path: Path, title: str, trajectory: Trajectory, capacity: float) -> None:
-    """One episode: tokens with requests and grants above, states and estimates below."""
-    steps = np.arange(1, len(trajectory.truth) + 1)
-    sensors, states = trajectory.granted.shape[1], trajectory.truth.shape[1]
-    figure, axes = plt.subplots(
-        1 + states, 1, figsize=(9, 2.2 * (1 + states)), sharex=True, constrained_layout=True
-    )
-    top = axes[0]
-    top.plot(steps, trajectory.tokens, color="#2a8c4a", lw=1.3, label="tokens")
-    for sensor in range(sensors):
-        height = capacity * (1.08 + 0.1 * sensor)
-        for kind, mask in (
-            ("denied", trajectory.requested[:, sensor] & ~trajectory.granted[:, sensor]),
-            ("granted", trajectory.granted[:, sensor]),
-        ):
-            style = {"marker": "o", "color": f"C{sensor}"} if kind == "granted" else {
-                "marker": "x", "color": "0.6"}  # fmt: skip
-            top.plot(
-                steps[mask], np.full(mask.sum(), height), linestyle="", ms=3.5,
-                label=f"sensor {sensor + 1}" if kind == "granted" else None, **style,
-            )  # fmt: skip
-    top.set_ylabel("tokens")
-    top.set_title(f"{title} (× = denied request)", loc="left", fontsize=10)
-    top.legend(ncols=1 + sensors, fontsize=7.5, loc="lower right", bbox_to_anchor=(1, 1))
-    for state, panel in enumerate(axes[1:]):
-        deviation = np.sqrt(trajectory.variance[:, state])
-        mean = trajectory.mean[:, state]
-        panel.fill_between(
-            steps, mean - 2 * deviation, mean + 2 * deviation, color=AGENT, alpha=0.12, lw=0,
-            label="fused ± 2 claimed deviations",
-        )  # fmt: skip
-        for sensor in range(sensors):
-            panel.plot(
-                steps, trajectory.local_mean[:, sensor, state], color=f"C{sensor}", lw=0.7,
-                alpha=0.7, label=f"node {sensor + 1}",
-            )  # fmt: skip
-        panel.plot(steps, trajectory.truth[:, state], color=INK, lw=1.4, label="state")
-        panel.plot(steps, mean, color=AGENT, lw=1.2, label="fused estimate")
-        reach = np.abs(trajectory.truth[:, state]).max() * 2
-        panel.set_ylim(*np.clip(panel.get_ylim(), -reach, reach))
-        panel.set_ylabel(f"x{state + 1}")
-    axes[1].legend(ncols=6, fontsize=7, loc="lower right", bbox_to_anchor=(1, 1))
-    axes[-1].set_xlabel("step")
-    save_figure(figure, path)
 
 
 def save_figure(figure: plt.Figure, *paths: Path) -> None:

@@ -4,7 +4,7 @@ From the palette of M. Okabe and K. Ito, which people who are colour-blind tell 
 blue, agents orange, lighter without memory; what stands still is grey or black.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib
 
@@ -37,37 +37,6 @@ LARGE: Any = {
     "legend.fontsize": 14,
     "figure.dpi": 100,
 }  # at half width still read
-
-
-class Style(NamedTuple):
-    """How one kind of policy is drawn; legends list them by ``order``."""
-
-    label: str
-    colour: str
-    marker: str
-    line: str = "-"
-    size: float = 6.0
-    order: int = 0
-
-
-RULES = Style("rules", SKY, "o", "--", 5.0, 0)
-RULES_MEMORY = Style("rules, memory", BLUE, "o", "-", 5.0, 1)
-AGENTS = Style("agents", ORANGE, "s", "--", 7.5, 2)
-AGENTS_MEMORY = Style("agents, memory", VERMILLION, "^", "-", 8.5, 3)
-ROLLOUT = Style("rule improved by simulation", PURPLE, "D", "", 8.0, 4)
-REFERENCE = Style("reference", BLACK, "x", ":", 7.0, 5)
-SCHEDULES = Style("best periodic schedules", BLACK, "+", "-.", 8.0, 6)
-BOUND = Style("proven: none lies below", GREEN, "", "-")
-
-# What the worths of the overview are drawn in.
-KINDS = {
-    "memory": BLUE,
-    "hearing": GREEN,
-    "deciding together": PURPLE,
-    "packets that hold the estimate": SKY,
-    "learning": VERMILLION,
-}
-
 # Figures of pages: still read at half their width, and their own labels are mathematics.
 READABLE: Any = {
     "text.parse_math": True,

@@ -94,7 +94,7 @@ class Lookahead:
                 stacklevel=2,
             )
             return
-        self._sets = transmission_sets(task, "policy 'lookahead'")
+        self._sets = transmission_sets(task)
         # The sets with each sensor, and the same sets without it.
         number = self._sets @ (1 << np.arange(task.sensors))
         order = np.argsort(number)

@@ -11,26 +11,13 @@ from fusion_gym.core.system import Signals
 from fusion_gym.core.task import Task
 from fusion_gym.core.token_bucket import Grants
 from fusion_gym.policies.belief_rule import beliefs_of
-from fusion_gym.validation import ConfigurationError
-
-_MOST_SENSORS = 12
 
 
-def transmission_sets(task: Task, expected_by: str) -> NDArray[np.bool_]:
-    """Every set of sensors that may transmit in one step, (sets, sensors) bool, silence first.
-
-    Raises:
-        ConfigurationError: more than 12 sensors, unless only one transmits at a time: there are
-            2^sensors sets, and each is weighed at every step.
-    """
+def transmission_sets(task: Task) -> NDArray[np.bool_]:
+    """Every set of sensors that may transmit in one step, (sets, sensors) bool, silence first."""
     if task.access == "single":
         nobody = np.zeros((1, task.sensors), dtype=np.bool_)
         return np.concatenate((nobody, np.eye(task.sensors, dtype=np.bool_)[::-1]))
-    if task.sensors > _MOST_SENSORS:
-        raise ConfigurationError(
-            f"sensors = {task.sensors} is not allowed with {expected_by}: it must be at most "
-            f"{_MOST_SENSORS}, for all 2^{task.sensors} sets of sensors would be weighed"
-        )
     return np.array(list(product((False, True), repeat=task.sensors)))
 
 

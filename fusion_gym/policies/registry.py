@@ -68,6 +68,7 @@ _ROWS: dict[str, PolicyRow] = {
         "paced": "rules.paced:Paced",
         "periodic": "rules.periodic:Periodic",
         "periodic_optimum": "periodic_optimum:PeriodicOptimum",
+        "priced_threshold": "rules.priced_threshold:PricedThreshold",
         "random": "rules.random:Random",
         "rollout": "rollout:Rollout",
         "round_robin": "rules.periodic:RoundRobin",

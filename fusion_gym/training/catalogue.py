@@ -107,11 +107,10 @@ def _settings(row: Algorithm) -> str:
 def _agent(name: str) -> Entry:
     card = zoo.card(name)
     options = " ".join(f"{key}={value}" for key, value in card["options"].items())
-    prices = zip(card["test"]["prices"], card["test"]["points"], strict=True)
-    rows = [
-        (f"{p:.3g}", f"{e['mse']['mean']:.4g}", f"{e['tokens']['mean']:.3g}") for p, e in prices
-    ]
-    where, head = f"{card['env']} {options}", ("price of a token", "MSE", "tokens per step")
+    points = zip(card["test"]["prices"], card["test"]["points"], strict=True)
+    names = ("cost", "mse", "tokens")
+    rows = [(f"{p:.3g}", *(f"{point[name]:.4g}" for name in names)) for p, point in points]
+    where, head = f"{card['env']} {options}", ("price of a token", "cost", "MSE", "tokens a step")
     return Entry(where, lambda: f"{where}\n\n{table(head, rows)}\n")
 
 

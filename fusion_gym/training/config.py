@@ -33,11 +33,10 @@ class EnvironmentConfig(Strict):
 class TrainingConfig(Strict):
     """How long, with how many runs side by side, from which seed, on how many threads.
 
-    ``target_rate`` trains to an average rate of transmissions per sensor and step: the price of a
-    token starts at the environment's ``cost_weight`` and is adapted. ``price_exponent`` is for a
-    price that is drawn: episodes count by (middle of the range / price)^exponent, in training and
-    in validation, so that an agent does not neglect the low prices. With more sensors than
-    ``many_sensors``, ``timesteps`` fall in proportion, for a step of theirs takes longer.
+    ``price_exponent`` is for a price that is drawn: episodes count by (middle of the range /
+    price)^exponent, in training and in validation, so that an agent does not neglect low prices.
+    With more sensors than ``many_sensors``, ``timesteps`` fall in proportion, for a step of theirs
+    takes longer.
 
     ``error`` is what is trained on (validations are of the true error): ``excess`` and ``mismatch``
     take off what no policy can change, by an estimate that takes in every measurement with the
@@ -49,7 +48,6 @@ class TrainingConfig(Strict):
     num_envs: Positive = 256
     seed: int = pydantic.Field(default=0, ge=0, lt=2**32)
     threads: Annotated[int, pydantic.Field(gt=0, le=1024)] = 1
-    target_rate: float | None = pydantic.Field(default=None, gt=0, le=1)
     price_exponent: Share = 0.0
     many_sensors: Positive | None = None
     error: Literal["squared", "excess", "mismatch"] = "squared"

@@ -142,19 +142,17 @@ def _begin_at(model: BaseAlgorithm, env: FusionSB3VecEnv, rate: float) -> None:
 def warn_of_cross_term(experiment: Experiment, env: FusionSB3VecEnv) -> None:
     """Print the cross term, with its interval, if that says that it is not zero.
 
-    Two policies are measured: random requests at the rate at which the training begins, or to
-    which it goes, and the one of the greatest value that the environment knows.
+    Two policies are measured: random requests at the rate at which the training begins, and
+    the one of the greatest value that the environment knows.
     """
     task, reference = env.task, env.batch.reference
     assert reference is not None  # the environment of such a training has one
     begins = getattr(experiment.algorithm, "initial_rate", None)
-    rate = experiment.training.target_rate or begins or 0.5
-    usual = usual_policies(task, (rate,))
-    policies = {name: make_policy(name, task) for name in (usual[0], usual[-1])}
+    rate = begins or 0.5
+    policies = {name: make_policy(name, task) for name in usual_policies(task, rate)}
     name, terms = worst(cross_terms(task, reference, policies, _EPISODES, _SEED, _LEVEL))
     if not terms.compatible:
         remark(
             f"warning: training.error = 'mismatch' leaves out a cross term of {terms.text} of the "
-            f"error under {name} ({_EPISODES} episodes); error: excess has none, and the command "
-            "mismatch measures it under other policies and filters"
+            f"error under {name} ({_EPISODES} episodes); error: excess has none"
         )

@@ -8,7 +8,6 @@ import json
 import signal
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -26,7 +25,6 @@ from fusion_gym.training import checkpoint
 from fusion_gym.training.callback import Callback
 from fusion_gym.training.checkpoint import Journal
 from fusion_gym.training.config import Experiment
-from fusion_gym.training.constraint import rate_score
 from fusion_gym.training.diagnosis import by_price, prices_of
 
 
@@ -71,15 +69,11 @@ class Progress(Callback):
         interrupt: Interrupt,
         bar: Bar,
         journal: Journal,
-        watch: Callable[[dict[str, Any]], bool] | None = None,
     ) -> None:
         super().__init__()
-        self.watch, self.stopped = watch, False
         self.experiment, self.folder, self.task = experiment, folder, task
         self.interrupt, self.bar, self.journal = interrupt, bar, journal
-        self.target = experiment.training.target_rate
-        scores = (rate_score(record, self.target) for record in journal.records)
-        self.best = max(scores, default=(-np.inf, -np.inf))
+        self.best = max((record["return"] for record in journal.records), default=-np.inf)
         self._mark = _now()
         self._env_mark = 0.0
         self._next = 0
@@ -87,8 +81,8 @@ class Progress(Callback):
         self._write_records()
         if journal.best is not None:
             self._write_best(journal.best)
-        for record in journal.records:
-            self._show(record)
+        if journal.records:
+            bar.say(log_line(journal.records[-1]))
 
     def _on_training_start(self) -> None:
         self._plan()
@@ -96,7 +90,7 @@ class Progress(Callback):
 
     def _on_rollout_start(self) -> None:
         self._measure("update")
-        if self.interrupt.raised or self.stopped:
+        if self.interrupt.raised:
             raise Stop
         if self._due:
             self._due = False
@@ -153,8 +147,8 @@ class Progress(Callback):
         parts = by_price(self.task, self.prices, results)
         if parts:
             record["prices"] = parts
-        if rate_score(record, self.target) > self.best:
-            self.best = rate_score(record, self.target)
+        if record["return"] > self.best:
+            self.best = record["return"]
             file = io.BytesIO()
             self.model.save(file)
             self.journal.best = file.getvalue()
@@ -169,7 +163,7 @@ class Progress(Callback):
             for key in ("mse", "rate"):
                 self.logger.record(f"validation/{key}_{where}", part[key])
         self.logger.dump(self.num_timesteps)
-        self._show(record)
+        self.bar.say(log_line(record))
 
     def run_cheapest(self) -> EpisodeResults:
         """Return the validation episodes of the model at its lowest price."""
@@ -180,12 +174,6 @@ class Progress(Callback):
         settings, local = self.experiment.validation, self.experiment.environment.local
         policy = ModelPolicy(self.model, self.task, price=price, trained=ModelView(local=local))
         return run_episodes(self.task, policy, settings.episodes, settings.seed)
-
-    def _show(self, record: dict[str, Any]) -> None:
-        """A validation to the bar, and to whoever watches and may end the training."""
-        self.bar.say(log_line(record))
-        if self.watch is not None:
-            self.stopped = self.watch(record)
 
     def _write_best(self, content: bytes) -> None:
         with replacing(self.folder / "best_model.zip") as partial:

@@ -1,8 +1,6 @@
 """One training from config to summary; it can be ended at any moment and gone on with."""
 
-import dataclasses
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import configure
 
-from fusion_gym.core.reward import Price
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
 from fusion_gym.envs.sb3 import FusionSB3VecEnv
@@ -23,7 +20,6 @@ from fusion_gym.output.progress import progress_bar, writing
 from fusion_gym.training.checked import load_checked
 from fusion_gym.training.checkpoint import Journal, read_journal, restore
 from fusion_gym.training.config import Experiment
-from fusion_gym.training.constraint import TargetRate, rate_score
 from fusion_gym.training.diagnosis import Traffic, warn_of_unused_tokens
 from fusion_gym.training.models import make_env, make_model, warn_of_cross_term
 from fusion_gym.training.monitor import Interrupt, Progress, Stop
@@ -31,10 +27,6 @@ from fusion_gym.validation import ConfigurationError
 
 # Training seeds lie far from the validation's and from the small numbers that tests use.
 TRAINING_SEEDS = 1_000_000_000
-
-
-class Diverged(ConfigurationError):
-    """The weights of a training are no numbers any more."""
 
 
 def holds_training(folder: Path) -> bool:
@@ -72,26 +64,6 @@ def earlier(experiment: Experiment, folder: Path, resume: bool) -> Journal | Non
     return None
 
 
-def validation_task(experiment: Experiment, task: Task) -> Task:
-    """The task that validation runs on: with a target rate its tokens are free of charge.
-
-    Raises:
-        ConfigurationError: a target rate, but a price that is drawn or zero.
-    """
-    if experiment.training.target_rate is None:
-        return task
-    price = task.reward.price
-    if price.span is not None or not price.fixed:
-        raise ConfigurationError(
-            f"target_rate = {experiment.training.target_rate} is not allowed with cost_weight = "
-            f"{experiment.environment.options.get('cost_weight')!r} and price_range = "
-            f"{price.span}: it starts from a fixed cost_weight > 0 without a price_range"
-        )
-    return dataclasses.replace(
-        task, reward=dataclasses.replace(task.reward, price=Price.create(0.0))
-    )
-
-
 def check_run(experiment: Experiment) -> tuple[BaseAlgorithm, FusionSB3VecEnv, Task]:
     """A new model, what it trains in, and the task that it is validated on; nothing is written.
 
@@ -99,9 +71,8 @@ def check_run(experiment: Experiment) -> tuple[BaseAlgorithm, FusionSB3VecEnv, T
         ConfigurationError: a config or environment that does not fit.
     """
     task = make_task(experiment.environment.id, **experiment.environment.options)
-    scored = validation_task(experiment, task)
     env = make_env(experiment, task)
-    return make_model(experiment, env), env, scored
+    return make_model(experiment, env), env, task
 
 
 def train(
@@ -109,12 +80,8 @@ def train(
     *,
     resume: bool = False,
     quiet: bool = False,
-    watch: Callable[[dict[str, Any]], bool] | None = None,
 ) -> dict[str, Any]:
     """Run the training and return its summary; ``quiet`` shows neither bar nor summary.
-
-    ``watch`` is handed each validation's record, those of earlier stretches first, and may end the
-    training by returning true.
 
     The summary has ``timesteps``, ``finished``, ``steps_per_second``, ``seconds`` by activity (of
     all stretches together), the best validation, and a hash of the inputs.
@@ -143,12 +110,12 @@ def train(
             writing(("checkpoints, models and validations", folder))
         plain = experiment.model_dump(mode="json")
         write_text(folder / "config.yaml", yaml.safe_dump(plain, sort_keys=False))
-        return _learn(experiment, folder, model, env, scored, journal, quiet, watch)
+        return _learn(experiment, folder, model, env, scored, journal, quiet)
 
 
 def _learn(
     experiment: Experiment, folder: Path, model: BaseAlgorithm, env: FusionSB3VecEnv, scored: Task,
-    journal: Journal, quiet: bool, watch: Callable[[dict[str, Any]], bool] | None,
+    journal: Journal, quiet: bool,
 ) -> dict[str, Any]:  # fmt: skip
     """Train what remains, write the results and return the summary."""
     model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
@@ -157,13 +124,9 @@ def _learn(
         Interrupt() as interrupt,
         progress_bar(total, f"training {experiment.algorithm.name}", begun, quiet) as bar,
     ):
-        progress = Progress(experiment, folder, scored, interrupt, bar, journal, watch)
+        progress = Progress(experiment, folder, scored, interrupt, bar, journal)
         progress.init_callback(model)
         callbacks: list[BaseCallback] = [Traffic(), progress]
-        if experiment.training.target_rate is not None:
-            price = env.task.reward.price.fixed
-            assert price is not None  # validation_task refuses a drawn price
-            callbacks.append(TargetRate(experiment.training.target_rate, price))
         if begun < total:
             try:
                 model.learn(total - begun, CallbackList(callbacks), reset_num_timesteps=False)
@@ -172,7 +135,7 @@ def _learn(
             except ValueError:  # what torch's distributions make of weights that are not finite
                 if all(bool(part.isfinite().all()) for part in model.policy.parameters()):
                     raise
-                raise Diverged(
+                raise ConfigurationError(
                     f"output = {str(folder)!r}: the training diverged after {model.num_timesteps} "
                     "steps, its weights are not finite; lower learning_rate or max_grad_norm"
                 ) from None
@@ -180,15 +143,13 @@ def _learn(
         finished = model.num_timesteps >= total
         if finished:
             progress.finish()
-            if not quiet and experiment.training.target_rate is None:
+            if not quiet:
                 warn_of_unused_tokens(scored, progress.run_cheapest())
         progress.save()
         if finished:
             with replacing(folder / "final_model.zip") as partial:
                 model.save(partial)
-    best = max(
-        journal.records, key=lambda record: rate_score(record, progress.target), default=None
-    )
+    best = max(journal.records, key=lambda record: record["return"], default=None)
     summary = {
         "timesteps": model.num_timesteps,
         "finished": finished,

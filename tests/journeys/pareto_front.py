@@ -2,7 +2,7 @@ import numpy as np
 
 import fusion_gym
 
-agent = "tobit_oscillator_sensors"
+agent = "tobit_oscillator_scheduler"
 card = fusion_gym.zoo.card(agent)
 task = fusion_gym.make_task(card["env"], **card["options"])
 
@@ -16,7 +16,7 @@ thresholds = [f"innovation_threshold:threshold={value:.2f}" for value in np.geom
 rules = {name: run(name) for name in ("never", "always", *thresholds)}
 for name, rate, mse in fusion_gym.evaluation.lower_envelope(rules):
     print(f"{rate:.3f}  {mse:.3f}  {name}")
-for price in (0.003, 0.03, 0.3):
+for price in (0.02, 0.2, 2.0):
     results = run(f"zoo:{agent},price={price}")
     found = fusion_gym.evaluation.compare_with_envelope(results, rules)
     print(f"{results.rate.mean():.3f}  {results.mse.mean():.3f}  price {price}", found.difference)

@@ -1,12 +1,6 @@
-import numpy as np
-
 import fusion_gym
 
-card = fusion_gym.zoo.card("tobit_oscillator_sensors")
-test = card["test"]
+card = fusion_gym.zoo.card("tobit_oscillator_scheduler")
 print(card["env"], card["options"])
-print(f"{test['episodes']} episodes from seed {test['seed']}")
-print("price   rate    MSE, 95 % interval")
-for price, point in zip(test["prices"], test["points"], strict=True):
-    rate, mse = np.mean(point["rate"]), point["mse"]
-    print(f"{price:<7.3g} {rate:.3f}  {mse['mean']:.3f} [{mse['low']:.3f}, {mse['high']:.3f}]")
+for price, point in zip(card["test"]["prices"], card["test"]["points"], strict=True):
+    print(f"{price:<7.3g} cost {point['cost']:.3f}  MSE {point['mse']:.3f}")

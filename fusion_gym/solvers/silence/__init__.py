@@ -1,6 +1,6 @@
 """When silence is best, once all else is given away: a lower bound of every policy's error."""
 
-from fusion_gym.solvers.silence.bound import PricedCost, SilenceBound, silence_bound
+from fusion_gym.solvers.silence.bound import PricedCost, SilenceBound, cost_bound, silence_bound
 from fusion_gym.solvers.silence.induction import SilenceSolution, solve_silence
 from fusion_gym.solvers.silence.model import SilenceModel, silence_model
 from fusion_gym.solvers.silence.problem import SilenceProblem
@@ -13,6 +13,7 @@ __all__ = [
     "SilenceProblem",
     "SilenceSolution",
     "UpperValue",
+    "cost_bound",
     "silence_bound",
     "silence_model",
     "simulate",

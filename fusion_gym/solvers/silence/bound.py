@@ -1,6 +1,6 @@
 """A lower bound of every policy's error at a rate, for linear plants measured at every step."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,7 +67,6 @@ def silence_bound(
     weights: ArrayLike | None = None,
     accuracy: float = 0.01,
     most_points: int = 3_000_000,
-    progress: Callable[[int, str], object] | None = None,
 ) -> SilenceBound:
     """Bound the error of every policy of the task from below, best at these rates.
 
@@ -76,8 +75,7 @@ def silence_bound(
     whatever tokens, knowledge of the past and filter for what arrives, has less.
 
     The lattices are so fine that the bound loses about ``accuracy``, relatively, as far as
-    ``most_points`` allow; what was reached is each cost's ``gap``. ``progress`` is told how many
-    rates are done, and what is being done.
+    ``most_points`` allow; what was reached is each cost's ``gap``.
 
     Raises:
         ConfigurationError: a task to which the bound does not apply, or a value that is not
@@ -87,15 +85,32 @@ def silence_bound(
     required = [validation.number("rates", rate, above=0.0, at_most=1.0) for rate in rates]
     share = validation.number("accuracy", accuracy, above=0.0, at_most=0.5)
     limit = validation.integer("most_points", most_points, at_least=1000)
-    progress_line = progress or (lambda done, text: None)
     costs: list[PricedCost] = []
     for rate in required:
-        progress_line(len(costs), f"rate {rate:g}: looking for the price")
         price, rough = _price(model, rate * task.sensors)
-        progress_line(len(costs), f"rate {rate:g}: price {price:.3g}")
         costs.append(_cost(model, price, rough, rate, share, limit))
     costs.sort(key=lambda cost: cost.price)
     return SilenceBound(model.floor, task.sensors, tuple(costs))
+
+
+def cost_bound(
+    task: Task, price: float, accuracy: float = 0.03, most_points: int = 1_000_000
+) -> PricedCost:
+    """Bound the cost of every policy of the task from below, at a price of a token.
+
+    The cost is error + price · tokens of a step, in the reward's units. Every packet costs
+    as much as the cheapest one.
+
+    Raises:
+        ConfigurationError: a task to which the bound does not apply, or a value that is not
+            allowed.
+    """
+    model = silence_model(task, task.error_scale * task.relative_weights[:, 0])
+    packet = validation.number("price", price, above=0.0) * float(task.bucket.cost.min())
+    problem = replace(model.problem, price=packet)
+    rough = solve_silence(problem, _ROUGH_STEP * np.sqrt(packet))
+    rate = simulate(problem, rough, _ROUGH_EPISODES).packets / task.sensors
+    return _cost(model, packet, rough, rate, accuracy, most_points)
 
 
 def _price(model: SilenceModel, packets: float) -> tuple[float, SilenceSolution]:

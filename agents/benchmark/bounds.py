@@ -1,0 +1,27 @@
+"""What no policy of a class can undercut, where that is proven."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from agents.benchmark.jobs import Job
+from fusion_gym.solvers.silence import cost_bound
+from fusion_gym.validation import ConfigurationError
+
+
+@dataclass(frozen=True)
+class Bound(Job):
+    """The proven lower bound of the cost at each price of a class."""
+
+    prices: tuple[float, ...]
+    weight: ClassVar[float] = 10.0
+
+
+def run_bound(job: Bound) -> tuple[float, ...]:
+    """Return the bound at each price; nothing for a setting to which it does not apply."""
+    task = job.setting.task(job.name)
+    try:
+        return tuple(cost_bound(task, price).lower for price in job.prices)
+    except ConfigurationError:
+        return ()

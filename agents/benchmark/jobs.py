@@ -1,0 +1,59 @@
+"""Pieces of work: frozen dataclasses whose fields are all that a result depends on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+import pydantic
+
+from agents.benchmark.settings import ClassName, Setting
+from agents.cache import Cache
+from agents.workers import Pool, missing, side_by_side
+
+AnyJob = TypeVar("AnyJob", bound="Job")
+Result = TypeVar("Result")
+_PLAIN: pydantic.TypeAdapter[Any] = pydantic.TypeAdapter(Any)
+
+
+@dataclass(frozen=True)
+class Job:
+    """A piece of work in a class of a setting; ``weight`` is about its seconds on one core.
+
+    A field with the metadata ``key`` false says where it works, not what comes out.
+    """
+
+    setting: Setting
+    name: ClassName
+    weight: ClassVar[float] = 30.0
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """Return its fields as plain data: the key of its result."""
+        return {
+            field.name: _PLAIN.dump_python(getattr(self, field.name), mode="json")
+            for field in fields(self)
+            if field.metadata.get("key", True)
+        }
+
+
+@dataclass(frozen=True)
+class Runner:
+    """The folder of finished pieces, and the processes that do the others."""
+
+    folder: Path
+    pool: Pool
+
+    @property
+    def cache(self) -> Cache:
+        """Return the results that are finished."""
+        return Cache(self.folder / "jobs")
+
+    def run(
+        self, work: Callable[[AnyJob], Result], jobs: Sequence[AnyJob], title: str
+    ) -> list[Result]:
+        """Return the results of jobs in their order, from the folder or computed now."""
+        side_by_side(missing(work, jobs, self.cache), self.pool, title)
+        return [self.cache.read(work, job.inputs) for job in jobs]

@@ -1,0 +1,166 @@
+"""Rules with one threshold, the five prices of a class, and the search of one rule for all."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from agents.benchmark.jobs import Job
+from agents.benchmark.settings import TUNING_SEED, ClassName, Setting, ThresholdRule, knowledge_of
+from fusion_gym.arrays import Array
+from fusion_gym.core.scale import prices_at
+from fusion_gym.core.system import covers
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.beside import run_beside
+from fusion_gym.evaluation.rule_search import (
+    Generation,
+    RuleSearch,
+    ThresholdTrial,
+    search_rule,
+    try_thresholds,
+)
+from fusion_gym.output.files import replacing
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError
+
+COUNT = 16  # thresholds of a rule over its whole range
+FINER = 6  # between the neighbours of the best one
+APART = 1.2  # neighbouring prices, at least, as a factor
+NEAR = 1.1  # rules whose cost is so near the least, as a factor, are tuned finer
+
+
+@dataclass(frozen=True)
+class SweepJob(Job):
+    """Every rule of a class over its thresholds; with ``prices`` finer about the best ones."""
+
+    memory: bool
+    rules: tuple[ThresholdRule, ...]
+    shares: tuple[float, ...]
+    episodes: tuple[int, int]
+    prices: tuple[float, ...] = ()
+    weight: ClassVar[float] = 40.0
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """The best threshold of a rule at a price, and its cost on the tuning episodes."""
+
+    rule: str
+    price: float
+    policy: str
+    cost: float
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """The prices of a class, frozen, and every rule's best threshold at each."""
+
+    prices: tuple[float, ...]
+    tuned: tuple[Tuned, ...]
+
+    def best(self, price: float, rule: str | None = None) -> Tuned:
+        """Return the best of all rules at a price, or of one."""
+        own = (t for t in self.tuned if t.price == price and rule in (None, t.rule))
+        return min(own, key=lambda item: item.cost)
+
+
+@dataclass(frozen=True)
+class SearchJob(Job):
+    """The search of one rule for all prices of a class."""
+
+    prices: tuple[float, ...]
+    generations: int
+    folder: Path = field(metadata={"key": False})
+    seed: int = 1_000_000_000
+    weight: ClassVar[float] = 120.0
+
+
+def run_sweep(job: SweepJob) -> SweepResult:
+    """Tune every rule of a class on the tuning episodes, and find the prices where none are."""
+    task = job.setting.task(job.name, job.memory)
+    trials = {
+        rule: _try(task, rule, np.geomspace(*rule.ends, COUNT), job.episodes[0])
+        for rule in job.rules
+    }
+    prices = job.prices or _prices(task, list(itertools.chain(*trials.values())), job)
+    tuned = []
+    for price in prices:
+        best = {rule: min(own, key=lambda t: t.cost(price)) for rule, own in trials.items()}
+        least = min(trial.cost(price) for trial in best.values())
+        for rule, trial in best.items():
+            if trial.cost(price) <= NEAR * least or rule == job.setting.trigger:
+                trial = _finer(task, job, rule, trials[rule], trial, price)
+            tuned.append(Tuned(rule.policy, price, trial.policy, trial.cost(price)))
+    return SweepResult(prices, tuple(tuned))
+
+
+def rules_of(
+    setting: Setting, name: ClassName, rules: Sequence[ThresholdRule], memory: bool
+) -> tuple[ThresholdRule, ...]:
+    """Return the rules whose declared knowledge the class covers."""
+    task, knower = setting.task(name, memory), knowledge_of(setting, name)
+    result = []
+    for rule in dict.fromkeys((setting.trigger, *setting.more_rules, *rules)):
+        try:
+            policy = make_policy(rule.policy.format(value=rule.ends[0]), task)
+        except ConfigurationError:  # a rule of another family
+            continue
+        if covers(knower, policy.knowledge):
+            result.append(rule)
+    return tuple(result)
+
+
+def _try(task: Task, rule: ThresholdRule, values: Array, episodes: int) -> list[ThresholdTrial]:
+    return try_thresholds(task, rule.policy, values.tolist(), episodes, TUNING_SEED)
+
+
+def _prices(task: Task, trials: Sequence[ThresholdTrial], job: SweepJob) -> tuple[float, ...]:
+    """Return the prices at which the best of all trials spends the shares of ``always``."""
+    always = make_policy("always", task)
+    most = float(run_beside(task, [always], job.episodes[0], TUNING_SEED)[0].tokens.mean())
+    tokens, error = np.array([(trial.tokens, trial.error) for trial in trials]).T
+    prices = prices_at(tokens, error, np.array(job.shares) * most)
+    for place in range(1, len(prices)):
+        prices[place] = max(prices[place], APART * prices[place - 1])
+    return tuple(float(f"{price:.4g}") for price in prices)
+
+
+def _finer(
+    task: Task, job: SweepJob, rule: ThresholdRule, own: Sequence[ThresholdTrial],
+    best: ThresholdTrial, price: float,
+) -> ThresholdTrial:  # fmt: skip
+    """Return the best of thresholds between the neighbours of the best one, on more episodes."""
+    place = own.index(best)
+    ends = own[max(place - 1, 0)].threshold, own[min(place + 1, len(own) - 1)].threshold
+    trials = _try(task, rule, np.geomspace(*ends, FINER), job.episodes[1])
+    return min(trials, key=lambda trial: trial.cost(price))
+
+
+def run_search(job: SearchJob) -> str:
+    """Return the searched rule's line of text; generations stay in the folder until the end."""
+    search = RuleSearch(
+        job.setting.task(job.name),
+        job.prices,
+        own=job.name == "local",
+        score="variance" if job.name == "centre" else "value",
+        generations=job.generations,
+        seed=job.seed,
+    )
+    state = job.folder / f"{job.setting.name}_{job.name}_{job.seed}.json"
+    state.parent.mkdir(parents=True, exist_ok=True)
+    content = json.loads(state.read_text()) if state.exists() else []
+    earlier = [Generation(**item) for item in content]
+    generations = list(earlier)
+
+    def store(generation: Generation) -> None:
+        generations.append(generation)
+        with replacing(state) as partial:
+            partial.write_text(json.dumps([asdict(item) for item in generations]))
+
+    return search_rule(search, earlier, store).policy

@@ -1,0 +1,162 @@
+"""The settings of the benchmark as typed YAML, and the tasks of their classes."""
+
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import pydantic
+
+from fusion_gym.core.system import Knowledge
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import make_task
+from fusion_gym.training.algorithms import AnyAlgorithm
+from fusion_gym.training.checked import Positive, Rate, Share, Strict, parse, read_yaml
+from fusion_gym.training.config import (
+    EnvironmentConfig,
+    Experiment,
+    TrainingConfig,
+    ValidationConfig,
+)
+from fusion_gym.validation import choice
+
+ClassName = Literal["centre", "local", "scheduler"]
+CLASSES: tuple[ClassName, ...] = get_args(ClassName)
+FILE = Path(__file__).with_name("settings.yaml")
+# First episodes: of tests, of the choice between policies, and of tuning.
+TEST_SEED, VALIDATION_SEED, TUNING_SEED = 0, 800_000_000, 600_000_000
+Options = dict[str, Any]
+
+
+class ThresholdRule(Strict):
+    """A rule with one threshold, ``{value}`` in its text, between two ends."""
+
+    policy: str
+    ends: tuple[Rate, Rate]
+
+
+class Case(Strict):
+    """Other options of a setting, and a factor of its token rate."""
+
+    name: str
+    options: Options = pydantic.Field(default_factory=dict)
+    tokens: Rate = 1.0
+
+
+class Setting(Strict):
+    """An environment with options, its paper's trigger, and how long its agents are trained.
+
+    ``optimum`` is a policy with ``{price}``.
+    """
+
+    name: str = pydantic.Field(pattern=r"^[a-z0-9_]+$")
+    title: str
+    environment: str
+    options: Options
+    trigger: ThresholdRule
+    more_rules: tuple[ThresholdRule, ...] = ()
+    agent_options: Options = pydantic.Field(default_factory=dict)
+    memory: bool = True
+    optimum: str | None = None
+    timesteps: Positive
+    num_envs: Positive = 1024
+    error: Literal["squared", "excess", "mismatch"] = "mismatch"
+    cases: tuple[Case, ...] = ()
+
+    def has_memory(self, name: ClassName) -> bool:
+        """Return whether the policies of a class have memory."""
+        return self.memory and name != "centre"
+
+    def task(self, name: ClassName, memory: bool | None = None, case: Case | None = None) -> Task:
+        """Return the task of a class's rules, by default with its memory and without a case."""
+        memory = self.has_memory(name) if memory is None else memory
+        options = self.options | ({"memory": True} if memory else {})
+        return make_task(self.environment, **_perturbed(options, case))
+
+    def agent_environment(
+        self, name: ClassName, price_range: tuple[float, float], case: Case | None = None
+    ) -> Options:
+        """Return the options of the environment in which an agent of a class decides."""
+        options = self.options | self.agent_options
+        options |= {"cost_weight": "random", "price_range": list(price_range)}
+        if name == "centre":
+            options["information"] = "centre"
+        elif self.has_memory(name):
+            options["memory"] = True
+        else:
+            options["belief_features"] = ["value"]
+        return _perturbed(options, case)
+
+
+class Suite(Strict):
+    """The whole benchmark; ``steps`` multiplies the lengths of all trainings."""
+
+    episodes: Positive
+    validation_episodes: Positive
+    tuning_episodes: tuple[Positive, Positive]
+    case_episodes: Positive
+    generations: Positive
+    training_seeds: Positive
+    shares: tuple[Share, ...]
+    algorithm: AnyAlgorithm
+    steps: Rate = 1.0
+    rules: tuple[ThresholdRule, ...]
+    cases: tuple[Case, ...]
+    settings: tuple[Setting, ...]
+
+    def cases_of(self, setting: Setting) -> tuple[Case, ...]:
+        """Return the perturbed cases of a setting."""
+        return setting.cases or self.cases
+
+    def experiment(
+        self, setting: Setting, name: ClassName, prices: tuple[float, ...], seed: int
+    ) -> Experiment:
+        """Return the training of one agent, which sees a price drawn for each episode."""
+        timesteps = max(round(setting.timesteps * self.steps), 1)
+        return Experiment(
+            environment=EnvironmentConfig(
+                id=setting.environment,
+                options=setting.agent_environment(name, (min(prices), max(prices))),
+                local=name == "local",
+            ),
+            algorithm=self.algorithm,
+            training=TrainingConfig(
+                timesteps=timesteps,
+                num_envs=setting.num_envs,
+                seed=seed,
+                price_exponent=0.8,
+                error=setting.error,
+            ),
+            validation=ValidationConfig(every=max(timesteps // 3, 1), episodes=256),
+            output="agent",
+        )
+
+
+def load_suite(quick: bool = False, settings: tuple[str, ...] = ()) -> Suite:
+    """Return the benchmark, or its quick version, with the settings of these names or all.
+
+    Raises:
+        ConfigurationError: unreadable, a value that is not allowed, or an unknown setting.
+    """
+    content = read_yaml(FILE)
+    changes = content.pop("quick")
+    by_name = {setting["name"]: setting for setting in content["settings"]}
+    for name in settings:
+        choice("settings", name, by_name)
+    usual = changes.pop("settings") if quick else by_name
+    content["settings"] = [by_name[name] for name in settings or usual]
+    return parse(Suite, content | (changes if quick else {}), str(FILE))
+
+
+def knowledge_of(setting: Setting, name: ClassName) -> Knowledge:
+    """Return what a policy of a class may know."""
+    if name == "centre":
+        return "centre"
+    memory = setting.has_memory(name)
+    if name == "local":
+        return "own_memory" if memory else "own"
+    return "scheduler_memory" if memory else "scheduler"
+
+
+def _perturbed(options: Options, case: Case | None) -> Options:
+    if case is None:
+        return options
+    return options | case.options | {"token_rate": options["token_rate"] * case.tokens}

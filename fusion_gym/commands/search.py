@@ -1,0 +1,170 @@
+"""Search one rule for all prices of a token; an interrupted search can be gone on with.
+
+    fusion-gym search --env fusion_gym/LinearFusion-v2 --set system=plant.yaml token_rate=.5 \\
+        --output runs/search [--resume]
+
+The rule is ``priced_threshold``: a threshold that follows the price, the tokens and the silence.
+A search over its dozen numbers (CMA-ES) begins with the best single threshold at each price. The
+prices lie evenly, as logarithms, over the price_range of the environment, by default ``auto``.
+
+Into the output folder go ``generations.json``, after every generation, and at the end
+``search.json``: the policy as one line, its cost at each price on fresh episodes, and the cost of
+the best single threshold there.
+"""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+from rich.table import Table
+
+from fusion_gym.commands.command_line import EnvironmentOptions, Long
+from fusion_gym.commands.options import OutputFolder, Whole
+from fusion_gym.core.task import Task
+from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation.rule_search import Generation, RuleSearch, SearchResult, search_rule
+from fusion_gym.output import tables
+from fusion_gym.output.files import read_json, write
+from fusion_gym.output.folders import alone_in, check_inputs
+from fusion_gym.output.progress import progress_bar, writing
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.training.checked import checked
+from fusion_gym.training.environment import environment_of
+from fusion_gym.validation import ConfigurationError
+
+_GENERATIONS, _RESULT = "generations.json", "search.json"
+
+
+@dataclass(frozen=True)
+class Search(EnvironmentOptions, Long):
+    """Search one rule for all prices of a token."""
+
+    output: Annotated[Path, OutputFolder()]
+    """Folder of the search."""
+    of: Annotated[Literal["scheduler", "local", "centre"], tyro.conf.arg(name="class")] = (
+        "scheduler"
+    )
+    """Who decides: a scheduler that sees all sensors, every sensor for itself, or the centre."""
+    prices: Annotated[int, Whole(2, 100)] = 5
+    """Prices of a token, from the lowest to the highest."""
+    generations: Annotated[int, Whole(1, 10_000)] = 30
+    """Generations of the search."""
+    resume: bool = False
+    """Go on after the generations that the folder holds."""
+
+    def run(self) -> None:
+        """Search; write and print the rule."""
+        env_id, options, _ = environment_of(self.env, self.config, self.options)
+        search = self.rule_search(env_id, options)
+        inputs = {
+            "env": env_id,
+            "class": self.of,
+            "prices": search.prices,
+            "generations": self.generations,
+            "settings": search.task.settings,
+        }
+        self.earlier(inputs)  # refuses before anything is made
+        with alone_in(self.output, "output"):
+            writing(("the generations and the rule", self.output))
+            result = self.continued(search, inputs)
+            write(self.output / _RESULT, asdict(result) | {"inputs": inputs})
+        print(result.policy)
+        tables.console().print(result_table(env_id, result))
+
+    def rule_search(self, env_id: str, options: dict[str, Any]) -> RuleSearch:
+        """The search of the class in this environment.
+
+        Raises:
+            ConfigurationError: an option that is not allowed, or a class that has no such rule.
+        """
+        task = make_task(env_id, **options)
+        prices = token_prices(env_id, options, task, self.prices)
+        result = RuleSearch(
+            task,
+            prices,
+            own=self.of == "local",
+            score="variance" if self.of == "centre" else "value",
+            generations=self.generations,
+        )
+        make_policy(result.text, task)
+        return result
+
+    def continued(self, search: RuleSearch, inputs: dict[str, Any]) -> SearchResult:
+        """The result of the search, with every generation in the file."""
+        generations = self.earlier(inputs)
+        initial = len(generations)
+
+        def keep(*more: Generation) -> None:
+            generations.extend(more)
+            plain = [asdict(generation) for generation in generations]
+            write(self.output / _GENERATIONS, {"inputs": inputs, "generations": plain})
+
+        keep()
+        with progress_bar(self.generations, "searching", initial, unit="generations") as bar:
+
+            def progress(generation: Generation) -> None:
+                keep(generation)
+                bar.say(f"best {min(generation.objectives) - 1.0:+.1%} of a single threshold")
+                bar.update()
+
+            return search_rule(search, tuple(generations), progress)
+
+    def earlier(self, inputs: dict[str, Any]) -> list[Generation]:
+        """The generations that the folder holds, of the same search.
+
+        Raises:
+            ConfigurationError: the folder holds a search and ``resume`` is false, there is nothing
+                to resume, or the search there had other inputs.
+        """
+        path, place = self.output / _GENERATIONS, f"output = {str(self.output)!r}"
+        if not self.resume:
+            if path.exists() or (self.output / _RESULT).exists():
+                raise ConfigurationError(
+                    f"{place} holds a search already: go on with --resume, or give another --output"
+                )
+            return []
+        if not path.exists():
+            raise ConfigurationError(f"{place} holds no search: nothing to resume")
+        content = read_json(path, "output")
+        check_inputs(inputs, content.get("inputs"), f"the search in {str(self.output)!r}")
+        source = f"output = {str(path)!r}"
+        result = checked(list[Generation], content.get("generations"), source)
+        numbers = [generation.number for generation in result]
+        if numbers != list(range(min(len(numbers), self.generations))):
+            raise ConfigurationError(f"{source} does not hold the first generations of a search")
+        return result
+
+    def interrupted(self) -> str:
+        """Nothing but a search that has begun is gone on with."""
+        begun = (self.output / _GENERATIONS).exists()
+        return super().interrupted() if begun else "interrupted before the search began"
+
+
+def token_prices(env_id: str, options: dict[str, Any], task: Task, count: int) -> tuple[float, ...]:
+    """Prices over the task's price_range, evenly as logarithms; without one it is "auto".
+
+    Raises:
+        ConfigurationError: a plant without such prices.
+    """
+    span = task.reward.price.span
+    if span is None:
+        drawn = {"price_range": "auto", "cost_weight": "random"}
+        span = make_task(env_id, **(options | drawn)).reward.price.span
+    assert span is not None
+    return tuple(float(f"{price:.5g}") for price in np.geomspace(*span, count))
+
+
+def result_table(env_id: str, result: SearchResult) -> Table:
+    """The costs of a searched rule beside the best single thresholds."""
+    rows = [
+        (f"{price:.4g}", f"{cost:.4g}", f"{single:.4g}", f"{cost / single - 1.0:+.1%}")
+        for price, cost, single in zip(
+            result.prices, result.costs, result.threshold_costs, strict=True
+        )
+    ]
+    title = f"{env_id}: costs on fresh episodes"
+    heads = ("price", "cost of the rule", "of the best single threshold", "relative")
+    note = f"cost = error + price · tokens, a step; relative in the mean {result.relative:+.1%}"
+    return tables.table_tables(title, heads, rows, note)

@@ -1,0 +1,305 @@
+"""CMA-ES over the numbers of the rule ``priced_threshold``, for one task at several prices at once.
+
+    search = RuleSearch(task, prices=(0.003, 0.01, 0.03, 0.1))
+    result = search_rule(search)
+    policy = make_policy(result.policy, task)
+
+It begins with the best one-threshold rule of the same score: of a sweep, the best threshold at each
+price, and the power of the price that fits them. Every generation meets fresh episodes, more from
+one to the next, and the result is the mean of the second half of the generations' means. All
+candidates, prices and episodes of a generation run side by side. Source: N. Hansen and
+A. Ostermeier, "Completely derandomized self-adaptation in evolution strategies", Evolutionary
+Computation 9, 2001, as in the package cmaes.
+"""
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.beside import Brief, run_beside, run_priced
+from fusion_gym.importing import require
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.policies.rules.priced_threshold import PricedThreshold, Score, ThresholdNumbers
+from fusion_gym.validation import ConfigurationError
+
+_RUNS = 2048  # beside each other; fixed, so that results do not depend on the machine
+_WIDE = 20.0  # a margin that hardly ever lets two sensors transmit in the same step
+_WORST = 1e30  # the cost of a candidate whose error is no number
+# Each coordinate's first standard deviation and limits; threshold and margin as logarithms.
+_RANGES = {
+    "threshold": (0.15, -np.inf, np.inf),
+    "price_exponent": (0.075, -1.0, 4.0),
+    "mixture": (0.1, 0.0, 1.0),
+    "token_exponent": (0.15, -3.0, 3.0),
+    "age_exponent": (0.1, -3.0, 3.0),
+    "margin": (0.15, 0.0, 4.0),
+}
+
+
+@dataclass(frozen=True)
+class ThresholdTrial:
+    """A rule with a threshold: its tokens and its error a step, means over episodes."""
+
+    policy: str
+    threshold: float
+    tokens: float
+    error: float
+
+    def cost(self, price: float) -> float:
+        """Return error + price · tokens."""
+        return self.error + price * self.tokens
+
+
+@dataclass(frozen=True)
+class Generation:
+    """One generation: its number from 0, each candidate's objective, and the mean that follows.
+
+    The ``mean`` is in the coordinates of the search. As JSON it is ``dataclasses.asdict``, back
+    ``Generation(**value)``.
+    """
+
+    number: int
+    objectives: Sequence[float]
+    mean: Sequence[float]
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """The policy as a line of text, its costs, and the costs of the best single thresholds.
+
+    ``costs`` and ``threshold_costs`` stand in the order of ``prices`` and are means over the same
+    fresh episodes.
+    """
+
+    policy: str
+    prices: tuple[float, ...]
+    costs: tuple[float, ...]
+    threshold_costs: tuple[float, ...]
+
+    @property
+    def relative(self) -> float:
+        """Mean over the prices of cost / cost of the best single threshold, minus 1."""
+        return float(np.mean(np.divide(self.costs, self.threshold_costs)) - 1.0)
+
+
+@dataclass(frozen=True)
+class RuleSearch:
+    """A search: the task, the ``prices`` of a token, whose beliefs (``own``) and which ``score``.
+
+    ``bounds`` are the least and the largest threshold of the sweep at the start, None for those
+    that the prices suggest. A generation has ``population`` candidates and meets ``episodes``
+    episodes, from the first number to the last; ``seed`` is the first episode's and the
+    candidates'.
+
+    Raises:
+        ConfigurationError: a value that is not allowed.
+    """
+
+    task: Task = field(repr=False)
+    prices: tuple[float, ...]
+    own: bool = False
+    score: Score = "value"
+    bounds: tuple[float, float] | None = None
+    generations: int = 30
+    population: int = 12
+    episodes: tuple[int, int] = (16, 96)
+    seed: int = 1_000_000_000
+
+    def __post_init__(self) -> None:
+        validation.positive("prices", self.prices, (len(self.prices),))
+        if len(set(self.prices)) < max(len(self.prices), 1):
+            raise validation.refusal("prices", self.prices, "one or more different numbers")
+        for name, least in (("generations", 1), ("population", 3), ("seed", 0)):
+            validation.integer(name, getattr(self, name), at_least=least)
+        for count in self.episodes:
+            validation.integer("episodes", count, at_least=1)
+        PricedThreshold(self.task, own=self.own, score=self.score)
+
+    @property
+    def text(self) -> str:
+        """The policy without its numbers."""
+        return f"priced_threshold:own={str(self.own).lower()},score={self.score}"
+
+    @property
+    def reference_price(self) -> float:
+        """The geometric mean of the prices, with five digits."""
+        return float(f"{np.exp(np.mean(np.log(self.prices))):.5g}")
+
+    @functools.cached_property
+    def coordinates(self) -> tuple[str, ...]:
+        """The number that each coordinate sets; sensors follow one another."""
+        task = self.task
+        per_sensor = ["threshold", "price_exponent"] if len(self.prices) > 1 else ["threshold"]
+        names = [name for name in per_sensor for _ in range(task.sensors)]
+        names += ["mixture"] if task.bucket.unlimited else ["mixture", "token_exponent"]
+        names.append("age_exponent")
+        return (*names, *(["margin"] if task.sensors > 1 and not self.own else []))
+
+    @functools.cached_property
+    def start(self) -> tuple[ThresholdTrial, ...]:
+        """The best single threshold at each price, with or without a wide margin at all prices."""
+        worth = np.array(self.prices) * self.task.bucket.cost / self.task.error_scale
+        low, high = self.bounds or (worth.min() / 30.0, worth.max() * 3.0)
+        values = np.geomspace(low, high, 24).tolist()
+        margins = (1.0, _WIDE) if "margin" in self.coordinates else (1.0,)
+        results = []
+        for margin in margins:
+            text = f"{self.text},price_exponent=0,margin={margin},threshold={{value}}"
+            trials = try_thresholds(self.task, text, values, 2 * self.episodes[1], self.seed)
+            results.append(tuple(min(trials, key=lambda t: t.cost(price)) for price in self.prices))
+        return min(results, key=lambda items: float(np.log(self.start_costs(items)).sum()))
+
+    def start_costs(self, trials: Sequence[ThresholdTrial]) -> Array:
+        """The costs of the start's trials, each at its price."""
+        return np.array([t.cost(p) for t, p in zip(trials, self.prices, strict=True)])
+
+    def first_point(self) -> Array:
+        """The coordinates at the start: the power of the price that fits its thresholds best."""
+        logs = np.log([result.threshold for result in self.start])
+        ratio = np.log(np.array(self.prices) / self.reference_price)
+        slope = np.clip(np.polyfit(ratio, logs, 1)[0], 0.0, 3.0) if len(ratio) > 1 else 1.0
+        rule: Any = make_policy(self.start[0].policy, self.task)
+        values = {"price_exponent": slope, "margin": np.log(rule.margin)}
+        values["threshold"] = (logs - slope * ratio).mean()
+        return np.array([values.get(name, 0.0) for name in self.coordinates])
+
+    def numbers(self, points: Array) -> ThresholdNumbers:
+        """The numbers (…, K) of K points (K, coordinates)."""
+        names = np.array(self.coordinates)
+        none = np.zeros((1, len(points)))
+        columns = dict.fromkeys(ThresholdNumbers._fields, none) | {"price_exponent": none + 1.0}
+        columns |= {name: points[:, names == name].T for name in self.coordinates}
+        for name in ("threshold", "margin"):
+            columns[name] = np.exp(columns[name])
+        return ThresholdNumbers(**columns)
+
+
+def try_thresholds(
+    task: Task, template: str, values: Sequence[float], episodes: int, seed: int
+) -> list[ThresholdTrial]:
+    """Run a rule with each of its thresholds, ``{value}`` in the template, side by side.
+
+    Raises:
+        ConfigurationError: no ``{value}``, or a policy that there is not.
+    """
+    if "{value}" not in template:
+        raise validation.refusal("template", template, "a policy with {value} for its threshold")
+    texts = [template.replace("{value}", f"{value:.5g}") for value in values]
+    rules = [make_policy(text, task) for text in texts]
+    size, briefs = max(_RUNS // episodes, 1), list[Brief]()
+    for first in range(0, len(rules), size):
+        briefs += run_beside(task, rules[first : first + size], episodes, seed)
+    return [
+        ThresholdTrial(text, float(f"{value:.5g}"), float(brief.tokens.mean()), error)
+        for text, value, brief in zip(texts, values, briefs, strict=True)
+        for error in np.nan_to_num([brief.error_cost.mean()], nan=_WORST, posinf=_WORST).tolist()
+    ]
+
+
+def search_rule(
+    search: RuleSearch,
+    earlier: Sequence[Generation] = (),
+    progress: Callable[[Generation], Any] | None = None,
+) -> SearchResult:
+    """Search, and measure the result on fresh episodes.
+
+    ``earlier`` are the generations of an interrupted search, which goes on after them as if it had
+    not been interrupted. ``progress`` is called with every new one.
+
+    Raises:
+        ConfigurationError: the package cmaes is absent, or generations of another search.
+    """
+    generations = list(earlier)
+    for generation in run_generations(search, earlier):
+        generations.append(generation)
+        if progress is not None:
+            progress(generation)
+    return search_result(search, generations)
+
+
+def run_generations(search: RuleSearch, earlier: Sequence[Generation] = ()) -> Iterator[Generation]:
+    """The generations of a search after the ``earlier`` ones, each when it is needed.
+
+    Raises:
+        ConfigurationError: the package cmaes is absent, or generations of another search.
+    """
+    require("a search of a rule", "agents", "cmaes")
+    from cmaes import CMA
+
+    ranges = np.array([_RANGES[name] for name in search.coordinates])
+    scale, limits = ranges[:, 0], ranges[:, 1:] / ranges[:, :1]
+    seed, size = search.seed, search.population
+    optimiser = CMA(search.first_point() / scale, 1.0, limits, 100, seed % 2**32, size)
+    seed += 2 * search.episodes[1]  # after the start's
+    for number in range(search.generations):
+        share = number / max(search.generations - 1, 1)
+        episodes = round(search.episodes[0] * (search.episodes[1] / search.episodes[0]) ** share)
+        points = [optimiser.ask() for _ in range(size)]
+        if number < len(earlier):
+            objectives = tuple(earlier[number].objectives)
+        else:
+            objectives = _objectives(search, np.array(points) * scale, episodes, seed)
+        optimiser.tell(list(zip(points, objectives, strict=True)))
+        generation = Generation(number, objectives, tuple((optimiser.mean * scale).tolist()))
+        if number >= len(earlier):
+            yield generation
+        elif not np.allclose(generation.mean, earlier[number].mean):
+            raise ConfigurationError(
+                f"earlier[{number}] is not allowed: it must be a generation of this search, with "
+                f"the mean {validation.display(generation.mean)}"
+            )
+        seed += episodes
+
+
+def search_result(search: RuleSearch, generations: Sequence[Generation]) -> SearchResult:
+    """The mean of the second half of the generations' means, measured on fresh episodes.
+
+    Raises:
+        ConfigurationError: no generations.
+    """
+    if not generations:
+        raise validation.refusal("generations", generations, "one or more")
+    mean = np.mean([item.mean for item in generations[len(generations) // 2 :]], axis=0)
+    settings = {"reference_price": search.reference_price, **search.numbers(mean[None])._asdict()}
+    texts = (
+        f"{name}={'/'.join(f'{value:.5g}' for value in np.ravel(column))}"
+        for name, column in settings.items()
+    )
+    policy = ",".join((search.text, *texts))
+    episodes = 4 * search.episodes[1]
+    seed = search.seed + (2 + search.generations) * search.episodes[1]
+    rule: Any = make_policy(policy, search.task)
+    costs = _costs(search, rule.numbers, episodes, seed)[0]
+    single = [make_policy(item.policy, search.task) for item in search.start]
+    briefs = [run_beside(search.task, [rule], episodes, seed)[0] for rule in single]
+    references = [
+        float(b.cost(price).mean()) for b, price in zip(briefs, search.prices, strict=True)
+    ]
+    return SearchResult(policy, search.prices, tuple(costs.tolist()), tuple(references))
+
+
+def _objectives(search: RuleSearch, points: Array, episodes: int, seed: int) -> tuple[float, ...]:
+    """Each point's cost over the cost of the best single threshold, averaged over the prices."""
+    costs = _costs(search, search.numbers(points), episodes, seed)
+    return tuple((costs / search.start_costs(search.start)).mean(-1).tolist())
+
+
+def _costs(search: RuleSearch, numbers: ThresholdNumbers, episodes: int, seed: int) -> Array:
+    """The costs (K, prices) of the numbers (…, K), on the same episodes."""
+    shape = (numbers.margin.shape[-1], len(search.prices), episodes)
+    candidate, price, episode = (place.ravel() for place in np.indices(shape))
+    policy = PricedThreshold(search.task, own=search.own, score=search.score)
+    policy.reference_price = search.reference_price
+    costs = np.empty(len(candidate))
+    for first in range(0, len(costs), _RUNS):
+        part = slice(first, first + _RUNS)
+        policy.numbers = ThresholdNumbers(*(column[:, candidate[part]] for column in numbers))
+        prices = np.array(search.prices)[price[part]]
+        costs[part] = run_priced(search.task, policy, seed + episode[part], prices).cost(prices)
+    return np.nan_to_num(costs, nan=_WORST, posinf=_WORST).reshape(shape).mean(-1)

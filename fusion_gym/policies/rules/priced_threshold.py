@@ -1,0 +1,154 @@
+"""Transmit above a threshold that follows price, tokens and age."""
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal, NamedTuple, get_args
+
+import numpy as np
+
+from fusion_gym import validation
+from fusion_gym.arrays import Array
+from fusion_gym.core.system import Knowledge, Signals
+from fusion_gym.policies.base import (
+    PerSensor,
+    Requests,
+    Rule,
+    each_number,
+    not_negative_parameter,
+    parameter,
+    surprise,
+)
+from fusion_gym.policies.belief_rule import BeliefRule
+
+Score = Literal["value", "innovation", "variance"]
+
+
+def _score(name: str, value: Score) -> None:
+    validation.choice(name, value, get_args(Score))
+
+
+def _price(name: str, value: float | None) -> None:
+    if value is not None:
+        validation.number(name, value, at_least=0.0)
+
+
+class ThresholdNumbers(NamedTuple):
+    """The searched numbers of :class:`PricedThreshold`, (sensors, 1); or of every run (…, N)."""
+
+    threshold: Array
+    price_exponent: Array
+    mixture: Array
+    token_exponent: Array
+    age_exponent: Array
+    margin: Array
+
+
+@dataclass
+class PricedThreshold(BeliefRule):
+    r"""Request where a mixture of value and loss reaches a threshold that follows the price.
+
+    It is a learned policy of a dozen numbers that one can read: a search
+    (:mod:`fusion_gym.evaluation.rule_search`) sets them for all prices at once, in the place of
+    one threshold for each price.
+
+    Args:
+        own: every sensor decides locally, by its memory and what it receives.
+        score: what v and l are. ``"value"``: the expected value of a packet and the squared norm of
+            the difference of the two estimates (:mod:`fusion_gym.core.beliefs`). ``"innovation"``:
+            the squared norm of the innovation, v in predicted standard deviations, l in the unit
+            of the measurement. ``"variance"``: the fall of the fused trace by a packet, and that
+            trace without any packet, which the centre predicts.
+        threshold: θ >= 0 at the reference price, for all sensors or for each, in the unit of the
+            score.
+        price_exponent: β, for all sensors or for each; 1 is proportional to the price.
+        price: of a token; None for the price in the reward, also where each episode draws its own.
+        reference_price: p₀ > 0.
+        mixture: m from 0, v alone, to 1, l alone.
+        token_exponent: κ; above 0 few tokens lower the threshold, below 0 they raise it.
+        age_exponent: α; above 0 a long silence raises the threshold, below 0 it lowers it.
+        margin: s >= 1, the factor by which each further sensor in the same step must exceed its
+            threshold; 1 for none.
+
+    Raises:
+        ConfigurationError: a value that is not allowed, ``margin`` with ``own``, ``own`` with the
+            variance, or a task whose policies do not see the sensors (but with the variance).
+
+    Equation:
+        $$
+        r_i=\frac{v_i^{1-m}\,l^m}{\theta_i}\left(\frac{p}{p_0}\right)^{-\beta_i}
+        \left(\frac{b+1}{\bar b+1}\right)^{-\kappa}\left(\frac{a_i+1}{6}\right)^{-\alpha},\qquad
+        \delta_i(t)=1\iff v_i>0,\ r_i\ge s^{k_i}
+        $$
+
+        vᵢ and l are the ``score``, p is the price of a token, b the tokens of at most b̄ (their
+        ratio is 1 where tokens are unlimited), aᵢ the steps since the last delivery, kᵢ the number
+        of sensors of a larger r in this step. θ is ``threshold``, β ``price_exponent``, p₀
+        ``reference_price``, m ``mixture``, κ ``token_exponent``, α ``age_exponent``, s ``margin``.
+
+    Assumes: what the rules of its score assume, ``value_of_information``,
+    ``innovation_threshold`` or ``variance_threshold``; numbers that were searched for this task.
+
+    Source: none; the scores belong to the three rules above, the powers are ours.
+
+    Example: ``priced_threshold:threshold=0.03,reference_price=0.02`` in
+    ``fusion_gym/TobitOscillator-v1 filter=tobit random_start=True token_rate=2 cost_weight=0.01
+    memory=True``.
+    """
+
+    score: Score = parameter("value", _score)
+    threshold: PerSensor = parameter(0.03, not_negative_parameter)
+    price_exponent: PerSensor = parameter(1.0, each_number)
+    price: float | None = parameter(None, _price)
+    reference_price: float = parameter(1.0, validation.number, above=0.0)
+    mixture: float = parameter(0.0, validation.number, at_least=0.0, at_most=1.0)
+    token_exponent: float = parameter(0.0, validation.number)
+    age_exponent: float = parameter(0.0, validation.number)
+    margin: float = parameter(1.0, validation.number, at_least=1.0)
+    together: ClassVar[tuple[str, ...]] = ("margin",)
+
+    def __post_init__(self) -> None:
+        if self.score == "variance":
+            Rule.__post_init__(self)
+            if self.own:
+                raise validation.refusal("own", self.own, "false with score='variance'")
+        else:
+            super().__post_init__()
+        if self.score != "value":
+            self.remember = None
+        columns = (self.column(name, self.task.sensors) for name in ThresholdNumbers._fields)
+        self.numbers = ThresholdNumbers(*columns)
+
+    @property
+    def knowledge(self) -> Knowledge:
+        """By the score, by the task's memory, and by whether sensors are compared."""
+        if self.score == "innovation":
+            return "own" if self.margin == 1.0 else "scheduler"
+        return "centre" if self.score == "variance" else super().knowledge
+
+    def __call__(self, signals: Signals) -> Requests:
+        """Requests (sensors, N)."""
+        value, loss = self._scores(signals)
+        numbers, bucket, age = self.numbers, self.task.bucket, np.maximum(signals["age"], 0.0)
+        price = signals["price"] if self.price is None else np.asarray(self.price)
+        tokens = (signals["tokens"] + 1.0) / (bucket.capacity + 1.0)
+        least = numbers.threshold * (price / self.reference_price) ** numbers.price_exponent
+        if not bucket.unlimited:
+            least = least * tokens**numbers.token_exponent
+        least = least * ((age + 1.0) / 6.0) ** numbers.age_exponent
+        value, loss = np.maximum(value, 0.0), np.maximum(loss, 0.0)
+        score = value ** (1.0 - numbers.mixture) * loss**numbers.mixture
+        requests = (value > 0.0) & (score >= least)
+        if np.all(numbers.margin == 1.0):
+            return requests
+        ratio = np.where(requests, score / np.maximum(least, 1e-300), 0.0)
+        rank = np.argsort(np.lexsort((-age, -ratio), axis=0), axis=0)
+        result: Requests = requests & (score >= least * numbers.margin**rank)
+        return result
+
+    def _scores(self, signals: Signals) -> tuple[Array, Array]:
+        """The two scores v (sensors, N) and l (…, N)."""
+        if self.score == "innovation":
+            return surprise(signals, whitened=True), surprise(signals)
+        if self.score == "variance":
+            return signals["variance_reduction"], signals["silent_variance"]
+        beliefs = self.beliefs(signals)
+        return beliefs.value(), beliefs.loss()

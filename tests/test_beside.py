@@ -1,0 +1,35 @@
+"""Policies beside each other in one batch."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fusion_gym
+from fusion_gym.evaluation.beside import run_beside
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.policies.registry import make_policy
+
+ENV = "fusion_gym/TobitOscillator-v1"
+
+
+@pytest.mark.parametrize(
+    ("options", "policies"),
+    [
+        ({}, ["innovation_threshold:threshold=0.5", "stochastic_event:weight=2", "always"]),
+        ({"memory": True}, ["value_of_information:threshold=0.01,steps=2", "value_of_information"]),
+        (
+            {"memory": True},
+            ["estimate_difference:own=true", "estimate_difference:own=true,whitened=true"],
+        ),
+    ],
+)
+def test_policies_beside_each_other_do_what_each_does_alone(
+    options: dict[str, Any], policies: list[str]
+) -> None:
+    task = fusion_gym.make_task(ENV, filter="tobit", horizon=15, **options)
+    built = [make_policy(name, task) for name in policies]
+    for name, brief in zip(policies, run_beside(task, built, 7, 3), strict=True):
+        single = run_episodes(task, make_policy(name, task), 7, 3)
+        np.testing.assert_array_equal(brief.mse, single.mse)
+        np.testing.assert_allclose(brief.rate, single.rate.mean(-1), rtol=1e-12)

@@ -1,0 +1,149 @@
+"""The search over the numbers of a rule: it lowers the cost, goes on where it stopped, repeats."""
+
+import dataclasses
+import functools
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fusion_gym
+from fusion_gym.core.task import Task
+from fusion_gym.evaluation.beside import run_beside, run_priced
+from fusion_gym.evaluation.episodes import run_episodes
+from fusion_gym.evaluation.rule_search import (
+    Generation,
+    RuleSearch,
+    run_generations,
+    search_result,
+    search_rule,
+    try_thresholds,
+)
+from fusion_gym.policies.registry import make_policy
+from fusion_gym.validation import ConfigurationError
+
+pytest.importorskip("cmaes")
+PRICES = (0.01, 0.1, 1.0)
+
+
+@functools.cache
+def task_of(**options: Any) -> Task:
+    options = {"filter": "tobit", "horizon": 40, "memory": True} | options
+    return fusion_gym.make_task("fusion_gym/TobitOscillator-v1", **options)
+
+
+def small(**changes: Any) -> RuleSearch:
+    options = {"generations": 4, "population": 4, "episodes": (4, 8), "seed": 10**6}
+    return RuleSearch(task_of(), PRICES, **(options | changes))
+
+
+def test_costs_beside_each_other_are_those_of_episodes() -> None:
+    task, text = task_of(), "priced_threshold:threshold=0.3"
+    rules = [f"{text},price={price}" for price in PRICES]
+    seeds = np.tile(np.arange(5, 11), 3)
+    prices = np.repeat(PRICES, 6)
+    priced = run_priced(task, make_policy(text, task), seeds, prices)
+    briefs = run_beside(task, [make_policy(rule, task) for rule in rules], 6, 5)
+    for place, (rule, price, brief) in enumerate(zip(rules, PRICES, briefs, strict=True)):
+        single = run_episodes(task, make_policy(rule, task), 6, 5)
+        np.testing.assert_array_equal(brief.error_cost, single.error_cost)
+        np.testing.assert_array_equal(brief.tokens, single.tokens)
+        cost = single.error_cost + price * single.tokens
+        np.testing.assert_array_equal(brief.cost(price), cost)
+        part = slice(6 * place, 6 * place + 6)
+        np.testing.assert_allclose(priced.cost(prices)[part], cost, rtol=1e-12)
+    assert len({float(brief.tokens.mean()) for brief in briefs}) == 3
+
+
+def test_a_search_from_a_bad_start_lowers_the_cost() -> None:
+    """Bounds allow too large thresholds only: the search saves a quarter on fresh episodes."""
+    search = small(bounds=(0.5, 1.0), generations=16, population=8, episodes=(4, 16))
+    every: list[Generation] = []
+    result = search_rule(search, progress=every.append)
+    assert [generation.number for generation in every] == list(range(16))
+    assert all(len(generation.objectives) == 8 for generation in every)
+    costs = np.zeros((2, len(PRICES)))
+    for place, price in enumerate(PRICES):
+        for row, text in zip(
+            costs, (f"{result.policy},price={price}", search.start[place].policy), strict=True
+        ):
+            single = run_episodes(task_of(), make_policy(text, task_of()), 100, 0)
+            row[place] = (single.error_cost + price * single.tokens).mean()
+    assert (costs[0] / costs[1]).mean() < 0.75
+    assert result.relative < -0.25
+    assert result.relative == pytest.approx((costs[0] / costs[1]).mean() - 1.0, abs=0.15)
+
+
+def test_a_resumed_search_is_the_uninterrupted_one() -> None:
+    every = list(run_generations(small()))
+    assert len(every) == 4
+    assert every == list(run_generations(small()))
+    assert every != list(run_generations(small(seed=7)))
+    states = json.loads(json.dumps([dataclasses.asdict(item) for item in every[:2]]))
+    earlier = [Generation(**state) for state in states]
+    assert list(run_generations(small(), earlier)) == every[2:]
+    result = search_rule(small(), earlier)
+    assert result == search_result(small(), every) == search_rule(small(), every)
+    assert "score=value,reference_price=0.1,threshold=" in result.policy
+    make_policy(result.policy, task_of())
+    with pytest.raises(ConfigurationError, match=r"earlier\[0\]"):
+        list(run_generations(small(seed=7), earlier))
+    with pytest.raises(ConfigurationError, match="generations = "):
+        search_result(small(), [])
+
+
+def test_trials_are_what_each_policy_does_alone() -> None:
+    task, template = task_of(), "value_of_information:threshold={value},at_most=1"
+    values = np.geomspace(0.001, 3.0, 6).tolist()
+    trials = try_thresholds(task, template, values, 8, 3)
+    for value, trial in zip(values, trials, strict=True):
+        assert trial.policy == template.format(value=f"{value:.5g}")
+        single = run_episodes(task, make_policy(trial.policy, task), 8, 3)
+        cost = float((single.error_cost + 0.1 * single.tokens).mean())
+        assert trial.cost(0.1) == pytest.approx(cost)
+    with pytest.raises(ConfigurationError, match="template = 'always'"):
+        try_thresholds(task, "always", values, 2, 0)
+
+
+def test_coordinates_are_those_that_matter() -> None:
+    names = ("threshold",) * 3 + ("price_exponent",) * 3 + ("mixture", "token_exponent")
+    assert small().coordinates == (*names, "age_exponent", "margin")
+    assert small(own=True).coordinates == (*names, "age_exponent")
+    free = dataclasses.replace(small(), task=task_of(tokens="unlimited"), prices=(0.1,))
+    assert free.coordinates == (*names[:3], "mixture", "age_exponent", "margin")
+    numbers = free.numbers(np.zeros((2, 6)))
+    assert [column.shape for column in numbers] == [(3, 2)] + [(1, 2)] * 5
+    assert [float(column[0, 0]) for column in numbers] == [1.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("options", "score"),
+    [({"information": "centre", "memory": False}, "variance"), ({}, "innovation")],
+)
+def test_other_scores_are_searched_too(options: dict[str, Any], score: Any) -> None:
+    task = task_of(**options)
+    search = dataclasses.replace(small(bounds=(0.01, 10.0)), task=task, score=score, generations=2)
+    result = search_rule(search)
+    assert f"score={score}" in result.policy
+    assert np.isfinite(result.costs).all()
+    policy: Any = make_policy(result.policy, task)
+    assert policy.knowledge == ("centre" if score == "variance" else "scheduler")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"prices": ()}, "prices = "),
+        ({"prices": (0.1, 0.1)}, "prices = "),
+        ({"prices": (0.1, -1.0)}, "prices = "),
+        ({"generations": 0}, "generations = 0"),
+        ({"population": 2}, "population = 2"),
+        ({"episodes": (0, 4)}, "episodes = 0"),
+        ({"seed": -1}, "seed = -1"),
+        ({"score": "worth"}, "score = 'worth'"),
+    ],
+)
+def test_what_a_search_refuses(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        dataclasses.replace(small(), **changes)
