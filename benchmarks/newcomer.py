@@ -89,22 +89,10 @@ def points_table(path: Path) -> str:
         comparison: dict[str, Any] = point["at_price"]
         cost, difference = comparison["cost"], comparison["difference"]
         ends = (f"{difference[end] / cost:+.1%}" for end in ("low", "high"))
-        rows.append(
-            (
-                f"{comparison['price']:.3g}",
-                f"{point['rate']:.3f}",
-                f"{point['mse']:.3g}",
-                f"`{comparison['best']}`",
-                f"{difference['mean'] / cost:+.1%} [{', '.join(ends)}]",
-            )
-        )
-    heads = (
-        "price",
-        "agent's rate",
-        "its MSE",
-        "best rule",
-        "agent's cost over the rule's",
-    )
+        cells = f"{comparison['price']:.3g}", f"{point['rate']:.3f}", f"{point['mse']:.3g}"
+        change = f"{difference['mean'] / cost:+.1%} [{', '.join(ends)}]"
+        rows.append((*cells, f"`{comparison['best']}`", change))
+    heads = "price", "agent's rate", "its MSE", "best rule", "agent's cost over the rule's"
     return table(heads, rows) + f"\n\nMeasured in fusion-gym {__version__}."
 
 

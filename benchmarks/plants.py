@@ -134,10 +134,7 @@ def run_commands(options: dict[str, Any], folder: Path, arguments: argparse.Name
         ended = subprocess.run(line, env=environment, capture_output=True, text=True)
         if ended.returncode:
             raise RuntimeError(f"{words[0]} ended with {ended.returncode}: {ended.stderr[-1000:]}")
-    after = os.times()
-    return (
-        after.children_user + after.children_system - before.children_user - before.children_system
-    )
+    return sum(os.times()[2:4]) - sum(before[2:4])  # of the children
 
 
 if __name__ == "__main__":

@@ -148,21 +148,14 @@ def main() -> None:
         rows[label] = vector(options, 1024, f"fusion_gym/{name}-v1")
     figures = measured(rows, seconds)
     medians = {name: statistics.median(figure) for name, figure in figures.items()}
-    names = list(rows)
+    first, _, _, other, *_ = medians.values()
     title = f"steps per second, one thread, median of {TURNS} turns ({ENV} where not named)"
     heads = ("what", "steps/s", "least", "most", "to the FilterPy loop", "to DummyVecEnv")
-    table = tables.table_tables(title, heads)
+    cells = []
     for name, median in medians.items():
-        result = figures[name]
-        table.add_row(
-            name,
-            f"{median:,.0f}",
-            f"{min(result):,.0f}",
-            f"{max(result):,.0f}",
-            f"{median / medians[names[0]]:.2f}",
-            f"{median / medians[names[3]]:.2f}",
-        )
-    Console(width=130).print(table)
+        speeds = (f"{speed:,.0f}" for speed in (median, min(figures[name]), max(figures[name])))
+        cells.append((name, *speeds, f"{median / first:.2f}", f"{median / other:.2f}"))
+    Console(width=130).print(tables.table_tables(title, heads, cells))
 
 
 def measured(rows: dict[str, Workload], seconds: float) -> dict[str, list[float]]:

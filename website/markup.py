@@ -47,13 +47,10 @@ def drawn(page: str) -> str:
         latex = html.unescape(match["latex"]).strip()
         picture, drop = _picture(latex, match["tag"] == "span")
         label = html.escape(" ".join(latex.split()), quote=True)
-        marks = f'role="img" aria-label="{label}"'
-        if match["tag"] == "span":
-            style = f'style="vertical-align:{drop:.2f}px"'
-            return (
-                f'<span class="formula">{picture.replace("<svg ", f"<svg {marks} {style} ")}</span>'
-            )
-        return f'<div class="formula">{picture.replace("<svg ", f"<svg {marks} ")}</div>'
+        marks = f'role="img" aria-label="{label}" '
+        marks += f'style="vertical-align:{drop:.2f}px" ' if match["tag"] == "span" else ""
+        picture = picture.replace("<svg ", f"<svg {marks}")
+        return f'<{match["tag"]} class="formula">{picture}</{match["tag"]}>'
 
     return _FORMULA.sub(svg, page)
 

@@ -21,7 +21,8 @@ def citations(text: str) -> list[str]:
         word = paper_of(env_id)
         if word and page not in visited and re.search(rf"\b{word}\b(?![./])", text):
             visited.add(page)
-            source = re.search(r"^Source: (.*?)\n\n", _doc(page), re.MULTILINE | re.DOTALL)
+            told = (DOCS / f"{page}.md").read_text(encoding="utf-8")
+            source = re.search(r"^Source: (.*?)\n\n", told, re.MULTILINE | re.DOTALL)
             assert source is not None, page
             cited = " ".join(source[1].split()).replace(
                 " Numbers in brackets are that paper's equations.", ""
@@ -31,7 +32,3 @@ def citations(text: str) -> list[str]:
                 links += f", [its figures and claims, reproduced](../reproduction/{word}.md)"
             result.append(f"*{word}* is {cited} See {links}.")
     return result
-
-
-def _doc(page: str) -> str:
-    return (DOCS / f"{page}.md").read_text(encoding="utf-8")

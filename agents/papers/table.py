@@ -11,6 +11,7 @@ import numpy as np
 
 from fusion_gym.commands.command_line import Long
 from fusion_gym.commands.options import Episodes, Seed
+from fusion_gym.docstrings import table
 from fusion_gym.envs.registration import make_task
 from fusion_gym.evaluation.episodes import EpisodeResults, run_episodes
 from fusion_gym.evaluation.intervals import mean_interval
@@ -44,9 +45,7 @@ class Table(Long):
         """Run every row and print the table."""
         rows = _rows_of(load_checked(SweepSettings, self.config), self.episodes, self.seed)
         if self.markdown:
-            lines = [COLUMNS, ("---",) * len(COLUMNS), *rows]
-            print("\n".join("| " + " | ".join(line) + " |" for line in lines))
-            return
+            return print(table(COLUMNS, rows))
         title = f"{self.episodes} episodes, seed {self.seed}"
         tables.console().print(tables.table_tables(title, COLUMNS, rows))
 

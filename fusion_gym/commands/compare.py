@@ -68,10 +68,8 @@ class Compare(Long):
 
     def run(self) -> None:
         """Run all policies on the same seeds; write, print and draw the comparison."""
-        world, sweep = (
-            load_checked(Experiment, self.config).environment,
-            load_checked(Sweep, self.sweep, "sweep"),
-        )
+        world = load_checked(Experiment, self.config).environment
+        sweep = load_checked(Sweep, self.sweep, "sweep")
         task = make_task(world.id, **world.options)
         requested = self.policies_of(task)
         for policy in requested:
@@ -93,9 +91,8 @@ class Compare(Long):
             return {self.policy: float(task.reward.price.draw(np.array([0.5]))[0])}
         span = task.reward.price.span
         if span is None:
-            raise refusal(
-                "prices", self.prices, "left out where the config has no price_range, as here"
-            )
+            reason = "left out where the config has no price_range, as here"
+            raise refusal("prices", self.prices, reason)
         name, _, text = self.policy.partition(":")
         if name not in policy_names() or "price" not in policy_parameters(name):
             reason = f"left out with policy = {self.policy!r}, which takes no price"
@@ -135,16 +132,11 @@ def compare(
     """
     episodes = next(iter(baselines.values())).episodes
     learned = run_all(task, list(agents), episodes, seed, "agent")
-    points = [
-        Point(
-            name,
-            float(item.rate.mean()),
-            float(item.mse.mean()),
-            compare_at_price(item, baselines, agents[name]),
-            compare_with_envelope(item, baselines),
-        )
-        for name, item in learned.items()
-    ]
+    points = []
+    for name, item in learned.items():
+        means = float(item.rate.mean()), float(item.mse.mean())
+        at_price = compare_at_price(item, baselines, agents[name])
+        points.append(Point(name, *means, at_price, compare_with_envelope(item, baselines)))
     envelope = lower_envelope(baselines)
     report = evaluation_report(env_id, task, episodes, seed, baselines | learned)
     write(folder / "evaluation.json", report)
@@ -152,14 +144,9 @@ def compare(
     best = (point.at_price.best for point in points)
     visible = dict.fromkeys([*sweep.points, *best, *(point.name for point in envelope), *learned])
     console = tables.console()
-    console.print(
-        tables.evaluation_table(
-            f"{env_id}: single policies, the best of all {len(baselines)} baselines, and the agent",
-            {name: report["policies"][name] for name in visible},
-            report["quantiles"],
-            {},
-        )
-    )
+    title = f"{env_id}: single policies, the best of all {len(baselines)} baselines, and the agent"
+    shown = {name: report["policies"][name] for name in visible}
+    console.print(tables.evaluation_table(title, shown, report["quantiles"], {}))
     console.print(price_table(points, baselines))
     console.print(rate_table(points))
     warn_of_unused_tokens(task, next(iter(learned.values())))

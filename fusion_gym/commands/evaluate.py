@@ -138,17 +138,13 @@ def evaluate(command: Evaluate) -> dict[str, Any]:
         if command.reference and name != command.reference
     }
     if command.reference:
-        report["reference"] = {
-            "name": command.reference,
-            "differences": {name: difference._asdict() for name, difference in differences.items()},
-        }
+        plain = {name: difference._asdict() for name, difference in differences.items()}
+        report["reference"] = {"name": command.reference, "differences": plain}
     write(command.json, report)
     title = f"{env_id}: {command.episodes} episodes of {task.horizon} steps, seed {command.seed}"
-    console = tables.console()
-    console.print(
-        tables.evaluation_table(title, report["policies"], report["quantiles"], differences)
-    )
-    console.print(tables.state_table(task.system.state_names, report["policies"]))
+    table = tables.evaluation_table(title, report["policies"], report["quantiles"], differences)
+    tables.console().print(table)
+    tables.console().print(tables.state_table(task.system.state_names, report["policies"]))
     return report
 
 
@@ -160,9 +156,8 @@ def warn_of_draws(
         return
     drawn = make_policy(f"{name},deterministic=false", task)
     episodes = min(results.episodes, _DRAWN)
-    difference = mean_interval(
-        run_episodes(task, drawn, episodes, seed).returns - results.returns[:episodes]
-    )
+    returns = run_episodes(task, drawn, episodes, seed).returns
+    difference = mean_interval(returns - results.returns[:episodes])
     if difference.low > 0.0 or difference.high < 0.0:
         remark(
             f"{name} takes its likeliest actions; drawn actions change the return by "

@@ -58,13 +58,8 @@ class Search(EnvironmentOptions, Long):
         """Search; write and print the rule."""
         env_id, options, _ = environment_of(self.env, self.config, self.options)
         search = self.rule_search(env_id, options)
-        inputs = {
-            "env": env_id,
-            "class": self.of,
-            "prices": search.prices,
-            "generations": self.generations,
-            "settings": search.task.settings,
-        }
+        inputs: dict[str, Any] = {"env": env_id, "class": self.of, "prices": search.prices}
+        inputs |= {"generations": self.generations, "settings": search.task.settings}
         self.earlier(inputs)  # refuses before anything is made
         with alone_in(self.output, "output"):
             writing(("the generations and the rule", self.output))
@@ -158,11 +153,10 @@ def token_prices(env_id: str, options: dict[str, Any], task: Task, count: int) -
 
 def result_table(env_id: str, result: SearchResult) -> Table:
     """The costs of a searched rule beside the best single thresholds."""
+    columns = result.prices, result.costs, result.threshold_costs
     rows = [
         (f"{price:.4g}", f"{cost:.4g}", f"{single:.4g}", f"{cost / single - 1.0:+.1%}")
-        for price, cost, single in zip(
-            result.prices, result.costs, result.threshold_costs, strict=True
-        )
+        for price, cost, single in zip(*columns, strict=True)
     ]
     title = f"{env_id}: costs on fresh episodes"
     heads = ("price", "cost of the rule", "of the best single threshold", "relative")

@@ -80,12 +80,9 @@ def layout_version(environment: str, names: list[str]) -> str:
 
 
 def _ports(shapes: Shapes) -> dict[str, Any]:
+    types = {name: {"type": _TYPES.get(name, "float32")} for name in shapes}
     return {
-        name: {
-            "shape": list(shape),
-            "type": _TYPES.get(name, "float32"),
-            "meaning": _MEANINGS[name],
-        }
+        name: {"shape": list(shape), **types[name], "meaning": _MEANINGS[name]}
         for name, shape in shapes.items()
     }
 
@@ -106,12 +103,8 @@ def _block(block: Block, local: bool) -> dict[str, Any]:
 def _action(agent: ModelPolicy, graph: DecisionGraph) -> dict[str, Any]:
     """The action space, and which requests each of its numbers stands for."""
     choices = None if graph.choices is None else graph.choices.tolist()
-    return {
-        "space": str(agent.view.actions),
-        "sensors": agent.task.sensors,
-        "access": agent.task.access,
-        "choices": choices,
-    }
+    space = {"space": str(agent.view.actions), "sensors": agent.task.sensors}
+    return space | {"access": agent.task.access, "choices": choices}
 
 
 def _fixed_price(agent: ModelPolicy) -> float | None:
