@@ -1,6 +1,7 @@
 """How commands are called: options, help, errors in one line, configs by their name."""
 
 import dataclasses
+import re
 import subprocess
 import sys
 import typing
@@ -10,12 +11,15 @@ import pytest
 import tyro
 from command_runs import call
 from hostile_commands import EVERY, load
+from rich.console import Console
 
 import fusion_gym
 from agents.benchmark.command import Benchmark
 from fusion_gym.commands import __main__ as everything
 from fusion_gym.commands import command_line
 from fusion_gym.commands.train import Train
+from fusion_gym.envs.registration import ENVIRONMENTS, options_of
+from fusion_gym.output.plain import plain_text
 from fusion_gym.policies.card import ALGORITHMS
 from fusion_gym.training.algorithms import TABLE
 from fusion_gym.training.catalogue import catalogue
@@ -79,22 +83,60 @@ def test_all_commands_under_one_name() -> None:
     assert absent.stderr.startswith("error: name = 'absent'")
 
 
-def test_list_and_info_show_every_entry() -> None:
+def test_list_shows_every_kind_and_every_entry() -> None:
     entries = catalogue()
-    listed = call("list", []).out
+    overview = call("list", []).out
+    assert len(overview.splitlines()) <= 60
+    assert all(name in overview for name in (*entries, *entries["environments"], "whittle"))
     for kind, named in entries.items():
         assert named, kind
-        for name, entry in named.items():
-            assert name in listed
-            assert len(entry.meaning) > 5, name
-            assert len(entry.page()) > 10, name
+        listed = call("list", [kind]).out.split()
+        assert not [name for name in named if name not in listed], kind
     assert call("list", ["zoo"]).out.split()[:2] == ["zoo", "biased_oscillator_centre"]
+    assert "'agent': known are algorithms" in call("list", ["agent"]).err
+
+
+# What no page may show: ticks, formulas and commands of LaTeX, roles of Sphinx, links, headings,
+# tables of Markdown, names that are cut off.
+MARKUP = re.compile(r"`|\$|\\[a-zA-Z]|:\w+:`|\]\(|\*\*|^ *#+ |\|--|\w…", re.MULTILINE)
+
+
+def test_info_shows_every_entry_as_plain_text() -> None:
+    terminal = Console(width=100)
+    for kind, named in catalogue().items():
+        for name, entry in named.items():
+            assert len(entry.meaning) > 5, name
+            text = plain_text(f"# {name} ({kind})\n\n{entry.page()}", terminal)
+            assert len(text) > 50, name
+            shown = text if kind != "configs" else re.sub(r"(?m)^ *#.*", "", text)
+            assert not MARKUP.findall(shown), (kind, name)
     assert "whittle:price=5" in call("info", ["whittle"]).out
     page = call("info", ["LinearFusion"]).out
-    assert "## Observation space" in page
+    assert "\nObservation space\n" in page
     assert "variance_reduction" in page
     assert call("info", ["whitle"]).err.endswith("fusion-gym list; did you mean 'whittle'?\n")
-    assert "'agent': known are algorithms" in call("list", ["agent"]).err
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_a_page_speaks_of_the_defaults_of_its_environment(env_id: str) -> None:
+    page = catalogue()["environments"][env_id].page()
+    options = options_of(env_id)()
+    assert ("sensors share limited tokens in turns" in page) == (options.sharing == "turns")
+    assert ("0 requests nobody" in page) == (options.access == "single")
+
+
+FORMULAS = {
+    r"\frac{a+b}{2}\,\theta_i^{2}": "(a+b)/2 θᵢ²",
+    r"P^{+}=P-K S K^{\mathsf T}": "P⁺ = P-K S Kᵀ",
+    r"\hat x_{k+1}\iff\det P_{s,t}>0": "x̂ₖ₊₁ ⇔ det P_(s,t) > 0",
+    r"\sum_{m=1}^{h}\sqrt{x}": "∑ₘ₌₁ʰ√(x)",
+}
+
+
+@pytest.mark.parametrize("formula", FORMULAS)
+def test_a_formula_is_a_line_of_text(formula: str) -> None:
+    page = f"before\n\n$$\n{formula}\n$$\n\nafter"
+    assert FORMULAS[formula] in plain_text(page, Console(width=100))
 
 
 def test_a_training_needs_no_config(monkeypatch: pytest.MonkeyPatch) -> None:

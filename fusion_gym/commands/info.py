@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import tyro
-from rich.markdown import Markdown
 
 from fusion_gym.commands.command_line import Command
 from fusion_gym.envs.registration import present_id
+from fusion_gym.output.plain import plain_text
 from fusion_gym.output.tables import console
 from fusion_gym.training.catalogue import catalogue
 from fusion_gym.validation import nearest, refusal
@@ -40,6 +40,4 @@ class Info(Command):
             raise refusal("name", name, f"a name of fusion-gym list{hint}")
         for kind, named in entries.items():
             if name in named:
-                text = f"# {name} ({kind})\n\n{named[name].page()}"
-                terminal = console()
-                terminal.print(Markdown(text) if terminal.is_terminal else text, markup=False)
+                print(plain_text(f"# {name} ({kind})\n\n{named[name].page()}", console()))

@@ -3,10 +3,12 @@
     fusion-gym list
     fusion-gym list environments rules
 
-``fusion-gym info NAME`` shows the page of an entry.
+Without a kind it is an overview, with kinds a line for each entry; ``fusion-gym info NAME`` shows
+the page of an entry.
 """
 
 from dataclasses import dataclass
+from textwrap import shorten
 from typing import Annotated
 
 import tyro
@@ -15,7 +17,7 @@ from rich.table import Table
 
 from fusion_gym.commands.command_line import Command
 from fusion_gym.output.tables import console
-from fusion_gym.training.catalogue import catalogue
+from fusion_gym.training.catalogue import Entry, catalogue
 from fusion_gym.validation import keys
 
 
@@ -24,20 +26,25 @@ class List(Command):
     """List what the suite has."""
 
     kinds: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="KIND")] = ()
-    """Kinds to list, such as environments or rules; none stands for all."""
+    """Kinds to list, such as environments or rules; without one the overview."""
 
     def run(self) -> None:
-        """Print a table of each kind.
+        """Print a table of each kind, or the environments and the names of all else.
 
         Raises:
             ConfigurationError: an unknown kind; the message lists all.
         """
         entries = catalogue()
         keys("kind", self.kinds, entries)
-        for kind in self.kinds or entries:
-            result = Table(title=kind, title_justify="left", box=box.SIMPLE_HEAD, show_header=False)
+        tables = {kind: entries[kind] for kind in self.kinds}
+        if not tables:
+            lines = {kind: ", ".join(entries.pop(kind)) for kind in [*entries][1:]}
+            names = {k: Entry(shorten(v, 270, placeholder=" …"), str) for k, v in lines.items()}
+            tables = entries | {"fusion-gym list KIND": names}
+        for title, rows in tables.items():
+            result = Table(title=title, title_justify="left", box=box.SIMPLE, show_header=False)
             result.add_column(no_wrap=True)
             result.add_column(overflow="fold")
-            for name, entry in entries[kind].items():
+            for name, entry in rows.items():
                 result.add_row(name, entry.meaning)
             console().print(result, markup=False)

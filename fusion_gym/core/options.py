@@ -66,11 +66,13 @@ class CommonOptions:
     ``"turns"`` grants in the order of a queue: a sensor that is granted goes to its end, and a head
     that the tokens do not pay for blocks those behind it."""
     packet: Literal["measurement", "estimate"] = "measurement"
-    """Content of a packet: the sensor's measurement as in the paper, or the centralised scheduler's
-    estimate with its covariance. ``"estimate"`` needs ``memory=True``."""
+    """Content of a packet. ``"measurement"`` is what the sensor measured or its node estimated.
+    ``"estimate"`` is the centralised scheduler's estimate with its covariance, with ``memory=True``
+    alone."""
     broadcast: Broadcast | None = None
     """What every node receives besides tokens and price: nothing, the fusion centre's prediction
-    with its covariance, or every delivered packet. By default as in the paper."""
+    with its covariance, or every delivered packet. By default ``"estimate"`` where the centre feeds
+    its estimate back, and otherwise ``"none"``."""
     memory: bool = False
     """Whether measurements that were not sent are remembered, by the centralised scheduler or by
     each sensor."""
@@ -109,7 +111,8 @@ class CommonOptions:
     rules: it takes the prices at which the best value of information with memory sends 60 and 12 %
     of what the bucket sustains, but at least two packets of each sensor in an episode."""
     state_weights: ArrayLike | None = None
-    """Weights of the states' squared errors in the reward. By default all states count alike."""
+    """Weights of the states' squared errors in the reward. By default the environment's own,
+    which ``help`` shows."""
     reward_scale: float | Literal["auto"] | None = "auto"
     """Factor of the state weights. ``"auto"`` simulates a moderate policy and takes the factor with
     which its error costs 1 a step; given ``state_weights`` then stay as they are. That policy

@@ -54,6 +54,11 @@ _BELIEFS: dict[Owner, str] = {
 }
 _SEES = {"own": "its own", "broadcast": "all", "hidden": "none"}
 _WORDS = {"ArrayLike": "number or array", "float": "number", "int": "whole number", "str": "word"}
+_ACTIONS = {
+    "single": "0 requests nobody, m requests sensor m - 1",
+    "binary": "A 1 requests the sensor",
+    "discrete": "The number has a bit for each sensor, the lowest for sensor 0",
+}
 _LONGEST = 60  # characters of a default in a table
 # What writes the tables of a kind from the text of their marker: "module:function".
 TABLES = {
@@ -67,11 +72,8 @@ TABLES = {
 }
 _MARKED = re.compile(rf"(<!-- ({'|'.join(TABLES)}): (.*?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
-_FIRST = "v0: first version."
-_SECOND = (
-    "v1: covariances may be singular, sensors share tokens in turns, noise is counted, not drawn "
-    "in sequence."
-)
+_QUEUE = ", sensors share limited tokens in turns"
+_SECOND = f"v1: covariances may be singular{_QUEUE}; noise is counted, not drawn in sequence."
 
 
 def page(env_id: str, task: Task | None = None) -> str:
@@ -88,10 +90,13 @@ def page(env_id: str, task: Task | None = None) -> str:
     system, view = task.system, make_view(task)
     description = _paragraphs(kind) or [env_id]
     versions = [text for text in description if re.match(r"v\d+: ", text)]
+    if kind.__module__.startswith("fusion_gym."):
+        versions.insert(0, _SECOND if kind().sharing == "turns" else _SECOND.replace(_QUEUE, ""))
     weights = task.reward.state_weights[:, 0]
     return _PAGE.read_text(encoding="utf-8").format(
-        description="\n\n".join(text for text in description if text not in versions),
+        description="\n\n".join(text for text in description if not re.match(r"v\d+: ", text)),
         actions=view.actions,
+        action=_ACTIONS["single" if task.access == "single" else task.action],
         entries=len(view.names),
         sensors=task.sensors,
         states=", ".join(system.state_names),
@@ -102,7 +107,7 @@ def page(env_id: str, task: Task | None = None) -> str:
         horizon=task.horizon,
         options=kind.__name__,
         arguments="\n".join(f"    {plain_marks(line)}" for line in list_options(options_in(kind))),
-        history="\n".join(f"- {text}" for text in [_FIRST, _SECOND, *versions]),
+        history="\n".join(f"- {text}" for text in ["v0: first version.", *versions]),
     )
 
 

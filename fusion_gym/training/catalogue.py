@@ -1,8 +1,8 @@
 """What the suite has, by kind and name, with the declaration of each."""
 
-import inspect
 import itertools
 import re
+import textwrap
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from fusion_gym.envs.registration import ENVIRONMENTS, make_task, options_of
 from fusion_gym.evaluation.metrics import METRICS
 from fusion_gym.fusion.table import RULES
 from fusion_gym.policies.registry import policy_maker, policy_names
-from fusion_gym.training.algorithms import TABLE, Algorithm
+from fusion_gym.training.algorithms import TABLE
 from fusion_gym.training.checked import SHIPPED
 
 
@@ -43,7 +43,7 @@ def catalogue() -> dict[str, dict[str, Entry]]:
             name: Entry(row.meaning, partial(str, row.meaning)) for name, row in METRICS.items()
         },
         "algorithms": {
-            name: Entry(row.meaning, partial(_settings, row)) for name, row in TABLE.items()
+            name: Entry(row.meaning, partial(_settings, name)) for name, row in TABLE.items()
         },
         "zoo": {name: _agent(name) for name in zoo.names()},
         "configs": {
@@ -55,9 +55,16 @@ def catalogue() -> dict[str, dict[str, Entry]]:
 
 def _declared(owner: Any, meaning: str = "") -> Entry:
     """Return what a docstring declares."""
-    return Entry(
-        plain_marks(meaning or read(owner).summary), lambda: _code(inspect.getdoc(owner) or "")
-    )
+    return Entry(plain_marks(meaning or read(owner).summary), partial(_page, owner, meaning))
+
+
+def _page(owner: Any, meaning: str) -> str:
+    """Return a docstring in Markdown, a heading for each of its labels."""
+    text, labelled = declared = read(owner)
+    arguments = "\n".join(f"- `{name}`: {what}" for name, what in declared.arguments.items())
+    parts = {"Parameters": arguments, **labelled, "Args": ""}
+    below = [f"## {label}\n\n{part}" for label, part in parts.items() if part]
+    return "\n\n".join([meaning, text, *below])
 
 
 def _environment(env_id: str) -> str:
@@ -74,15 +81,15 @@ def _filters() -> dict[str, Entry]:
         for name, owner in options_of(env_id).filters.items():
             owners.setdefault(name or owner.__name__, {}).setdefault(owner, []).append(env_id)
     return {
-        name: Entry(_declared(next(iter(places))).meaning, partial(_classes, places))
+        name: Entry("; ".join(_declared(o).meaning for o in places), partial(_classes, places))
         for name, places in owners.items()
     }
 
 
 def _classes(places: Mapping[type, list[str]]) -> str:
     """Return the declarations of classes, each below the environments that have it."""
-    return "\n".join(
-        f"{', '.join(where)}:\n\n{_declared(owner).page()}" for owner, where in places.items()
+    return "\n\n".join(
+        f"# {', '.join(where)}\n\n{_declared(owner).page()}" for owner, where in places.items()
     )
 
 
@@ -97,10 +104,11 @@ def _signals() -> dict[str, Entry]:
     return {name: Entry(where[0][-1], partial(table, head, where)) for name, where in rows.items()}
 
 
-def _settings(row: Algorithm) -> str:
+def _settings(name: str) -> str:
     """Return the settings of an algorithm with their defaults."""
-    fields = row.config.model_fields.items()
-    rows = [(f"`{name}`", short(field.default)) for name, field in fields if name != "name"]
+    row = TABLE[name]
+    fields = row.config(name=name).model_dump(exclude={"name"})
+    rows = [(f"`{name}`", short(value)) for name, value in fields.items()]
     return f"{row.meaning}; {row.source}\n\n{table(('setting', 'default'), rows)}\n"
 
 
@@ -118,8 +126,4 @@ def _config(text: str) -> Entry:
     """Return a config with the sentence of its first comment."""
     lines = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
     comment = " ".join(line.strip("# ") for line in lines)
-    return Entry(re.split(r"(?<=[.])\s", comment)[0], partial(_code, text, "yaml"))
-
-
-def _code(text: str, language: str = "text") -> str:
-    return f"```{language}\n{text.rstrip()}\n```\n"
+    return Entry(re.split(r"(?<=[.])\s", comment)[0], partial(textwrap.indent, text, "    "))

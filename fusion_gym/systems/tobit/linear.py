@@ -62,6 +62,9 @@ class LinearFusionOptions(FeedbackOptions):
 
     The defaults are a target in one dimension, sampled every 0.1 s, with white acceleration;
     one sensor measures its position in metres, one its velocity in metres a second.
+
+    v2: ``reward_scale`` multiplies the state weights: a moderate policy costs 1 a step by default.
+    Entries of beliefs scale by its errors, and the price of a token is 0.5.
     """
 
     filters: ClassVar[Mapping[str, type]] = classes(_FILTERS)
