@@ -8,7 +8,7 @@ LOWEST := .venv-lowest
 QUICK  := tests/laws/test_interfaces.py tests/test_bad_input.py tests/test_environment_api.py \
 	tests/test_evaluation.py tests/test_model_files.py \
 	tests/test_resume.py::test_a_resumed_training_is_the_uninterrupted_one \
-	tests/test_benchmark.py::test_from_tuning_to_report_and_zoo
+	tests/test_benchmark.py::test_from_prices_to_pages_and_zoo
 
 .PHONY: help demo test test-all test-lowest mutants mutants-sample coverage wheel-test wheel films benchmark papers zoo newcomer docs integrations \
 	integrations-tianshou integrations-rllib lines lint format bench clean

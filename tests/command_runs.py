@@ -4,7 +4,6 @@ import contextlib
 import io
 import os
 import re
-import resource
 import signal
 import sys
 import traceback
@@ -14,6 +13,10 @@ from typing import NamedTuple
 
 from hostile_commands import Try, load
 from hostile_folder import contents
+
+POSIX = os.name == "posix"
+if POSIX:
+    import resource
 
 NOBODY = 65534
 
@@ -38,10 +41,11 @@ def call(command: str, words: list[str], seconds: float = 60.0, limit: int | Non
         raise Hung
 
     out, err, trace, status = io.StringIO(), io.StringIO(), "", 0
-    longest = resource.getrlimit(resource.RLIMIT_FSIZE)
-    before = sys.argv, signal.signal(signal.SIGALRM, late)
-    sys.argv = ["program", *words]
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    arguments, sys.argv = sys.argv, ["program", *words]
+    if POSIX:  # elsewhere a try may take any time
+        longest = resource.getrlimit(resource.RLIMIT_FSIZE)
+        alarm = signal.signal(signal.SIGALRM, late)
+        signal.setitimer(signal.ITIMER_REAL, seconds)
     if limit is not None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, longest[1]))
     try:
@@ -55,10 +59,11 @@ def call(command: str, words: list[str], seconds: float = 60.0, limit: int | Non
     except BaseException:
         status, trace = 1, traceback.format_exc()
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        resource.setrlimit(resource.RLIMIT_FSIZE, longest)
-        sys.argv = before[0]
-        signal.signal(signal.SIGALRM, before[1])
+        if POSIX:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            resource.setrlimit(resource.RLIMIT_FSIZE, longest)
+            signal.signal(signal.SIGALRM, alarm)
+        sys.argv = arguments
     return Ended(status, out.getvalue(), err.getvalue(), trace)
 
 
@@ -81,7 +86,7 @@ def refusal(command: str, words: list[str], limit: int | None = None) -> str:
 @contextlib.contextmanager
 def without_rights(requests: bool) -> Iterator[None]:
     """As somebody who may not enter a locked folder, even if the tests run as root."""
-    if not requests or os.geteuid() != 0:
+    if not requests or not POSIX or os.geteuid() != 0:
         yield
         return
     os.seteuid(NOBODY)

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 from page_blocks import blocks_of, imported
 
 import fusion_gym
@@ -136,3 +137,17 @@ def test_the_citation_is_of_this_version() -> None:
         assert re.search(r'^version(?:: | = ")([\d.]+)', text, re.MULTILINE)[1] == (  # type: ignore[index]
             fusion_gym.__version__
         )
+    assert f"version = {{{fusion_gym.__version__}}}" in (ROOT / "docs/papers.bib").read_text()
+
+
+def test_the_bibliography_has_every_paper_that_an_environment_names() -> None:
+    keys = re.findall(r"^@\w+{(\w+),$", (ROOT / "docs/papers.bib").read_text(), re.MULTILINE)
+    papers = [path.stem for path in (ROOT / "docs/reproduction").glob("*.md")]
+    assert {*papers, "fusion_gym"} == {*keys, "README"}
+
+
+@pytest.mark.skipif(not (ROOT / ".github").exists(), reason="the source distribution has none")
+def test_the_workflow_runs_the_targets_of_ci() -> None:
+    workflow = yaml.safe_load((ROOT / ".github/workflows/test.yml").read_text())
+    targets = workflow["jobs"]["targets"]["strategy"]["matrix"]["target"]
+    assert re.findall(r"^make (\S+)$", (ROOT / ".ci/run").read_text(), re.MULTILINE) == targets
