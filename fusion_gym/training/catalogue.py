@@ -98,7 +98,8 @@ def _signals() -> dict[str, Entry]:
     rows: dict[str, list[tuple[str, ...]]] = {}
     for env_id in ENVIRONMENTS:
         for signal in make_task(env_id).system.signals:
-            row = (env_id, signal.axes, MEANING[signal.knowledge], signal.meaning)
+            known, place = MEANING[signal.knowledge], env_id.rpartition("/")[2]
+            row = (place, signal.axes, known, signal.meaning)
             rows.setdefault(signal.name, []).append(row)
     head = ("environment", "axes", "known to", "meaning")
     return {name: Entry(where[0][-1], partial(table, head, where)) for name, where in rows.items()}
