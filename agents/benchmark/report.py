@@ -91,8 +91,9 @@ def write_results(suite: Suite, classes: Sequence[Class], folder: Path) -> None:
 
 def relative_text(row: ClassRow | PointRow | ChoiceRow | object) -> str:
     """Return a difference with its interval, in per cent."""
-    mean, low, high = (getattr(row, name) for name in ("difference", "low", "high"))
-    return f"{100 * mean:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]".replace("-", "−")
+    mean, low, high = (100.0 * getattr(row, name) for name in ("difference", "low", "high"))
+    interval = "" if low == high else f" [{low:+.1f}, {high:+.1f}]"
+    return f"{mean:+.1f}{interval}".replace("-", "−")
 
 
 def headline_text(titles: dict[str, str], rows: Sequence[ClassRow]) -> str:

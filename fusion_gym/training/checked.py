@@ -13,7 +13,10 @@ from fusion_gym.errors import display
 from fusion_gym.validation import ConfigurationError
 from fusion_gym.yaml_text import parsed
 
-SHIPPED = Path(str(files("fusion_gym.configs")))
+try:
+    SHIPPED = Path(str(files("fusion_gym.configs")))
+except ModuleNotFoundError:  # a source tree that is not installed
+    SHIPPED = Path(__file__).parents[2] / "configs"
 
 Model = TypeVar("Model", bound=pydantic.BaseModel)
 Shape = TypeVar("Shape")
