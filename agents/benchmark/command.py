@@ -88,7 +88,3 @@ class Benchmark(Long):
             write_results(suite, classes, folder)
             print_classes(class_rows(classes), point_rows(suite, classes))
         print(f"results in {folder}")
-
-    def interrupted(self) -> str:
-        """Return the command that goes on: the same."""
-        return f"interrupted; go on with: {self.again()}"

@@ -24,6 +24,7 @@ from fusion_gym.docstrings import table
 from fusion_gym.output import tables
 from fusion_gym.output.figures import save_figure
 from fusion_gym.output.files import write_text
+from fusion_gym.output.palette import READABLE
 from fusion_gym.version import __version__
 
 GAIN = 0.01  # a difference that the sentences name
@@ -39,6 +40,7 @@ LINES = {  # kind: label, colour, marker
     "rule": ("searched rule", "black", "s"),
     "agent": ("agents", "tab:orange", "^"),
     "optimum": ("optimum", "tab:green", "*"),
+    "bound": ("proven bound", "tab:red", "_"),
 }
 
 
@@ -115,13 +117,11 @@ def class_table(
     lines = []
     for row in choices:
         cells = [by_kind.get((row.setting, row.name, kind), "–") for kind in kinds]
-        bound = by_kind.get((row.setting, row.name, "bound"), "–").partition(" ")[0]
         memory = "–" if np.isnan(row.memory) else f"{row.memory:+.1%}".replace("-", "−")
         chosen = f"{row.choice} {relative_text(row)}" if row.choice != "rule" else "rule"
-        lines.append((titles[row.setting], TITLES[row.name], *cells, bound, chosen, memory))
+        lines.append((titles[row.setting], TITLES[row.name], *cells, chosen, memory))
     heads = (LINES[kind][0] for kind in kinds)
-    last = ("proven bound", "validation chooses", "without memory")
-    return table(("setting", "class", *heads, *last), lines)
+    return table(("setting", "class", *heads, "validation chooses", "without memory"), lines)
 
 
 def sentences(rows: Sequence[ClassRow], points: Sequence[PointRow]) -> list[str]:
@@ -159,6 +159,7 @@ def sentences(rows: Sequence[ClassRow], points: Sequence[PointRow]) -> list[str]
 
 def draw_setting(rows: Sequence[TestRow], title: str, path: Path) -> None:
     """Draw error against tokens a step, one panel a class."""
+    plt.rcParams.update(READABLE)
     names = list(dict.fromkeys(row.name for row in rows))
     figure, panels = plt.subplots(1, len(names), figsize=(4.2 * len(names), 3.6), squeeze=False)
     for panel, name in zip(panels[0], names, strict=True):
@@ -172,9 +173,9 @@ def draw_setting(rows: Sequence[TestRow], title: str, path: Path) -> None:
                 )  # fmt: skip
         panel.set(xscale="log", yscale="log", xlabel="tokens a step", title=TITLES[name])
     panels[0][0].set_ylabel("error, in the reward's weights")
-    panels[0][-1].legend(fontsize=7)
     figure.suptitle(title)
-    figure.tight_layout()
+    figure.tight_layout(rect=(0.0, 0.08, 1.0, 1.0))
+    figure.legend(*panels[0][-1].get_legend_handles_labels(), loc="lower center", ncols=5)
     save_figure(figure, path)
 
 

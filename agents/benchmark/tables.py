@@ -62,7 +62,7 @@ class ClassRow:
 
 @dataclass(frozen=True)
 class ChoiceRow:
-    """The policy of a class that validation chooses, and what memory is worth to single thresholds.
+    """The policy of a class that validation chooses, and the gain by memory of single thresholds.
 
     ``memory`` is the cost without memory over that with it, minus 1, on the tuning episodes; NaN
     where a class has none.
