@@ -172,6 +172,7 @@ def draw_setting(rows: Sequence[TestRow], title: str, path: Path) -> None:
                     marker=marker, markersize=5, linewidth=1, label=label if seed == 0 else None,
                 )  # fmt: skip
         panel.set(xscale="log", yscale="log", xlabel="tokens a step", title=TITLES[name])
+        panel.xaxis.set_minor_formatter("")
     panels[0][0].set_ylabel("error, in the reward's weights")
     figure.suptitle(title)
     figure.tight_layout(rect=(0.0, 0.08, 1.0, 1.0))
