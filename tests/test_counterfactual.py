@@ -222,6 +222,20 @@ SETTINGS: list[Any] = [
 ]  # fmt: skip
 
 
+def test_another_unit_of_the_critic_changes_no_value() -> None:
+    env, _ = env_of("all")
+    model = CounterfactualPPO("MlpPolicy", env, seed=0)
+    observation = torch.rand((RUNS, env.observation_space.shape[0]))  # type: ignore[index]
+    before = model._critic(observation)
+    model._rescale_critic(400.0)
+    assert model.value_scale == pytest.approx(400.0)
+    torch.testing.assert_close(model._critic(observation), before)
+    model._n_updates = 1
+    model._rescale_critic(4.0)
+    assert 4.0 < model.value_scale < 400.0
+    torch.testing.assert_close(model._critic(observation), before)
+
+
 @pytest.mark.parametrize(("kind", "options", "training", "where"), SETTINGS)
 def test_its_models_are_ordinary_ones(
     tmp_path: Path, kind: str, options: Any, training: Any, where: Any

@@ -16,6 +16,7 @@ from fusion_gym.evaluation.rule_search import (
     Generation,
     RuleSearch,
     run_generations,
+    search_of_class,
     search_result,
     search_rule,
     try_thresholds,
@@ -108,13 +109,43 @@ def test_trials_are_what_each_policy_does_alone() -> None:
 
 def test_coordinates_are_those_that_matter() -> None:
     names = ("threshold",) * 3 + ("price_exponent",) * 3 + ("mixture", "token_exponent")
-    assert small().coordinates == (*names, "age_exponent", "margin")
+    assert small().coordinates == (*names, "age_exponent", "margin", "margin_exponent")
     assert small(own=True).coordinates == (*names, "age_exponent")
     free = dataclasses.replace(small(), task=task_of(tokens="unlimited"), prices=(0.1,))
     assert free.coordinates == (*names[:3], "mixture", "age_exponent", "margin")
     numbers = free.numbers(np.zeros((2, 6)))
-    assert [column.shape for column in numbers] == [(3, 2)] + [(1, 2)] * 5
-    assert [float(column[0, 0]) for column in numbers] == [1.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+    assert [column.shape for column in numbers] == [(3, 2)] + [(1, 2)] * 6
+    assert [float(column[0, 0]) for column in numbers] == [1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+
+
+def test_the_start_fits_the_margin_to_the_prices() -> None:
+    search = small()
+    cheap, dear = search.start[0], search.start[-1]
+    trials = (
+        dataclasses.replace(cheap, policy="priced_threshold:margin=1"),
+        *(dataclasses.replace(dear, policy="priced_threshold:margin=20") for _ in range(2)),
+    )
+    search.__dict__["start"] = trials
+    point = dict(zip(search.coordinates, search.first_point(), strict=True))
+    assert point["margin_exponent"] == pytest.approx(np.log(20.0) / np.log(100.0))
+    assert point["margin"] == pytest.approx(2.0 / 3.0 * np.log(20.0))
+    rule: Any = make_policy("priced_threshold:margin=4,margin_exponent=1,price=0.1", task_of())
+    same: Any = make_policy("priced_threshold:margin=1,price=0.1", task_of())  # 4 · 0.1 is below 1
+    results = [run_beside(task_of(), [policy], 4, 0)[0] for policy in (rule, same)]
+    np.testing.assert_array_equal(results[0].tokens, results[1].tokens)
+
+
+def test_a_class_is_searched_by_its_cheapest_score() -> None:
+    options = {"generations": 1, "population": 4, "episodes": (4, 8)}
+    search = search_of_class("local", task_of(), PRICES, **options)
+    costs = {}
+    for score in ("value", "innovation"):
+        single: Any = dataclasses.replace(search, score=score)
+        costs[score] = np.log(single.start_costs(single.start)).sum()
+    assert search.own
+    assert search.score == min(costs, key=costs.__getitem__)
+    assert search_of_class("scheduler", task_of(), PRICES).score == "value"
+    assert search_of_class("centre", task_of(), PRICES).score == "variance"
 
 
 @pytest.mark.parametrize(

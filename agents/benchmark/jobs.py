@@ -9,9 +9,10 @@ from typing import Any, ClassVar, TypeVar
 
 import pydantic
 
-from agents.benchmark.settings import ClassName, Setting
+from agents.benchmark.settings import Setting
 from agents.cache import Cache
 from agents.workers import Pool, missing, side_by_side
+from fusion_gym.evaluation.rule_search import ClassName
 
 AnyJob = TypeVar("AnyJob", bound="Job")
 Result = TypeVar("Result")

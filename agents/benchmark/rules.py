@@ -20,8 +20,8 @@ from fusion_gym.core.task import Task
 from fusion_gym.evaluation.beside import run_beside
 from fusion_gym.evaluation.rule_search import (
     Generation,
-    RuleSearch,
     ThresholdTrial,
+    search_of_class,
     search_rule,
     try_thresholds,
 )
@@ -144,14 +144,8 @@ def _finer(
 
 def run_search(job: SearchJob) -> str:
     """Return the searched rule's line of text; generations stay in the folder until the end."""
-    search = RuleSearch(
-        job.setting.task(job.name),
-        job.prices,
-        own=job.name == "local",
-        score="variance" if job.name == "centre" else "value",
-        generations=job.generations,
-        seed=job.seed,
-    )
+    task = job.setting.task(job.name)
+    search = search_of_class(job.name, task, job.prices, generations=job.generations, seed=job.seed)
     state = job.folder / f"{job.setting.name}_{job.name}_{job.seed}.json"
     state.parent.mkdir(parents=True, exist_ok=True)
     content = json.loads(state.read_text()) if state.exists() else []

@@ -8,6 +8,7 @@ import pydantic
 from fusion_gym.core.system import Knowledge
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
+from fusion_gym.evaluation.rule_search import ClassName
 from fusion_gym.training.algorithms import AnyAlgorithm
 from fusion_gym.training.checked import Positive, Rate, Share, Strict, parse, read_yaml
 from fusion_gym.training.config import (
@@ -18,7 +19,6 @@ from fusion_gym.training.config import (
 )
 from fusion_gym.validation import choice
 
-ClassName = Literal["centre", "local", "scheduler"]
 CLASSES: tuple[ClassName, ...] = get_args(ClassName)
 FILE = Path(__file__).with_name("settings.yaml")
 # First episodes: of tests, of the choice between policies, and of tuning.

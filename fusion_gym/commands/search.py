@@ -14,7 +14,7 @@ the best single threshold there.
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -24,7 +24,14 @@ from fusion_gym.commands.command_line import EnvironmentOptions, Long
 from fusion_gym.commands.options import OutputFolder, Whole
 from fusion_gym.core.task import Task
 from fusion_gym.envs.registration import make_task
-from fusion_gym.evaluation.rule_search import Generation, RuleSearch, SearchResult, search_rule
+from fusion_gym.evaluation.rule_search import (
+    ClassName,
+    Generation,
+    RuleSearch,
+    SearchResult,
+    search_of_class,
+    search_rule,
+)
 from fusion_gym.output import tables
 from fusion_gym.output.files import read_json, write
 from fusion_gym.output.folders import alone_in, check_inputs
@@ -43,9 +50,7 @@ class Search(EnvironmentOptions, Long):
 
     output: Annotated[Path, OutputFolder()]
     """Folder of the search."""
-    of: Annotated[Literal["scheduler", "local", "centre"], tyro.conf.arg(name="class")] = (
-        "scheduler"
-    )
+    of: Annotated[ClassName, tyro.conf.arg(name="class")] = "scheduler"
     """Who decides: a scheduler that sees all sensors, every sensor for itself, or the centre."""
     prices: Annotated[int, Whole(2, 100)] = 5
     """Prices of a token, from the lowest to the highest."""
@@ -76,13 +81,7 @@ class Search(EnvironmentOptions, Long):
         """
         task = make_task(env_id, **options)
         prices = token_prices(env_id, options, task, self.prices)
-        result = RuleSearch(
-            task,
-            prices,
-            own=self.of == "local",
-            score="variance" if self.of == "centre" else "value",
-            generations=self.generations,
-        )
+        result = search_of_class(self.of, task, prices, generations=self.generations)
         make_policy(result.text, task)
         return result
 

@@ -1,6 +1,6 @@
 """CMA-ES over the numbers of the rule ``priced_threshold``, for one task at several prices at once.
 
-    search = RuleSearch(task, prices=(0.003, 0.01, 0.03, 0.1))
+    search = search_of_class("scheduler", task, prices=(0.003, 0.01, 0.03, 0.1))
     result = search_rule(search)
     policy = make_policy(result.policy, task)
 
@@ -15,7 +15,7 @@ Computation 9, 2001, as in the package cmaes.
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -28,6 +28,13 @@ from fusion_gym.policies.registry import make_policy
 from fusion_gym.policies.rules.priced_threshold import PricedThreshold, Score, ThresholdNumbers
 from fusion_gym.validation import ConfigurationError
 
+ClassName = Literal["centre", "local", "scheduler"]
+# The scores of each class's search.
+_SCORES: dict[ClassName, tuple[Score, ...]] = {
+    "centre": ("variance",),
+    "local": ("value", "innovation"),
+    "scheduler": ("value",),
+}
 _RUNS = 2048  # beside each other; fixed, so that results do not depend on the machine
 _WIDE = 20.0  # a margin that hardly ever lets two sensors transmit in the same step
 _WORST = 1e30  # the cost of a candidate whose error is no number
@@ -39,6 +46,7 @@ _RANGES = {
     "token_exponent": (0.15, -3.0, 3.0),
     "age_exponent": (0.1, -3.0, 3.0),
     "margin": (0.15, 0.0, 4.0),
+    "margin_exponent": (0.075, -3.0, 3.0),
 }
 
 
@@ -139,35 +147,39 @@ class RuleSearch:
         names = [name for name in per_sensor for _ in range(task.sensors)]
         names += ["mixture"] if task.bucket.unlimited else ["mixture", "token_exponent"]
         names.append("age_exponent")
-        return (*names, *(["margin"] if task.sensors > 1 and not self.own else []))
+        if task.sensors > 1 and not self.own:
+            names += ["margin", "margin_exponent"] if len(self.prices) > 1 else ["margin"]
+        return tuple(names)
 
     @functools.cached_property
     def start(self) -> tuple[ThresholdTrial, ...]:
-        """The best single threshold at each price, with or without a wide margin at all prices."""
+        """The best single threshold at each price, with or without a wide margin."""
         worth = np.array(self.prices) * self.task.bucket.cost / self.task.error_scale
         low, high = self.bounds or (worth.min() / 30.0, worth.max() * 3.0)
         values = np.geomspace(low, high, 24).tolist()
         margins = (1.0, _WIDE) if "margin" in self.coordinates else (1.0,)
-        results = []
+        trials = []
         for margin in margins:
             text = f"{self.text},price_exponent=0,margin={margin},threshold={{value}}"
-            trials = try_thresholds(self.task, text, values, 2 * self.episodes[1], self.seed)
-            results.append(tuple(min(trials, key=lambda t: t.cost(price)) for price in self.prices))
-        return min(results, key=lambda items: float(np.log(self.start_costs(items)).sum()))
+            trials += try_thresholds(self.task, text, values, 2 * self.episodes[1], self.seed)
+        return tuple(min(trials, key=lambda t: t.cost(price)) for price in self.prices)
 
     def start_costs(self, trials: Sequence[ThresholdTrial]) -> Array:
         """The costs of the start's trials, each at its price."""
         return np.array([t.cost(p) for t, p in zip(trials, self.prices, strict=True)])
 
     def first_point(self) -> Array:
-        """The coordinates at the start: the power of the price that fits its thresholds best."""
-        logs = np.log([result.threshold for result in self.start])
+        """The coordinates at the start: the powers of the price that fit its numbers best."""
         ratio = np.log(np.array(self.prices) / self.reference_price)
-        slope = np.clip(np.polyfit(ratio, logs, 1)[0], 0.0, 3.0) if len(ratio) > 1 else 1.0
-        rule: Any = make_policy(self.start[0].policy, self.task)
-        values = {"price_exponent": slope, "margin": np.log(rule.margin)}
-        values["threshold"] = (logs - slope * ratio).mean()
-        return np.array([values.get(name, 0.0) for name in self.coordinates])
+        values = dict[str, float]()
+        for name, exponent in (("threshold", "price_exponent"), ("margin", "margin_exponent")):
+            rules: list[Any] = [make_policy(trial.policy, self.task) for trial in self.start]
+            logs = np.log([getattr(rule, name) for rule in rules])
+            slope = float(ratio @ logs) / float(ratio @ ratio) if len(ratio) > 1 else 1.0
+            values |= {exponent: slope, name: (logs - slope * ratio).mean()}
+        limits = (_RANGES[name][1:] for name in self.coordinates)
+        start = zip(self.coordinates, limits, strict=True)
+        return np.array([np.clip(values.get(name, 0.0), *ends) for name, ends in start])
 
     def numbers(self, points: Array) -> ThresholdNumbers:
         """The numbers (…, K) of K points (K, coordinates)."""
@@ -178,6 +190,25 @@ class RuleSearch:
         for name in ("threshold", "margin"):
             columns[name] = np.exp(columns[name])
         return ThresholdNumbers(**columns)
+
+
+def search_of_class(
+    name: ClassName, task: Task, prices: Sequence[float], **options: Any
+) -> RuleSearch:
+    """Return the search of a class, by the score with the cheapest single thresholds.
+
+    ``options`` are other fields of :class:`RuleSearch`.
+
+    Raises:
+        ConfigurationError: a value that is not allowed, or a task without such rules.
+    """
+    searches = [
+        RuleSearch(task, tuple(prices), name == "local", score, **options)
+        for score in _SCORES[name]
+    ]
+    if len(searches) == 1:
+        return searches[0]
+    return min(searches, key=lambda item: float(np.log(item.start_costs(item.start)).sum()))
 
 
 def try_thresholds(

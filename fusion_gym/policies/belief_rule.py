@@ -50,7 +50,7 @@ def check_owner(task: Task, own: bool, **only_together: Any) -> None:
     """Whether a task lets its policies see the sensors, or every sensor decide by itself.
 
     ``only_together`` are parameters that take more than one sensor to decide: with ``own`` they
-    must be ``None`` or 1.
+    must be ``None``, 0 or 1.
 
     Raises:
         ConfigurationError: it does not, or such a parameter beside ``own``.
@@ -64,7 +64,7 @@ def check_owner(task: Task, own: bool, **only_together: Any) -> None:
         return
     SensorView(task)  # refuses what a sensor cannot do by itself
     for name, value in only_together.items():
-        if value not in (None, 1):
+        if value not in (None, 0, 1):
             raise refusal(name, value, "left out with own=True, for every sensor decides by itself")
 
 

@@ -73,6 +73,7 @@ class Counterfactual(OnPolicyAlgorithm):
         self, *args: Any, alternatives: Kind | None = None, path_credit: bool = True, **kwargs: Any
     ) -> None:
         self.alternatives, self.path_credit = alternatives, path_credit
+        self.value_scale = 1.0
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
@@ -171,6 +172,7 @@ class Counterfactual(OnPolicyAlgorithm):
         clip = float(self.clip_range(self._current_progress_remaining))
         weight = rollout.old.exp()
         spread = float((weight * rollout.advantages**2).sum(-1).mean().sqrt()) + 1e-8
+        self._rescale_critic(float(rollout.returns.square().mean().sqrt()))
         entries: dict[str, list[float]] = {}
         size = max(self.batch_size // _privileged(self.env).view.rows_per_run, 1)
         for _ in range(self.n_epochs):
@@ -197,6 +199,19 @@ class Counterfactual(OnPolicyAlgorithm):
             self.logger.record(f"train/{name}", float(np.mean(entry)))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
+    def _rescale_critic(self, size: float) -> None:
+        """Let the critic's unit follow the root mean square of the returns, its values unchanged.
+
+        Source: van Hasselt et al. 2016 (Pop-Art). In the returns' own unit a large loss of the
+        critic takes all of the gradient that clipping leaves.
+        """
+        policy: Any = self.policy
+        scale = self.value_scale * (size / self.value_scale) ** (0.05 if self._n_updates else 1.0)
+        with torch.no_grad():
+            for parameter in policy.value_net.parameters():
+                parameter.mul_(self.value_scale / scale)
+        self.value_scale = scale
+
     def _loss(
         self, rollout: RolloutBatch, batch: torch.Tensor, spread: float, clip: float
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
@@ -217,7 +232,8 @@ class Counterfactual(OnPolicyAlgorithm):
         if self.path_credit:
             policy = policy - late.sum((-1, -2)).mean()
         entropy = -(new.exp() * new).sum((-1, -2)).mean()
-        value = (self._critic(observation) - rollout.returns[batch]).square().mean()
+        error = (self._critic(observation) - rollout.returns[batch]) / self.value_scale
+        value = error.square().mean()
         loss = policy - self.ent_coef * entropy + self.vf_coef * value
         with torch.no_grad():
             parts = {
@@ -244,7 +260,7 @@ class Counterfactual(OnPolicyAlgorithm):
         policy: Any = self.policy
         rows = policy.vf_features_extractor(observation.reshape(-1, observation.shape[-1]))
         values: torch.Tensor = policy.value_net(policy.mlp_extractor.forward_critic(rows))
-        values = values.reshape(observation.shape[:-1])
+        values = self.value_scale * values.reshape(observation.shape[:-1])
         return values.sum(-1) if self._decisions.local else values
 
     def _value(self, observation: NDArray[np.float32]) -> Array:

@@ -40,6 +40,7 @@ class ThresholdNumbers(NamedTuple):
     token_exponent: Array
     age_exponent: Array
     margin: Array
+    margin_exponent: Array
 
 
 @dataclass
@@ -66,23 +67,25 @@ class PricedThreshold(BeliefRule):
         token_exponent: κ; above 0 few tokens lower the threshold, below 0 they raise it.
         age_exponent: α; above 0 a long silence raises the threshold, below 0 it lowers it.
         margin: s >= 1, the factor by which each further sensor in the same step must exceed its
-            threshold; 1 for none.
+            threshold at the reference price; 1 for none.
+        margin_exponent: μ; above 0 the margin grows with the price, and is never below 1.
 
     Raises:
-        ConfigurationError: a value that is not allowed, ``margin`` with ``own``, ``own`` with the
+        ConfigurationError: a value that is not allowed, a margin with ``own``, ``own`` with the
             variance, or a task whose policies do not see the sensors (but with the variance).
 
     Equation:
         $$
         r_i=\frac{v_i^{1-m}\,l^m}{\theta_i}\left(\frac{p}{p_0}\right)^{-\beta_i}
         \left(\frac{b+1}{\bar b+1}\right)^{-\kappa}\left(\frac{a_i+1}{6}\right)^{-\alpha},\qquad
-        \delta_i(t)=1\iff v_i>0,\ r_i\ge s^{k_i}
+        \delta_i(t)=1\iff v_i>0,\ r_i\ge\max\{1,s\,(p/p_0)^\mu\}^{k_i}
         $$
 
         vᵢ and l are the ``score``, p is the price of a token, b the tokens of at most b̄ (their
         ratio is 1 where tokens are unlimited), aᵢ the steps since the last delivery, kᵢ the number
         of sensors of a larger r in this step. θ is ``threshold``, β ``price_exponent``, p₀
-        ``reference_price``, m ``mixture``, κ ``token_exponent``, α ``age_exponent``, s ``margin``.
+        ``reference_price``, m ``mixture``, κ ``token_exponent``, α ``age_exponent``, s ``margin``,
+        μ ``margin_exponent``.
 
     Assumes: what the rules of its score assume, ``value_of_information``,
     ``innovation_threshold`` or ``variance_threshold``; numbers that were searched for this task.
@@ -103,7 +106,8 @@ class PricedThreshold(BeliefRule):
     token_exponent: float = parameter(0.0, validation.number)
     age_exponent: float = parameter(0.0, validation.number)
     margin: float = parameter(1.0, validation.number, at_least=1.0)
-    together: ClassVar[tuple[str, ...]] = ("margin",)
+    margin_exponent: float = parameter(0.0, validation.number)
+    together: ClassVar[tuple[str, ...]] = ("margin", "margin_exponent")
 
     def __post_init__(self) -> None:
         if self.score == "variance":
@@ -121,7 +125,7 @@ class PricedThreshold(BeliefRule):
     def knowledge(self) -> Knowledge:
         """By the score, by the task's memory, and by whether sensors are compared."""
         if self.score == "innovation":
-            return "own" if self.margin == 1.0 else "scheduler"
+            return "scheduler" if self.margin != 1.0 or self.margin_exponent else "own"
         return "centre" if self.score == "variance" else super().knowledge
 
     def __call__(self, signals: Signals) -> Requests:
@@ -130,18 +134,20 @@ class PricedThreshold(BeliefRule):
         numbers, bucket, age = self.numbers, self.task.bucket, np.maximum(signals["age"], 0.0)
         price = signals["price"] if self.price is None else np.asarray(self.price)
         tokens = (signals["tokens"] + 1.0) / (bucket.capacity + 1.0)
-        least = numbers.threshold * (price / self.reference_price) ** numbers.price_exponent
+        price = price / self.reference_price
+        least = numbers.threshold * price**numbers.price_exponent
         if not bucket.unlimited:
             least = least * tokens**numbers.token_exponent
         least = least * ((age + 1.0) / 6.0) ** numbers.age_exponent
         value, loss = np.maximum(value, 0.0), np.maximum(loss, 0.0)
         score = value ** (1.0 - numbers.mixture) * loss**numbers.mixture
         requests = (value > 0.0) & (score >= least)
-        if np.all(numbers.margin == 1.0):
+        margin = np.maximum(numbers.margin * price**numbers.margin_exponent, 1.0)
+        if np.all(margin == 1.0):
             return requests
         ratio = np.where(requests, score / np.maximum(least, 1e-300), 0.0)
         rank = np.argsort(np.lexsort((-age, -ratio), axis=0), axis=0)
-        result: Requests = requests & (score >= least * numbers.margin**rank)
+        result: Requests = requests & (score >= least * margin**rank)
         return result
 
     def _scores(self, signals: Signals) -> tuple[Array, Array]:
