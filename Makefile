@@ -123,18 +123,18 @@ lint: $(STAMP)  ## ruff and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-format: $(STAMP)  ## let ruff mend what it can, and write the tables of docs/
+format: $(STAMP)  ## let ruff mend what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
-	$(BIN)/python -m fusion_gym.envs.pages docs/*.md
 
-# Beside the other packages, for the tutorials train agents. Warnings end it (strict, in mkdocs.yml).
+# Beside the other packages, for the tutorials train agents. Warnings end it. The outputs of the pages' Python stay in runs/docs/.
 $(VENV)/.docs: $(STAMP)
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable '.[agents,docs]'
 	touch $@
 
-docs: $(VENV)/.docs  ## the documentation site into site/, its tutorials executed, its links checked
-	NO_MKDOCS_2_WARNING=1 OMP_NUM_THREADS=1 $(BIN)/python -m mkdocs build
+docs: $(VENV)/.docs  ## the documentation site into site/, its Python executed, its links checked
+	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -q -c docs -d runs/docs/doctrees . site/html
+	echo '<meta http-equiv="refresh" content="0; url=html/docs/index.html">' > site/index.html
 
 bench: $(STAMP)  ## steps per second beside the alternatives, as ratios of one run
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.throughput

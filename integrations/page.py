@@ -18,7 +18,7 @@ def section(library: str) -> str:
 
 def run(library: str) -> dict[str, Any]:
     """Run a library's block as a script; returns its names."""
-    (code,) = re.findall(r"^```python\n(.*?)^```", section(library), re.DOTALL | re.MULTILINE)
+    (code,) = re.findall(r"^```py(?:thon)?\n(.*?)^```", section(library), re.DOTALL | re.MULTILINE)
     names: dict[str, Any] = {"__name__": "__main__"}
     exec(compile(code, f"docs/other_libraries.md, {library}", "exec"), names)
     return names

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-LANGUAGES = {"python": "python", "bash": "shell", "sh": "shell", "yaml": "yaml"}
+LANGUAGES = {"python": "python", "py": "python", "bash": "shell", "sh": "shell", "yaml": "yaml"}
 HIDDEN = "# markdown-exec: hide"
 COMMAND = re.compile(r"^(fusion-gym|make|pip install|python -m (agents|benchmarks|fusion_gym))\b")
 _FENCE = re.compile(r"^ *(```+)\s*(\w*)(.*)$")

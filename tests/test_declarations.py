@@ -7,6 +7,7 @@ import pytest
 
 from fusion_gym.docstrings import read
 from fusion_gym.envs.pages import task_of
+from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 from fusion_gym.evaluation.metrics import METRICS
 from fusion_gym.fusion.table import RULES
 from fusion_gym.policies.registry import (
@@ -16,17 +17,17 @@ from fusion_gym.policies.registry import (
     policy_parameters,
 )
 from fusion_gym.training.algorithms import TABLE
-from website import parts
 
-DECLARED = [(kind, part) for kind in parts.KIND_NAMES for part in parts.parts(kind)]
+POLICIES = [policy_maker(name) for kind in ("rule", "reference") for name in policy_names(kind)]
+FILTERS = [owner for env_id in ENVIRONMENTS for owner in options_of(env_id).filters.values()]
+FUSION = [type(row.make()) for row in RULES.values()]
+DECLARED: list[Any] = list(dict.fromkeys([*POLICIES, *FILTERS, *FUSION]))
 
 
-@pytest.mark.parametrize(
-    ("kind", "part"), DECLARED, ids=lambda value: getattr(value, "name", value)
-)
-def test_a_declaration_is_complete(kind: str, part: parts.Part) -> None:
-    result = read(part.owner)
-    expected = {"Equation", "Assumes", "Source"} | ({"Example"} if kind == "rules" else set())
+@pytest.mark.parametrize("owner", DECLARED, ids=lambda owner: owner.__name__)
+def test_a_declaration_is_complete(owner: Any) -> None:
+    result = read(owner)
+    expected = {"Equation", "Assumes", "Source"} | ({"Example"} if owner in POLICIES else set())
     assert result.summary.endswith((".", ":"))
     assert expected <= result.labelled.keys()
     assert all(result.labelled[label].strip() for label in expected)

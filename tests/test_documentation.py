@@ -1,6 +1,5 @@
 """What the README and the pages show must run, and their tables must name what exists."""
 
-import importlib.util
 import pydoc
 import re
 import subprocess
@@ -9,13 +8,12 @@ from pathlib import Path
 
 import pytest
 import yaml
-from page_blocks import blocks_of, imported
+from page_blocks import blocks_of
 
 import fusion_gym
 from agents.benchmark.report import headline_text
 from agents.benchmark.settings import load_suite
 from agents.benchmark.tables import ClassRow, read_rows
-from fusion_gym.envs import pages
 from fusion_gym.envs.option_text import options_in
 from fusion_gym.envs.registration import ENVIRONMENTS, options_of
 
@@ -25,46 +23,13 @@ DOCS = sorted((ROOT / "docs").glob("*.md"))
 TEXTS = README + "".join(path.read_text() for path in (*DOCS, ROOT / "CONTRIBUTING.md"))
 
 
-def importable(code: str) -> bool:
-    """Whether all packages that it imports are here."""
-    packages = {module.partition(".")[0] for module in imported(code)}
-    return all(importlib.util.find_spec(package) is not None for package in packages)
-
-
 TITLES = {setting.name: setting.title for setting in load_suite().settings}
-JOURNEYS = [path.read_text() for path in (ROOT / "tests" / "journeys").glob("*.py")]
-BLOCKS = {
-    path.name: blocks_of(path.relative_to(ROOT), path.read_text())
-    for path in (ROOT / "README.md", *DOCS, ROOT / "CONTRIBUTING.md")
-}
-EXAMPLES = [
-    (name, place)
-    for name, blocks in BLOCKS.items()
-    for place, block in enumerate(blocks)
-    # Those of libraries that are not here are run by `make integrations` and its sisters.
-    if block.language == "python"
-    and block.text not in JOURNEYS  # tests/test_journeys.py runs them
-    and (name != "other_libraries.md" or importable(block.text))
-]
-
-
-@pytest.mark.parametrize(("name", "place"), EXAMPLES)
-def test_python_examples_run(
-    name: str, place: int, registries: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """``tests/wheel_blocks.py`` runs them again, with the wheel and the extras that they need."""
-    monkeypatch.chdir(tmp_path)
-    block = BLOCKS[name][place]
-    for other in BLOCKS[name][:place]:
-        if other.file is not None:
-            Path(other.file).write_text(other.text)
-    exec(compile(block.text, "example", "exec"), {})
 
 
 def test_the_evaluation_command_runs(tmp_path: Path) -> None:
     words = next(
         words
-        for block in BLOCKS["policies.md"]
+        for block in blocks_of(Path("policies.md"), (ROOT / "docs/policies.md").read_text())
         for _, words in block.commands()
         if words[:2] == ["fusion-gym", "evaluate"]
     )
@@ -107,10 +72,11 @@ def test_the_readme_says_what_the_results_say() -> None:
 
 
 def doc_of(env_id: str) -> str:
-    """The file in docs that the README's table links for an environment."""
-    row = re.search(rf"\[`{env_id}`\]\((docs/\w+\.md)\)", README)
+    """The page that docs/environments.md links for an environment."""
+    text = (ROOT / "docs/environments.md").read_text()
+    row = re.search(rf"\[`{env_id}`\]\((\w+\.md)\)", text)
     assert row is not None
-    return (ROOT / row[1]).read_text()
+    return (ROOT / "docs" / row[1]).read_text()
 
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
@@ -120,14 +86,8 @@ def test_every_option_and_entry_has_a_meaning_and_a_table(env_id: str) -> None:
     meanings |= {block.name: block.meaning for block in blocks}
     assert not [name for name, meaning in meanings.items() if not meaning]
     page = doc_of(env_id)
-    assert re.search(rf"<!-- options: .*{env_id}", page)
-    assert "<!-- observation: " in page
-
-
-@pytest.mark.parametrize("path", DOCS, ids=lambda path: path.stem)
-def test_tables_in_the_docs_are_those_of_the_code(path: Path) -> None:
-    text = path.read_text()
-    assert text == pages.update_tables(text), "run python -m fusion_gym.envs.pages docs/*.md"
+    assert re.search(rf"{{options-table}} .*{env_id}", page)
+    assert "{observation-table} " in page
 
 
 def test_the_citation_is_of_this_version() -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 import fusion_gym
 from fusion_gym.commands.__main__ import COMMANDS
 from fusion_gym.envs import registered
-from fusion_gym.envs.pages import _MARKED
 from fusion_gym.envs.registration import ENVIRONMENTS, class_name
 
 ROOT = Path(__file__).parent.parent
@@ -53,7 +52,7 @@ def named_by_environments() -> set[str]:
 def texts() -> Iterator[tuple[str, str]]:
     for path in sorted((ROOT / "docs").rglob("*.md")):
         if path.name != "glossary.md":
-            yield path.relative_to(ROOT).as_posix(), _MARKED.sub("", path.read_text())
+            yield path.relative_to(ROOT).as_posix(), path.read_text()
     for name, tree in TREES.items():
         values = (getattr(n.value, "value", 0) for n in ast.walk(tree) if isinstance(n, ast.Expr))
         yield name, "\n".join(value for value in values if isinstance(value, str))

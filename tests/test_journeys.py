@@ -18,7 +18,7 @@ PAGES = {
     "evaluate": "README.md",
     "train": "README.md",
     "pareto_front": "docs/training.md",
-    "own_plant": "docs/own_system.md",
+    "own_plant": "docs/your_system.md",
     "read_result": "docs/benchmark.md",
 }
 LIBRARIES = {"fusion_gym", "gymnasium", "numpy", "stable_baselines3"}

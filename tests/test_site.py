@@ -1,59 +1,37 @@
-"""What the site is made of, as far as that needs no builder: `make docs` checks the rest."""
+"""The reference has a page for every public name; `make docs` checks the rest of the site."""
 
-import re
 from pathlib import Path
 
-import pytest
+import fusion_gym
+from fusion_gym import evaluation
+from fusion_gym.envs.registration import ENVIRONMENTS, options_of
+from fusion_gym.fusion.table import RULES
+from fusion_gym.policies.registry import policy_maker, policy_names
 
-from fusion_gym.envs.registration import ENVIRONMENTS
-from website import environment_pages, parts, places, reference
-
-
-@pytest.mark.parametrize("kind", parts.KIND_NAMES)
-def test_every_part_has_a_page_with_its_declaration(kind: str) -> None:
-    pages = parts.pages(kind)
-    overview = pages.pop(f"{kind}/index.md")
-    assert len(pages) > 7
-    for place, text in pages.items():
-        assert f"({Path(place).name})" in overview
-        assert re.search(r"^::: fusion_gym\.[\w.]+$", text, re.MULTILINE)
+DOCS = Path(__file__).parent.parent / "docs"
 
 
-def test_environment_pages_get_their_tables() -> None:
-    assert places.pages_of().keys() == ENVIRONMENTS.keys()
-    text = environment_pages.with_tables("# A page\n\nText.\n\n## One\n\nMore.\n", "biased")
-    heads = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
-    assert heads[:3] == ["A page", "One", "From the code"]
-    for name in ("BiasedOscillator-v1", "BiasedTracking-v1"):
-        assert {f"{head} of {name}" for head in environment_pages.SECTIONS} <= set(heads)
-        assert f"`fusion_gym/{name}`" in text.partition("## One")[0]
+def listed(page: str) -> set[str]:
+    """The names of the tables of a page that are links to the reference."""
+    lines = (line.strip() for line in (DOCS / page).read_text().splitlines())
+    return {line for line in lines if line.startswith("fusion_gym.")}
 
 
-def test_links_lead_to_what_there_is() -> None:
-    text = (
-        "[a](step.md) [b](../results/README.md#overview) [c](../fusion_gym/linalg.py) "
-        "[d](../nowhere.md) [e](https://example.org) ![f](../results/tobit_oscillator.png) "
-        "[g](../tests/laws)"
-    )
-    changed = places.with_links(text, "docs/use.md", "use.md")
-    assert changed == (
-        "[a](step.md) [b](results/report.md#overview) "
-        f"[c]({places.REPOSITORY}/blob/main/fusion_gym/linalg.py) [d](../nowhere.md) "
-        "[e](https://example.org) ![f](results/tobit_oscillator.png) "
-        f"[g]({places.REPOSITORY}/tree/main/tests/laws)"
-    )
-    assert places.with_links("[a](biased.md)", "docs/use.md", "x/y.md") == "[a](../biased.md)"
+def paths(owners: list[object]) -> set[str]:
+    return {f"{owner.__module__}.{owner.__qualname__}" for owner in owners}  # type: ignore[attr-defined]
 
 
-def test_the_navigation_has_every_page_once() -> None:
-    text = (places.ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2].partition("\nhooks:")[0]
-    pages = re.findall(r"[\w/]+\.md", text)
-    assert len(pages) == len(set(pages))
-    written = {str(path.relative_to(places.DOCS)) for path in places.DOCS.rglob("*.md")}
-    assert set(pages) == written | set(places.PAGES.values())
+def test_the_reference_has_every_public_name() -> None:
+    modules = {"evaluation", "zoo"}
+    names = {f"fusion_gym.{name}" for name in {*fusion_gym.__all__} - modules - {"__version__"}}
+    names |= {f"fusion_gym.evaluation.{name}" for name in evaluation.__all__}
+    names |= paths([options_of(env_id) for env_id in ENVIRONMENTS])
+    assert names <= listed("reference.md")
 
 
-def test_the_navigation_of_the_reference_has_every_module() -> None:
-    first, *groups = reference.navigation()
-    listed = [page for group in groups for pages in group.values() for page in pages]
-    assert {first, *(place for page in listed for place in page.values())} == set(reference.pages())
+def test_every_policy_filter_and_fusion_rule_has_a_page() -> None:
+    kinds: list[str] = [*policy_names("rule"), *policy_names("reference")]
+    assert paths([policy_maker(name) for name in kinds]) == listed("rules.md")
+    filters = [owner for env_id in ENVIRONMENTS for owner in options_of(env_id).filters.values()]
+    rules = [type(row.make()) for row in RULES.values()]
+    assert paths([*filters, *rules]) == listed("filters.md")

@@ -24,6 +24,7 @@ from agents.benchmark.evidence import (
     evaluate_policy,
     gather,
     point_rows,
+    search_again,
 )
 from agents.benchmark.jobs import Runner
 from agents.benchmark.report import print_classes, write_results
@@ -51,6 +52,9 @@ class Benchmark(Long):
     """A policy to compare with the searched rule, in the place of all else."""
     of: Annotated[ClassName | None, tyro.conf.arg(name="class")] = None
     """Class of the policy."""
+    second_search: bool = False
+    """Search three classes again with four times the generations, and compare, in the place of all
+    else."""
     results: Annotated[Path | None, OutputFolder()] = None
     """Folder for tables, figures and README.md: results, or runs/benchmark/results with --quick."""
     work: Annotated[Path, OutputFolder()] = Path("runs/benchmark")
@@ -68,6 +72,8 @@ class Benchmark(Long):
         Raises:
             ConfigurationError: a policy without a class, or a value that is not allowed.
         """
+        if self.second_search and self.policy is not None:
+            raise refusal("second_search", True, "given without --policy")
         if (self.policy is None) != (self.of is None):
             raise refusal("class", self.of, "given with --policy, and only then")
         suite = load_suite(self.quick, self.settings)
@@ -80,8 +86,11 @@ class Benchmark(Long):
         with ended_like_by_ctrl_c(), alone_in(work, "work"):
             runner = Runner(work.absolute(), pool)
             writing(("finished pieces of work", work))
-            if self.policy is not None and self.of is not None:
-                classes = evaluate_policy(suite, runner, self.policy, self.of)
+            if self.second_search or self.policy is not None:
+                if self.policy is not None and self.of is not None:
+                    classes = evaluate_policy(suite, runner, self.policy, self.of)
+                else:
+                    classes = search_again(suite, runner)
                 print_classes(class_rows(classes), point_rows(suite, classes))
                 return
             classes = gather(suite, runner)

@@ -135,7 +135,7 @@ def find_prices(suite: Suite, runner: Runner, names: Sequence[ClassName] = CLASS
 
 
 def find_rules(suite: Suite, runner: Runner, classes: Sequence[Class]) -> None:
-    """SearchJob one rule for all prices of each class."""
+    """Search one rule for all prices of each class."""
     jobs = [
         SearchJob(of.setting, of.name, of.prices, suite.generations, runner.folder / "searches")
         for of in classes
@@ -228,13 +228,38 @@ def evaluate_policy(suite: Suite, runner: Runner, text: str, name: ClassName) ->
     """Test anybody's policy in a class of every setting, beside the searched rule."""
     classes = find_prices(suite, runner, (name,))
     find_rules(suite, runner, classes)
-    count = len(suite.shares)
     kinds = {REFERENCE: [of.rule for of in classes], "policy": [text] * len(classes)}
+    test_texts(suite, runner, classes, kinds)
+    return classes
+
+
+def search_again(suite: Suite, runner: Runner) -> list[Class]:
+    """Search three classes, drawn by a seed, with four times the generations and other episodes."""
+    classes = find_prices(suite, runner)
+    find_rules(suite, runner, classes)
+    drawn = np.random.default_rng(0).choice(len(classes), min(3, len(classes)), replace=False)
+    classes = [classes[place] for place in sorted(drawn)]
+    jobs = [
+        SearchJob(of.setting, of.name, of.prices, 4 * suite.generations, runner.folder / "searches",
+                  2_000_000_000)
+        for of in classes
+    ]  # fmt: skip
+    texts = [f"{text},price={{price}}" for text in runner.run(run_search, jobs, "second searches")]
+    test_texts(suite, runner, classes, {REFERENCE: [of.rule for of in classes], "second": texts})
+    return classes
+
+
+def test_texts(
+    suite: Suite, runner: Runner, classes: Sequence[Class], kinds: dict[str, list[str]]
+) -> None:
+    """Test one policy for each class, at all prices, of every kind."""
     for kind, texts in kinds.items():
-        jobs = [of.test([t] * count, suite.episodes) for of, t in zip(classes, texts, strict=True)]
+        jobs = [
+            of.test([text] * len(of.prices), suite.episodes)
+            for of, text in zip(classes, texts, strict=True)
+        ]
         for of, outcomes in zip(classes, runner.run(run_test, jobs, kind), strict=True):
             of.tests[kind] = [outcomes]
-    return classes
 
 
 def policy_rows(suite: Suite, classes: Sequence[Class]) -> list[TestRow]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from rich.table import Table
 
 from agents.benchmark.evidence import (
@@ -27,6 +28,8 @@ from fusion_gym.output.files import write_text
 from fusion_gym.output.palette import READABLE
 from fusion_gym.version import __version__
 
+ERROR = "error a step, in the reward's weights"
+HEADLINE = "tobit_oscillator", "scheduler"  # the class of README's figure
 GAIN = 0.01  # a difference that the sentences name
 README = Path("README.md")
 TITLES = {
@@ -55,6 +58,9 @@ def write_results(suite: Suite, classes: Sequence[Class], folder: Path) -> None:
     for setting in suite.settings:
         own = [row for row in policies if row.setting == setting.name]
         draw_setting(own, setting.title, folder / f"{setting.name}.png")
+    for of in classes:
+        if (of.setting.name, of.name) == HEADLINE:
+            draw_headline(policies, of, folder / "readme.png")
     titles = {setting.name: setting.title for setting in suite.settings}
     headline = headline_text(titles, means)
     page = [
@@ -105,7 +111,16 @@ def headline_text(titles: dict[str, str], rows: Sequence[ClassRow]) -> str:
         (title, *(agents.get((name, of), "–") for of in CLASSES)) for name, title in titles.items()
     )
     head = ("cost of agents over the searched rule's, %", *TITLES.values())
-    return f"{table(head, cells)}\n\nNegative: the agent is better."
+    medians = {
+        kind: np.median([row.difference for row in rows if row.kind == kind] or [np.nan])
+        for kind in ("trigger", "threshold", "agent")
+    }
+    text = (
+        "Negative: the agent is better. In the median class the paper's trigger, scaled, costs "
+        f"{medians['trigger']:+.1%} over the searched rule, the best rule with one threshold "
+        f"{medians['threshold']:+.1%}, and an agent {medians['agent']:+.1%}."
+    )
+    return f"{table(head, cells)}\n\n{text.replace('-', '−')}"
 
 
 def class_table(
@@ -163,21 +178,45 @@ def draw_setting(rows: Sequence[TestRow], title: str, path: Path) -> None:
     names = list(dict.fromkeys(row.name for row in rows))
     figure, panels = plt.subplots(1, len(names), figsize=(4.2 * len(names), 3.6), squeeze=False)
     for panel, name in zip(panels[0], names, strict=True):
-        for kind, (label, colour, marker) in LINES.items():
-            own = [row for row in rows if (row.name, row.kind) == (name, kind)]
-            for seed in sorted({row.seed for row in own}):
-                line = [row for row in own if row.seed == seed]
-                panel.plot(
-                    [row.tokens for row in line], [row.error for row in line], color=colour,
-                    marker=marker, markersize=5, linewidth=1, label=label if seed == 0 else None,
-                )  # fmt: skip
-        panel.set(xscale="log", yscale="log", xlabel="tokens a step", title=TITLES[name])
-        panel.xaxis.set_minor_formatter("")
-    panels[0][0].set_ylabel("error, in the reward's weights")
+        draw_class(panel, [row for row in rows if row.name == name])
+        panel.set(title=TITLES[name])
+    panels[0][0].set_ylabel(ERROR)
     figure.suptitle(title)
     figure.tight_layout(rect=(0.0, 0.08, 1.0, 1.0))
     figure.legend(*panels[0][-1].get_legend_handles_labels(), loc="lower center", ncols=5)
     save_figure(figure, path)
+
+
+def draw_headline(rows: Sequence[TestRow], of: Class, path: Path) -> None:
+    """Draw one class and its proven bound: error >= max over prices of (bound - price · tokens)."""
+    plt.rcParams.update(READABLE)
+    figure, panel = plt.subplots(figsize=(7.0, 4.4))
+    draw_class(
+        panel, [row for row in rows if (row.setting, row.name) == (of.setting.name, of.name)]
+    )
+    if of.bounds:
+        label, colour, _ = LINES["bound"]
+        tokens = np.geomspace(*panel.get_xlim(), 200)
+        errors = np.max(np.array(of.bounds) - np.multiply.outer(tokens, of.prices), axis=1)
+        panel.plot(tokens[errors > 0], errors[errors > 0], "--", color=colour, label=label)
+    panel.set(ylabel=ERROR, title=f"{of.setting.title}, {TITLES[of.name]}")
+    panel.legend()
+    figure.tight_layout()
+    save_figure(figure, path)
+
+
+def draw_class(panel: Axes, rows: Sequence[TestRow]) -> None:
+    """Draw error against tokens a step in one class, a line for each policy and seed."""
+    for kind, (label, colour, marker) in LINES.items():
+        own = [row for row in rows if row.kind == kind]
+        for seed in sorted({row.seed for row in own}):
+            line = [row for row in own if row.seed == seed]
+            panel.plot(
+                [row.tokens for row in line], [row.error for row in line], color=colour,
+                marker=marker, markersize=5, linewidth=1, label=label if seed == 0 else None,
+            )  # fmt: skip
+    panel.set(xscale="log", yscale="log", xlabel="tokens a step")
+    panel.xaxis.set_minor_formatter("")
 
 
 def print_classes(rows: Sequence[ClassRow], points: Sequence[PointRow]) -> None:

@@ -82,7 +82,7 @@ def _summarise_network(data: Data) -> Data:
     means = {
         "transmissions an event": [data["grant_share"]], "level of tokens": [data["tokens"]],
         "tokens spent a step": [data["spent"]],
-        "tokens asked for a step without a bucket": [data["wanted"]],
+        "tokens requested a step without a bucket": [data["wanted"]],
     }  # fmt: skip
     return {
         "columns": columns,

@@ -1,16 +1,14 @@
 """An environment's page, made from what the code declares: options, blocks, spaces.
 
-``python -m fusion_gym.envs.pages docs/*.md`` writes the tables of these files anew. A table stands
-between ``<!-- KIND: TEXT -->`` and ``<!-- end -->``, KIND a name of ``TABLES``. The text of
-``observation`` is ``ID name=value``; after a semicolon follow other options, and what they add is
-marked so. ``options`` has ids, and the names of the options in the table.
+The documentation shows a table by the directive ``KIND-table`` with a text, KIND a name of
+``TABLES``. The text of ``observation`` is ``ID name=value``; after a semicolon follow other
+options, and the table marks their entries. That of ``options`` has ids and names of options.
 """
 
 import ast
 import inspect
 import re
 import shlex
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +30,6 @@ from fusion_gym.envs.option_text import list_options, options_in, short
 from fusion_gym.envs.registration import make_task, options_of
 from fusion_gym.envs.views import is_received, make_view
 from fusion_gym.fusion.table import RULES
-from fusion_gym.importing import import_named
 
 LEGEND = """\
 A star marks what only the sensors know: `information="centre"` leaves it out. The third column
@@ -60,7 +57,7 @@ _ACTIONS = {
     "discrete": "The number has a bit for each sensor, the lowest for sensor 0",
 }
 _LONGEST = 60  # characters of a default in a table
-# What writes the tables of a kind from the text of their marker: "module:function".
+# What writes the table of a kind from the text of its directive: "module:function".
 TABLES = {
     "observation": f"{__name__}:observation_text",
     "options": f"{__name__}:option_table",
@@ -70,7 +67,6 @@ TABLES = {
     "metrics": "fusion_gym.evaluation.metrics:metric_table",
     "algorithms": "fusion_gym.training.algorithms:algorithm_table",
 }
-_MARKED = re.compile(rf"(<!-- ({'|'.join(TABLES)}): (.*?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 _QUEUE = ", sensors share limited tokens in turns"
 _SECOND = f"v1: covariances may be singular{_QUEUE}; noise is counted, not drawn in sequence."
@@ -153,19 +149,6 @@ def option_table(text: str) -> str:
         cells = " or ".join(types), "; ".join(d if len(d) < _LONGEST else "…" for d in defaults)
         rows.append((f"`{name}`", *map(_double, cells), plain_marks(every[0][name].meaning)))
     return table(("option", "type", "default", "meaning"), rows)
-
-
-def update_tables(text: str) -> str:
-    """The text with all its marked tables made anew.
-
-    Raises:
-        ConfigurationError: an id or an option in a marker that does not exist.
-    """
-
-    def rewrite(match: re.Match[str]) -> str:
-        return f"{match[1]}{import_named('table', TABLES[match[2]])(match[3])}\n{match[4]}"
-
-    return _MARKED.sub(rewrite, text)
 
 
 def observation_text(marker: str) -> str:
@@ -260,13 +243,3 @@ def _listed(words: list[str]) -> str:
 def _double(text: str) -> str:
     """Words in the quotes of the documentation."""
     return text.replace("'", '"')
-
-
-def main(paths: list[str]) -> None:
-    """Write the tables of these files anew."""
-    for path in map(Path, paths):
-        path.write_text(update_tables(path.read_text(encoding="utf-8")), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

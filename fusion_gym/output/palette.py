@@ -4,11 +4,13 @@ From the palette of M. Okabe and K. Ito, which people who are colour-blind tell 
 blue, agents orange, lighter without memory; what stands still is grey or black.
 """
 
+import os
 from typing import Any
 
 import matplotlib
 
-matplotlib.use("Agg")
+if "MPLBACKEND" not in os.environ:
+    matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 INK = "#30343b"
