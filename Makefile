@@ -104,7 +104,7 @@ integrations-rllib: .venv-rllib/.installed  ## RLlib
 	.venv-rllib/bin/python -m pytest integrations/rllib
 
 benchmark: $(STAMP)  ## rules and agents of every class: results/
-	$(BIN)/python -m agents.benchmark --resume
+	$(BIN)/python -m agents.benchmark
 
 papers: $(STAMP)  ## the five papers' figures, tables and claims: docs/reproduction/
 	$(BIN)/python -m agents.papers all --resume

@@ -102,6 +102,13 @@ def test_a_policy_of_ones_own_has_the_same_verdict(small: list[str]) -> None:
     assert "second_search = True is not allowed" in both
 
 
+def test_the_make_target_is_a_command() -> None:
+    makefile = (Path(__file__).parent.parent / "Makefile").read_text()
+    _, words = makefile.split("python -m agents.benchmark", 1)
+    error = refusal("benchmark", [*words.splitlines()[0].split(), "--settings", "nowhere"])
+    assert "settings = 'nowhere' is not allowed" in error
+
+
 def test_a_second_search_has_other_episodes_and_more_of_them(
     small: list[str], tmp_path: Path
 ) -> None:
