@@ -45,7 +45,6 @@ class Listed:
 
 LISTED = (
     Listed("make ", "works in a clone: its targets are looked for in the Makefile"),
-    Listed("python -m pytest", "works in a clone"),
     Listed("python -m agents.", "works in a clone"),
     Listed("pip install ", "downloads: its extras are looked for in the wheel"),
     Listed("fusion-gym train --config tobit_oscillator_front", "minutes; wheel_smoke.py trains it"),
