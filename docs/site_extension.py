@@ -51,7 +51,6 @@ class DeclarationTable(SphinxDirective):
     """A table of what the code declares; its name is a kind of ``fusion_gym.envs.pages``."""
 
     required_arguments, final_argument_whitespace = 1, True
-    has_content = False
 
     def run(self) -> list[nodes.Node]:
         """Parse the table."""

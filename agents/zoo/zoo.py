@@ -4,8 +4,7 @@
 
 The agent is that of the training seed with the least cost in validation, so its test figures stay
 honest. What the benchmark has not finished is done first. Agents of other names are removed. A
-model
-is kept as Stable-Baselines3 saved it, without the state of its optimiser.
+model is kept as Stable-Baselines3 saved it, without the state of its optimiser.
 """
 
 import hashlib

@@ -221,7 +221,7 @@ class SchedulerBeliefs(Beliefs):
 
 
 class OwnBeliefs(Beliefs):
-    """Of every sensor by itself (k = sensors), by its own measurements and what it hears."""
+    """The beliefs of local sensors (k = sensors), by their measurements and what they receive."""
 
     @cached_property
     def silent(self) -> Estimate:

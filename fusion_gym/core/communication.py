@@ -1,4 +1,4 @@
-"""The communication model: what a packet holds, what a node hears, whether it remembers."""
+"""The communication model: what a packet holds, what a node receives, whether it has memory."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple, get_args

@@ -163,7 +163,7 @@ class Scenario:
     weighs all states alike. ``reward_scale`` multiplies them. ``policy_defaults`` are the
     scenario's own parameters of named policies.
 
-    ``feedback`` says that every node hears the centre's estimate by construction.
+    ``feedback`` says that every node receives the centre's estimate by construction.
     ``memory_system`` is the system, on the same noise, whose filter remembers what was not sent;
     ``None`` is the system itself, and with ``nodes_remember`` there is no need of it: every node's
     packet holds all that the node has ever measured. ``no_estimates`` is why a packet cannot hold

@@ -22,7 +22,7 @@ class EstimateDifference(BeliefRule):
     own measurement would change.
 
     Args:
-        own: every sensor decides by itself, on its own memory and what it hears.
+        own: every sensor decides locally, by its memory and what it receives.
         threshold: θ >= 0, in the unit of the states, or without a unit.
         whitened: weigh by the inverse of the centre's claimed covariance.
         at_most: most sensors requested in a step, those of the highest value; None for no limit.

@@ -28,7 +28,7 @@ class ValueOfInformation(BeliefRule):
     memory.
 
     Args:
-        own: every sensor decides by itself, on its own memory and what it hears.
+        own: every sensor decides locally, by its memory and what it receives.
         threshold: θ >= 0, in squared units of the states; 0.03 where no price is given either.
         price: of a token, in the reward's units, in the place of the threshold.
         at_most: most sensors requested in a step, those of the highest value; None for no limit.
